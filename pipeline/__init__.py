@@ -1,0 +1,1 @@
+"""From the MCAP logs of field robots to knowledge about their motion."""

@@ -1,0 +1,38 @@
+"""The one base of every error that a user may see.
+
+An error has a stable code for scripts, says what is wrong and where, and ends with what to do about it.
+Each room derives one class of its own.
+"""
+
+from __future__ import annotations
+
+
+class SlipError(Exception):
+    """Something the user can mend.
+
+    Args:
+        code: stable identifier in snake_case, for example ``log_not_found``.
+        what: what is wrong, one sentence without a full stop.
+        where: the file, topic, key or line it concerns; empty when there is none.
+        hint: what to do about it.
+    """
+
+    def __init__(self, code: str, what: str, *, where: str = "", hint: str) -> None:
+        super().__init__(what)
+        self.code = code
+        self.what = what
+        self.where = where
+        self.hint = hint
+
+    def __str__(self) -> str:
+        """One line: where, what, what to do."""
+        place = f"{self.where}: " if self.where else ""
+        return f"{place}{self.what}. {self.hint}"
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Keep every part when the error crosses a process boundary."""
+        return _rebuild, (type(self), self.code, self.what, self.where, self.hint)
+
+
+def _rebuild(kind: type[SlipError], code: str, what: str, where: str, hint: str) -> SlipError:
+    return kind(code, what, where=where, hint=hint)
