@@ -1,0 +1,33 @@
+"""What was asked of the drive."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import dataframely as dy
+import polars as pl
+
+from schemas import fields
+from schemas.contract import Table
+
+
+class Commands(Table):
+    """One row a command message, held until the next one or until it is stale."""
+
+    NAME: ClassVar[str] = "commands"
+    VERSION: ClassVar[int] = 1
+
+    t = fields.seconds()
+    stamp = fields.stamp()
+    log_time = fields.log_time()
+    left = fields.number("rad/s", "commanded speed of the left wheels", nullable=True)
+    right = fields.number("rad/s", "commanded speed of the right wheels", nullable=True)
+    speed = fields.body("m/s", "commanded speed (Ackermann)", nullable=True)
+    steering = fields.body("rad", "commanded steering angle (Ackermann), left positive", nullable=True)
+    body_x = fields.body("m/s", "commanded forward speed where the command is a Twist", nullable=True)
+    body_w = fields.body("rad/s", "commanded yaw rate where the command is a Twist", nullable=True)
+    active = fields.flag("inside an interval in which commands are live")
+
+    @dy.rule()
+    def drive_is_complete(cls) -> pl.Expr:  # noqa: N805 - dataframely rules receive the class
+        return fields.drive_is_complete()

@@ -1,0 +1,29 @@
+"""What was noticed about a log, in words, with stable ids."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import dataframely as dy
+
+from schemas import fields
+from schemas.contract import Table
+
+SEVERITIES = ("info", "warning", "error")
+
+
+class Findings(Table):
+    """One row a finding."""
+
+    NAME: ClassVar[str] = "findings"
+    VERSION: ClassVar[int] = 1
+
+    stage = fields.text("stage that noticed it")
+    id = dy.String(min_length=1, regex=r"^[a-z][a-z0-9_]*$", metadata={"description": "stable id"})
+    severity = dy.Enum(SEVERITIES, metadata={"description": "info, warning, or error: do not trust results"})
+    text = dy.String(min_length=1, metadata={"description": "the finding in one sentence"})
+    where = fields.text("topic, column or stretch of time; empty for the whole run")
+    t_start = fields.number("s", "start of the stretch it concerns", nullable=True)
+    t_end = fields.number("s", "end of the stretch it concerns", nullable=True)
+    value = fields.number("1", "the number behind it, in the unit the text gives", nullable=True)
+    count = dy.Int64(nullable=True, min=0, metadata={"description": "how often"})

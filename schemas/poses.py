@@ -1,0 +1,39 @@
+"""Where the localization says the vehicle was."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import dataframely as dy
+import polars as pl
+
+from schemas import fields
+from schemas.contract import Table
+
+UNIT_TOLERANCE = 1e-6
+
+
+class Poses(Table):
+    """One row a pose message of base_link in a fixed frame."""
+
+    NAME: ClassVar[str] = "poses"
+    VERSION: ClassVar[int] = 1
+
+    t = fields.seconds()
+    stamp = fields.stamp()
+    log_time = fields.log_time()
+    segment = fields.segment()
+    x = fields.number("m", "position of base_link", frame="map")
+    y = fields.number("m", "position of base_link", frame="map")
+    z = fields.number("m", "position of base_link", frame="map")
+    q_x = fields.number("1", "quaternion of base_link", frame="map")
+    q_y = fields.number("1", "quaternion of base_link", frame="map")
+    q_z = fields.number("1", "quaternion of base_link", frame="map")
+    q_w = fields.number("1", "quaternion of base_link", frame="map")
+    held = fields.flag("repeats the pose before it: an old estimate sampled again")
+    active = fields.flag("inside an interval in which commands are live")
+
+    @dy.rule()
+    def quaternion_has_unit_length(cls) -> pl.Expr:  # noqa: N805 - dataframely rules receive the class
+        squared = sum((pl.col(name) ** 2 for name in ("q_x", "q_y", "q_z", "q_w")), pl.lit(0.0))
+        return (squared - 1.0).abs() < UNIT_TOLERANCE

@@ -1,0 +1,31 @@
+"""What the encoders measured."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import dataframely as dy
+import polars as pl
+
+from schemas import fields
+from schemas.contract import Table
+
+
+class Wheels(Table):
+    """One row an encoder message."""
+
+    NAME: ClassVar[str] = "wheels"
+    VERSION: ClassVar[int] = 1
+
+    t = fields.seconds()
+    stamp = fields.stamp()
+    log_time = fields.log_time()
+    left = fields.number("rad/s", "measured speed of the left wheels, mean of the side", nullable=True)
+    right = fields.number("rad/s", "measured speed of the right wheels, mean of the side", nullable=True)
+    speed = fields.body("m/s", "measured speed (Ackermann)", nullable=True)
+    steering = fields.body("rad", "measured steering angle (Ackermann), left positive", nullable=True)
+    active = fields.flag("inside an interval in which commands are live")
+
+    @dy.rule()
+    def drive_is_complete(cls) -> pl.Expr:  # noqa: N805 - dataframely rules receive the class
+        return fields.drive_is_complete()

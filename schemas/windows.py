@@ -1,0 +1,33 @@
+"""Slip over windows of two seconds, the quantity of the published figure."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import dataframely as dy
+
+from schemas import fields
+from schemas.contract import Table
+from schemas.slip import INPUTS
+
+
+class Windows(Table):
+    """One row a full window; windows start where a segment or a command step starts."""
+
+    NAME: ClassVar[str] = "windows"
+    VERSION: ClassVar[int] = 1
+
+    input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})
+    t_start = fields.seconds("start of the window")
+    t_end = fields.seconds("end of the window")
+    segment = fields.segment()
+    step = fields.step()
+    transitory = fields.flag("the window is the first of its command step")
+    samples = dy.Int32(min=1, metadata={"description": "grid steps in the window"})
+    rms_modulus = dy.Float64(
+        min=0.0, metadata={"unit": "m/s", "description": "root mean square of the slip modulus"}
+    )
+    window_norm = dy.Float64(
+        min=0.0,
+        metadata={"unit": "m/s", "description": "sqrt(40) rms_modulus: the published 2 s window norm"},
+    )
