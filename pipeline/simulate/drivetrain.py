@@ -1,0 +1,152 @@
+"""From commands to wheels: limits, deadband, delay, rate limit, lags and droop, in that order.
+
+Static limits act on the commands at their own stamps, so that nothing depends on the integration step there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.simulate.effects import Effects
+from pipeline.simulate.programs import Commands
+from pipeline.simulate.signals import hold_on_grid, integrate_cells, lag_signal, limit_rate
+from pipeline.simulate.vehicles import Vehicle
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What the drivetrain does, on cells of ``step_s``.
+
+    Attributes:
+        step_s: cell width [s].
+        left, right: true wheel speeds [rad/s], shape (n,); equal on a car, whose rear axle they are.
+        steering: true steering angle [rad], shape (n,); zero on a differential vehicle.
+    """
+
+    step_s: float
+    left: Floats
+    right: Floats
+    steering: Floats
+
+    def wheel_angles(self) -> tuple[Floats, Floats]:
+        """Turned angles [rad] of left and right wheels at the cell edges, each of shape (n + 1,)."""
+        return integrate_cells(self.left, step_s=self.step_s), integrate_cells(self.right, step_s=self.step_s)
+
+
+def invert_ideal_model(vehicle: Vehicle, speed: Floats, turn: Floats) -> tuple[Floats, Floats]:
+    """Wheel speeds (left, right) [rad/s] that the ideal vehicle needs for a body command, each of shape (n,).
+
+    A differential vehicle's controller uses its own multiple of the track; on a car both wheels are the rear
+    axle and the turn does not enter.
+    """
+    if vehicle.kind == "ackermann":
+        return speed / vehicle.wheel_radius_m, speed / vehicle.wheel_radius_m
+    half = 0.5 * vehicle.track_width_m * vehicle.controller_track_multiplier
+    return (speed - half * turn) / vehicle.wheel_radius_m, (speed + half * turn) / vehicle.wheel_radius_m
+
+
+def apply_ideal_model(
+    vehicle: Vehicle, left: Floats, right: Floats, steering: Floats
+) -> tuple[Floats, Floats]:
+    """Ideal speed [m/s] and yaw rate [rad/s] of wheel speeds [rad/s] and steering [rad], each of shape (n,)."""
+    speed = 0.5 * vehicle.wheel_radius_m * (left + right)
+    if vehicle.kind == "ackermann":
+        return speed, speed * np.tan(steering) / vehicle.wheelbase_m
+    return speed, vehicle.wheel_radius_m * (right - left) / vehicle.track_width_m
+
+
+def drive_wheels(
+    commands: Commands, vehicle: Vehicle, effects: Effects, *, hold_s: float, step_s: float, cells: int
+) -> Drive:
+    """Run the commands through the drivetrain.
+
+    Args:
+        commands: body commands at their stamps.
+        vehicle: geometry.
+        effects: which of the drivetrain's effects act.
+        hold_s: the controller stops this long after its last command [s].
+        step_s: cell width [s].
+        cells: number of cells.
+    """
+    commands = _stop_when_silent(commands, hold_s)
+    speed, turn = _limit_body(commands, vehicle, effects)
+    deadband = effects.value("deadband", "d")
+
+    def hold(values: Floats) -> Floats:
+        return hold_on_grid(
+            commands.time_s,
+            values,
+            delay_s=effects.value("transport_delay", "d"),
+            step_s=step_s,
+            cells=cells,
+        )
+
+    def turn_wheel(asked: Floats) -> Floats:
+        heard = np.where(np.abs(asked) * vehicle.wheel_radius_m < deadband, 0.0, asked)
+        top = effects.value("wheel_speed_limit", "limit")
+        wheel: Floats = np.clip(hold(heard), -top, top)
+        if effects.is_active("acceleration_limit"):
+            wheel = limit_rate(wheel, per_second=effects.value("acceleration_limit", "limit"), step_s=step_s)
+        if effects.is_active("drive_lag"):
+            wheel = lag_signal(wheel, tau_s=effects.value("drive_lag", "tau"), step_s=step_s)
+        return wheel
+
+    asked_left, asked_right = invert_ideal_model(vehicle, speed, turn)
+    if vehicle.kind == "ackermann":
+        axle = turn_wheel(asked_left)
+        return Drive(step_s, axle, axle, _steer(hold(turn), effects, step_s))
+    left, right = _couple_sides(turn_wheel(asked_left), turn_wheel(asked_right), effects, step_s)
+    return Drive(step_s, left, right, np.zeros(cells))
+
+
+def _stop_when_silent(commands: Commands, hold_s: float) -> Commands:
+    time = commands.time_s
+    silent = np.flatnonzero(np.diff(time, append=np.inf) > hold_s)
+    at = silent + 1
+    return Commands(
+        np.insert(time, at, time[silent] + hold_s),
+        np.insert(commands.speed_mps, at, 0.0),
+        np.insert(commands.turn, at, 0.0),
+    )
+
+
+def _limit_body(commands: Commands, vehicle: Vehicle, effects: Effects) -> tuple[Floats, Floats]:
+    fastest = effects.value("body_speed_limit", "limit")
+    sharpest = effects.value("body_turn_limit", "limit")
+    speed = np.clip(commands.speed_mps, -fastest, fastest)
+    turn = commands.turn
+    if vehicle.kind == "differential":
+        return speed, np.clip(turn, -sharpest, sharpest)
+    if effects.is_active("body_turn_limit"):
+        moving = np.maximum(np.abs(speed), 1e-9)
+        widest = np.arctan(sharpest * vehicle.wheelbase_m / moving)
+        turn = np.clip(turn, -widest, widest)
+    return speed, turn
+
+
+def _couple_sides(left: Floats, right: Floats, effects: Effects, step_s: float) -> tuple[Floats, Floats]:
+    if not (effects.is_active("turn_lag") or effects.is_active("turn_droop")):
+        return left, right
+    mean, difference = 0.5 * (left + right), right - left
+    tau_mean, tau_difference = effects.value("turn_lag", "tau_mean"), effects.value("turn_lag", "tau_diff")
+    if tau_mean > 0.0:
+        mean = lag_signal(mean, tau_s=tau_mean, step_s=step_s)
+    if tau_difference > 0.0:
+        difference = lag_signal(difference, tau_s=tau_difference, step_s=step_s)
+    if effects.is_active("turn_droop"):
+        threshold = float(np.nan_to_num(effects.value("turn_droop", "threshold")))
+        kept = np.clip(difference, -threshold, threshold)
+        difference = kept + effects.value("turn_droop", "gain") * (difference - kept)
+    return mean - 0.5 * difference, mean + 0.5 * difference
+
+
+def _steer(asked: Floats, effects: Effects, step_s: float) -> Floats:
+    angle = effects.value("steering_gain", "g") * asked
+    if effects.is_active("steering_lag"):
+        angle = lag_signal(angle, tau_s=effects.value("steering_lag", "tau"), step_s=step_s)
+    return angle + effects.value("steering_offset", "o")

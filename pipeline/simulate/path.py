@@ -1,0 +1,230 @@
+"""From body velocity to pose: over a flat or tilted plane at once, over hills and odd physics step by step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core.rigid import (
+    multiply_quaternions,
+    quaternions_from_euler,
+    quaternions_from_yaw,
+    rotate,
+)
+from pipeline.simulate.body import BodyMotion
+from pipeline.simulate.drivetrain import Drive
+from pipeline.simulate.effects import Effects
+from pipeline.simulate.scenario import ExtraPhysics, Ground, State
+from pipeline.simulate.signals import integrate_cells
+from pipeline.simulate.surface import Surface, Vector, cross, make_surface, slide_onto_plane, tilt_quaternion
+
+Floats = NDArray[np.float64]
+
+_SLOW_STEP_S = 0.005
+
+
+@dataclass(frozen=True)
+class Path:
+    """The true motion.
+
+    Attributes:
+        time_s: cell edges [s], shape (n + 1,).
+        position: base_link in the world [m], shape (n + 1, 3).
+        quaternion: attitude, shape (n + 1, 4).
+        velocity: body velocity (v_x, v_y, v_w) in each cell, shape (n, 3).
+    """
+
+    time_s: Floats
+    position: Floats
+    quaternion: Floats
+    velocity: Floats
+
+
+def integrate_path(
+    motion: BodyMotion,
+    drive: Drive,
+    effects: Effects,
+    *,
+    ground: Ground,
+    extra: ExtraPhysics | None,
+    start: tuple[float, float, float],
+    generator: np.random.Generator,
+) -> Path:
+    """Drive the body over the ground.
+
+    Args:
+        motion: velocities before slope and place act.
+        drive: wheels, for odd physics that looks at them.
+        effects: slope_drift and a terrain_change at a place act here.
+        ground: shape of the ground.
+        extra: odd physics.
+        start: x [m], y [m] in the plane and yaw [rad].
+        generator: source of the hills.
+    """
+    at_a_place = effects.is_active("terrain_change") and math.isfinite(
+        effects.value("terrain_change", "at_x")
+    )
+    if extra is None and ground.hill_m == 0.0 and not at_a_place:
+        return _cross_plane(motion, drive.step_s, effects.value("slope_drift", "k"), ground, start)
+    surface = make_surface(ground, generator)
+    return _cross_surface(_Walk(motion, drive, effects, extra), surface, ground, start)
+
+
+def _cross_plane(
+    motion: BodyMotion, step_s: float, slope_gain: float, ground: Ground, start: tuple[float, float, float]
+) -> Path:
+    tilt = tilt_quaternion(ground)
+    velocity = motion.velocity
+    heading = start[2] + integrate_cells(velocity[:, 2], step_s=step_s)
+    middle = 0.5 * (heading[:-1] + heading[1:])
+    cosine, sine = np.cos(middle), np.sin(middle)
+    if slope_gain != 0.0:
+        up_x, up_y, _ = rotate(tilt * np.array([-1.0, -1.0, -1.0, 1.0]), np.array([0.0, 0.0, 1.0])).tolist()
+        downhill = -slope_gain * motion.turning
+        velocity = velocity + np.stack(
+            (
+                downhill * (cosine * up_x + sine * up_y),
+                downhill * (cosine * up_y - sine * up_x),
+                np.zeros_like(downhill),
+            ),
+            axis=1,
+        )
+    in_plane = np.stack(
+        (
+            start[0] + integrate_cells(velocity[:, 0] * cosine - velocity[:, 1] * sine, step_s=step_s),
+            start[1] + integrate_cells(velocity[:, 0] * sine + velocity[:, 1] * cosine, step_s=step_s),
+            np.zeros_like(heading),
+        ),
+        axis=1,
+    )
+    time = np.arange(heading.size) * step_s
+    quaternion = multiply_quaternions(np.broadcast_to(tilt, (heading.size, 4)), quaternions_from_yaw(heading))
+    return Path(time, rotate(tilt, in_plane), quaternion, velocity)
+
+
+class _Walk:
+    """Velocities and wheels averaged onto the slower grid of the step-by-step integration."""
+
+    def __init__(
+        self, motion: BodyMotion, drive: Drive, effects: Effects, extra: ExtraPhysics | None
+    ) -> None:
+        self.stride = max(round(_SLOW_STEP_S / drive.step_s), 1)
+        self.cells = motion.v0.size // self.stride
+        self.step_s = self.stride * drive.step_s
+        self.effects = effects
+        self.extra = extra
+        self.velocity = np.stack([self._average(column) for column in motion.velocity.T], axis=1)
+        self.v0, self.w0 = self._average(motion.v0), self._average(motion.w0)
+        self.turning = self._average(motion.turning)
+        self.left, self.right = self._average(drive.left), self._average(drive.right)
+        self.steering = self._average(drive.steering)
+        self.left_angle, self.right_angle = (angle[:: self.stride] for angle in drive.wheel_angles())
+
+    def _average(self, signal: Floats) -> Floats:
+        whole = signal[: self.cells * self.stride].reshape(self.cells, self.stride)
+        means: Floats = whole.mean(axis=1)
+        return means
+
+
+def _cross_surface(
+    walk: _Walk, surface: Surface, ground: Ground, start: tuple[float, float, float]
+) -> Path:
+    step = walk.step_s
+    tilt = tilt_quaternion(ground)
+    x, y, _ = rotate(tilt, np.array([start[0], start[1], 0.0])).tolist()
+    ahead_x, ahead_y, ahead_z = rotate(tilt, np.array([math.cos(start[2]), math.sin(start[2]), 0.0])).tolist()
+    normal = surface.normal_at(x, y)
+    ahead = slide_onto_plane((ahead_x, ahead_y, ahead_z), normal)
+    position = np.empty((walk.cells + 1, 3))
+    angles = np.empty((walk.cells + 1, 3))
+    velocity = np.empty((walk.cells, 3))
+    forces = _Forces(walk)
+    columns = zip(*(column.tolist() for column in walk.velocity.T), strict=True)
+    for index, (base_x, base_y, base_w) in enumerate(columns):
+        left = cross(normal, ahead)
+        attitude = _attitude(ahead, left, normal)
+        position[index] = x, y, surface.height_at(x, y)
+        angles[index] = attitude
+        d_x, d_y, d_w = forces.push(index, x, y, ahead, left, attitude)
+        v_x, v_y, v_w = base_x + d_x, base_y + d_y, base_w + d_w
+        velocity[index] = v_x, v_y, v_w
+        half_c, half_s = math.cos(0.5 * v_w * step), math.sin(0.5 * v_w * step)
+        along, across = v_x * half_c - v_y * half_s, v_x * half_s + v_y * half_c
+        x += step * (along * ahead[0] + across * left[0])
+        y += step * (along * ahead[1] + across * left[1])
+        cosine, sine = math.cos(v_w * step), math.sin(v_w * step)
+        turned = (
+            ahead[0] * cosine + left[0] * sine,
+            ahead[1] * cosine + left[1] * sine,
+            ahead[2] * cosine + left[2] * sine,
+        )
+        normal = surface.normal_at(x, y)
+        ahead = slide_onto_plane(turned, normal)
+    position[-1] = x, y, surface.height_at(x, y)
+    angles[-1] = _attitude(ahead, cross(normal, ahead), normal)
+    time = np.arange(walk.cells + 1) * step
+    quaternion = quaternions_from_euler(angles[:, 0], angles[:, 1], angles[:, 2])
+    return Path(time, position, quaternion, velocity)
+
+
+def _attitude(ahead: Vector, left: Vector, normal: Vector) -> Vector:
+    """Roll, pitch, yaw [rad] of a body with these axes in the world."""
+    pitch = math.asin(max(-1.0, min(1.0, -ahead[2])))
+    return math.atan2(left[2], normal[2]), pitch, math.atan2(ahead[1], ahead[0])
+
+
+class _Forces:
+    """What depends on where the body is: slope, a terrain's border, odd physics."""
+
+    def __init__(self, walk: _Walk) -> None:
+        effects = walk.effects
+        self._walk = walk
+        self._slope = effects.value("slope_drift", "k")
+        self._border = effects.value("terrain_change", "at_x")
+        self._gain_v = effects.value("terrain_change", "k_v")
+        self._gain_w = effects.value("terrain_change", "k_w")
+        self._state = State(dt=walk.step_s)
+        self._signals = tuple(
+            signal.tolist()
+            for signal in (
+                walk.v0,
+                walk.w0,
+                walk.left,
+                walk.right,
+                walk.left_angle[:-1],
+                walk.right_angle[:-1],
+                walk.steering,
+            )
+        )
+        self._turning = walk.turning.tolist()
+
+    def push(
+        self, index: int, x: float, y: float, ahead: Vector, left: Vector, attitude: Vector
+    ) -> tuple[float, float, float]:
+        """Velocity to add in this cell: d_x [m/s], d_y [m/s], d_w [rad/s]."""
+        downhill = -self._slope * self._turning[index]
+        d_x, d_y, d_w = downhill * ahead[2], downhill * left[2], 0.0
+        if x > self._border:
+            base = self._walk.velocity[index]
+            d_x += (self._gain_v - 1.0) * float(base[0])
+            d_w += (self._gain_w - 1.0) * float(base[2])
+        if self._walk.extra is not None:
+            state = self._state
+            state.t = (index + 0.5) * self._walk.step_s
+            state.x, state.y = x, y
+            state.roll, state.pitch, state.yaw = attitude
+            (
+                state.v0,
+                state.w0,
+                state.left_speed,
+                state.right_speed,
+                state.left_angle,
+                state.right_angle,
+                state.steering,
+            ) = (signal[index] for signal in self._signals)
+            odd = self._walk.extra(state)
+            d_x, d_y, d_w = d_x + odd[0], d_y + odd[1], d_w + odd[2]
+        return d_x, d_y, d_w

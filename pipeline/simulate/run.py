@@ -1,0 +1,155 @@
+"""From a scenario to a simulated run: the truth, and what the robot's sensors say of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core.rigid import quaternions_from_yaw
+from pipeline.simulate.body import BodyMotion, move_body
+from pipeline.simulate.drivetrain import Drive, apply_ideal_model, drive_wheels
+from pipeline.simulate.effects import Effects, resolve_effects
+from pipeline.simulate.errors import SimulateError
+from pipeline.simulate.localization import Poses, report_poses
+from pipeline.simulate.path import Path, integrate_path
+from pipeline.simulate.programs import Commands, make_commands
+from pipeline.simulate.scenario import Scenario
+from pipeline.simulate.sensors import ImuReadings, WheelReadings, read_encoders, read_imu
+from pipeline.simulate.signals import integrate_cells
+from pipeline.simulate.streams import open_stream
+from pipeline.simulate.vehicles import Vehicle
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What really happened; never written to a log.
+
+    Attributes:
+        commands: what the drive was really told, hand driving included.
+        drive: wheels and steering on the integration grid.
+        motion: velocities before slope and place acted.
+        path: true pose and body velocity.
+        effects: the effects that acted.
+    """
+
+    commands: Commands
+    drive: Drive
+    motion: BodyMotion
+    path: Path
+    effects: Effects
+
+
+@dataclass(frozen=True)
+class SimulatedRun:
+    """One run: its scenario, the truth, and what is recorded.
+
+    Attributes:
+        scenario: what was asked for.
+        truth: what happened.
+        commands: body commands as recorded.
+        poses: what the localization reported.
+        wheels: what the encoders reported, or None.
+        imu: what the inertial unit reported, or None.
+    """
+
+    scenario: Scenario
+    truth: Truth
+    commands: Commands
+    poses: Poses
+    wheels: WheelReadings | None
+    imu: ImuReadings | None
+
+
+def simulate_run(scenario: Scenario) -> SimulatedRun:
+    """Simulate a scenario; the same scenario gives the same arrays, bit for bit.
+
+    Raises:
+        SimulateError: an unknown effect, parameter or program, an impossible value, or a combination that
+            makes no sense.
+    """
+    vehicle, seed = scenario.vehicle, scenario.seed
+    effects = resolve_effects(scenario.effects, vehicle.kind)
+    cells = round(scenario.duration_s / scenario.step_s)
+    commands = make_commands(
+        scenario.program, vehicle, duration_s=scenario.duration_s, generator=open_stream(seed, "program")
+    )
+    drive = drive_wheels(
+        commands, vehicle, effects, hold_s=scenario.program.hold_s, step_s=scenario.step_s, cells=cells
+    )
+    motion = move_body(
+        drive,
+        vehicle,
+        effects,
+        disturbance=scenario.disturbance,
+        ground_input=scenario.ground_input,
+        generator=open_stream(seed, "disturbance"),
+    )
+    path = integrate_path(
+        motion,
+        drive,
+        effects,
+        ground=scenario.ground,
+        extra=scenario.extra,
+        start=scenario.start_pose,
+        generator=open_stream(seed, "hills"),
+    )
+    return record_truth(scenario, Truth(commands, drive, motion, path, effects))
+
+
+def record_truth(scenario: Scenario, truth: Truth) -> SimulatedRun:
+    """Let the scenario's sensors look at what happened, whoever computed it.
+
+    Raises:
+        SimulateError: ``encoders_needed`` when the pose is wheel odometry and there are no encoders.
+    """
+    duration, seed = scenario.duration_s, scenario.seed
+    wheels = imu = None
+    if scenario.encoders is not None:
+        wheels = read_encoders(scenario.encoders, truth.drive, duration_s=duration, seed=seed)
+    if scenario.imu is not None:
+        imu = read_imu(scenario.imu, truth.path, duration_s=duration, seed=seed)
+    seen = truth.path
+    if scenario.pose.source == "wheels":
+        if wheels is None:
+            raise SimulateError(
+                "encoders_needed",
+                "a pose from wheels needs encoders",
+                where="pose.source",
+                hint="Add encoders to the scenario or let the pose come from localization",
+            )
+        seen = integrate_odometry(scenario.vehicle, wheels, start=scenario.start_pose)
+    poses = report_poses(scenario.pose, seen, truth.effects, duration_s=duration, seed=seed)
+    return SimulatedRun(scenario, truth, _as_recorded(scenario, truth.commands), poses, wheels, imu)
+
+
+def integrate_odometry(vehicle: Vehicle, wheels: WheelReadings, *, start: tuple[float, float, float]) -> Path:
+    """Wheel odometry: the ideal model of the encoders, each reading held until the next."""
+    time = wheels.time_s
+    step = float(np.median(np.diff(time)))
+    speed, rate = apply_ideal_model(vehicle, wheels.left, wheels.right, wheels.steering)
+    heading = start[2] + integrate_cells(rate, step_s=step)
+    middle = 0.5 * (heading[:-1] + heading[1:])
+    position = np.stack(
+        (
+            start[0] + integrate_cells(speed * np.cos(middle), step_s=step),
+            start[1] + integrate_cells(speed * np.sin(middle), step_s=step),
+            np.zeros_like(heading),
+        ),
+        axis=1,
+    )
+    edges = np.append(time, time[-1] + step)
+    velocity = np.stack((speed, np.zeros_like(speed), rate), axis=1)
+    return Path(edges, position, quaternions_from_yaw(heading), velocity)
+
+
+def _as_recorded(scenario: Scenario, commands: Commands) -> Commands:
+    by_hand = scenario.recording.hand_driven_s
+    if by_hand is None:
+        return commands
+    # The command topic keeps repeating zeros while a person drives by radio, past the computer.
+    live = commands.time_s >= by_hand
+    return Commands(commands.time_s, commands.speed_mps * live, commands.turn * live)

@@ -1,0 +1,90 @@
+"""Held signals, first-order lags, rate limits and coloured noise on a uniform grid.
+
+A signal lives on cells of ``step`` seconds: entry k is its mean over [k step, (k+1) step].
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def hold_on_grid(event_s: Floats, values: Floats, *, delay_s: float, step_s: float, cells: int) -> Floats:
+    """Cell means of a signal that keeps each value until the next event, shifted by a delay.
+
+    Exact for any event times: a cell that holds an event gets the time-weighted mean of both values.
+
+    Args:
+        event_s: increasing times [s], shape (n,); the signal is zero before the first.
+        values: value from that time on, shape (n,).
+        delay_s: shift towards later [s].
+        step_s: cell width [s].
+        cells: number of cells.
+
+    Returns:
+        Cell means, shape (cells,).
+    """
+    edges = np.arange(cells + 1) * step_s - delay_s
+    padded = np.concatenate(([0.0], values))
+    at_start = np.searchsorted(event_s, edges[:-1], side="right")
+    at_end = np.searchsorted(event_s, edges[1:], side="left")
+    held = padded[at_start]
+    mixed = np.flatnonzero(at_start < at_end)
+    if mixed.size:
+        knots = np.concatenate((event_s, [max(event_s[-1], edges[-1]) + 1.0]))
+        integral = np.concatenate(([0.0], np.cumsum(values * np.diff(knots))))
+        area = np.interp(edges[mixed + 1], knots, integral) - np.interp(edges[mixed], knots, integral)
+        held[mixed] = area / step_s
+    return held
+
+
+def lag_signal(signal: Floats, *, tau_s: float, step_s: float) -> Floats:
+    """First-order lag from rest, exact for a signal constant in each cell: tau dy/dt = u - y."""
+    decay = float(np.exp(-step_s / tau_s))
+    at_end = filter_pole(signal * (1.0 - decay), decay)
+    means: Floats = 0.5 * (at_end + np.concatenate(([0.0], at_end[:-1])))
+    return means
+
+
+def filter_pole(signal: Floats, pole: float) -> Floats:
+    """The recurrence y_k = pole y_(k-1) + u_k from rest."""
+    from scipy.signal import lfilter  # noqa: PLC0415 - heavy, and the room is imported by the command line
+
+    filtered: Floats = np.asarray(lfilter([1.0], [1.0, -pole], signal), dtype=np.float64)
+    return filtered
+
+
+def limit_rate(signal: Floats, *, per_second: float, step_s: float) -> Floats:
+    """Follow a signal from rest with at most ``per_second`` of change a second."""
+    largest = per_second * step_s
+    followed = np.empty_like(signal)
+    now = 0.0
+    # A rate limit depends on its own past and has no closed form for arbitrary input; floats in a plain list
+    # are several times faster here than elements of an array.
+    out: list[float] = []
+    for target in signal.tolist():
+        gap = target - now
+        now = target if -largest <= gap <= largest else now + (largest if gap > 0.0 else -largest)
+        out.append(now)
+    followed[:] = out
+    return followed
+
+
+def make_coloured_noise(
+    generator: np.random.Generator, *, size: int, deviation: float, correlation_s: float, step_s: float
+) -> Floats:
+    """Stationary first-order Gauss-Markov noise, shape (size,), with autocorrelation exp(-|t|/correlation_s)."""
+    pole = float(np.exp(-step_s / correlation_s))
+    white = generator.standard_normal(size)
+    drive = white * np.sqrt(1.0 - pole**2)
+    if size:
+        drive[0] = white[0]
+    return filter_pole(drive * deviation, pole)
+
+
+def integrate_cells(signal: Floats, *, step_s: float) -> Floats:
+    """Integral at the cell edges, shape (n + 1,), starting from zero."""
+    total: Floats = np.concatenate(([0.0], np.cumsum(signal) * step_s))
+    return total

@@ -1,0 +1,72 @@
+"""Vehicles that can be simulated: geometry and the command space their programs draw from.
+
+Radii, tracks and speeds are those of the vendors' data sheets and of the published DRIVE recordings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pipeline.simulate.errors import SimulateError, unknown_name
+
+Kind = Literal["differential", "ackermann"]
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """Geometry and limits of one vehicle.
+
+    Attributes:
+        name: how it calls itself in the log's deployment record.
+        kind: ``differential`` (wheels or tracks a side) or ``ackermann`` (steered front axle, base_link on
+            the rear axle).
+        wheel_radius_m: nominal radius.
+        track_width_m: nominal distance between left and right wheels.
+        wheelbase_m: distance between the axles; matters for ``ackermann`` only.
+        max_speed_mps: largest speed a program asks for.
+        max_turn_radps: largest yaw rate a program asks for (differential).
+        max_steering_rad: largest steering angle a program asks for (Ackermann).
+        wheels_per_side: how many joints a side has in a JointState.
+        controller_track_multiplier: the onboard controller turns a body command into wheel speeds with this
+            multiple of the nominal track.
+    """
+
+    name: str
+    kind: Kind
+    wheel_radius_m: float
+    track_width_m: float
+    wheelbase_m: float
+    max_speed_mps: float
+    max_turn_radps: float = 0.0
+    max_steering_rad: float = 0.0
+    wheels_per_side: int = 2
+    controller_track_multiplier: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "max_speed_mps"):
+            if not getattr(self, name) > 0.0:
+                raise SimulateError(
+                    "bad_vehicle", f"{name} must be above zero", where=self.name, hint=f"Give {name} in SI units"
+                )
+
+
+VEHICLES: dict[str, Vehicle] = {
+    "husky": Vehicle("husky_a200", "differential", 0.165, 0.55, 0.512, 1.0, max_turn_radps=1.0),
+    "warthog": Vehicle("warthog", "differential", 0.30, 1.08, 0.916, 5.0, max_turn_radps=2.0),
+    "jackal": Vehicle("jackal", "differential", 0.098, 0.37559, 0.262, 2.0, max_turn_radps=2.0),
+    "car": Vehicle("ackermann_car", "ackermann", 0.10, 0.45, 0.60, 3.0, max_steering_rad=0.45),
+}
+_ALIASES = {"husky_a200": "husky", "ackermann_car": "car", "ackermann": "car"}
+
+
+def find_vehicle(name: str) -> Vehicle:
+    """The named vehicle.
+
+    Raises:
+        SimulateError: ``unknown_vehicle``.
+    """
+    key = _ALIASES.get(name, name)
+    if key not in VEHICLES:
+        raise unknown_name("vehicle", name, sorted(VEHICLES))
+    return VEHICLES[key]
