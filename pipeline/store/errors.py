@@ -1,0 +1,65 @@
+"""What can go wrong with results, in one line that says what to do."""
+
+from __future__ import annotations
+
+import errno
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from pipeline.core.errors import SlipError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+class StoreError(SlipError):
+    """Results cannot be written, read or trusted."""
+
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_FORBIDDEN = (errno.EACCES, errno.EPERM)
+
+
+@contextmanager
+def name_disk_errors(place: Path) -> Iterator[None]:
+    """Turn an ``OSError`` of the block into a `StoreError` about ``place``.
+
+    Args:
+        place: the file or folder to name where the system's error names none.
+
+    Raises:
+        StoreError: ``disk_full``, ``read_only``, ``permission_denied`` or ``disk_error``.
+    """
+    try:
+        yield
+    except OSError as error:
+        where = str(error.filename or place)
+        if error.errno in _FULL:
+            raise StoreError(
+                "disk_full",
+                "the disk of the results is full",
+                where=where,
+                hint="Free space or choose another folder with --out, then run the same command again; "
+                "the results that were there before are untouched",
+            ) from error
+        if error.errno == errno.EROFS:
+            raise StoreError(
+                "read_only",
+                "the folder of the results cannot be written: its file system is read-only",
+                where=where,
+                hint="Choose another folder with --out or mount this one writable",
+            ) from error
+        if error.errno in _FORBIDDEN:
+            raise StoreError(
+                "permission_denied",
+                "permission denied",
+                where=where,
+                hint="Choose another folder with --out or give your user the right to this one",
+            ) from error
+        raise StoreError(
+            "disk_error",
+            f"the system reports: {error.strerror or error}",
+            where=where,
+            hint="Check the disk and run the same command again; what was there before is untouched",
+        ) from error

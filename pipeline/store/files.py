@@ -1,0 +1,109 @@
+"""Files that are there whole or not at all, and stay there when the power goes."""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import shutil
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+TEMPORARY = ".tmp-"
+"""How the names of unfinished files and folders begin; no reader looks at them."""
+
+_NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF)
+_NO_LINK = (errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS)
+
+
+def write_new_file(path: Path, data: bytes) -> None:
+    """Write a file that must not exist yet, and wait until the disk has it.
+
+    Refusing an existing file matters: it could be a hard link into an older generation.
+
+    Raises:
+        FileExistsError: there is a file already.
+        OSError: the disk is full, read-only, ...; a half-written file may remain.
+    """
+    with path.open("xb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Put a whole new file in the place of ``path`` in one moment; readers see the old or the new one.
+
+    Raises:
+        OSError: the old file is untouched and nothing else remains.
+    """
+    temporary = temporary_beside(path)
+    try:
+        write_new_file(temporary, data)
+        temporary.replace(path)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink()
+        raise
+    sync_folder(path.parent)
+
+
+def temporary_beside(path: Path) -> Path:
+    """A fresh hidden name in the folder of ``path``."""
+    return path.parent / f"{TEMPORARY}{os.getpid()}-{secrets.token_hex(4)}"
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the disk has the names of a folder; some network file systems have no such call."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in _NO_FOLDER_SYNC:
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it, each of them durable."""
+    if folder.is_dir():
+        return
+    make_folder(folder.parent)
+    with suppress(FileExistsError):
+        folder.mkdir()
+    sync_folder(folder.parent)
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Give a finished file a second name, or copy it where links are impossible.
+
+    Raises:
+        FileExistsError: ``target`` exists.
+        OSError: the disk is full, read-only, ...
+    """
+    try:
+        os.link(source, target)
+    except OSError as error:
+        if error.errno not in _NO_LINK:
+            raise
+        write_new_file(target, source.read_bytes())
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder so that it never stands there half empty under its own name."""
+    doomed = temporary_beside(folder)
+    folder.rename(doomed)
+    shutil.rmtree(doomed)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what killed writers left in ``folder``; call only under its lock."""
+    for entry in sorted(folder.glob(f"{TEMPORARY}*")):
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        else:
+            entry.unlink()

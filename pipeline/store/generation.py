@@ -1,0 +1,288 @@
+"""One run's results in the making: written beside the current generation, published in one moment."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from pipeline.store.errors import StoreError, name_disk_errors
+from pipeline.store.files import (
+    link_or_copy,
+    make_folder,
+    remove_folder,
+    replace_file,
+    sync_folder,
+    temporary_beside,
+    write_new_file,
+)
+from pipeline.store.manifest import (
+    MANIFEST,
+    MARKER,
+    FileEntry,
+    Manifest,
+    TableEntry,
+    TableReport,
+    file_missing,
+    hash_bytes,
+    load_manifest,
+)
+from pipeline.store.names import check_file_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    import polars as pl
+
+    from pipeline.store.manifest import JSON
+
+LATEST = "latest"
+
+STEPS = ("file_written", "folder_synced", "folder_renamed", "manifest_replaced", "latest_replaced")
+"""The moments of a commit that `Store` reports to ``watch``, in this order (the first once a file)."""
+
+
+class Generation:
+    """A generation that nobody sees until `commit`.
+
+    Made by `Store.open_generation`, which holds the run's lock as long as the generation is open.
+
+    Attributes:
+        run: name of the run.
+        key: key of the generation.
+        previous: the manifest that was current when the lock was taken; None for a new run.
+    """
+
+    def __init__(
+        self, *, run: str, key: str, home: Path, previous: Manifest | None, watch: Callable[[str], None]
+    ) -> None:
+        self.run = run
+        self.key = key
+        self.previous = previous
+        self._home = home
+        self._watch = watch
+        self._folder = temporary_beside(home / key)
+        self._tables: dict[str, TableEntry] = {}
+        self._files: dict[str, FileEntry] = {}
+        self._is_open = True
+        with name_disk_errors(self._folder):
+            self._folder.mkdir()
+
+    def write_table(self, name: str, frame: pl.DataFrame) -> TableReport:
+        """Hold a frame against its contract and write it; rows that break a rule go to the quarantine.
+
+        Args:
+            name: table name.
+            frame: exactly the contract's columns, in any order.
+
+        Raises:
+            StoreError: ``wrong_columns``, ``no_such_table``, ``written_twice``, or the disk refuses.
+        """
+        from pipeline.store.tables import QUARANTINE, check_table  # noqa: PLC0415 - heavy
+
+        checked = check_table(name, frame)
+        entry = self._write(f"{name}.parquet", checked.valid)
+        if checked.broken is not None:
+            broken = f"{QUARANTINE}{name}.parquet"
+            self._files[broken] = self._write(broken, checked.broken)
+        self._tables[name] = TableEntry(
+            file=f"{name}.parquet",
+            rows=checked.report.rows,
+            quarantined=checked.report.quarantined,
+            sha256=entry.sha256,
+            bytes=entry.bytes,
+            contract_version=checked.contract.version,
+            rules=checked.report.rules,
+        )
+        return checked.report
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a text file, UTF-8.
+
+        Raises:
+            StoreError: ``bad_file_name``, ``written_twice``, or the disk refuses.
+        """
+        self.write_bytes(name, text.encode())
+
+    def write_bytes(self, name: str, data: bytes) -> None:
+        """Write a file.
+
+        Raises:
+            StoreError: ``bad_file_name``, ``written_twice``, or the disk refuses.
+        """
+        check_file_name(name)
+        self._files[name] = self._write(name, data)
+
+    def reuse_table(self, name: str) -> TableReport:
+        """Take a table, and its quarantine, over from the previous generation unchanged.
+
+        Raises:
+            StoreError: ``no_such_table`` when the previous generation has none; ``file_missing`` or
+                ``file_damaged`` when what is there is not what was written.
+        """
+        from pipeline.store.tables import QUARANTINE  # noqa: PLC0415 - heavy
+
+        previous = self._require_previous(name)
+        previous.path(name)
+        entry = previous.tables[name]
+        self._link(entry.file, entry.sha256)
+        broken = f"{QUARANTINE}{name}.parquet"
+        if broken in previous.files:
+            self._link(broken, previous.files[broken].sha256)
+            self._files[broken] = previous.files[broken]
+        self._tables[name] = entry
+        return TableReport(rows=entry.rows, quarantined=entry.quarantined, rules=entry.rules)
+
+    def reuse_file(self, name: str) -> None:
+        """Take a file that is no table over from the previous generation unchanged.
+
+        Raises:
+            StoreError: as `reuse_table`.
+        """
+        previous = self._require_previous(name)
+        previous.path(name)
+        self._link(name, previous.files[name].sha256)
+        self._files[name] = previous.files[name]
+
+    def commit(self, details: Mapping[str, JSON]) -> Manifest:
+        """Publish the generation: from here on every reader sees it, and nothing of the one before.
+
+        Args:
+            details: what the run's keeper wants to find again: identity of the log, stage keys, versions.
+
+        Raises:
+            StoreError: ``bad_details``, or the disk refuses; readers go on seeing the generation before.
+        """
+        self._require_open()
+        with name_disk_errors(self._home):
+            manifest = self._describe(details)
+            data = manifest.encode()
+            write_new_file(self._folder / MARKER, b"")
+            for folder in sorted(path for path in self._folder.rglob("*") if path.is_dir()):
+                sync_folder(folder)
+            sync_folder(self._folder)
+            self._watch("folder_synced")
+            self._folder.rename(manifest.folder)
+            self._folder = manifest.folder
+            sync_folder(self._home)
+            self._watch("folder_renamed")
+            replace_file(self._home / MANIFEST, data)
+            self._watch("manifest_replaced")
+        self._is_open = False
+        point_latest(self._home, manifest.folder.name)
+        self._watch("latest_replaced")
+        return manifest
+
+    def discard(self) -> None:
+        """Remove what was not published; without effect after a commit."""
+        self._is_open = False
+        current = None
+        with suppress(StoreError, OSError):
+            current = load_manifest(self._home)
+        # The manifest on disk decides: a commit interrupted right behind its last step is a commit.
+        if current is None or current.folder != self._folder:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _describe(self, details: Mapping[str, JSON]) -> Manifest:
+        earlier: tuple[str, ...] = ()
+        if self.previous is not None:
+            earlier = (self.previous.folder.name, *self.previous.earlier)
+        return Manifest(
+            run=self.run,
+            key=self.key,
+            folder=find_free_folder(self._home, self.key),
+            tables=self._tables,
+            files=self._files,
+            details=details,
+            earlier=earlier,
+        )
+
+    def _write(self, name: str, data: bytes) -> FileEntry:
+        self._require_new(name)
+        path = self._folder / name
+        with name_disk_errors(path):
+            make_folder(path.parent)
+            write_new_file(path, data)
+        self._watch("file_written")
+        return FileEntry(sha256=hash_bytes(data), bytes=len(data))
+
+    def _link(self, name: str, sha256: str) -> None:
+        self._require_new(name)
+        source = self._require_previous(name).folder / name
+        with name_disk_errors(source):
+            try:
+                found = hash_bytes(source.read_bytes())
+            except FileNotFoundError as error:
+                raise file_missing(source) from error
+            if found != sha256:
+                raise StoreError(
+                    "file_damaged",
+                    "a file of the results is not what was written",
+                    where=str(source),
+                    hint="Analyze the log again with --force",
+                )
+            make_folder((self._folder / name).parent)
+            link_or_copy(source, self._folder / name)
+        self._watch("file_written")
+
+    def _require_open(self) -> None:
+        if not self._is_open:
+            raise StoreError(
+                "generation_closed",
+                f"the generation {self.key} is closed",
+                where=self.run,
+                hint="Open a new one; a generation never changes after its commit",
+            )
+
+    def _require_new(self, name: str) -> None:
+        self._require_open()
+        taken = {entry.file for entry in self._tables.values()} | set(self._files)
+        if name in taken:
+            raise StoreError(
+                "written_twice",
+                f"{name} was written already",
+                where=self.run,
+                hint="Write each table and file of a generation once",
+            )
+
+    def _require_previous(self, name: str) -> Manifest:
+        if self.previous is None:
+            raise StoreError(
+                "no_such_table",
+                f"there are no results of {self.run!r} to take {name!r} over from",
+                hint="Write it instead",
+            )
+        return self.previous
+
+
+def find_free_folder(home: Path, key: str) -> Path:
+    """The folder for a new generation: the key, with a number behind it where the key is taken.
+
+    A generation made again under the same key gets a folder of its own, because a folder cannot be replaced
+    in one moment, and the readers of the old one must not find the new one's files in it.
+    """
+    folder, number = home / key, 1
+    while folder.exists():
+        number += 1
+        folder = home / f"{key}.{number}"
+    return folder
+
+
+def point_latest(home: Path, folder: str) -> None:
+    """Point the link ``latest`` at a generation; it is a convenience, so failing is no error."""
+    temporary = temporary_beside(home / LATEST)
+    with suppress(OSError):
+        temporary.symlink_to(folder, target_is_directory=True)
+        temporary.replace(home / LATEST)
+
+
+def remove_orphans(home: Path, current: Manifest | None) -> None:
+    """Remove generations that no manifest names: of writers killed just before their last step.
+
+    Call only under the run's lock.
+    """
+    named = {current.folder.name, *current.earlier} if current else set()
+    for marker in sorted(home.glob(f"*/{MARKER}")):
+        if marker.parent.name not in named and not marker.parent.is_symlink():
+            remove_folder(marker.parent)

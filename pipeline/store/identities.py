@@ -1,0 +1,133 @@
+"""What the logs' hashes were, so that an unchanged log is not hashed again.
+
+One small file a log, replaced whole: writers never wait for each other, and the worst that can happen to an
+entry is that it is lost, which costs a hash. A wrong answer would need a log that changed while its path,
+size, modification time and inode did not.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+from pipeline.store.errors import StoreError
+from pipeline.store.files import temporary_beside
+from pipeline.store.manifest import hash_bytes
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pipeline.store.results import Store
+
+FOLDER = "identities"
+
+_TICK_NS = 20_000_000
+"""Changes within this time may leave the same modification time: clocks of kernels tick every 1 to 10 ms."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogSighting:
+    """What a log's file looked like at a moment.
+
+    Attributes:
+        path: absolute, links resolved.
+        size: bytes.
+        mtime_ns: modification time [ns since 1970].
+        inode: number of the file in its file system.
+        seen_ns: when it was looked at [ns since 1970].
+    """
+
+    path: str
+    size: int
+    mtime_ns: int
+    inode: int
+    seen_ns: int
+
+    def is_same_file(self, other: LogSighting) -> bool:
+        """Whether nothing that the file system tells has changed."""
+        return (self.path, self.size, self.mtime_ns, self.inode) == (
+            other.path,
+            other.size,
+            other.mtime_ns,
+            other.inode,
+        )
+
+
+def see_log(path: Path) -> LogSighting:
+    """Look at a log before reading it.
+
+    Raises:
+        OSError: there is no such file.
+    """
+    seen_ns = time.time_ns()
+    status = path.stat()
+    return LogSighting(
+        path=os.path.realpath(path),
+        size=status.st_size,
+        mtime_ns=status.st_mtime_ns,
+        inode=status.st_ino,
+        seen_ns=seen_ns,
+    )
+
+
+class LogIdentities:
+    """The remembered hashes of a results folder.
+
+    Args:
+        store: the results they stand beside.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._folder = store.root / FOLDER
+
+    def lookup(self, path: Path) -> str | None:
+        """SHA-256 of a log that has not changed since it was remembered; None when it must be hashed."""
+        try:
+            now = see_log(path)
+            content = json.loads(self._entry_of(now).read_bytes())
+            sha256 = content.pop("sha256")
+            then = LogSighting(**content)
+        except (OSError, ValueError, TypeError, KeyError, AttributeError):
+            # Whatever is wrong with an entry, hashing the log is the answer to it.
+            return None
+        return str(sha256) if then.is_same_file(now) else None
+
+    def remember(self, path: Path, sha256: str, *, seen: LogSighting | None = None) -> bool:
+        """Remember the hash of a log; failing to is no error.
+
+        Args:
+            path: the log.
+            sha256: its hash in hexadecimal.
+            seen: what `see_log` said before the log was read; with it, a log that changed while it was read
+                is not remembered.
+
+        Returns:
+            Whether it was remembered.
+        """
+        try:
+            now = see_log(path)
+            if seen is not None and not (seen.is_same_file(now) and seen.seen_ns - seen.mtime_ns > _TICK_NS):
+                return False
+            self._write(self._entry_of(now), json.dumps({**asdict(now), "sha256": sha256}).encode())
+        except (OSError, StoreError):
+            return False
+        return True
+
+    def _entry_of(self, log: LogSighting) -> Path:
+        name = hash_bytes(os.fsencode(log.path))
+        return self._folder / name[:2] / f"{name[2:]}.json"
+
+    def _write(self, entry: Path, data: bytes) -> None:
+        # No waiting for the disk: after a power cut an empty entry only costs a hash.
+        entry.parent.mkdir(parents=True, exist_ok=True)
+        temporary = temporary_beside(entry)
+        try:
+            temporary.write_bytes(data)
+            temporary.replace(entry)
+        finally:
+            with suppress(OSError):
+                temporary.unlink()

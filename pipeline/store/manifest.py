@@ -1,0 +1,237 @@
+"""The manifest: the one pointer from a run to its current generation.
+
+It is replaced last and in one moment, so whoever follows it sees a whole generation. For several tables of
+the same generation take the manifest once and read them all through it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence  # noqa: TC003 - msgspec evaluates the annotations
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from pipeline.store.errors import StoreError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import polars as pl
+
+MANIFEST = "manifest.json"
+MARKER = ".generation"
+"""Stands in every generation's folder and tells it from a folder of runs."""
+
+FORMAT = 1
+
+JSON: TypeAlias = "bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | None"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileEntry:
+    """A file of a generation: its size in bytes and its SHA-256 in hexadecimal."""
+
+    sha256: str
+    bytes: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableEntry:
+    """A table of a generation.
+
+    Attributes:
+        file: name of the Parquet file in the generation's folder.
+        rows: rows that keep the contract.
+        quarantined: rows that break it; they stand in ``quarantine_<table>.parquet``.
+        sha256: of the file, in hexadecimal.
+        bytes: size of the file.
+        contract_version: version of the contract it was written under.
+        rules: how many rows broke each rule.
+    """
+
+    file: str
+    rows: int
+    quarantined: int
+    sha256: str
+    bytes: int
+    contract_version: int
+    rules: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableReport:
+    """What became of a frame: rows kept, rows quarantined, and how many rows broke each rule."""
+
+    rows: int
+    quarantined: int
+    rules: Mapping[str, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """What a run's current generation is and holds.
+
+    Attributes:
+        run: name of the run.
+        key: key of the generation, as given by the writer.
+        folder: folder of the generation, named by the key, with a number behind it where the key was taken.
+        tables: the tables by name.
+        files: all other files by name.
+        details: what the writer gave with the commit.
+        earlier: names of the folders of the generations before this one that are still there, newest first.
+    """
+
+    run: str
+    key: str
+    folder: Path
+    tables: Mapping[str, TableEntry]
+    files: Mapping[str, FileEntry]
+    details: Mapping[str, JSON]
+    earlier: tuple[str, ...] = ()
+
+    def path(self, name: str) -> Path:
+        """Path of a table (by its name) or of another file (by its file name).
+
+        Raises:
+            StoreError: ``no_such_table``, this generation holds neither.
+        """
+        if name in self.tables:
+            return self.folder / self.tables[name].file
+        if name in self.files:
+            return self.folder / name
+        raise StoreError(
+            "no_such_table",
+            f"the results of {self.run!r} hold no {name!r}; they hold {', '.join(self.names()) or 'nothing'}",
+            where=str(self.folder),
+            hint="Analyze the log again to make it",
+        )
+
+    def names(self) -> tuple[str, ...]:
+        """Names of all tables, then of all other files."""
+        return (*sorted(self.tables), *sorted(self.files))
+
+    def read(self, table: str) -> pl.DataFrame:
+        """A table of exactly this generation.
+
+        Raises:
+            StoreError: ``no_such_table``; ``file_missing`` when it was pruned or deleted meanwhile.
+        """
+        import polars as pl  # noqa: PLC0415 - heavy, and `slip --help` imports this room
+
+        path = self.path(table)
+        try:
+            return pl.read_parquet(path, glob=False)
+        except FileNotFoundError as error:
+            raise file_missing(path) from error
+        except (pl.exceptions.ComputeError, OSError) as error:
+            raise StoreError(
+                "table_damaged",
+                f"the table cannot be read: {error}",
+                where=str(path),
+                hint="Analyze the log again with --force",
+            ) from error
+
+    def with_earlier(self, earlier: Sequence[str]) -> Manifest:
+        """The same manifest with another list of older generations."""
+        return replace(self, earlier=tuple(earlier))
+
+    def encode(self) -> bytes:
+        """The manifest as the text of its file; equal manifests give equal bytes.
+
+        Raises:
+            StoreError: ``bad_details``, the details hold something JSON has no word for.
+        """
+        try:
+            content = {
+                "format": FORMAT,
+                "run": self.run,
+                "key": self.key,
+                "folder": self.folder.name,
+                "tables": {name: asdict(entry) for name, entry in self.tables.items()},
+                "files": {name: asdict(entry) for name, entry in self.files.items()},
+                "details": self.details,
+                "earlier": list(self.earlier),
+            }
+            text = json.dumps(content, allow_nan=False, ensure_ascii=False, indent=1, sort_keys=True)
+            return text.encode() + b"\n"
+        except (TypeError, ValueError) as error:
+            raise StoreError(
+                "bad_details",
+                f"the details of a generation must be JSON: {error}",
+                where=self.run,
+                hint="Give texts, finite numbers, lists and tables with text keys only",
+            ) from error
+
+
+def hash_bytes(data: bytes) -> str:
+    """SHA-256 in hexadecimal."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def file_missing(path: Path) -> StoreError:
+    """The error for a file that a manifest names and that is not there."""
+    return StoreError(
+        "file_missing",
+        "a file of the results is gone",
+        where=str(path),
+        hint="Analyze the log again with --force",
+    )
+
+
+def load_manifest(folder: Path) -> Manifest | None:
+    """The manifest in a run's folder; None when there is none.
+
+    Raises:
+        StoreError: ``manifest_damaged``, or ``manifest_too_new`` when a newer version wrote it.
+        OSError: the file cannot be read.
+    """
+    import msgspec  # noqa: PLC0415 - heavy, and `slip --help` imports this room
+
+    path = folder / MANIFEST
+    try:
+        data = path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    try:
+        header = msgspec.json.decode(data, type=_Header)
+        if header.format > FORMAT:
+            raise StoreError(
+                "manifest_too_new",
+                f"the results were written in format {header.format}, this version reads up to {FORMAT}",
+                where=str(path),
+                hint="Use the newer version, or another folder with --out",
+            )
+        stored = msgspec.json.decode(data, type=_Stored)
+    except msgspec.DecodeError as error:
+        raise StoreError(
+            "manifest_damaged",
+            f"the manifest is damaged ({error})",
+            where=str(path),
+            hint="Delete this one file and analyze the log again; other runs are not concerned",
+        ) from error
+    return Manifest(
+        run=stored.run,
+        key=stored.key,
+        folder=folder / stored.folder,
+        tables=stored.tables,
+        files=stored.files,
+        details=stored.details,
+        earlier=stored.earlier,
+    )
+
+
+@dataclass(frozen=True)
+class _Header:
+    format: int
+
+
+@dataclass(frozen=True)
+class _Stored:
+    run: str
+    key: str
+    folder: str
+    tables: dict[str, TableEntry]
+    files: dict[str, FileEntry]
+    details: dict[str, Any]
+    earlier: tuple[str, ...]

@@ -1,0 +1,106 @@
+"""Safe names: a run may be called anything, its folder may not.
+
+A run ``folder/stem`` lives in ``runs/folder/stem``. Parts that are harmless stay as they are, so that people
+find them; everything else is percent-encoded. Two different names never share a folder: `~` stands only
+before a hash, `%` only before a code, and the text before the last slash becomes one part whatever it holds.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import unicodedata
+from pathlib import PurePosixPath
+
+from pipeline.store.errors import StoreError
+
+LONGEST_PART = 120
+"""Bytes of one part of a path; file systems allow 255, encrypted ones 143."""
+
+_HASH_DIGITS = 16
+_RESERVED = ("manifest.json", "latest")
+_UNSAFE = frozenset('%~/\\*?"<>|')
+_KEY = re.compile(r"[0-9A-Za-z][0-9A-Za-z_-]{0,63}")
+_FILE_PART = re.compile(r"[0-9A-Za-z_][0-9A-Za-z_. -]{0,99}")
+
+
+def encode_run(run: str) -> PurePosixPath:
+    """The folder of a run, relative to ``runs/``: one or two safe parts.
+
+    Args:
+        run: name of the run, ``stem`` or ``folder/stem``; any text.
+
+    Raises:
+        StoreError: ``bad_run_name``, the name is empty or cannot be written as UTF-8.
+    """
+    if not run or not _is_writable(run):
+        raise StoreError(
+            "bad_run_name",
+            f"{run!r} cannot name a run",
+            hint="Rename the log to a name that is not empty and is valid Unicode",
+        )
+    folder, slash, stem = run.rpartition("/")
+    parts = (folder, stem) if slash else (stem,)
+    return PurePosixPath(*(_encode_part(part) for part in parts))
+
+
+def check_key(key: str) -> None:
+    """Refuse generation keys that are not a plain word of at most 64 letters, digits, ``_`` and ``-``.
+
+    Raises:
+        StoreError: ``bad_key``.
+    """
+    if not _KEY.fullmatch(key):
+        raise StoreError(
+            "bad_key",
+            f"{key!r} cannot be the key of a generation",
+            hint="Use letters, digits, _ and - only, at most 64",
+        )
+
+
+def check_file_name(name: str) -> None:
+    """Refuse file names that could leave their folder or hide in it.
+
+    Raises:
+        StoreError: ``bad_file_name``.
+    """
+    if not all(_FILE_PART.fullmatch(part) for part in name.split("/")):
+        raise StoreError(
+            "bad_file_name",
+            f"{name!r} cannot name a file of the results",
+            hint="Use letters, digits, dots, _ and -, and start with a letter or a digit",
+        )
+
+
+def _is_writable(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _encode_part(part: str) -> str:
+    normal = unicodedata.normalize("NFC", part)
+    last = len(normal) - 1
+    encoded = "".join(
+        _encode_character(character) if _is_unsafe(character, at, last) else character
+        for at, character in enumerate(normal)
+    )
+    if encoded.casefold() in _RESERVED:
+        encoded = _encode_character(encoded[0]) + encoded[1:]
+    if normal == part and len(encoded.encode()) <= LONGEST_PART:
+        return encoded or "%"
+    digest = hashlib.sha256(part.encode()).hexdigest()[:_HASH_DIGITS]
+    start = encoded.encode()[: LONGEST_PART - _HASH_DIGITS - 1].decode(errors="ignore")
+    return f"{start}~{digest}"
+
+
+def _is_unsafe(character: str, at: int, last: int) -> bool:
+    if character in _UNSAFE or unicodedata.category(character) in ("Cc", "Cf", "Cn", "Co", "Zl", "Zp"):
+        return True
+    return character in ". " and (at in (0, last))
+
+
+def _encode_character(character: str) -> str:
+    return "".join(f"%{byte:02X}" for byte in character.encode())

@@ -1,0 +1,263 @@
+"""The results folder: what is there, and the only way to add to it."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.store.errors import StoreError, name_disk_errors
+from pipeline.store.files import make_folder, remove_folder, remove_leftovers, replace_file
+from pipeline.store.generation import Generation, point_latest, remove_orphans
+from pipeline.store.locks import hold_lock
+from pipeline.store.manifest import MANIFEST, MARKER, Manifest, load_manifest
+from pipeline.store.names import check_file_name, check_key, encode_run
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    import polars as pl
+
+    from pipeline.store.manifest import TableReport
+    from pipeline.store.verification import Problem
+
+LOCK = ".lock"
+RUNS = "runs"
+
+
+def _ignore_step(step: str) -> None:
+    del step
+
+
+class Store:
+    """Results under one folder. Nothing is created before something is written.
+
+    Args:
+        root: the results folder.
+        patience_s: how long a writer waits for another one of the same run.
+        watch: called with the name of every step of a commit (`STEPS`).
+    """
+
+    def __init__(
+        self, root: Path, *, patience_s: float = 60.0, watch: Callable[[str], None] = _ignore_step
+    ) -> None:
+        self.root = Path(root)
+        self._patience_s = patience_s
+        self._watch = watch
+
+    def manifest(self, run: str) -> Manifest | None:
+        """The current generation of a run; None when there is none.
+
+        Raises:
+            StoreError: ``manifest_damaged``, ``manifest_too_new``, ``bad_run_name``, or another run's
+                results stand in the folder (``name_clash``).
+        """
+        home = self._home_of(run)
+        with name_disk_errors(home):
+            manifest = load_manifest(home)
+        if manifest is not None and manifest.run != run:
+            raise _name_clash(run, manifest.run, home)
+        return manifest
+
+    def manifests(self) -> tuple[Manifest, ...]:
+        """The current generations of all runs, sorted by run.
+
+        Raises:
+            StoreError: one of them is damaged: leaving a run out silently would falsify what is computed.
+        """
+        found = []
+        for home in self.homes():
+            with name_disk_errors(home):
+                manifest = load_manifest(home)
+            if manifest is not None:
+                found.append(manifest)
+        return tuple(sorted(found, key=lambda manifest: manifest.run))
+
+    def runs(self) -> tuple[str, ...]:
+        """Names of all runs that have a current generation, sorted.
+
+        Raises:
+            StoreError: as `manifests`.
+        """
+        return tuple(manifest.run for manifest in self.manifests())
+
+    def homes(self) -> tuple[Path, ...]:
+        """Folders of all runs that have a manifest, readable or not, sorted."""
+        top = self.root / RUNS
+        found = [path.parent for depth in ("*", "*/*") for path in top.glob(f"{depth}/{MANIFEST}")]
+        return tuple(sorted(home for home in found if not (home / MARKER).exists()))
+
+    @contextmanager
+    def open_generation(self, run: str, key: str) -> Iterator[Generation]:
+        """Begin new results of a run, alone; without a commit nothing of them remains.
+
+        Args:
+            run: name of the run, ``stem`` or ``folder/stem``.
+            key: hash of everything the results depend on; may be the current one.
+
+        Raises:
+            StoreError: ``locked``, ``bad_key``, ``bad_run_name``, a damaged manifest, or the disk refuses.
+        """
+        check_key(key)
+        with self._lock_run(run) as home:
+            previous = self.manifest(run)
+            with name_disk_errors(home):
+                remove_leftovers(home)
+                remove_orphans(home, previous)
+            generation = Generation(run=run, key=key, home=home, previous=previous, watch=self._watch)
+            try:
+                yield generation
+            finally:
+                generation.discard()
+
+    def read(self, run: str, table: str) -> pl.DataFrame:
+        """A table of a run's current generation.
+
+        Raises:
+            StoreError: ``no_such_run``, ``no_such_table``, or the file is gone or damaged.
+        """
+        manifest = self.manifest(run)
+        while True:
+            if manifest is None:
+                raise StoreError(
+                    "no_such_run",
+                    f"there are no results of {run!r}",
+                    where=str(self.root),
+                    hint="Analyze its log first, or look with `slip status` for the runs there are",
+                )
+            try:
+                return manifest.read(table)
+            except StoreError:
+                # A generation pruned between the look at the manifest and at the file has a successor.
+                newer = self.manifest(run)
+                if newer == manifest:
+                    raise
+                manifest = newer
+
+    def scan(self, table: str) -> pl.LazyFrame:
+        """A table over the current generations of all runs, or one of the whole results (``datasets``).
+
+        Args:
+            table: a table's name, or ``quarantine_<table>``.
+
+        Returns:
+            The contract's columns, empty when no run has any.
+
+        Raises:
+            StoreError: ``no_such_table``, or a manifest is damaged.
+        """
+        from pipeline.store.queries import scan_table  # noqa: PLC0415 - heavy
+
+        return scan_table(table, root=self.root, manifests=self.manifests())
+
+    def query(self, sql: str) -> pl.DataFrame:
+        """Answer SQL over all tables by name.
+
+        Raises:
+            StoreError: ``bad_query``, or a manifest is damaged.
+        """
+        from pipeline.store.queries import answer_query  # noqa: PLC0415 - heavy
+
+        return answer_query(sql, root=self.root, manifests=self.manifests())
+
+    def verify(self) -> tuple[Problem, ...]:
+        """Rehash every file of every current generation; what differs from its manifest."""
+        from pipeline.store.verification import verify_home  # noqa: PLC0415 - keeps the room's import light
+
+        return tuple(problem for home in self.homes() for problem in verify_home(home, top=self.root / RUNS))
+
+    def prune(self, keep: int) -> tuple[Path, ...]:
+        """Remove all but the newest ``keep`` generations of every run that are not current.
+
+        Returns:
+            The folders removed.
+
+        Raises:
+            StoreError: ``locked``, a damaged manifest, or the disk refuses.
+        """
+        if keep < 0:
+            raise StoreError("bad_keep", f"cannot keep {keep} generations", hint="Give 0 or more")
+        removed: list[Path] = []
+        for manifest in self.manifests():
+            with self._lock_run(manifest.run) as home:
+                removed += self._prune_run(manifest.run, home, keep)
+        return tuple(removed)
+
+    def write_results_table(self, name: str, frame: pl.DataFrame) -> TableReport:
+        """Write a table of the whole results, ``<name>.parquet``, in the place of the one before.
+
+        Rows that break the contract go to ``quarantine_<name>.parquet``, removed when there are none.
+
+        Raises:
+            StoreError: ``wrong_columns``, ``no_such_table``, ``locked``, or the disk refuses.
+        """
+        from pipeline.store.tables import QUARANTINE, check_table  # noqa: PLC0415 - heavy
+
+        checked = check_table(name, frame)
+        quarantine = self.root / f"{QUARANTINE}{name}.parquet"
+        with self._lock(self.root), name_disk_errors(self.root):
+            if checked.broken is None:
+                quarantine.unlink(missing_ok=True)
+            else:
+                replace_file(quarantine, checked.broken)
+            replace_file(self.root / f"{name}.parquet", checked.valid)
+        return checked.report
+
+    def write_results_text(self, name: str, text: str) -> Path:
+        """Write a text of the whole results, UTF-8, in the place of the one before.
+
+        Raises:
+            StoreError: ``bad_file_name``, ``locked``, or the disk refuses.
+        """
+        check_file_name(name)
+        path = self.root / name
+        with self._lock(self.root), name_disk_errors(path):
+            make_folder(path.parent)
+            remove_leftovers(path.parent)
+            replace_file(path, text.encode())
+        return path
+
+    def _home_of(self, run: str) -> Path:
+        return self.root / RUNS / encode_run(run)
+
+    @contextmanager
+    def _lock_run(self, run: str) -> Iterator[Path]:
+        home = self._home_of(run)
+        for folder in (home, home.parent):
+            if (folder / MARKER).exists():
+                raise _name_clash(run, folder.parent.name, folder)
+        with self._lock(home):
+            yield home
+
+    @contextmanager
+    def _lock(self, folder: Path) -> Iterator[None]:
+        with name_disk_errors(folder):
+            make_folder(folder)
+        with hold_lock(folder / LOCK, patience_s=self._patience_s):
+            with name_disk_errors(folder):
+                remove_leftovers(folder)
+            yield
+
+    def _prune_run(self, run: str, home: Path, keep: int) -> list[Path]:
+        manifest = self.manifest(run)
+        with name_disk_errors(home):
+            remove_orphans(home, manifest)
+            if manifest is None or len(manifest.earlier) <= keep:
+                return []
+            doomed = [home / name for name in manifest.earlier[keep:]]
+            # First the manifest forgets them: killed in between, they are orphans for the next writer.
+            replace_file(home / MANIFEST, manifest.with_earlier(manifest.earlier[:keep]).encode())
+            for folder in doomed:
+                if folder.exists():
+                    remove_folder(folder)
+            point_latest(home, manifest.folder.name)
+        return doomed
+
+
+def _name_clash(run: str, other: str, folder: Path) -> StoreError:
+    return StoreError(
+        "name_clash",
+        f"the results of {run!r} and of {other!r} would share a folder",
+        where=str(folder),
+        hint="Rename one of the logs, or give it another folder with --out",
+    )

@@ -1,0 +1,161 @@
+"""Tables against their contracts, and as Parquet bytes that carry units and frames.
+
+polars drops field metadata when it rewrites a file, so the Arrow schema is built here from the contract and
+pyarrow writes it. This module is heavy to import; the rest of the room does so only where tables are touched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.store.errors import StoreError
+from pipeline.store.manifest import TableReport
+from schemas import Contract, contract_of, list_contracts
+
+if TYPE_CHECKING:
+    from dataframely import FailureInfo
+
+QUARANTINE = "quarantine_"
+BROKEN_RULES = "broken_rules"
+
+_ROWS_PER_GROUP = 1 << 17
+_ZSTD_LEVEL = 3
+_ABOUT_BROKEN_RULES = {"description": "rules of the contract that the row breaks"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckedTable:
+    """A frame split by its contract, ready to be written.
+
+    Attributes:
+        contract: the contract it was held against.
+        valid: Parquet bytes of the rows that keep it.
+        broken: Parquet bytes of the rows that break it, with `BROKEN_RULES`; None when there are none.
+        report: the counts.
+    """
+
+    contract: Contract
+    valid: bytes
+    broken: bytes | None
+    report: TableReport
+
+
+def find_contract(name: str) -> Contract:
+    """The contract of a table.
+
+    Raises:
+        StoreError: ``no_such_table``, the message lists those there are.
+    """
+    try:
+        return contract_of(name)
+    except KeyError as error:
+        known = ", ".join(contract.name for contract in list_contracts())
+        raise StoreError(
+            "no_such_table", f"no table is called {name!r}", hint=f"The tables are: {known}"
+        ) from error
+
+
+def schema_of(name: str) -> pl.Schema:
+    """Columns and types of a table or of its quarantine (``quarantine_<table>``).
+
+    Raises:
+        StoreError: ``no_such_table``.
+    """
+    schema = find_contract(name.removeprefix(QUARANTINE)).schema.create_empty().schema
+    if name.startswith(QUARANTINE):
+        return pl.Schema({**schema, BROKEN_RULES: pl.List(pl.String())})
+    return schema
+
+
+def check_table(name: str, frame: pl.DataFrame) -> CheckedTable:
+    """Hold a frame against its contract.
+
+    Args:
+        name: table name.
+        frame: exactly the contract's columns, in any order.
+
+    Raises:
+        StoreError: ``no_such_table``; ``wrong_columns``: a column is missing, unknown or of another type.
+    """
+    contract = find_contract(name)
+    schema = schema_of(name)
+    _check_columns(name, frame.schema, schema)
+    valid, failure = contract.schema.filter(frame.select(schema.names()))
+    report = TableReport(
+        rows=valid.height, quarantined=len(failure), rules=dict(sorted(failure.counts().items()))
+    )
+    return CheckedTable(
+        contract=contract,
+        valid=encode_parquet(contract, valid),
+        broken=encode_parquet(contract, name_broken_rules(failure)) if len(failure) else None,
+        report=report,
+    )
+
+
+def name_broken_rules(failure: FailureInfo) -> pl.DataFrame:
+    """The rows that failed, with a list of the names of the rules each of them breaks."""
+    details = failure.details()
+    rows = failure.invalid()
+    verdicts = details.select(pl.exclude(rows.columns))
+    names = [
+        pl.when(pl.col(rule).cast(pl.String()) == "invalid").then(pl.lit(rule))
+        for rule in sorted(verdicts.columns)
+    ]
+    broken = verdicts.select(pl.concat_list(names).list.drop_nulls().alias(BROKEN_RULES))
+    return rows.with_columns(broken.to_series())
+
+
+def encode_parquet(contract: Contract, frame: pl.DataFrame) -> bytes:
+    """A frame as Parquet bytes; the same frame gives the same bytes.
+
+    Fields carry unit, frame and description, the schema carries ``contract`` and ``contract_version``.
+    """
+    table = frame.rechunk().to_arrow(compat_level=pl.CompatLevel.oldest())
+    schema = _describe(contract, table.schema)
+    sink = pa.BufferOutputStream()
+    pq.write_table(
+        pa.Table.from_arrays(table.columns, schema=schema),
+        sink,
+        compression="zstd",
+        compression_level=_ZSTD_LEVEL,
+        row_group_size=_ROWS_PER_GROUP,
+        # Numbers of a sensor hardly repeat: their dictionaries would be larger than they are.
+        use_dictionary=[field.name for field in schema if not pa.types.is_floating(field.type)],
+    )
+    data: bytes = sink.getvalue().to_pybytes()
+    return data
+
+
+def _describe(contract: Contract, schema: pa.Schema) -> pa.Schema:
+    fields = []
+    for field in schema:
+        ours = _ABOUT_BROKEN_RULES if field.name == BROKEN_RULES else contract.metadata_of(field.name)
+        # polars keeps the values of an Enum in the field's metadata; without them it reads back a category.
+        kept = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+        fields.append(field.with_metadata(kept | dict(sorted(ours.items()))))
+    return pa.schema(fields, metadata={"contract": contract.name, "contract_version": str(contract.version)})
+
+
+def _check_columns(name: str, found: pl.Schema, wanted: pl.Schema) -> None:
+    missing = [column for column in wanted if column not in found]
+    unknown = [column for column in found if column not in wanted]
+    wrong = [
+        f"{column} is {found[column]} instead of {kind}"
+        for column, kind in wanted.items()
+        if column in found and found[column] != kind
+    ]
+    complaints = [f"column {column} is missing" for column in missing]
+    complaints += [f"column {column} is unknown" for column in unknown]
+    complaints += [f"column {complaint}" for complaint in wrong]
+    if complaints:
+        raise StoreError(
+            "wrong_columns",
+            f"table {name!r} does not fit its contract: {'; '.join(complaints)}",
+            where=f"schemas/{name}.py",
+            hint="Mend the code that makes the table, or its contract",
+        )
