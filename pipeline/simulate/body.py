@@ -6,16 +6,18 @@ What depends on the place or the slope is added while the pose is integrated (``
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulate.drivetrain import Drive
-from pipeline.simulate.effects import Effects
-from pipeline.simulate.scenario import Disturbance
 from pipeline.simulate.signals import filter_pole, integrate_cells, lag_signal, make_coloured_noise
-from pipeline.simulate.vehicles import Vehicle
+
+if TYPE_CHECKING:
+    from pipeline.simulate.drivetrain import Drive
+    from pipeline.simulate.effects import Effects
+    from pipeline.simulate.scenario import Disturbance
+    from pipeline.simulate.vehicles import Vehicle
 
 Floats = NDArray[np.float64]
 

@@ -6,14 +6,17 @@ Static limits act on the commands at their own stamps, so that nothing depends o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulate.effects import Effects
 from pipeline.simulate.programs import Commands
 from pipeline.simulate.signals import hold_on_grid, integrate_cells, lag_signal, limit_rate
-from pipeline.simulate.vehicles import Vehicle
+
+if TYPE_CHECKING:
+    from pipeline.simulate.effects import Effects
+    from pipeline.simulate.vehicles import Vehicle
 
 Floats = NDArray[np.float64]
 
@@ -53,7 +56,7 @@ def invert_ideal_model(vehicle: Vehicle, speed: Floats, turn: Floats) -> tuple[F
 def apply_ideal_model(
     vehicle: Vehicle, left: Floats, right: Floats, steering: Floats
 ) -> tuple[Floats, Floats]:
-    """Ideal speed [m/s] and yaw rate [rad/s] of wheel speeds [rad/s] and steering [rad], each of shape (n,)."""
+    """Ideal speed [m/s] and yaw rate [rad/s] of wheel speeds [rad/s] and steering [rad], shape (n,) each."""
     speed = 0.5 * vehicle.wheel_radius_m * (left + right)
     if vehicle.kind == "ackermann":
         return speed, speed * np.tan(steering) / vehicle.wheelbase_m

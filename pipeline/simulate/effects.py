@@ -9,9 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from pipeline.simulate.errors import SimulateError, unknown_name
-from pipeline.simulate.vehicles import Kind
+
+if TYPE_CHECKING:
+    from pipeline.simulate.vehicles import Kind
 
 _INF = math.inf
 _NAN = math.nan
@@ -105,7 +108,9 @@ _SPECS: tuple[EffectSpec, ...] = (
     EffectSpec("icr_lateral", "v_x += y_icr w", _one("y_icr", "m", 0.0, 0.08)),
     EffectSpec("heading_skew", "reported yaw is that of d ago: v_y += d v0 w0", _one("d", "s", 0.0, 0.1)),
     EffectSpec(
-        "yaw_misalignment", "reported yaw = yaw + psi: v_y = -psi v_x", _one("psi", "rad", 0.0, math.radians(3.0))
+        "yaw_misalignment",
+        "reported yaw = yaw + psi: v_y = -psi v_x",
+        _one("psi", "rad", 0.0, math.radians(3.0)),
     ),
     EffectSpec(
         "lever_arm",
@@ -182,11 +187,12 @@ def _check_parameters(spec: EffectSpec, given: Mapping[str, float] | float) -> d
         given = {names[0]: given}
     for name, value in given.items():
         if name not in names:
+            known = ", ".join(f"{item.name} [{item.unit}]" for item in spec.parameters)
             raise SimulateError(
                 "unknown_parameter",
                 f"{spec.id} has no parameter '{name}'",
                 where=spec.id,
-                hint=f"Its parameters are {', '.join(f'{item.name} [{item.unit}]' for item in spec.parameters)}",
+                hint=f"Its parameters are {known}",
             )
         _check_value(spec.id, name, float(value))
     return {name: float(value) for name, value in given.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +15,13 @@ from pipeline.core.rigid import (
     quaternions_from_yaw,
     rotate,
 )
-from pipeline.simulate.effects import Effects
-from pipeline.simulate.path import Path
-from pipeline.simulate.scenario import PoseSensor
 from pipeline.simulate.signals import make_coloured_noise
 from pipeline.simulate.streams import open_stream
+
+if TYPE_CHECKING:
+    from pipeline.simulate.effects import Effects
+    from pipeline.simulate.path import Path
+    from pipeline.simulate.scenario import PoseSensor
 
 Floats = NDArray[np.float64]
 

@@ -1,9 +1,10 @@
-"""From body velocity to pose: over a flat or tilted plane at once, over hills and odd physics step by step."""
+"""From body velocity to pose: over a plane at once, over hills and with odd physics step by step."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +15,14 @@ from pipeline.core.rigid import (
     quaternions_from_yaw,
     rotate,
 )
-from pipeline.simulate.body import BodyMotion
-from pipeline.simulate.drivetrain import Drive
-from pipeline.simulate.effects import Effects
 from pipeline.simulate.scenario import ExtraPhysics, Ground, State
 from pipeline.simulate.signals import integrate_cells
 from pipeline.simulate.surface import Surface, Vector, cross, make_surface, slide_onto_plane, tilt_quaternion
+
+if TYPE_CHECKING:
+    from pipeline.simulate.body import BodyMotion
+    from pipeline.simulate.drivetrain import Drive
+    from pipeline.simulate.effects import Effects
 
 Floats = NDArray[np.float64]
 
@@ -100,7 +103,7 @@ def _cross_plane(
         ),
         axis=1,
     )
-    time = np.arange(heading.size) * step_s
+    time = np.arange(heading.size, dtype=np.float64) * step_s
     quaternion = multiply_quaternions(np.broadcast_to(tilt, (heading.size, 4)), quaternions_from_yaw(heading))
     return Path(time, rotate(tilt, in_plane), quaternion, velocity)
 
@@ -129,9 +132,7 @@ class _Walk:
         return means
 
 
-def _cross_surface(
-    walk: _Walk, surface: Surface, ground: Ground, start: tuple[float, float, float]
-) -> Path:
+def _cross_surface(walk: _Walk, surface: Surface, ground: Ground, start: tuple[float, float, float]) -> Path:
     step = walk.step_s
     tilt = tilt_quaternion(ground)
     x, y, _ = rotate(tilt, np.array([start[0], start[1], 0.0])).tolist()
@@ -148,7 +149,7 @@ def _cross_surface(
         attitude = _attitude(ahead, left, normal)
         position[index] = x, y, surface.height_at(x, y)
         angles[index] = attitude
-        d_x, d_y, d_w = forces.push(index, x, y, ahead, left, attitude)
+        d_x, d_y, d_w = forces.push(index, (x, y), axes=(ahead, left), attitude=attitude)
         v_x, v_y, v_w = base_x + d_x, base_y + d_y, base_w + d_w
         velocity[index] = v_x, v_y, v_w
         half_c, half_s = math.cos(0.5 * v_w * step), math.sin(0.5 * v_w * step)
@@ -165,7 +166,7 @@ def _cross_surface(
         ahead = slide_onto_plane(turned, normal)
     position[-1] = x, y, surface.height_at(x, y)
     angles[-1] = _attitude(ahead, cross(normal, ahead), normal)
-    time = np.arange(walk.cells + 1) * step
+    time = np.arange(walk.cells + 1, dtype=np.float64) * step
     quaternion = quaternions_from_euler(angles[:, 0], angles[:, 1], angles[:, 2])
     return Path(time, position, quaternion, velocity)
 
@@ -186,6 +187,7 @@ class _Forces:
         self._border = effects.value("terrain_change", "at_x")
         self._gain_v = effects.value("terrain_change", "k_v")
         self._gain_w = effects.value("terrain_change", "k_w")
+        self._odd = walk.extra
         self._state = State(dt=walk.step_s)
         self._signals = tuple(
             signal.tolist()
@@ -202,19 +204,19 @@ class _Forces:
         self._turning = walk.turning.tolist()
 
     def push(
-        self, index: int, x: float, y: float, ahead: Vector, left: Vector, attitude: Vector
+        self, index: int, place: tuple[float, float], *, axes: tuple[Vector, Vector], attitude: Vector
     ) -> tuple[float, float, float]:
         """Velocity to add in this cell: d_x [m/s], d_y [m/s], d_w [rad/s]."""
         downhill = -self._slope * self._turning[index]
-        d_x, d_y, d_w = downhill * ahead[2], downhill * left[2], 0.0
-        if x > self._border:
+        d_x, d_y, d_w = downhill * axes[0][2], downhill * axes[1][2], 0.0
+        if place[0] > self._border:
             base = self._walk.velocity[index]
             d_x += (self._gain_v - 1.0) * float(base[0])
             d_w += (self._gain_w - 1.0) * float(base[2])
-        if self._walk.extra is not None:
+        if self._odd is not None:
             state = self._state
             state.t = (index + 0.5) * self._walk.step_s
-            state.x, state.y = x, y
+            state.x, state.y = place
             state.roll, state.pitch, state.yaw = attitude
             (
                 state.v0,
@@ -225,6 +227,6 @@ class _Forces:
                 state.right_angle,
                 state.steering,
             ) = (signal[index] for signal in self._signals)
-            odd = self._walk.extra(state)
+            odd = self._odd(state)
             d_x, d_y, d_w = d_x + odd[0], d_y + odd[1], d_w + odd[2]
         return d_x, d_y, d_w

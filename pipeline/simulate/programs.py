@@ -6,16 +6,20 @@ steering angle [rad] on a car.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulate.errors import SimulateError, unknown_name
-from pipeline.simulate.scenario import Program
 from pipeline.simulate.signals import make_coloured_noise
-from pipeline.simulate.vehicles import Vehicle
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pipeline.simulate.scenario import Program
+    from pipeline.simulate.vehicles import Vehicle
 
 Floats = NDArray[np.float64]
 
@@ -168,7 +172,7 @@ def _stop_and_go(time: Floats, space: _Space) -> Drawn:
 
 
 def _teleop(time: Floats, space: _Space) -> Drawn:
-    """A person with a joystick: quantised, rounded steps of uneven length, and nothing at all when released."""
+    """A person with a joystick: quantised steps of uneven length, and nothing at all when released."""
     edges = np.cumsum(space.generator.uniform(0.3, 1.0, time.size) * space.step_s)
     which = np.searchsorted(edges, time)
     speed = np.clip(space.generator.normal(0.4, 0.5, time.size), -1.0, 1.0)[which]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +16,13 @@ from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.localization import Poses, report_poses
 from pipeline.simulate.path import Path, integrate_path
 from pipeline.simulate.programs import Commands, make_commands
-from pipeline.simulate.scenario import Scenario
 from pipeline.simulate.sensors import ImuReadings, WheelReadings, read_encoders, read_imu
 from pipeline.simulate.signals import integrate_cells
 from pipeline.simulate.streams import open_stream
-from pipeline.simulate.vehicles import Vehicle
+
+if TYPE_CHECKING:
+    from pipeline.simulate.scenario import Scenario
+    from pipeline.simulate.vehicles import Vehicle
 
 Floats = NDArray[np.float64]
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.vehicles import VEHICLES, Vehicle
+
+if TYPE_CHECKING:
+    from pipeline.simulate.layouts import Layout
 
 ProgramName = Literal[
     "drive_steps", "ramps", "smooth", "straight", "circle", "spins", "slalom", "stop_and_go", "teleop"
@@ -208,7 +211,7 @@ class Recording:
     """What the log holds.
 
     Attributes:
-        layout: name of the topic layout (see ``layouts``).
+        layout: the topics: a name of ``layouts.LAYOUTS``, or a layout of one's own.
         deployment: whether and how the deployment record is written: vehicle and terrain, or nothing.
         terrain: name of the ground in that record.
         decoys: topics that a hasty reader takes for the right ones.
@@ -218,7 +221,7 @@ class Recording:
         command_latency_s: from a command's stamp to the recorder.
     """
 
-    layout: str = "husky"
+    layout: str | Layout = "husky"
     deployment: Literal["written", "absent"] = "written"
     terrain: str = "simulated"
     decoys: Literal["none", "odometry", "commands", "both"] = "none"
@@ -274,5 +277,8 @@ class Scenario:
         ):
             if not low <= value <= high:
                 raise SimulateError(
-                    "bad_value", f"{name} = {value} is not possible", where=name, hint=f"Give {low:g} to {high:g}"
+                    "bad_value",
+                    f"{name} = {value} is not possible",
+                    where=name,
+                    hint=f"Give {low:g} to {high:g}",
                 )

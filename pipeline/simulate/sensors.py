@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +15,12 @@ from pipeline.core.rigid import (
     rotate,
     rotation_vectors,
 )
-from pipeline.simulate.drivetrain import Drive
-from pipeline.simulate.path import Path
-from pipeline.simulate.scenario import Encoders, Imu
 from pipeline.simulate.streams import open_stream
+
+if TYPE_CHECKING:
+    from pipeline.simulate.drivetrain import Drive
+    from pipeline.simulate.path import Path
+    from pipeline.simulate.scenario import Encoders, Imu
 
 Floats = NDArray[np.float64]
 

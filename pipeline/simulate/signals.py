@@ -75,7 +75,7 @@ def limit_rate(signal: Floats, *, per_second: float, step_s: float) -> Floats:
 def make_coloured_noise(
     generator: np.random.Generator, *, size: int, deviation: float, correlation_s: float, step_s: float
 ) -> Floats:
-    """Stationary first-order Gauss-Markov noise, shape (size,), with autocorrelation exp(-|t|/correlation_s)."""
+    """Stationary first-order Gauss-Markov noise (size,), autocorrelation exp(-|t|/correlation_s)."""
     pole = float(np.exp(-step_s / correlation_s))
     white = generator.standard_normal(size)
     drive = white * np.sqrt(1.0 - pole**2)

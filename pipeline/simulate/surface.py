@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.rigid import quaternions_from_euler, rotate
-from pipeline.simulate.scenario import Ground
+
+if TYPE_CHECKING:
+    from pipeline.simulate.scenario import Ground
 
 Floats = NDArray[np.float64]
 Vector = tuple[float, float, float]

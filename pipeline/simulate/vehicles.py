@@ -47,7 +47,10 @@ class Vehicle:
         for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "max_speed_mps"):
             if not getattr(self, name) > 0.0:
                 raise SimulateError(
-                    "bad_vehicle", f"{name} must be above zero", where=self.name, hint=f"Give {name} in SI units"
+                    "bad_vehicle",
+                    f"{name} must be above zero",
+                    where=self.name,
+                    hint=f"Give {name} in SI units",
                 )
 
 

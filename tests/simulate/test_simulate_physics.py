@@ -1,0 +1,317 @@
+"""Every effect against numbers worked out by hand from its formula, on motions with a closed form."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.core.rigid import rotate
+from pipeline.simulate.effects import CATALOGUE
+from pipeline.simulate.run import simulate_run
+from pipeline.simulate.scenario import Disturbance, Ground, Program, Scenario, State
+from pipeline.simulate.vehicles import VEHICLES
+
+Floats = NDArray[np.float64]
+Asked = Mapping[str, Mapping[str, float] | float]
+
+HUSKY = VEHICLES["husky"]
+CAR = VEHICLES["car"]
+CIRCLE = Scenario(
+    program=Program("circle", lead_s=1.0),
+    duration_s=30.0,
+    pose=replace(Scenario().pose, noise_m=0, noise_rad=0),
+)
+# A circle is driven at 60 % of the Husky's 1 m/s and 1 rad/s.
+V0, W0 = 0.6, 0.6
+FIRST_COMMAND_S = 1.0 + 0.37 / 20.0
+
+
+def steady_velocity(effects: Asked, scenario: Scenario = CIRCLE) -> Floats:
+    run = simulate_run(replace(scenario, effects=effects))
+    path = run.truth.path
+    window = (path.time_s[:-1] > 20.0) & (path.time_s[:-1] < 28.0)
+    return path.velocity[window].mean(axis=0)
+
+
+INERTIA = 1.0 + (0.5 * W0) ** 2
+
+
+@pytest.mark.parametrize(
+    ("effects", "expected"),
+    [
+        ({}, (V0, 0, W0)),
+        ({"wheel_radius": 0.9}, (0.9 * V0, 0, 0.9 * W0)),
+        ({"wheel_asymmetry": 0.1}, (V0 + 0.05 * W0 * 0.275, 0, W0 + 0.1 * V0 / 0.55)),
+        ({"effective_track": 1.8}, (V0, 0, W0 / 1.8)),
+        ({"icr_offset": 0.12}, (V0, -0.12 * W0, W0)),
+        ({"icr_lateral": 0.1}, (V0 + 0.1 * W0, 0, W0)),
+        ({"lateral_skid": 0.1}, (V0, -0.1 * V0 * W0, W0)),
+        ({"speed_slip": 0.08}, (V0 - 0.08 * V0**2, 0, W0)),
+        ({"turning_resistance": 0.24}, (V0 - 0.24 * V0 * W0, 0, W0)),
+        ({"lateral_drift": 0.05}, (V0, 0.05, W0)),
+        ({"yaw_drift": 0.06}, (V0, 0, W0 + 0.06)),
+        ({"terrain_change": {"k_v": 0.8, "k_w": 0.7, "at_s": 10.0}}, (0.8 * V0, 0, 0.7 * W0)),
+        ({"body_speed_limit": 0.5}, (0.5, 0, W0)),
+        ({"body_turn_limit": 0.4}, (V0, 0, 0.4)),
+        # The right wheel runs at (0.6 + 0.6 * 0.275) / 0.165 = 4.636 rad/s, the left one at 2.636.
+        ({"wheel_speed_limit": 4.0}, ((0.435 + 0.66) / 2, 0, (0.66 - 0.435) / 0.55)),
+        ({"deadband": 0.5}, (0.765 / 2, 0, 0.765 / 0.55)),
+        ({"turn_droop": {"threshold": 1.5, "gain": 0.4}}, (V0, 0, 0.165 / 0.55 * (1.5 + 0.4 * 0.5))),
+        ({"body_inertia": 0.5}, (V0 / INERTIA, -0.5 * W0 * V0 / INERTIA, W0)),
+        # The order of a command's way: the track changes w0, and only then inertia and skid look at it.
+        (
+            {"effective_track": 1.5, "lateral_skid": 0.1, "icr_offset": 0.1},
+            (V0, -0.1 * V0 * 0.4 - 0.1 * 0.4, 0.4),
+        ),
+        (
+            {"body_inertia": 0.5, "lateral_skid": 0.1},
+            (V0 / INERTIA, -0.5 * W0 * V0 / INERTIA - 0.1 * V0 * W0, W0),
+        ),
+        ({"drive_lag": 0.4, "turn_lag": {"tau_mean": 0.2, "tau_diff": 0.9}}, (V0, 0, W0)),
+    ],
+    ids=str,
+)
+def test_steady_circle_has_the_velocity_of_the_formula(
+    effects: Asked, expected: tuple[float, float, float]
+) -> None:
+    np.testing.assert_allclose(steady_velocity(effects), expected, atol=1e-6)
+
+
+def test_ground_effects_may_act_on_what_inertia_made() -> None:
+    after = steady_velocity(
+        {"body_inertia": 0.5, "lateral_skid": 0.1}, replace(CIRCLE, ground_input="inertia")
+    )
+    v_x = V0 / INERTIA
+    np.testing.assert_allclose(after, (v_x, -0.5 * W0 * v_x - 0.1 * v_x * W0, W0), atol=1e-6)
+
+
+DELTA, SPEED = 0.6 * CAR.max_steering_rad, 0.6 * CAR.max_speed_mps
+
+
+@pytest.mark.parametrize(
+    ("effects", "rate"),
+    [
+        ({}, SPEED * math.tan(DELTA) / 0.6),
+        ({"steering_offset": 0.05}, SPEED * math.tan(DELTA + 0.05) / 0.6),
+        ({"steering_gain": 0.8}, SPEED * math.tan(0.8 * DELTA) / 0.6),
+        ({"understeer": 0.03}, SPEED * math.tan(DELTA) / (0.6 + 0.03 * SPEED**2)),
+        ({"steering_lag": 0.4}, SPEED * math.tan(DELTA) / 0.6),
+        ({"body_turn_limit": 0.5}, 0.5),
+    ],
+    ids=str,
+)
+def test_a_car_turns_as_the_bicycle_model_says(effects: Asked, rate: float) -> None:
+    car = replace(CIRCLE, vehicle=CAR, recording=replace(CIRCLE.recording, layout="ackermann"))
+    np.testing.assert_allclose(steady_velocity(effects, car), (SPEED, 0.0, rate), atol=1e-6)
+
+
+def test_a_circle_has_the_radius_of_speed_over_rate() -> None:
+    path = simulate_run(replace(CIRCLE, effects={"effective_track": 1.8})).truth.path
+    x, y = path.position[(path.time_s > 2.0) & (path.time_s < 28.0), :2].T
+    # Least-squares circle: x^2 + y^2 = 2 a x + 2 b y + c.
+    (a, b, c), *_ = np.linalg.lstsq(np.stack((2 * x, 2 * y, np.ones_like(x)), 1), x**2 + y**2, rcond=None)
+    assert math.sqrt(c + a**2 + b**2) == pytest.approx(1.8, rel=1e-5)
+
+
+STRAIGHT = replace(CIRCLE, program=Program("circle", lead_s=1.0, turn_scale=0.0))
+
+
+def wheel_response(effects: Asked, scenario: Scenario = STRAIGHT) -> tuple[Floats, Floats, Floats]:
+    drive = simulate_run(replace(scenario, effects=effects)).truth.drive
+    time = (np.arange(drive.left.size) + 0.5) * drive.step_s - FIRST_COMMAND_S
+    keep = (time > 0.002) & (time < 20.0)
+    return time[keep], drive.left[keep], drive.right[keep]
+
+
+def test_drive_lag_answers_a_step_exponentially() -> None:
+    time, left, _ = wheel_response({"drive_lag": 0.5})
+    np.testing.assert_allclose(left, V0 / 0.165 * (1 - np.exp(-time / 0.5)), atol=2e-5)
+
+
+def test_turn_lag_has_one_time_constant_for_the_mean_and_one_for_the_difference() -> None:
+    time, left, right = wheel_response({"turn_lag": {"tau_mean": 0.3, "tau_diff": 1.2}}, CIRCLE)
+    np.testing.assert_allclose((left + right) / 2, V0 / 0.165 * (1 - np.exp(-time / 0.3)), atol=2e-5)
+    np.testing.assert_allclose(right - left, W0 * 0.55 / 0.165 * (1 - np.exp(-time / 1.2)), atol=2e-5)
+
+
+def test_acceleration_limit_makes_a_ramp() -> None:
+    time, left, _ = wheel_response({"acceleration_limit": 2.0})
+    np.testing.assert_allclose(left, np.minimum(2.0 * time, V0 / 0.165), atol=2e-3)
+
+
+@pytest.mark.parametrize("delay", [0.2, 0.1234567])
+def test_transport_delay_shifts_the_step_even_between_grid_points(delay: float) -> None:
+    drive = simulate_run(replace(STRAIGHT, effects={"transport_delay": delay})).truth.drive
+    until = int(20.0 / drive.step_s)
+    missing = 20.0 - drive.left[:until].sum() * drive.step_s / (V0 / 0.165)
+    assert missing == pytest.approx(FIRST_COMMAND_S + delay, abs=1e-9)
+
+
+def test_inertia_starts_from_rest_as_a_lag_when_going_straight() -> None:
+    path = simulate_run(replace(STRAIGHT, effects={"body_inertia": 0.7})).truth.path
+    time = path.time_s[:-1] + 0.0005 - FIRST_COMMAND_S
+    keep = (time > 0.002) & (time < 20.0)
+    np.testing.assert_allclose(path.velocity[keep, 0], V0 * (1 - np.exp(-time[keep] / 0.7)), atol=2e-5)
+
+
+def test_time_drift_reaches_its_share_at_the_end() -> None:
+    path = simulate_run(replace(STRAIGHT, effects={"time_drift": 0.1})).truth.path
+    at = path.time_s[:-1]
+    half = path.velocity[np.argmin(np.abs(at - 15.0)), 0]
+    assert half == pytest.approx(V0 * 0.95, rel=1e-4)
+
+
+def test_the_controller_stops_some_time_after_the_last_command() -> None:
+    quiet = replace(STRAIGHT, program=Program("circle", rate_hz=1.0, lead_s=1.0, hold_s=0.25))
+    drive = simulate_run(quiet).truth.drive
+    moving = np.mean(drive.left[5000:25000] > 0.0)
+    assert moving == pytest.approx(0.25, abs=0.01)
+
+
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_neutral_parameters_change_nothing_bit_for_bit(name: str) -> None:
+    spec = CATALOGUE[name]
+    neutral = {item.name: item.neutral for item in spec.parameters if not math.isnan(item.neutral)}
+    vehicle = HUSKY if "differential" in spec.kinds else CAR
+    base = Scenario(
+        vehicle=vehicle,
+        duration_s=12.0,
+        disturbance=Disturbance(0.03, 0.05),
+        ground=Ground(pitch_rad=0.1),
+        effects={"drive_lag": 0.3},
+    )
+    plain, with_it = (
+        simulate_run(replace(base, effects=given))
+        for given in ({"drive_lag": 0.3}, neutral_set(name, neutral))
+    )
+    assert plain.truth.path.position.tobytes() == with_it.truth.path.position.tobytes()
+    assert plain.poses.quaternion.tobytes() == with_it.poses.quaternion.tobytes()
+    assert plain.poses.stamp_s.tobytes() == with_it.poses.stamp_s.tobytes()
+
+
+def neutral_set(name: str, neutral: dict[str, float]) -> Asked:
+    return {"drive_lag": 0.3} if name == "drive_lag" else {"drive_lag": 0.3, name: neutral}
+
+
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_a_usual_size_of_every_effect_moves_what_is_reported(name: str) -> None:
+    spec = CATALOGUE[name]
+    usual = {item.name: item.typical for item in spec.parameters if not math.isnan(item.typical)}
+    vehicle = HUSKY if "differential" in spec.kinds else CAR
+    base = Scenario(vehicle=vehicle, duration_s=30.0, ground=Ground(pitch_rad=0.15))
+    plain, with_it = simulate_run(base), simulate_run(replace(base, effects={name: usual}))
+    moved = np.abs(plain.poses.position - with_it.poses.position).max()
+    turned = np.abs(plain.poses.quaternion - with_it.poses.quaternion).max()
+    shifted = np.abs(plain.poses.stamp_s - with_it.poses.stamp_s).max()
+    assert max(moved, turned, shifted) > 0.02
+
+
+def test_slope_pulls_downhill_whatever_the_heading() -> None:
+    slope = Scenario(
+        program=Program("spins"),
+        duration_s=60.0,
+        ground=Ground(pitch_rad=0.1, roll_rad=-0.05),
+        effects={"slope_drift": 0.6},
+    )
+    path = simulate_run(slope).truth.path
+    moved = path.position[-1] - path.position[0]
+    # The plane's steepest way down: +x for pitch > 0, +y for roll < 0.
+    down = np.array([math.sin(0.1) * math.cos(0.05), math.sin(0.05)])
+    turning = simulate_run(slope).truth.motion.turning.sum() * slope.step_s
+    assert moved[2] < 0.0
+    np.testing.assert_allclose(moved[:2] / np.linalg.norm(moved[:2]), down / np.linalg.norm(down), atol=0.01)
+    steepest = math.sqrt(1.0 - (math.cos(0.1) * math.cos(0.05)) ** 2)
+    assert np.linalg.norm(moved) == pytest.approx(0.6 * steepest * turning, rel=1e-3)
+
+
+def test_slope_follows_pitch_and_roll_of_the_body() -> None:
+    run = simulate_run(
+        Scenario(
+            duration_s=40.0,
+            ground=Ground(pitch_rad=0.2),
+            effects={"slope_drift": 0.5},
+            start_pose=(0, 0, 1.0),
+        )
+    )
+    path = run.truth.path
+    k = np.flatnonzero(run.truth.motion.turning)[::777]
+    up = rotate(path.quaternion[k] * np.array([-1, -1, -1, 1]), np.tile([0.0, 0.0, 1.0], (k.size, 1)))
+    pushed = path.velocity[k, :2] - run.truth.motion.velocity[k, :2]
+    # sin(pitch) = -up_x, cos(pitch) sin(roll) = up_y.
+    np.testing.assert_allclose(pushed, -0.5 * up[:, :2], atol=2e-4)
+
+
+def test_both_integrators_agree_on_a_plane() -> None:
+    base = Scenario(
+        duration_s=60.0, ground=Ground(0.15, -0.1), effects={"slope_drift": 0.4, "drive_lag": 0.3}
+    )
+    at_once = simulate_run(base).truth.path
+    stepwise = simulate_run(replace(base, extra=lambda _: (0.0, 0.0, 0.0))).truth.path
+    np.testing.assert_allclose(stepwise.position, at_once.position[::5], atol=2e-3)
+    alike = np.abs(np.sum(stepwise.quaternion * at_once.quaternion[::5], axis=1))
+    np.testing.assert_allclose(alike, 1.0, atol=1e-8)
+
+
+def test_on_hills_the_body_lies_on_the_ground_and_turns_as_its_gyro_says() -> None:
+    run = simulate_run(
+        Scenario(
+            duration_s=60.0,
+            ground=Ground(hill_m=0.4, hill_length_m=12.0),
+            imu=replace(Scenario().imu, noise_radps=0.0),
+        )
+    )
+    path = run.truth.path
+    normal = rotate(path.quaternion, np.tile([0.0, 0.0, 1.0], (path.time_s.size, 1)))
+    steps = np.diff(path.position, axis=0)
+    assert np.ptp(path.position[:, 2]) > 0.1
+    off_ground = np.abs(np.einsum("ij,ij->i", steps, 0.5 * (normal[1:] + normal[:-1])))
+    assert off_ground.max() < 1e-5
+    speed = np.linalg.norm(steps, axis=1) / 0.005
+    np.testing.assert_allclose(speed, np.hypot(*path.velocity[:, :2].T), atol=2e-3)
+    gyro = np.interp(run.imu.time_s, path.time_s[:-1] + 0.0025, path.velocity[:, 2])
+    assert np.median(np.abs(gyro - run.imu.rates[:, 2])) < 1e-3
+
+
+def test_odd_physics_sees_the_state_and_adds_to_the_velocity() -> None:
+    seen = []
+
+    def wobble(state: State) -> tuple[float, float, float]:
+        seen.append((state.t, state.left_angle, state.yaw))
+        return 0.0, 0.05 * math.sin(state.left_angle), 0.0
+
+    run = simulate_run(replace(CIRCLE, extra=wobble))
+    path = run.truth.path
+    time, angle, yaw = np.array(seen).T
+    np.testing.assert_allclose(path.velocity[:, 1], 0.05 * np.sin(angle), atol=1e-12)
+    np.testing.assert_allclose(np.diff(time), 0.005, atol=1e-12)
+    assert np.ptp(yaw) > 5.0
+
+
+def test_terrain_may_change_at_a_place() -> None:
+    effects = {"terrain_change": {"k_v": 0.5, "k_w": 1.0, "at_x": 3.0}}
+    path = simulate_run(replace(STRAIGHT, effects=effects)).truth.path
+    before, after = (
+        path.velocity[mask, 0] for mask in (path.position[:-1, 0] < 2.9, path.position[:-1, 0] > 3.1)
+    )
+    assert before.max() == pytest.approx(V0, rel=1e-6)
+    assert after.max() == pytest.approx(0.5 * V0, rel=1e-6)
+
+
+def test_random_motion_has_the_asked_size_and_memory_and_rests_with_the_wheels() -> None:
+    shaken = replace(
+        STRAIGHT,
+        duration_s=400.0,
+        disturbance=Disturbance(speed_mps=0.03, turn_radps=0.05, correlation_s=0.5),
+        seed=4,
+    )
+    path = simulate_run(shaken).truth.path
+    moving = path.velocity[3000:-3000] - [V0, 0.0, 0.0]
+    np.testing.assert_allclose(moving.std(axis=0), [0.03, 0.03, 0.05], rtol=0.12)
+    later = np.corrcoef(moving[:-500, 1], moving[500:, 1])[0, 1]
+    assert later == pytest.approx(math.exp(-1.0), abs=0.1)
+    assert not path.velocity[:900].any()
