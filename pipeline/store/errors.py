@@ -19,6 +19,7 @@ class StoreError(SlipError):
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _FORBIDDEN = (errno.EACCES, errno.EPERM)
+_NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 
 
 @contextmanager
@@ -29,7 +30,7 @@ def name_disk_errors(place: Path) -> Iterator[None]:
         place: the file or folder to name where the system's error names none.
 
     Raises:
-        StoreError: ``disk_full``, ``read_only``, ``permission_denied`` or ``disk_error``.
+        StoreError: ``disk_full``, ``read_only``, ``permission_denied``, ``no_locks`` or ``disk_error``.
     """
     try:
         yield
@@ -56,6 +57,13 @@ def name_disk_errors(place: Path) -> Iterator[None]:
                 "permission denied",
                 where=where,
                 hint="Choose another folder with --out or give your user the right to this one",
+            ) from error
+        if error.errno in _NO_LOCKS:
+            raise StoreError(
+                "no_locks",
+                "the file system of the results has no file locks or links",
+                where=where,
+                hint="Choose a folder on a local disk with --out",
             ) from error
         raise StoreError(
             "disk_error",

@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 TEMPORARY = ".tmp-"
@@ -34,8 +35,17 @@ def write_new_file(path: Path, data: bytes) -> None:
         os.fsync(file.fileno())
 
 
-def replace_file(path: Path, data: bytes) -> None:
+def _do_nothing() -> None:
+    pass
+
+
+def replace_file(path: Path, data: bytes, *, when_written: Callable[[], None] = _do_nothing) -> None:
     """Put a whole new file in the place of ``path`` in one moment; readers see the old or the new one.
+
+    Args:
+        path: the file, which need not exist yet; its folder does.
+        data: the new content.
+        when_written: called when the new file is on the disk, before it takes the place.
 
     Raises:
         OSError: the old file is untouched and nothing else remains.
@@ -43,6 +53,7 @@ def replace_file(path: Path, data: bytes) -> None:
     temporary = temporary_beside(path)
     try:
         write_new_file(temporary, data)
+        when_written()
         temporary.replace(path)
     except BaseException:
         with suppress(OSError):
@@ -57,8 +68,15 @@ def temporary_beside(path: Path) -> Path:
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until the disk has the names of a folder; some network file systems have no such call."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    """Wait until the disk has the names of a folder.
+
+    Some network file systems have no such call, and a folder may be writable without being readable; the
+    system then writes the names in its own time.
+    """
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except PermissionError:
+        return
     try:
         os.fsync(descriptor)
     except OSError as error:

@@ -10,12 +10,12 @@ from pipeline.store.errors import StoreError, name_disk_errors
 from pipeline.store.files import (
     link_or_copy,
     make_folder,
-    remove_folder,
     replace_file,
     sync_folder,
     temporary_beside,
     write_new_file,
 )
+from pipeline.store.homes import name_free_folder, point_latest
 from pipeline.store.manifest import (
     MANIFEST,
     MARKER,
@@ -25,8 +25,8 @@ from pipeline.store.manifest import (
     TableReport,
     file_missing,
     hash_bytes,
-    load_manifest,
 )
+from pipeline.store.manifest_file import encode_manifest, load_manifest
 from pipeline.store.names import check_file_name
 
 if TYPE_CHECKING:
@@ -37,10 +37,16 @@ if TYPE_CHECKING:
 
     from pipeline.store.manifest import JSON
 
-LATEST = "latest"
-
-STEPS = ("file_written", "folder_synced", "folder_renamed", "manifest_replaced", "latest_replaced")
-"""The moments of a commit that `Store` reports to ``watch``, in this order (the first once a file)."""
+STEPS = (
+    "opened",
+    "file_written",
+    "folder_synced",
+    "folder_renamed",
+    "manifest_written",
+    "manifest_replaced",
+    "latest_replaced",
+)
+"""The moments of a generation that `Store` reports to ``watch``, in this order, the second once a file."""
 
 
 class Generation:
@@ -68,6 +74,7 @@ class Generation:
         self._is_open = True
         with name_disk_errors(self._folder):
             self._folder.mkdir()
+        watch("opened")
 
     def write_table(self, name: str, frame: pl.DataFrame) -> TableReport:
         """Hold a frame against its contract and write it; rows that break a rule go to the quarantine.
@@ -157,7 +164,7 @@ class Generation:
         self._require_open()
         with name_disk_errors(self._home):
             manifest = self._describe(details)
-            data = manifest.encode()
+            data = encode_manifest(manifest)
             write_new_file(self._folder / MARKER, b"")
             for folder in sorted(path for path in self._folder.rglob("*") if path.is_dir()):
                 sync_folder(folder)
@@ -167,7 +174,7 @@ class Generation:
             self._folder = manifest.folder
             sync_folder(self._home)
             self._watch("folder_renamed")
-            replace_file(self._home / MANIFEST, data)
+            replace_file(self._home / MANIFEST, data, when_written=lambda: self._watch("manifest_written"))
             self._watch("manifest_replaced")
         self._is_open = False
         point_latest(self._home, manifest.folder.name)
@@ -191,7 +198,7 @@ class Generation:
         return Manifest(
             run=self.run,
             key=self.key,
-            folder=find_free_folder(self._home, self.key),
+            folder=name_free_folder(self._home, self.key),
             tables=self._tables,
             files=self._files,
             details=details,
@@ -254,35 +261,3 @@ class Generation:
                 hint="Write it instead",
             )
         return self.previous
-
-
-def find_free_folder(home: Path, key: str) -> Path:
-    """The folder for a new generation: the key, with a number behind it where the key is taken.
-
-    A generation made again under the same key gets a folder of its own, because a folder cannot be replaced
-    in one moment, and the readers of the old one must not find the new one's files in it.
-    """
-    folder, number = home / key, 1
-    while folder.exists():
-        number += 1
-        folder = home / f"{key}.{number}"
-    return folder
-
-
-def point_latest(home: Path, folder: str) -> None:
-    """Point the link ``latest`` at a generation; it is a convenience, so failing is no error."""
-    temporary = temporary_beside(home / LATEST)
-    with suppress(OSError):
-        temporary.symlink_to(folder, target_is_directory=True)
-        temporary.replace(home / LATEST)
-
-
-def remove_orphans(home: Path, current: Manifest | None) -> None:
-    """Remove generations that no manifest names: of writers killed just before their last step.
-
-    Call only under the run's lock.
-    """
-    named = {current.folder.name, *current.earlier} if current else set()
-    for marker in sorted(home.glob(f"*/{MARKER}")):
-        if marker.parent.name not in named and not marker.parent.is_symlink():
-            remove_folder(marker.parent)

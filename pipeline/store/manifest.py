@@ -7,10 +7,9 @@ the same generation take the manifest once and read them all through it.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence  # noqa: TC003 - msgspec evaluates the annotations
-from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, TypeAlias
 
 from pipeline.store.errors import StoreError
 
@@ -22,8 +21,6 @@ if TYPE_CHECKING:
 MANIFEST = "manifest.json"
 MARKER = ".generation"
 """Stands in every generation's folder and tells it from a folder of runs."""
-
-FORMAT = 1
 
 JSON: TypeAlias = "bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | None"
 
@@ -91,15 +88,16 @@ class Manifest:
     earlier: tuple[str, ...] = ()
 
     def path(self, name: str) -> Path:
-        """Path of a table (by its name) or of another file (by its file name).
+        """Path of a table or a quarantine (by its name) or of another file (by its file name).
 
         Raises:
             StoreError: ``no_such_table``, this generation holds neither.
         """
         if name in self.tables:
             return self.folder / self.tables[name].file
-        if name in self.files:
-            return self.folder / name
+        for file in (name, f"{name}.parquet"):
+            if file in self.files:
+                return self.folder / file
         raise StoreError(
             "no_such_table",
             f"the results of {self.run!r} hold no {name!r}; they hold {', '.join(self.names()) or 'nothing'}",
@@ -112,7 +110,7 @@ class Manifest:
         return (*sorted(self.tables), *sorted(self.files))
 
     def read(self, table: str) -> pl.DataFrame:
-        """A table of exactly this generation.
+        """A table of exactly this generation, or the ``quarantine_<table>`` of one.
 
         Raises:
             StoreError: ``no_such_table``; ``file_missing`` when it was pruned or deleted meanwhile.
@@ -136,33 +134,6 @@ class Manifest:
         """The same manifest with another list of older generations."""
         return replace(self, earlier=tuple(earlier))
 
-    def encode(self) -> bytes:
-        """The manifest as the text of its file; equal manifests give equal bytes.
-
-        Raises:
-            StoreError: ``bad_details``, the details hold something JSON has no word for.
-        """
-        try:
-            content = {
-                "format": FORMAT,
-                "run": self.run,
-                "key": self.key,
-                "folder": self.folder.name,
-                "tables": {name: asdict(entry) for name, entry in self.tables.items()},
-                "files": {name: asdict(entry) for name, entry in self.files.items()},
-                "details": self.details,
-                "earlier": list(self.earlier),
-            }
-            text = json.dumps(content, allow_nan=False, ensure_ascii=False, indent=1, sort_keys=True)
-            return text.encode() + b"\n"
-        except (TypeError, ValueError) as error:
-            raise StoreError(
-                "bad_details",
-                f"the details of a generation must be JSON: {error}",
-                where=self.run,
-                hint="Give texts, finite numbers, lists and tables with text keys only",
-            ) from error
-
 
 def hash_bytes(data: bytes) -> str:
     """SHA-256 in hexadecimal."""
@@ -177,61 +148,3 @@ def file_missing(path: Path) -> StoreError:
         where=str(path),
         hint="Analyze the log again with --force",
     )
-
-
-def load_manifest(folder: Path) -> Manifest | None:
-    """The manifest in a run's folder; None when there is none.
-
-    Raises:
-        StoreError: ``manifest_damaged``, or ``manifest_too_new`` when a newer version wrote it.
-        OSError: the file cannot be read.
-    """
-    import msgspec  # noqa: PLC0415 - heavy, and `slip --help` imports this room
-
-    path = folder / MANIFEST
-    try:
-        data = path.read_bytes()
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    try:
-        header = msgspec.json.decode(data, type=_Header)
-        if header.format > FORMAT:
-            raise StoreError(
-                "manifest_too_new",
-                f"the results were written in format {header.format}, this version reads up to {FORMAT}",
-                where=str(path),
-                hint="Use the newer version, or another folder with --out",
-            )
-        stored = msgspec.json.decode(data, type=_Stored)
-    except msgspec.DecodeError as error:
-        raise StoreError(
-            "manifest_damaged",
-            f"the manifest is damaged ({error})",
-            where=str(path),
-            hint="Delete this one file and analyze the log again; other runs are not concerned",
-        ) from error
-    return Manifest(
-        run=stored.run,
-        key=stored.key,
-        folder=folder / stored.folder,
-        tables=stored.tables,
-        files=stored.files,
-        details=stored.details,
-        earlier=stored.earlier,
-    )
-
-
-@dataclass(frozen=True)
-class _Header:
-    format: int
-
-
-@dataclass(frozen=True)
-class _Stored:
-    run: str
-    key: str
-    folder: str
-    tables: dict[str, TableEntry]
-    files: dict[str, FileEntry]
-    details: dict[str, Any]
-    earlier: tuple[str, ...]

@@ -64,12 +64,17 @@ def check_file_name(name: str) -> None:
     Raises:
         StoreError: ``bad_file_name``.
     """
-    if not all(_FILE_PART.fullmatch(part) for part in name.split("/")):
+    if not is_file_name(name):
         raise StoreError(
             "bad_file_name",
             f"{name!r} cannot name a file of the results",
             hint="Use letters, digits, dots, _ and -, and start with a letter or a digit",
         )
+
+
+def is_file_name(name: str) -> bool:
+    """Whether a name stays inside its folder: plain parts with ``/`` between them."""
+    return all(_FILE_PART.fullmatch(part) for part in name.split("/"))
 
 
 def _is_writable(text: str) -> bool:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.store.errors import StoreError
+from pipeline.store.errors import StoreError, name_disk_errors
 from pipeline.store.tables import QUARANTINE, find_contract, schema_of
 from schemas import list_contracts
 
@@ -55,7 +55,8 @@ def answer_query(sql: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.D
         for name in (*names, *(f"{QUARANTINE}{name}" for name in names))
     }
     try:
-        return pl.SQLContext(frames).execute(sql, eager=True)
+        with name_disk_errors(root):
+            return pl.SQLContext(frames).execute(sql, eager=True)
     except pl.exceptions.PolarsError as error:
         raise StoreError(
             "bad_query",

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 from pipeline.store.errors import StoreError, name_disk_errors
 from pipeline.store.files import make_folder, remove_folder, remove_leftovers, replace_file
-from pipeline.store.generation import Generation, point_latest, remove_orphans
+from pipeline.store.generation import Generation
+from pipeline.store.homes import point_latest, remove_orphans
 from pipeline.store.locks import hold_lock
-from pipeline.store.manifest import MANIFEST, MARKER, Manifest, load_manifest
+from pipeline.store.manifest import MANIFEST, MARKER, Manifest
+from pipeline.store.manifest_file import encode_manifest, load_manifest
 from pipeline.store.names import check_file_name, check_key, encode_run
 
 if TYPE_CHECKING:
@@ -196,11 +198,11 @@ class Store:
         checked = check_table(name, frame)
         quarantine = self.root / f"{QUARANTINE}{name}.parquet"
         with self._lock(self.root), name_disk_errors(self.root):
+            replace_file(self.root / f"{name}.parquet", checked.valid)
             if checked.broken is None:
                 quarantine.unlink(missing_ok=True)
             else:
                 replace_file(quarantine, checked.broken)
-            replace_file(self.root / f"{name}.parquet", checked.valid)
         return checked.report
 
     def write_results_text(self, name: str, text: str) -> Path:
@@ -246,7 +248,8 @@ class Store:
                 return []
             doomed = [home / name for name in manifest.earlier[keep:]]
             # First the manifest forgets them: killed in between, they are orphans for the next writer.
-            replace_file(home / MANIFEST, manifest.with_earlier(manifest.earlier[:keep]).encode())
+            shorter = manifest.with_earlier(manifest.earlier[:keep])
+            replace_file(home / MANIFEST, encode_manifest(shorter))
             for folder in doomed:
                 if folder.exists():
                     remove_folder(folder)

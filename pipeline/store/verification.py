@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pipeline.store.errors import StoreError
-from pipeline.store.manifest import hash_bytes, load_manifest
+from pipeline.store.manifest import hash_bytes
+from pipeline.store.manifest_file import load_manifest
 
 if TYPE_CHECKING:
     from pathlib import Path
