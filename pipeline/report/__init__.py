@@ -1,1 +1,13 @@
-"""."""
+"""Figures and one offline page for a run.
+
+A figure is one file in `pipeline.report.figures`, a function from tables to an Altair chart; a section of the page
+is a function from the report to HTML. Nothing is computed here that a table could hold: the report only draws.
+"""
+
+from pipeline.report.bundle import warm_bundle
+from pipeline.report.errors import ReportError
+from pipeline.report.export import FORMATS, write_figures
+from pipeline.report.page import render_report
+from pipeline.report.run import RunReport
+
+__all__ = ["FORMATS", "ReportError", "RunReport", "render_report", "warm_bundle", "write_figures"]

@@ -1,0 +1,108 @@
+"""Slip over what was asked: forward speed against yaw rate of the ideal velocity."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import altair as alt
+import polars as pl
+
+from pipeline.report import theme
+from pipeline.report.figures import parts
+from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.run import INPUT_WORDS
+from pipeline.report.scene import round_up
+
+if TYPE_CHECKING:
+    from pipeline.report.scene import Scene
+
+_CELLS = 20
+_FEWEST_SAMPLES = 3
+_SMALLEST_BOUND = 0.1
+
+
+def draw_command_space(scene: Scene) -> Drawing | None:
+    """A heat map: colour is the median modulus of the samples in a cell; empty cells stay empty."""
+    slip = scene.main_slip
+    if slip is None or scene.track is None:
+        return None
+    cells = _count_cells(slip)
+    bounds = {name: _bound(slip, name) for name in ("f_x", "f_w")}
+    words = INPUT_WORDS[scene.report.main_input]
+    x = alt.X(
+        "f_w:Q",
+        scale=alt.Scale(domain=bounds["f_w"], nice=False),
+        axis=alt.Axis(title=f"ideal yaw rate f_w {words} [rad/s]", format="~g", tickCount=6),
+    )
+    y = alt.Y(
+        "f_x:Q",
+        scale=alt.Scale(domain=bounds["f_x"], nice=False),
+        axis=alt.Axis(title=f"ideal speed f_x {words} [m/s]", format="~g", tickCount=6, minExtent=26),
+    )
+    tooltip = [
+        alt.Tooltip("modulus:Q", title="median slip [m/s]", format=".2f"),
+        alt.Tooltip("samples:Q", title="samples", format=","),
+    ]
+    base = alt.Chart(alt.NamedData("command_cells"))
+    heat = base.mark_rect().encode(
+        x=alt.X("w_low:Q"), x2="w_high:Q", y=alt.Y("x_low:Q"), y2="x_high:Q", color=parts.slip_colour(scene),
+        tooltip=tooltip,
+    )
+    marked = (
+        alt.Chart(alt.NamedData(parts.MARKED_POINTS))
+        .mark_circle(size=26, opacity=0.9, color=theme.MARK, stroke=theme.INK, strokeWidth=0.5)
+        .encode(x=x, y=y)
+    )
+    meta = parts.brush_over_plane("f_w", "f_x")
+    chart = alt.layer(heat, marked).properties(width=480, height=340, usermeta=meta)
+    note = f"Cells with fewer than {_FEWEST_SAMPLES} samples are left empty."
+    return Drawing(chart, {"command_cells": cells} | parts.marked_rows(), note)
+
+
+def _bound(slip: pl.DataFrame, name: str) -> list[float]:
+    top = round_up(max(float(slip[name].abs().max() or 0.0), _SMALLEST_BOUND))  # type: ignore[arg-type]
+    return [-top, top]
+
+
+def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
+    """Cells of equal size over the plane of commands: edges, median modulus, samples."""
+    columns = []
+    for name, short in (("f_x", "x"), ("f_w", "w")):
+        low, high = _bound(slip, name)
+        size = (high - low) / _CELLS
+        number = ((pl.col(name) - low) / size).floor().clip(0, _CELLS - 1)
+        columns += [(low + number * size).alias(f"{short}_low"), (low + (number + 1) * size).alias(f"{short}_high")]
+    edges = ["x_low", "x_high", "w_low", "w_high"]
+    return (
+        slip.select(*columns, "modulus")
+        .group_by(edges)
+        .agg(modulus=pl.col("modulus").median(), samples=pl.len())
+        .filter(pl.col("samples") >= _FEWEST_SAMPLES)
+        .sort(edges)
+    )
+
+
+def describe_command_space(scene: Scene) -> str:
+    """Which commands slip most and least."""
+    if scene.main_slip is None:
+        return "There is no slip to draw."
+    cells = _count_cells(scene.main_slip)
+    told = "Median slip modulus over ideal speed and ideal yaw rate."
+    if cells.is_empty():
+        return told
+    row = cells.row(cells["modulus"].arg_max() or 0, named=True)
+    return (
+        f"{told} It is highest, {row['modulus']:.2f} m/s, near {(row['x_low'] + row['x_high']) / 2:.2f} m/s "
+        f"and {(row['w_low'] + row['w_high']) / 2:.2f} rad/s."
+    )
+
+
+FIGURE = Figure(
+    id="command_space",
+    title="Over the commands",
+    section=Section.WHERE,
+    order=20,
+    width=Width.HALF,
+    draw=draw_command_space,
+    describe=describe_command_space,
+)

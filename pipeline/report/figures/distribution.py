@@ -1,0 +1,37 @@
+"""How the slip modulus is distributed over the time steps."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.shares import describe_medians, draw_shares, tabulate_shares
+
+if TYPE_CHECKING:
+    from pipeline.report.scene import Scene
+
+
+def draw_distribution(scene: Scene) -> Drawing | None:
+    """The share of time steps below each modulus."""
+    if not scene.slip:
+        return None
+    curves, medians = tabulate_shares({name: frame["modulus"] for name, frame in scene.slip.items()})
+    chart = draw_shares("modulus_shares", medians, title="slip modulus of a time step [m/s]")
+    return Drawing(chart, {"modulus_shares": curves, "modulus_shares_medians": medians})
+
+
+def describe_distribution(scene: Scene) -> str:
+    """The medians."""
+    _, medians = tabulate_shares({name: frame["modulus"] for name, frame in scene.slip.items()})
+    return describe_medians(medians, "slip modulus")
+
+
+FIGURE = Figure(
+    id="distribution",
+    title="Distribution over time steps",
+    section=Section.HOW_BAD,
+    order=20,
+    width=Width.HALF,
+    draw=draw_distribution,
+    describe=describe_distribution,
+)

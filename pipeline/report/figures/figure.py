@@ -1,0 +1,85 @@
+"""What a figure is, and where figures are found."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import altair as alt
+    import polars as pl
+
+    from pipeline.report.scene import Scene
+
+
+class Section(Enum):
+    """The question of the page that a figure answers."""
+
+    HOW_BAD = "how-bad"
+    WHERE = "where"
+    WHY = "why"
+
+
+class Width(Enum):
+    """How much of the page's width a figure takes on a wide screen."""
+
+    HALF = "half"
+    FULL = "full"
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure of one run.
+
+    Attributes:
+        chart: an Altair chart whose rows are named.
+        rows: rows by the name that the chart uses; equal names mean equal rows in every figure.
+        note: what the reader must know to trust it, for example that points were left out; may be empty.
+    """
+
+    chart: alt.Chart | alt.LayerChart | alt.VConcatChart
+    rows: Mapping[str, pl.DataFrame]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure that any run may have.
+
+    Attributes:
+        id: stable name, also of its file.
+        title: what it shows, in a few words.
+        section: the question it answers.
+        order: place within the section, small first.
+        width: how much of a wide page it takes.
+        draw: the function from tables to a drawing; None when there is nothing to draw.
+        describe: the same in a sentence or two, for people who cannot see it.
+    """
+
+    id: str
+    title: str
+    section: Section
+    order: int
+    width: Width
+    draw: Callable[[Scene], Drawing | None]
+    describe: Callable[[Scene], str]
+
+
+@functools.cache
+def list_figures() -> tuple[Figure, ...]:
+    """All figures of this folder, in the order of the page."""
+    import pipeline.report.figures as folder  # noqa: PLC0415 - the folder imports this module
+
+    found = []
+    for module in pkgutil.iter_modules(folder.__path__):
+        content = vars(importlib.import_module(f"{folder.__name__}.{module.name}"))
+        figure = content.get("FIGURE")
+        if isinstance(figure, Figure):
+            found.append(figure)
+    sections = list(Section)
+    return tuple(sorted(found, key=lambda figure: (sections.index(figure.section), figure.order, figure.id)))

@@ -1,0 +1,63 @@
+"""Slip modulus over time, on the command and on the measured wheels."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import altair as alt
+
+from pipeline.report import theme
+from pipeline.report.figures import parts
+from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.run import INPUT_WORDS
+
+if TYPE_CHECKING:
+    from pipeline.report.scene import Scene
+
+
+def draw_modulus(scene: Scene) -> Drawing | None:
+    """One line an input; gaps are left open, stretches after a change of command shaded."""
+    lines = scene.modulus_lines
+    if lines is None:
+        return None
+    line = (
+        alt.Chart(alt.NamedData("modulus"))
+        .mark_line()
+        .encode(
+            x=parts.time_axis(scene),
+            y=parts.value_axis(zero=True),
+            color=parts.series_colour(list(scene.slip), INPUT_WORDS),
+            detail="piece:N",
+        )
+    )
+    shade = parts.shade_spans("transitory", theme.SHADE, opacity=0.55)
+    marked = parts.shade_spans(parts.MARKED_SPANS, theme.MARK, opacity=0.3)
+    chart = alt.layer(shade, marked, line).properties(
+        width=parts.WIDTH, height=150, title="slip modulus [m/s]", usermeta=parts.brush_over_time()
+    )
+    note = parts.tell_thinning(lines, kept="lowest and highest of every bin")
+    shaded = "Grey bands: after a change of command."
+    return Drawing(chart, {"modulus": lines.frame} | parts.span_rows(scene), f"{shaded} {note}".strip())
+
+
+def describe_modulus(scene: Scene) -> str:
+    """Median, highest value and its time for each input."""
+    told = []
+    for name, frame in scene.slip.items():
+        row = frame.row(frame["modulus"].arg_max() or 0, named=True)
+        told.append(
+            f"{INPUT_WORDS[name]} its median is {frame['modulus'].median():.2f} m/s and it is highest, "
+            f"{row['modulus']:.2f} m/s, at {row['t']:.0f} s"
+        )
+    return "Slip modulus over time: " + "; ".join(told) + "."
+
+
+FIGURE = Figure(
+    id="modulus",
+    title="Slip over time",
+    section=Section.HOW_BAD,
+    order=10,
+    width=Width.FULL,
+    draw=draw_modulus,
+    describe=describe_modulus,
+)

@@ -1,0 +1,97 @@
+"""Pieces that figures share: axes over time, shading, brushing, notes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import altair as alt
+import polars as pl
+
+from pipeline.report import theme
+from pipeline.report.run import INPUT_WORDS
+
+if TYPE_CHECKING:
+    from pipeline.report.scene import Scene, Thinned
+
+WIDTH = 720
+GUTTER = 46
+
+SERIES_WORDS = {
+    "velocity": "measured",
+    "command": "ideal on command",
+    "measured": "ideal on measured wheels",
+}
+SERIES_COLOURS = {"velocity": theme.MEASURED, **theme.INPUT_COLOURS}
+
+MARKED_SPANS = "marked_spans"
+MARKED_POINTS = "marked_points"
+
+_EMPTY_SPANS = pl.DataFrame(schema={"t_start": pl.Float64, "t_end": pl.Float64})
+_EMPTY_POINTS = pl.DataFrame(schema={name: pl.Float64 for name in ("t", "x", "y", "f_x", "f_w", "modulus")})
+
+
+def time_axis(scene: Scene, *, title: str | None = "time since the start of the run [s]") -> alt.X:
+    """The axis that every figure over time has; without a title its labels are left out too."""
+    axis = alt.Axis(title=title, tickCount=8, labels=title is not None, grid=False, format="~g")
+    return alt.X("t:Q", axis=axis, scale=alt.Scale(domain=list(scene.time_domain or (0, 1)), nice=False))
+
+
+def value_axis(**scale: object) -> alt.Y:
+    """A vertical axis without a title of its own (the panel's title names quantity and unit)."""
+    axis = alt.Axis(title=None, tickCount=4, format="~g", minExtent=GUTTER - 10)
+    return alt.Y("value:Q", axis=axis, scale=alt.Scale(**scale))
+
+
+def shade_spans(name: str, colour: str, *, opacity: float) -> alt.Chart:
+    """Bands over the full height of a panel, from rows with ``t_start`` and ``t_end``."""
+    return (
+        alt.Chart(alt.NamedData(name))
+        .mark_rect(color=colour, opacity=opacity, tooltip=None)
+        .encode(x=alt.X("t_start:Q"), x2="t_end:Q")
+    )
+
+
+def series_colour(names: list[str], words: dict[str, str]) -> alt.Color:
+    """The colour of each series, the same in every figure, with words in the legend."""
+    label = " : ".join(f"datum.value === '{name}' ? '{words[name]}'" for name in names)
+    scale = alt.Scale(domain=names, range=[SERIES_COLOURS[name] for name in names])
+    legend = alt.Legend(title=None, labelExpr=f"{label} : datum.value", symbolType="stroke", symbolSize=220)
+    return alt.Color("series:N", scale=scale, legend=legend)
+
+
+def slip_colour(scene: Scene, field: str = "modulus") -> alt.Color:
+    """The ramp of slip modulus, the same in every figure of a run."""
+    words = INPUT_WORDS[scene.report.main_input]
+    legend = alt.Legend(
+        title=f"slip modulus {words} [m/s]", gradientLength=150, gradientThickness=8, tickCount=3, format="~g"
+    )
+    scale = alt.Scale(domain=[0.0, scene.modulus_cap], range=list(theme.SLIP_RAMP), clamp=True)
+    return alt.Color(f"{field}:Q", scale=scale, legend=legend)
+
+
+def brush_over_time() -> dict[str, object]:
+    """Tells the page that dragging sideways marks a stretch of time."""
+    return {"brush": "time", "gutter": GUTTER}
+
+
+def brush_over_plane(x: str, y: str) -> dict[str, object]:
+    """Tells the page that dragging a box marks the points with ``x`` and ``y`` inside."""
+    return {"brush": "plane", "x": x, "y": y, "gutter": GUTTER + 16}
+
+
+def span_rows(scene: Scene) -> dict[str, pl.DataFrame]:
+    """The rows behind `shade_spans` of transitory and of marked stretches."""
+    return {"transitory": scene.transitory_spans, MARKED_SPANS: _EMPTY_SPANS}
+
+
+def marked_rows() -> dict[str, pl.DataFrame]:
+    """The rows behind the points that a reader marked: none until then."""
+    return {MARKED_POINTS: _EMPTY_POINTS}
+
+
+def tell_thinning(*lines: Thinned, kept: str) -> str:
+    """A sentence about rows that were left out; empty when none were."""
+    drawn, total = sum(line.frame.height for line in lines), sum(line.total for line in lines)
+    if drawn >= total:
+        return ""
+    return f"Drawn from {drawn:,} of {total:,} points: {kept}, so no peak is lost."

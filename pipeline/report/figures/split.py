@@ -1,0 +1,100 @@
+"""What the drivetrain does to the command, and what the ground does to the wheels' motion."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import altair as alt
+import polars as pl
+
+from pipeline.report import theme
+from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+
+if TYPE_CHECKING:
+    from pipeline.report.scene import Scene
+
+_PARTS = {
+    "drivetrain": "drivetrain (command to wheels)",
+    "ground": "ground (wheels to body)",
+    "cross": "cross term",
+}
+_COLOURS = {"drivetrain": theme.DRIVETRAIN, "ground": theme.GROUND, "cross": theme.CROSS}
+_SUBSETS = ("all", "transitory", "steady")
+
+
+def draw_split(scene: Scene) -> Drawing | None:
+    """Mean squares of the two parts of slip on the command, for all, transitory and steady samples."""
+    rows = _list_parts(scene)
+    if rows is None:
+        return None
+    scale = alt.Scale(domain=list(_PARTS), range=list(_COLOURS.values()))
+    label = " : ".join(f"datum.value === '{name}' ? '{words}'" for name, words in _PARTS.items())
+    legend = alt.Legend(title=None, labelExpr=f"{label} : datum.value", symbolType="square")
+    span = [min(0.0, float(rows["mean_square"].min())), max(0.0, float(rows["mean_square"].max()))]  # type: ignore[arg-type]
+    room = 0.12 * (span[1] - span[0] or 1.0)
+    base = alt.Chart(alt.NamedData("split")).encode(
+        y=alt.Y("subset:N", sort=list(_SUBSETS), axis=alt.Axis(title=None, minExtent=58, grid=False)),
+        yOffset=alt.YOffset("part:N", sort=list(_PARTS)),
+        x=alt.X(
+            "mean_square:Q",
+            scale=alt.Scale(domain=[span[0] - (room if span[0] < 0 else 0), span[1] + room], nice=False),
+            axis=alt.Axis(title="mean square of slip on command [m²/s²]", format="~g", tickCount=6),
+        ),
+    )
+    bars = base.mark_bar(cornerRadiusEnd=2).encode(color=alt.Color("part:N", scale=scale, legend=legend))
+    right = base.transform_filter("datum.mean_square >= 0").mark_text(align="left", dx=5)
+    left = base.transform_filter("datum.mean_square < 0").mark_text(align="right", dx=-5)
+    words = [side.encode(text=alt.Text("share:Q", format=".0%")) for side in (right, left)]
+    chart = alt.layer(bars, *words).properties(
+        width=640, height=34 * 3 * rows["subset"].n_unique() // 2 + 40, usermeta={"gutter": 74}
+    )
+    note = "Vectors add, moduli do not: the shares are of the mean square; the cross term is twice the mean product."
+    return Drawing(chart, {"split": rows}, note)
+
+
+def _list_parts(scene: Scene) -> pl.DataFrame | None:
+    """Long rows ``subset part mean_square share``; None without measured wheels."""
+    table = scene.report.table("aggregates")
+    if table is None:
+        return None
+    wanted = table.filter(
+        (pl.col("input").cast(pl.String) == "command")
+        & pl.col("drivetrain_mean_square").is_not_null()
+        & (pl.col("mean_square") > 0.0)
+    )
+    if wanted.is_empty():
+        return None
+    return (
+        wanted.select(
+            pl.col("subset").cast(pl.String),
+            pl.col("mean_square").alias("total"),
+            *(pl.col(f"{part}_mean_square").fill_null(0.0).alias(part) for part in _PARTS),
+        )
+        .unpivot(list(_PARTS), index=["subset", "total"], variable_name="part", value_name="mean_square")
+        .with_columns(share=pl.col("mean_square") / pl.col("total"))
+        .drop("total")
+        .sort(pl.col("subset").replace_strict({name: i for i, name in enumerate(_SUBSETS)}), maintain_order=True)
+    )
+
+
+def describe_split(scene: Scene) -> str:
+    """The shares of all samples in words."""
+    rows = _list_parts(scene)
+    if rows is None:
+        return "There are no measured wheel speeds to split slip with."
+    told = [
+        f"{_PARTS[row['part']]} {row['share']:.0%}"
+        for row in rows.filter(pl.col("subset") == rows["subset"][0]).iter_rows(named=True)
+    ]
+    return "Shares of the mean square slip on the command: " + ", ".join(told) + "."
+
+
+FIGURE = Figure(
+    id="split",
+    title="Drivetrain and ground",
+    section=Section.WHY,
+    order=10,
+    width=Width.FULL,
+    draw=draw_split,
+    describe=describe_split,
+)

@@ -1,0 +1,110 @@
+"""Where the vehicle went, coloured by how much it slipped there."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import altair as alt
+import polars as pl
+
+from pipeline.report import theme
+from pipeline.report.figures import parts
+from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+
+if TYPE_CHECKING:
+    from pipeline.report.scene import Scene
+
+_WIDTH, _LOWEST, _HIGHEST = 480, 260, 420
+_MARGIN = 0.05
+_SMALLEST_SPAN_M = 1.0
+
+
+def draw_trajectory(scene: Scene) -> Drawing | None:
+    """A map with equal scales in x and y; start and end marked, segments not joined."""
+    track = scene.track
+    if track is None:
+        return None
+    frame = track.frame
+    extent = [_extent(frame["x"]), _extent(frame["y"])]
+    height, x_domain, y_domain = fit_equal_aspect(extent[0], extent[1])
+    x = alt.X("x:Q", scale=alt.Scale(domain=x_domain, nice=False, zero=False), axis=_axis("x in the map [m]"))
+    y = alt.Y("y:Q", scale=alt.Scale(domain=y_domain, nice=False, zero=False), axis=_axis("y in the map [m]"))
+    base = alt.Chart(alt.NamedData("track"))
+    path = base.mark_line(color=theme.QUIET, strokeWidth=0.8, opacity=0.5).encode(
+        x=x, y=y, order="t:Q", detail="piece:N"
+    )
+    tooltip = [
+        alt.Tooltip("t:Q", title="time [s]", format=".2f"),
+        alt.Tooltip("modulus:Q", title="slip modulus [m/s]", format=".2f"),
+    ]
+    dots = base.mark_circle(size=16, opacity=1).encode(
+        x="x:Q", y="y:Q", color=parts.slip_colour(scene), tooltip=tooltip
+    )
+    marked = (
+        alt.Chart(alt.NamedData(parts.MARKED_POINTS))
+        .mark_circle(size=52, opacity=0.9, color=theme.MARK)
+        .encode(x="x:Q", y="y:Q")
+    )
+    ends = alt.Chart(alt.NamedData("track_ends")).encode(x="x:Q", y="y:Q")
+    spots = ends.mark_point(size=85, filled=True, fill=theme.PAPER, stroke=theme.INK, strokeWidth=2, opacity=1).encode(
+        shape=alt.Shape("place:N", scale=alt.Scale(domain=["start", "end"], range=["circle", "square"]), legend=None)
+    )
+    words = ends.mark_text(align="left", dx=10, dy=-9, fontWeight=600, color=theme.INK).encode(text="place:N")
+    meta = parts.brush_over_plane("x", "y") | {
+        "equal": {"x": extent[0], "y": extent[1], "lowest": _LOWEST, "highest": _HIGHEST}
+    }
+    chart = alt.layer(path, marked, dots, spots, words).properties(width=_WIDTH, height=height, usermeta=meta)
+    first, last = frame.head(1).with_columns(place=pl.lit("start")), frame.tail(1).with_columns(place=pl.lit("end"))
+    rows = {"track": frame, "track_ends": pl.concat([first, last])} | parts.marked_rows()
+    note = parts.tell_thinning(track, kept="the highest slip of every bin")
+    return Drawing(chart, rows, f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile. {note}".strip())
+
+
+def fit_equal_aspect(
+    x: list[float], y: list[float], *, width: float = _WIDTH
+) -> tuple[float, list[float], list[float]]:
+    """Height [px] and domains [m] that give x and y the same scale and hold both extents."""
+    wide, tall = x[1] - x[0], y[1] - y[0]
+    height = min(max(width * tall / wide, _LOWEST), _HIGHEST)
+    scale = max(wide / width, tall / height)
+    return round(height), _widen(x, scale * width), _widen(y, scale * height)
+
+
+def _widen(extent: list[float], span: float) -> list[float]:
+    middle = (extent[0] + extent[1]) / 2.0
+    return [middle - span / 2.0, middle + span / 2.0]
+
+
+def _extent(values: pl.Series) -> list[float]:
+    low, high = float(values.min() or 0.0), float(values.max() or 0.0)  # type: ignore[arg-type]
+    span = max(high - low, _SMALLEST_SPAN_M) * (1.0 + 2.0 * _MARGIN)
+    return [round(value, 4) for value in _widen([low, high], span)]
+
+
+def _axis(title: str) -> alt.Axis:
+    return alt.Axis(title=title, tickCount=5, format="~g", minExtent=parts.GUTTER - 20)
+
+
+def describe_trajectory(scene: Scene) -> str:
+    """Size of the area, distance and where slip was highest."""
+    if scene.track is None:
+        return "There are no poses to draw."
+    frame = scene.track.frame
+    x, y = _extent(frame["x"]), _extent(frame["y"])
+    told = f"Map of the trajectory, {x[1] - x[0]:.0f} m by {y[1] - y[0]:.0f} m, coloured by slip modulus."
+    known = frame.filter(pl.col("modulus").is_not_null())
+    if known.is_empty():
+        return told
+    row = known.row(known["modulus"].arg_max() or 0, named=True)
+    return f"{told} Slip was highest, {row['modulus']:.2f} m/s, at x {row['x']:.1f} m, y {row['y']:.1f} m."
+
+
+FIGURE = Figure(
+    id="trajectory",
+    title="On the map",
+    section=Section.WHERE,
+    order=10,
+    width=Width.HALF,
+    draw=draw_trajectory,
+    describe=describe_trajectory,
+)

@@ -1,0 +1,51 @@
+"""How the published quantity, the 2 s window norm, is distributed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import polars as pl
+
+from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.shares import describe_medians, draw_shares, tabulate_shares
+
+if TYPE_CHECKING:
+    from pipeline.report.scene import Scene
+
+
+def draw_window_norms(scene: Scene) -> Drawing | None:
+    """The share of windows below each norm."""
+    norms = _list_norms(scene)
+    if not norms:
+        return None
+    curves, medians = tabulate_shares(norms)
+    chart = draw_shares("norm_shares", medians, title="2 s window norm [m/s]")
+    note = "The norm of the published figure: \u221a40 \u00d7 root mean square modulus of 2 s."
+    return Drawing(chart, {"norm_shares": curves, "norm_shares_medians": medians}, note)
+
+
+def _list_norms(scene: Scene) -> dict[str, pl.Series]:
+    windows = scene.report.table("windows")
+    if windows is None:
+        return {}
+    by_input = {
+        name: windows.filter(pl.col("input").cast(pl.String) == name)["window_norm"] for name in scene.report.inputs
+    }
+    return {name: norms for name, norms in by_input.items() if not norms.is_empty()}
+
+
+def describe_window_norms(scene: Scene) -> str:
+    """The medians."""
+    _, medians = tabulate_shares(_list_norms(scene))
+    return describe_medians(medians, "2 s window norm")
+
+
+FIGURE = Figure(
+    id="window_norms",
+    title="Distribution over 2 s windows",
+    section=Section.HOW_BAD,
+    order=30,
+    width=Width.HALF,
+    draw=draw_window_norms,
+    describe=describe_window_norms,
+)

@@ -1,0 +1,276 @@
+"use strict";
+// Draws the figures and links them: a stretch of time marked in one is shown in all.
+(() => {
+  const page = JSON.parse(document.getElementById("page-data").textContent);
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  const RIGHT = 16;
+  const views = new Map();
+  let spans = [];
+  let points = [];
+
+  const unpack = (columns) => {
+    const names = Object.keys(columns);
+    const read = names.map((name) => {
+      const column = columns[name];
+      return Array.isArray(column) ? column : column.codes.map((code) => column.levels[code]);
+    });
+    const count = names.length ? read[0].length : 0;
+    const rows = new Array(count);
+    for (let i = 0; i < count; i += 1) {
+      const row = {};
+      for (let k = 0; k < names.length; k += 1) row[names[k]] = read[k][i];
+      rows[i] = row;
+    }
+    return rows;
+  };
+
+  const swap = (value, twins) => {
+    if (typeof value === "string") return twins[value] ?? value;
+    if (Array.isArray(value)) return value.map((entry) => swap(entry, twins));
+    if (value === null || typeof value !== "object") return value;
+    return Object.fromEntries(Object.entries(value).map(([key, entry]) => [key, swap(entry, twins)]));
+  };
+
+  const widen = ([low, high], span) => [(low + high - span) / 2, (low + high + span) / 2];
+
+  const setDomains = (spec, domains) => {
+    for (const layer of spec.layer ?? [])
+      for (const axis of ["x", "y"]) {
+        const scale = layer.encoding?.[axis]?.scale;
+        if (scale?.domain) scale.domain = domains[axis];
+      }
+  };
+
+  const fit = (spec, width) => {
+    const equal = spec.usermeta?.equal;
+    if (equal) {
+      const wide = equal.x[1] - equal.x[0];
+      const tall = equal.y[1] - equal.y[0];
+      const height = Math.min(Math.max((width * tall) / wide, equal.lowest), equal.highest);
+      const scale = Math.max(wide / width, tall / height);
+      spec.height = Math.round(height);
+      setDomains(spec, { x: widen(equal.x, scale * width), y: widen(equal.y, scale * height) });
+    }
+    for (const part of spec.vconcat ?? [spec]) part.width = Math.floor(width);
+  };
+
+  const namesIn = (value, found) => {
+    if (Array.isArray(value)) value.forEach((entry) => namesIn(entry, found));
+    else if (value && typeof value === "object") {
+      if (value.data && typeof value.data.name === "string") found.add(value.data.name);
+      Object.values(value).forEach((entry) => namesIn(entry, found));
+    }
+    return found;
+  };
+
+  const rowsOf = (name) => {
+    if (name === "marked_spans") return spans.map((span) => ({ ...span }));
+    if (name === "marked_points") return points.map((point) => ({ ...point }));
+    return unpack(page.rows[name]);
+  };
+
+  const embed = async (place, width) => {
+    const id = place.dataset.figure;
+    const spec = swap(page.figures[id], dark.matches ? page.dark : {});
+    fit(spec, width);
+    spec.padding = { left: 2, right: RIGHT - 4, top: 4, bottom: 4 };
+    const names = namesIn(spec, new Set());
+    spec.datasets = Object.fromEntries([...names].map((name) => [name, rowsOf(name)]));
+    views.get(id)?.finalize();
+    const result = await vegaEmbed(place, spec, {
+      actions: false,
+      ast: true,
+      mode: "vega-lite",
+      renderer: "svg",
+      tooltip: { theme: dark.matches ? "dark" : "light" },
+    });
+    views.set(id, { view: result.view, names, meta: spec.usermeta ?? {}, finalize: () => result.finalize() });
+    return result.view;
+  };
+
+  const draw = async (place) => {
+    const room = place.clientWidth;
+    let width = room - (page.figures[place.dataset.figure].usermeta?.gutter ?? 50) - RIGHT;
+    await embed(place, width);
+    const excess = place.querySelector("svg").width.baseVal.value - room;
+    if (excess > 1 || excess < -12) {
+      width -= excess;
+      await embed(place, width);
+    }
+    place.classList.add("drawn");
+  };
+
+  const drawAll = async () => {
+    for (const place of document.querySelectorAll(".plot[data-figure]")) await draw(place);
+    document.documentElement.dataset.drawn = "yes";
+  };
+
+  // Marking -----------------------------------------------------------------------------------------------
+
+  const track = page.rows.track ? unpack(page.rows.track) : [];
+  const bar = document.getElementById("marked");
+  const from = document.getElementById("mark-from");
+  const to = document.getElementById("mark-to");
+
+  const tell = () => {
+    bar.hidden = spans.length === 0;
+    if (!spans.length) return;
+    const length = spans.reduce((sum, span) => sum + span.t_end - span.t_start, 0);
+    const start = spans[0].t_start.toFixed(1);
+    const end = spans[spans.length - 1].t_end.toFixed(1);
+    const peak = points.reduce((most, point) => Math.max(most, point.modulus ?? 0), 0);
+    const many = spans.length > 1 ? ` in ${spans.length} stretches` : "";
+    bar.firstElementChild.textContent =
+      `Marked ${start}–${end} s: ${length.toFixed(1)} s${many}, highest slip ${peak.toFixed(2)} m/s`;
+  };
+
+  const show = () => {
+    for (const { view, names } of views.values()) {
+      let changed = false;
+      for (const name of ["marked_spans", "marked_points"])
+        if (names.has(name)) {
+          view.data(name, rowsOf(name));
+          changed = true;
+        }
+      if (changed) view.runAsync();
+    }
+    tell();
+  };
+
+  let waiting = false;
+  const showSoon = () => {
+    if (waiting) return;
+    waiting = true;
+    requestAnimationFrame(() => {
+      waiting = false;
+      show();
+    });
+  };
+
+  const markTime = (start, end) => {
+    const [low, high] = start < end ? [start, end] : [end, start];
+    spans = [{ t_start: low, t_end: high }];
+    points = track.filter((row) => row.t >= low && row.t <= high);
+    if (from) from.value = low.toFixed(1);
+    if (to) to.value = high.toFixed(1);
+    showSoon();
+  };
+
+  const markPoints = (inside) => {
+    points = track.filter(inside);
+    spans = [];
+    let open = null;
+    track.forEach((row) => {
+      if (!inside(row)) open = null;
+      else if (open && open.piece === row.piece) open.span.t_end = row.t;
+      else {
+        open = { piece: row.piece, span: { t_start: row.t, t_end: row.t } };
+        spans.push(open.span);
+      }
+    });
+    showSoon();
+  };
+
+  const clear = () => {
+    spans = [];
+    points = [];
+    if (from) from.value = "";
+    if (to) to.value = "";
+    showSoon();
+  };
+
+  const findPanel = (view) => {
+    const [left, top] = view.origin();
+    for (const mark of view.scenegraph().root.items[0].items)
+      if (mark.name === "concat_0_group") return { left: left + mark.items[0].x, top, prefix: "concat_0_" };
+    return { left, top, prefix: "" };
+  };
+
+  const locate = (place, view, event) => {
+    const svg = place.querySelector("svg");
+    const box = svg.getBoundingClientRect();
+    const zoom = box.width / svg.width.baseVal.value;
+    const panel = findPanel(view);
+    const at = (axis, pixel) => view.scale(panel.prefix + axis).invert(pixel);
+    return {
+      x: at("x", (event.clientX - box.left) / zoom - panel.left),
+      y: () => at("y", (event.clientY - box.top) / zoom - panel.top),
+    };
+  };
+
+  const startDrag = (place, event) => {
+    const drawn = views.get(place.dataset.figure);
+    const brush = drawn?.meta.brush;
+    if (!brush || event.button !== 0 || (brush === "plane" && event.pointerType === "touch")) return;
+    const { view, meta } = drawn;
+    const first = { px: event.clientX, py: event.clientY, ...locate(place, view, event) };
+    const firstY = brush === "plane" ? first.y() : 0;
+    let box = null;
+    place.setPointerCapture(event.pointerId);
+    const move = (now) => {
+      if (Math.abs(now.clientX - first.px) < 4 && !box && brush === "time") return;
+      const here = locate(place, view, now);
+      if (brush === "time") {
+        box = true;
+        markTime(first.x, here.x);
+        return;
+      }
+      if (!box) {
+        box = document.createElement("div");
+        box.className = "box";
+        place.append(box);
+      }
+      const edge = place.getBoundingClientRect();
+      box.style.left = `${Math.min(first.px, now.clientX) - edge.left}px`;
+      box.style.top = `${Math.min(first.py, now.clientY) - edge.top}px`;
+      box.style.width = `${Math.abs(now.clientX - first.px)}px`;
+      box.style.height = `${Math.abs(now.clientY - first.py)}px`;
+      const within = (value, a, b) => value !== null && value >= Math.min(a, b) && value <= Math.max(a, b);
+      const y = here.y();
+      markPoints((row) => within(row[meta.x], first.x, here.x) && within(row[meta.y], firstY, y));
+    };
+    const stop = () => {
+      place.removeEventListener("pointermove", move);
+      if (box instanceof Element) box.remove();
+      if (!box) clear();
+    };
+    place.addEventListener("pointermove", move);
+    place.addEventListener("pointerup", stop, { once: true });
+    place.addEventListener("pointercancel", stop, { once: true });
+    if (event.pointerType !== "touch") event.preventDefault();
+  };
+
+  for (const place of document.querySelectorAll(".plot[data-figure]")) {
+    const brush = page.figures[place.dataset.figure].usermeta?.brush;
+    if (!brush) continue;
+    place.classList.add(`brush-${brush}`);
+    place.addEventListener("pointerdown", (event) => startDrag(place, event));
+  }
+  document.getElementById("mark-clear").addEventListener("click", clear);
+  document.getElementById("mark-set")?.addEventListener("click", () => {
+    const start = parseFloat(from.value);
+    const end = parseFloat(to.value);
+    if (Number.isFinite(start) && Number.isFinite(end) && start !== end) markTime(start, end);
+  });
+  document.addEventListener("keydown", (event) => {
+    if (event.key === "Escape") clear();
+  });
+
+  // Drawing again when room or colours change -----------------------------------------------------------------
+
+  let queue = drawAll();
+  let timer = 0;
+  let lastWidth = document.documentElement.clientWidth;
+  const again = () => {
+    clearTimeout(timer);
+    timer = setTimeout(() => {
+      queue = queue.then(drawAll);
+    }, 150);
+  };
+  addEventListener("resize", () => {
+    if (document.documentElement.clientWidth === lastWidth) return;
+    lastWidth = document.documentElement.clientWidth;
+    again();
+  });
+  dark.addEventListener("change", again);
+})();

@@ -1,0 +1,151 @@
+"""What several figures draw from: the tables of a run, joined and thinned once."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import polars as pl
+
+from pipeline.report.run import RunReport
+from pipeline.report.thinning import find_spans, thin_series, thin_to_peaks
+
+LINE_BINS = 500
+TRACK_BINS = 2400
+COMPONENTS = ("x", "y", "w")
+
+_DEFAULT_RATE_HZ = 20.0
+_HOLE_PERIODS = 2.5
+_CAP_QUANTILE = 0.98
+
+
+@dataclass(frozen=True)
+class Thinned:
+    """Rows to draw, and how many there were.
+
+    Attributes:
+        frame: the rows that are drawn.
+        total: the rows that they stand for.
+    """
+
+    frame: pl.DataFrame
+    total: int
+
+    @property
+    def is_shorter(self) -> bool:
+        """Whether rows were left out."""
+        return self.frame.height < self.total
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A run's tables as figures need them; every part is worked out once, when it is first asked for."""
+
+    report: RunReport
+
+    @cached_property
+    def period(self) -> float:
+        """Time between two steps of the grid [s]."""
+        return 1.0 / (self.report.number("rate_hz") or _DEFAULT_RATE_HZ)
+
+    @cached_property
+    def slip(self) -> dict[str, pl.DataFrame]:
+        """Slip by input, in order of time, with ``piece``: a number for each stretch without a hole."""
+        table = self.report.table("slip")
+        if table is None:
+            return {}
+        found = {}
+        for name in self.report.inputs:
+            rows = table.filter(pl.col("input").cast(pl.String) == name)
+            if not rows.is_empty():
+                found[name] = self._number_pieces(rows)
+        return found
+
+    @cached_property
+    def main_slip(self) -> pl.DataFrame | None:
+        """Slip of the leading input."""
+        return self.slip.get(self.report.main_input)
+
+    @cached_property
+    def velocities(self) -> pl.DataFrame | None:
+        """Velocities in order of time, with ``piece``."""
+        table = self.report.table("velocities")
+        return None if table is None else self._number_pieces(table)
+
+    @cached_property
+    def time_domain(self) -> tuple[float, float] | None:
+        """First and last time of anything drawn over time [s]."""
+        frames = [*self.slip.values()] + ([] if self.velocities is None else [self.velocities])
+        if not frames:
+            return None
+        start = min(float(frame["t"][0]) for frame in frames)
+        end = max(float(frame["t"][-1]) for frame in frames)
+        return start, max(end, start + self.period)
+
+    @cached_property
+    def modulus_cap(self) -> float:
+        """Where the colour ramp of slip ends [m/s]: the 98th percentile, rounded up to two digits."""
+        if self.main_slip is None:
+            return 1.0
+        top = self.main_slip["modulus"].quantile(_CAP_QUANTILE) or 0.0
+        return round_up(top) if top > 0.0 else 1.0
+
+    @cached_property
+    def track(self) -> Thinned | None:
+        """Where the vehicle was, what was asked and how much it slipped: ``t x y f_x f_w modulus piece``."""
+        if self.velocities is None:
+            return None
+        places = self.velocities.select("t", "stamp", "segment", "piece", "x", "y")
+        if self.main_slip is None:
+            columns = [pl.lit(None, pl.Float64).alias(name) for name in ("f_x", "f_w", "modulus")]
+            joined = places.with_columns(columns)
+        else:
+            asked = self.main_slip.select("stamp", "segment", "f_x", "f_w", "modulus")
+            asked = asked.unique(["stamp", "segment"], maintain_order=True)
+            joined = places.join(asked, on=["stamp", "segment"], how="left", maintain_order="left")
+        joined = joined.drop("stamp", "segment")
+        peaks = joined.with_columns(segment=pl.col("piece"), peak=pl.col("modulus").fill_null(-1.0))
+        thinned = thin_to_peaks(peaks, "peak", bins=TRACK_BINS).drop("segment", "peak")
+        return Thinned(thinned, joined.height)
+
+    @cached_property
+    def modulus_lines(self) -> Thinned | None:
+        """Slip modulus over time, long: ``t value series piece``."""
+        return self._join_lines([(frame, "modulus", name) for name, frame in self.slip.items()])
+
+    def component_lines(self, component: str) -> Thinned | None:
+        """Measured and ideal velocity over time of `x`, `y` or `w`, long: ``t value series piece``."""
+        measured = self.velocities if self.velocities is not None else self.main_slip
+        lines = [] if measured is None else [(measured, f"v_{component}", "velocity")]
+        return self._join_lines([(frame, f"f_{component}", name) for name, frame in self.slip.items()] + lines)
+
+    @cached_property
+    def transitory_spans(self) -> pl.DataFrame:
+        """Stretches after a change of command: ``t_start t_end`` [s]."""
+        if self.main_slip is None or self.time_domain is None:
+            return pl.DataFrame({"t_start": [], "t_end": []}, schema_overrides={"t_start": pl.Float64, "t_end": pl.Float64})
+        pixel = (self.time_domain[1] - self.time_domain[0]) / LINE_BINS
+        return find_spans(self.main_slip, "transitory", period=self.period, shortest_gap=pixel)
+
+    def _number_pieces(self, frame: pl.DataFrame) -> pl.DataFrame:
+        ordered = frame.sort("t", maintain_order=True)
+        hole = pl.col("t").diff() > _HOLE_PERIODS * self.period
+        new = (hole | (pl.col("segment") != pl.col("segment").shift(1))).fill_null(value=False)
+        return ordered.with_columns(piece=new.cum_sum().cast(pl.Int32))
+
+    def _join_lines(self, lines: list[tuple[pl.DataFrame, str, str]]) -> Thinned | None:
+        if not lines:
+            return None
+        parts = []
+        for frame, column, series in lines:
+            line = frame.select("t", value=pl.col(column), segment=pl.col("piece"))
+            thinned = thin_series(line, ["value"], bins=LINE_BINS)
+            parts.append(thinned.select("t", "value", pl.lit(series).alias("series"), piece="segment"))
+        return Thinned(pl.concat(parts), sum(frame.height for frame, _, _ in lines))
+
+
+def round_up(value: float) -> float:
+    """The next number of two significant digits, for example 1.53 to 1.6."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{math.ceil(value / unit - 1e-9) * unit:.12g}")

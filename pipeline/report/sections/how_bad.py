@@ -1,0 +1,76 @@
+"""How far the motion was from the ideal model: the numbers, over time, and their distribution."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from pipeline.report.figures.figure import Section
+from pipeline.report.run import INPUT_WORDS, RunReport, mapping_in, number_in, numbers_in
+from pipeline.report.sections.page import Page
+from pipeline.report.words import build_table, escape, say_number
+
+
+def render_how_bad(page: Page) -> str:
+    """Cards with the medians, slip over time, distributions, table of both inputs."""
+    report = page.report
+    cards = "".join(_render_card(name, _numbers_of(report, name)) for name in report.inputs)
+    lead = f'<div class="cards">{cards}</div>' if cards else '<p class="lead">No slip could be worked out.</p>'
+    return lead + page.render_figures(Section.HOW_BAD) + _render_table(report)
+
+
+def _numbers_of(report: RunReport, name: str) -> Mapping[str, object]:
+    found = mapping_in(report.part("by_input"), name)
+    if found or name != report.main_input:
+        return found
+    return {key: report.summary.get(key) for key in ("samples", "median_modulus", "median_window_norm")}
+
+
+def _render_card(name: str, numbers: Mapping[str, object]) -> str:
+    median = say_number(number_in(numbers, "median_modulus"))
+    norm = say_number(number_in(numbers, "median_window_norm"))
+    transitory = number_in(numbers, "transitory_median_modulus")
+    steady = number_in(numbers, "steady_median_modulus")
+    split = (
+        f"<div><dt>after a change of command</dt><dd>{say_number(transitory)} m/s</dd></div>"
+        f"<div><dt>steady</dt><dd>{say_number(steady)} m/s</dd></div>"
+        if transitory is not None or steady is not None
+        else ""
+    )
+    return (
+        f'<div class="card {escape(name)}"><p class="what">median slip <b>{INPUT_WORDS[name]}</b></p>'
+        f'<p class="big">{median} <span>m/s</span></p>'
+        f"<dl>{split}<div><dt>2 s window norm</dt><dd>{norm} m/s</dd></div></dl></div>"
+    )
+
+
+def _render_table(report: RunReport) -> str:
+    rows = []
+    for name in report.inputs:
+        numbers = _numbers_of(report, name)
+        rms = (numbers_in(numbers, "rms") + [None] * 3)[:3]
+        samples = number_in(numbers, "samples")
+        rows.append(
+            [
+                INPUT_WORDS[name],
+                "\u2013" if samples is None else f"{samples:,.0f}",
+                say_number(number_in(numbers, "median_modulus")),
+                say_number(number_in(numbers, "median_window_norm")),
+                *(say_number(value) for value in rms),
+            ]
+        )
+    if not rows:
+        return ""
+    scale = report.number("length_scale_m")
+    caption = "Slip g = f(u) \u2212 v of the ideal model"
+    if scale is not None:
+        caption += f"; modulus with L = {scale:g} m"
+    head = [
+        "u",
+        "time steps",
+        "median modulus <small>m/s</small>",
+        "median window norm <small>m/s</small>",
+        "rms g<sub>x</sub> <small>m/s</small>",
+        "rms g<sub>y</sub> <small>m/s</small>",
+        "rms g<sub>w</sub> <small>rad/s</small>",
+    ]
+    return build_table(head, rows, caption=caption, numeric=range(1, 7))

@@ -1,0 +1,26 @@
+"""What to do next: what the findings ask for, and commands to copy."""
+
+from __future__ import annotations
+
+import shlex
+
+from pipeline.report.sections.page import Page
+from pipeline.report.words import escape
+
+
+def render_what_now(page: Page) -> str:
+    """Commands that go on from this run."""
+    run = page.report.text("run")
+    if not run:
+        return ""
+    # A run that starts with a dash would be read as an option.
+    name = shlex.quote(run) if not run.startswith("-") else shlex.quote(f"./{run}")
+    lines = (
+        ("Name the effects that are missing from the model", f"slip diagnose {name}"),
+        ("Set it beside other vehicles and terrains", "slip compare"),
+        ("Look at slip in the viewer that plays the log", f"slip export {name} --to mcap"),
+    )
+    items = "".join(
+        f"<div><dt>{words}</dt><dd><code>{escape(line)}</code></dd></div>" for words, line in lines
+    )
+    return f'<dl class="steps">{items}</dl>'

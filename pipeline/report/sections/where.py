@@ -1,0 +1,82 @@
+"""Where the vehicle slipped: in words, on the map, over the commands, over time."""
+
+from __future__ import annotations
+
+import polars as pl
+
+from pipeline.report.figures.figure import Section
+from pipeline.report.run import INPUT_WORDS
+from pipeline.report.scene import round_up
+from pipeline.report.sections.page import Page
+from pipeline.report.words import say_share
+
+_MOST_REGIONS = 3
+_WORTH_TELLING = 1.15
+_SMALLEST_SHARE = 0.15
+_UPPER_QUANTILE = 0.7
+_SLOW = 0.05
+
+
+def render_where(page: Page) -> str:
+    """The regions that carry the slip, the linked figures, and a way to mark time without a mouse."""
+    figures = page.render_figures(Section.WHERE)
+    if not figures:
+        return ""
+    regions = find_regions(page.scene.main_slip)
+    told = ""
+    if regions:
+        words = INPUT_WORDS[page.report.main_input]
+        lines = "".join(
+            f"<li><b>{region}</b> carries {say_share(slip)} of the squared slip {words} in {say_share(time)} of the time</li>"
+            for region, slip, time in regions
+        )
+        told = f'<ul class="regions">{lines}</ul>'
+    return told + _MARKING + figures
+
+
+def find_regions(slip: pl.DataFrame | None) -> list[tuple[str, float, float]]:
+    """Regions of driving that carry more slip than their share of the time.
+
+    Args:
+        slip: slip of one input.
+
+    Returns:
+        Words, share of the sum of squared moduli and share of the samples, the densest first, at most three.
+    """
+    if slip is None or slip.is_empty():
+        return []
+    squared = pl.col("modulus") ** 2
+    total = float((slip["modulus"] ** 2).sum())
+    if total <= 0.0:
+        return []
+    turning = _threshold(slip, "f_w")
+    fast = _threshold(slip, "f_x")
+    spinning = (pl.col("f_x").abs() < _SLOW) & (pl.col("f_w").abs() > _SLOW)
+    candidates = {
+        f"Asked to turn faster than {turning:g} rad/s": pl.col("f_w").abs() > turning,
+        f"Asked to drive faster than {fast:g} m/s": pl.col("f_x").abs() > fast,
+        "Just after a change of command": pl.col("transitory"),
+        "Turning on the spot": spinning,
+        "Reversing": pl.col("f_x") < -_SLOW,
+    }
+    found = []
+    for words, inside in candidates.items():
+        part = slip.filter(inside)
+        time = part.height / slip.height
+        share = float(part.select(squared.sum()).item()) / total
+        if share >= _SMALLEST_SHARE and time > 0.0 and share / time >= _WORTH_TELLING:
+            found.append((words, share, time))
+    return sorted(found, key=lambda region: region[2] / region[1])[:_MOST_REGIONS]
+
+
+def _threshold(slip: pl.DataFrame, name: str) -> float:
+    level = float(slip[name].abs().quantile(_UPPER_QUANTILE) or 0.0)
+    return round_up(level) if level > _SLOW else _SLOW
+
+
+_MARKING = """<div class="marking" role="group" aria-label="Mark a stretch of time">
+<span>Mark a stretch: drag over any figure, or</span>
+<label>from <input type="number" id="mark-from" step="0.1" inputmode="decimal"> s</label>
+<label>to <input type="number" id="mark-to" step="0.1" inputmode="decimal"> s</label>
+<button type="button" id="mark-set">Mark</button>
+</div>"""

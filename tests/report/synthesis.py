@@ -1,0 +1,216 @@
+"""Tables of a made-up run that keep the contracts: command steps, a lagging skid-steer vehicle, gaps."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from pipeline.report import RunReport
+from schemas import contract_of
+
+RATE_HZ = 20.0
+START_NS = 1_725_000_000_000_000_000
+
+Floats = NDArray[np.float64]
+
+
+def make_report(
+    *, duration_s: float = 60.0, seed: int = 1, measured: bool = True, names: dict[str, str] | None = None
+) -> RunReport:
+    """A run of so many seconds; ``names`` replaces texts of the summary and the identity columns."""
+    tables = make_tables(duration_s=duration_s, seed=seed, measured=measured, names=names or {})
+    return RunReport(make_summary(tables, names or {}), tables)
+
+
+def make_tables(
+    *, duration_s: float, seed: int, measured: bool, names: dict[str, str]
+) -> dict[str, pl.DataFrame]:
+    """All tables, each validated against its contract."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(int(duration_s * RATE_HZ)) / RATE_HZ
+    t = t[(t < 0.4 * duration_s) | (t > 0.4 * duration_s + 3.0)]
+    segment = (t > 0.4 * duration_s).astype(np.int32)
+    step = (t // 6.0).astype(np.int32)
+    steps = int(step.max()) + 1
+    asked = np.column_stack((rng.uniform(-1.0, 4.0, steps), np.zeros(steps), rng.uniform(-1.6, 1.6, steps)))
+    command = asked[step]
+    wheels = _lag(command, 0.8)
+    body = _lag(wheels, 0.2) * np.array([0.96, 0.0, 0.56]) + rng.normal(0.0, 0.03, (t.size, 3))
+    body[:, 1] -= 0.05 * body[:, 0] * body[:, 2]
+    yaw = np.cumsum(body[:, 2]) / RATE_HZ
+    x = np.cumsum(body[:, 0] * np.cos(yaw) - body[:, 1] * np.sin(yaw)) / RATE_HZ
+    y = np.cumsum(body[:, 0] * np.sin(yaw) + body[:, 1] * np.cos(yaw)) / RATE_HZ
+    stamp = START_NS + np.round(t * 1e9).astype(np.int64)
+    identity = {
+        "run": names.get("run", "field/2026-11-02_warthog"),
+        "dataset": names.get("dataset", "warthog_gravel"),
+        "vehicle": names.get("vehicle", "warthog"),
+        "terrain": names.get("terrain", "gravel"),
+    }
+    grid = {"t": t, "stamp": stamp, "segment": segment}
+    zero = np.zeros(t.size)
+    velocity = {"v_x": body[:, 0], "v_y": body[:, 1], "v_w": body[:, 2]}
+    pose = {"x": x, "y": y, "z": zero, "roll": zero, "pitch": zero, "yaw": yaw}
+    velocities = _frame(identity, {**grid, **pose, **velocity, "v_w_imu": body[:, 2]})
+    ideal = {"command": command} | ({"measured": wheels} if measured else {})
+    late = (t % 6.0) < 2.0
+    slip = pl.concat([_slip(identity, grid, name, f, body, step, late) for name, f in ideal.items()])
+    tables = {
+        "velocities": velocities,
+        "slip": slip,
+        "windows": _windows(slip),
+        "aggregates": _aggregates(slip, command - wheels, wheels - body, measured=measured),
+        "findings": _findings(identity, names),
+    }
+    return {name: contract_of(name).schema.validate(frame, cast=True) for name, frame in tables.items()}
+
+
+def make_summary(tables: dict[str, pl.DataFrame], names: dict[str, str]) -> dict[str, object]:
+    """The JSON object that goes with the tables."""
+    rows = tables["aggregates"].to_dicts()
+    overall = {row["input"]: row for row in rows if row["subset"] == "all"}
+    part = {(row["input"], row["subset"]): row["median_modulus"] for row in rows}
+    by_input = {
+        name: {
+            "samples": row["samples"],
+            "median_modulus": row["median_modulus"],
+            "median_window_norm": row["median_window_norm"],
+            "rms": [row["rms_x"], row["rms_y"], row["rms_w"]],
+            "transitory_median_modulus": part[name, "transitory"],
+            "steady_median_modulus": part[name, "steady"],
+        }
+        for name, row in overall.items()
+    }
+    command = overall["command"]
+    split = None
+    if command["drivetrain_mean_square"] is not None:
+        kinds = ("drivetrain", "ground", "cross")
+        split = {kind: command[f"{kind}_mean_square"] / command["mean_square"] for kind in kinds}
+    slip = tables["slip"]
+    return {
+        "run": slip["run"][0],
+        "log": {
+            "path": names.get("path", "logs/2026-11-02_warthog.mcap"),
+            "sha256": "5d" * 32,
+            "duration_s": float(slip["t"].max()),  # type: ignore[arg-type]
+            "complete": False,
+            "losses": [{"kind": "chunk_crc", "bytes": 48231, "chunks": 1, "start_s": 24.0, "end_s": 27.0}],
+        },
+        "vehicle": slip["vehicle"][0],
+        "terrain": slip["terrain"][0],
+        "dataset": slip["dataset"][0],
+        "input": "both",
+        "rate_hz": RATE_HZ,
+        "samples": command["samples"],
+        "segments": 2,
+        "median_modulus": command["median_modulus"],
+        "median_window_norm": command["median_window_norm"],
+        "length_scale_m": 1.0,
+        "by_input": by_input,
+        "split": split,
+        "held_poses": 0.52,
+        "distance_m": 1421.0,
+        "findings": [
+            {key: row[key] for key in ("id", "severity", "text", "where", "t_start", "t_end")}
+            for row in tables["findings"].to_dicts()
+        ],
+        "topics": {
+            "command": {"topic": names.get("topic", "/cmd_vel"), "reason": "what the controller received"},
+            "wheels": {"topic": "/joint_states", "reason": "four wheel joints by name"},
+            "pose": {"topic": "/mapping/icp_odom", "reason": "the only localization that is no wheel odometry"},
+            "imu": {"topic": None, "reason": names.get("reason", "no IMU in the log")},
+        },
+        "provenance": {
+            "versions": {"slip": "0.1.0"},
+            "keys": {"slip": "9c1f2a"},
+            "configuration": {"run": {"terrain": slip["terrain"][0]}, "velocity": {"rate_hz": 20}},
+        },
+    }
+
+
+def _lag(target: Floats, tau: float) -> Floats:
+    reached = np.zeros_like(target)
+    gain = 1.0 - np.exp(-1.0 / (RATE_HZ * tau))
+    for i in range(1, len(target)):
+        reached[i] = reached[i - 1] + gain * (target[i] - reached[i - 1])
+    return reached
+
+
+def _frame(identity: dict[str, str], columns: dict[str, object]) -> pl.DataFrame:
+    return pl.DataFrame(columns).with_columns(**{name: pl.lit(text) for name, text in identity.items()})
+
+
+def _slip(
+    identity: dict[str, str],
+    grid: dict[str, object],
+    name: str,
+    ideal: Floats,
+    body: Floats,
+    step: NDArray[np.int32],
+    transitory: NDArray[np.bool_],
+) -> pl.DataFrame:
+    gap = ideal - body
+    parts: dict[str, object] = {"step": step, "transitory": transitory}
+    for i, axis in enumerate("xyw"):
+        parts |= {f"f_{axis}": ideal[:, i], f"v_{axis}": body[:, i], f"g_{axis}": gap[:, i]}
+    parts["modulus"] = np.linalg.norm(gap, axis=1)
+    return _frame(identity, {**grid, **parts}).with_columns(input=pl.lit(name))
+
+
+def _windows(slip: pl.DataFrame) -> pl.DataFrame:
+    square = (pl.col("modulus") ** 2).mean()
+    keys = ["run", "dataset", "vehicle", "terrain", "input", "segment", "step"]
+    return (
+        slip.with_columns(window=(pl.col("t") % 6.0 // 2.0))
+        .group_by(*keys, "window", maintain_order=True)
+        .agg(
+            t_start=pl.col("t").min(),
+            t_end=pl.col("t").max(),
+            transitory=pl.col("transitory").first(),
+            samples=pl.len().cast(pl.Int32),
+            rms_modulus=square.sqrt(),
+            window_norm=square.sqrt() * np.sqrt(40.0),
+        )
+        .drop("window")
+    )
+
+
+def _aggregates(slip: pl.DataFrame, drive: Floats, ground: Floats, *, measured: bool) -> pl.DataFrame:
+    rows = []
+    for (name,), frame in slip.group_by("input", maintain_order=True):
+        late = frame["transitory"].to_numpy()
+        for subset, chosen in (("all", late | True), ("transitory", late), ("steady", ~late)):
+            part = frame.filter(chosen)
+            split = measured and name == "command"
+            rows.append(
+                {key: frame[key][0] for key in ("run", "dataset", "vehicle", "terrain")}
+                | {"input": name, "subset": subset, "samples": part.height, "windows": part.height // 40}
+                | {"median_modulus": part["modulus"].median()}
+                | {"median_window_norm": 6.3 * (part["modulus"] ** 2).mean() ** 0.5}
+                | {f"rms_{axis}": (part[f"g_{axis}"] ** 2).mean() ** 0.5 for axis in "xyw"}
+                | {"mean_square": (part["modulus"] ** 2).mean()}
+                | {"drivetrain_mean_square": float((drive[chosen] ** 2).sum(axis=1).mean()) if split else None}
+                | {"ground_mean_square": float((ground[chosen] ** 2).sum(axis=1).mean()) if split else None}
+                | {"cross_mean_square": float(2 * (drive * ground)[chosen].sum(axis=1).mean()) if split else None}
+                | {"distance": 1421.0, "duration": part.height / RATE_HZ, "height_rate": 0.1}
+                | {"largest_kinetic_energy": 3100.0, "length_scale": 1.0}
+            )
+    return pl.DataFrame(rows)
+
+
+def _findings(identity: dict[str, str], names: dict[str, str]) -> pl.DataFrame:
+    rows = [
+        ("extract", "held_poses", "info", "52 % of the poses repeat the one before: a slow ICP sampled at 20 Hz"),
+        ("extract", "imu_sign", "warning", names.get("finding", "The IMU's yaw rate has the opposite sign.")),
+        ("velocity", "pose_jump", "info", "1 jump of the pose: a correction of the map, not a motion"),
+    ]
+    frame = pl.DataFrame(rows, schema=["stage", "id", "severity", "text"], orient="row")
+    return frame.with_columns(
+        **{name: pl.lit(text) for name, text in identity.items()},
+        where=pl.lit(names.get("where", "/imu/data")),
+        t_start=pl.lit(24.0),
+        t_end=pl.lit(27.0),
+        value=pl.lit(0.5),
+        count=pl.lit(1),
+    )
