@@ -55,12 +55,20 @@ class Scene:
         table = self.report.table("slip")
         if table is None:
             return {}
+        if "suspect" not in table.columns:
+            table = table.with_columns(suspect=pl.lit(value=False))
         found = {}
         for name in self.report.inputs:
             rows = table.filter(pl.col("input").cast(pl.String) == name)
             if not rows.is_empty():
                 found[name] = self._number_pieces(rows)
         return found
+
+    @cached_property
+    def sound_slip(self) -> dict[str, pl.DataFrame]:
+        """Slip by input without the suspect stretches: what medians are taken of."""
+        sound = {name: frame.filter(~pl.col("suspect")) for name, frame in self.slip.items()}
+        return {name: frame for name, frame in sound.items() if not frame.is_empty()}
 
     @cached_property
     def main_slip(self) -> pl.DataFrame | None:
@@ -86,9 +94,10 @@ class Scene:
     @cached_property
     def modulus_cap(self) -> float:
         """Where the colour ramp of slip ends [m/s]: the 98th percentile, rounded up to two digits."""
-        if self.main_slip is None:
+        sound = self.sound_slip.get(self.report.main_input)
+        if sound is None:
             return 1.0
-        top = self.main_slip["modulus"].quantile(_CAP_QUANTILE) or 0.0
+        top = sound["modulus"].quantile(_CAP_QUANTILE) or 0.0
         return round_up(top) if top > 0.0 else 1.0
 
     @cached_property
@@ -123,10 +132,18 @@ class Scene:
     @cached_property
     def transitory_spans(self) -> pl.DataFrame:
         """Stretches after a change of command: ``t_start t_end`` [s]."""
+        return self._find_spans("transitory")
+
+    @cached_property
+    def suspect_spans(self) -> pl.DataFrame:
+        """Stretches that medians leave out, their poses being wrong: ``t_start t_end`` [s]."""
+        return self._find_spans("suspect")
+
+    def _find_spans(self, flag: str) -> pl.DataFrame:
         if self.main_slip is None or self.time_domain is None:
-            return pl.DataFrame({"t_start": [], "t_end": []}, schema_overrides={"t_start": pl.Float64, "t_end": pl.Float64})
+            return pl.DataFrame(schema={"t_start": pl.Float64, "t_end": pl.Float64})
         pixel = (self.time_domain[1] - self.time_domain[0]) / LINE_BINS
-        return find_spans(self.main_slip, "transitory", period=self.period, shortest_gap=pixel)
+        return find_spans(self.main_slip, flag, period=self.period, shortest_gap=pixel)
 
     def _number_pieces(self, frame: pl.DataFrame) -> pl.DataFrame:
         ordered = frame.sort("t", maintain_order=True)

@@ -20,7 +20,8 @@ CROSS = "#8b949c"
 INK = "#38424b"
 QUIET = "#6b757e"
 GRID = "#e6e9ec"
-SHADE = "#dfe3e7"
+SHADE = "#eceff1"
+SUSPECT = "#f8ddd6"
 MARK = "#f0b429"
 PAPER = "#ffffff"
 
@@ -41,7 +42,8 @@ DARK_TWINS = MappingProxyType(
         INK: "#c9d1d8",
         QUIET: "#95a0aa",
         GRID: "#2a3138",
-        SHADE: "#2b333b",
+        SHADE: "#20262c",
+        SUSPECT: "#43252a",
         MARK: "#ffd166",
         PAPER: "#14181c",
         SLIP_RAMP[0]: "#46535d",
@@ -82,6 +84,7 @@ def chart_config() -> dict[str, object]:
         "titleColor": INK,
         "titleFontSize": 11.5,
         "titleFontWeight": 500,
+        "titleLimit": 400,
         "offset": 12,
     }
     return {

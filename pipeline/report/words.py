@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import math
+import unicodedata
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 
@@ -15,9 +16,13 @@ _EARLIEST_YEAR = 2000
 
 
 def escape(text: object) -> str:
-    """A text as HTML, safe in content and in quoted attributes; control characters become visible marks."""
-    visible = "".join(mark if mark.isprintable() or mark in "\n\t" else "\ufffd" for mark in str(text))
+    """A text as HTML, safe in content and in quoted attributes; control characters (also those that turn the writing direction) become visible marks."""
+    visible = "".join("\ufffd" if _is_control(mark) else mark for mark in str(text))
     return html.escape(visible, quote=True)
+
+
+def _is_control(mark: str) -> bool:
+    return unicodedata.category(mark).startswith("C") and mark not in "\n\t"
 
 
 def encode_json(value: object) -> str:

@@ -155,6 +155,7 @@ def _slip(
     for i, axis in enumerate("xyw"):
         parts |= {f"f_{axis}": ideal[:, i], f"v_{axis}": body[:, i], f"g_{axis}": gap[:, i]}
     parts["modulus"] = np.linalg.norm(gap, axis=1)
+    parts["suspect"] = (step == 1) & (np.arange(step.size) % 120 > 90)
     return _frame(identity, {**grid, **parts}).with_columns(input=pl.lit(name))
 
 
@@ -168,6 +169,7 @@ def _windows(slip: pl.DataFrame) -> pl.DataFrame:
             t_start=pl.col("t").min(),
             t_end=pl.col("t").max(),
             transitory=pl.col("transitory").first(),
+            suspect=pl.col("suspect").any(),
             samples=pl.len().cast(pl.Int32),
             rms_modulus=square.sqrt(),
             window_norm=square.sqrt() * np.sqrt(40.0),

@@ -23,7 +23,7 @@ _SMALLEST_BOUND = 0.1
 
 def draw_command_space(scene: Scene) -> Drawing | None:
     """A heat map: colour is the median modulus of the samples in a cell; empty cells stay empty."""
-    slip = scene.main_slip
+    slip = scene.sound_slip.get(scene.report.main_input)
     if slip is None or scene.track is None:
         return None
     cells = _count_cells(slip)
@@ -32,12 +32,12 @@ def draw_command_space(scene: Scene) -> Drawing | None:
     x = alt.X(
         "f_w:Q",
         scale=alt.Scale(domain=bounds["f_w"], nice=False),
-        axis=alt.Axis(title=f"ideal yaw rate f_w {words} [rad/s]", format="~g", tickCount=6),
+        axis=alt.Axis(title=f"ideal yaw rate f_w {words} [rad/s]", format=",~r", tickCount=6),
     )
     y = alt.Y(
         "f_x:Q",
         scale=alt.Scale(domain=bounds["f_x"], nice=False),
-        axis=alt.Axis(title=f"ideal speed f_x {words} [m/s]", format="~g", tickCount=6, minExtent=26),
+        axis=alt.Axis(title=f"ideal speed f_x {words} [m/s]", format=",~r", tickCount=6, minExtent=26),
     )
     tooltip = [
         alt.Tooltip("modulus:Q", title="median slip [m/s]", format=".2f"),
@@ -60,8 +60,11 @@ def draw_command_space(scene: Scene) -> Drawing | None:
 
 
 def _bound(slip: pl.DataFrame, name: str) -> list[float]:
-    top = round_up(max(float(slip[name].abs().max() or 0.0), _SMALLEST_BOUND))  # type: ignore[arg-type]
-    return [-top, top]
+    low, high = (float(slip[name].min() or 0.0), float(slip[name].max() or 0.0))  # type: ignore[arg-type]
+    return [
+        -round_up(-low) if low < -_SMALLEST_BOUND else -_SMALLEST_BOUND,
+        round_up(high) if high > _SMALLEST_BOUND else _SMALLEST_BOUND,
+    ]
 
 
 def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
@@ -84,9 +87,10 @@ def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
 
 def describe_command_space(scene: Scene) -> str:
     """Which commands slip most and least."""
-    if scene.main_slip is None:
+    slip = scene.sound_slip.get(scene.report.main_input)
+    if slip is None:
         return "There is no slip to draw."
-    cells = _count_cells(scene.main_slip)
+    cells = _count_cells(slip)
     told = "Median slip modulus over ideal speed and ideal yaw rate."
     if cells.is_empty():
         return told

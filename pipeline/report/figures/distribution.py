@@ -13,16 +13,16 @@ if TYPE_CHECKING:
 
 def draw_distribution(scene: Scene) -> Drawing | None:
     """The share of time steps below each modulus."""
-    if not scene.slip:
+    if not scene.sound_slip:
         return None
-    curves, medians = tabulate_shares({name: frame["modulus"] for name, frame in scene.slip.items()})
+    curves, medians = tabulate_shares({name: frame["modulus"] for name, frame in scene.sound_slip.items()})
     chart = draw_shares("modulus_shares", medians, title="slip modulus of a time step [m/s]")
     return Drawing(chart, {"modulus_shares": curves, "modulus_shares_medians": medians})
 
 
 def describe_distribution(scene: Scene) -> str:
     """The medians."""
-    _, medians = tabulate_shares({name: frame["modulus"] for name, frame in scene.slip.items()})
+    _, medians = tabulate_shares({name: frame["modulus"] for name, frame in scene.sound_slip.items()})
     return describe_medians(medians, "slip modulus")
 
 

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import altair as alt
 
-from pipeline.report import theme
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
 from pipeline.report.run import INPUT_WORDS
@@ -30,20 +29,17 @@ def draw_modulus(scene: Scene) -> Drawing | None:
             detail="piece:N",
         )
     )
-    shade = parts.shade_spans("transitory", theme.SHADE, opacity=0.55)
-    marked = parts.shade_spans(parts.MARKED_SPANS, theme.MARK, opacity=0.3)
-    chart = alt.layer(shade, marked, line).properties(
+    chart = alt.layer(*parts.shade_spans(), line).properties(
         width=parts.WIDTH, height=150, title="slip modulus [m/s]", usermeta=parts.brush_over_time()
     )
     note = parts.tell_thinning(lines, kept="lowest and highest of every bin")
-    shaded = "Grey bands: after a change of command."
-    return Drawing(chart, {"modulus": lines.frame} | parts.span_rows(scene), f"{shaded} {note}".strip())
+    return Drawing(chart, {"modulus": lines.frame} | parts.span_rows(scene), f"{parts.tell_bands(scene)} {note}".strip())
 
 
 def describe_modulus(scene: Scene) -> str:
     """Median, highest value and its time for each input."""
     told = []
-    for name, frame in scene.slip.items():
+    for name, frame in scene.sound_slip.items():
         row = frame.row(frame["modulus"].arg_max() or 0, named=True)
         told.append(
             f"{INPUT_WORDS[name]} its median is {frame['modulus'].median():.2f} m/s and it is highest, "

@@ -32,23 +32,25 @@ _EMPTY_POINTS = pl.DataFrame(schema={name: pl.Float64 for name in ("t", "x", "y"
 
 def time_axis(scene: Scene, *, title: str | None = "time since the start of the run [s]") -> alt.X:
     """The axis that every figure over time has; without a title its labels are left out too."""
-    axis = alt.Axis(title=title, tickCount=8, labels=title is not None, grid=False, format="~g")
+    axis = alt.Axis(title=title, tickCount=8, labels=title is not None, grid=False, format=",~r")
     return alt.X("t:Q", axis=axis, scale=alt.Scale(domain=list(scene.time_domain or (0, 1)), nice=False))
 
 
 def value_axis(**scale: object) -> alt.Y:
     """A vertical axis without a title of its own (the panel's title names quantity and unit)."""
-    axis = alt.Axis(title=None, tickCount=4, format="~g", minExtent=GUTTER - 10)
+    axis = alt.Axis(title=None, tickCount=4, format=",~r", minExtent=GUTTER - 10)
     return alt.Y("value:Q", axis=axis, scale=alt.Scale(**scale))
 
 
-def shade_spans(name: str, colour: str, *, opacity: float) -> alt.Chart:
-    """Bands over the full height of a panel, from rows with ``t_start`` and ``t_end``."""
-    return (
+def shade_spans() -> list[alt.Chart]:
+    """Bands over the full height of a panel: after a change of command, suspect, marked by the reader."""
+    bands = (("transitory", theme.SHADE, 1.0), ("suspect", theme.SUSPECT, 1.0), (MARKED_SPANS, theme.MARK, 0.3))
+    return [
         alt.Chart(alt.NamedData(name))
-        .mark_rect(color=colour, opacity=opacity, tooltip=None)
+        .mark_rect(color=colour, opacity=opacity)
         .encode(x=alt.X("t_start:Q"), x2="t_end:Q")
-    )
+        for name, colour, opacity in bands
+    ]
 
 
 def series_colour(names: list[str], words: dict[str, str]) -> alt.Color:
@@ -63,9 +65,9 @@ def slip_colour(scene: Scene, field: str = "modulus") -> alt.Color:
     """The ramp of slip modulus, the same in every figure of a run."""
     words = INPUT_WORDS[scene.report.main_input]
     legend = alt.Legend(
-        title=f"slip modulus {words} [m/s]", gradientLength=150, gradientThickness=8, tickCount=3, format="~g"
+        title=f"slip modulus {words} [m/s]", gradientLength=150, gradientThickness=8, tickCount=3, format=",~r"
     )
-    scale = alt.Scale(domain=[0.0, scene.modulus_cap], range=list(theme.SLIP_RAMP), clamp=True)
+    scale = alt.Scale(domain=[0.0, scene.modulus_cap], range=list(theme.SLIP_RAMP), clamp=True, interpolate="rgb")
     return alt.Color(f"{field}:Q", scale=scale, legend=legend)
 
 
@@ -80,13 +82,23 @@ def brush_over_plane(x: str, y: str) -> dict[str, object]:
 
 
 def span_rows(scene: Scene) -> dict[str, pl.DataFrame]:
-    """The rows behind `shade_spans` of transitory and of marked stretches."""
-    return {"transitory": scene.transitory_spans, MARKED_SPANS: _EMPTY_SPANS}
+    """The rows behind `shade_spans`."""
+    return {"transitory": scene.transitory_spans, "suspect": scene.suspect_spans, MARKED_SPANS: _EMPTY_SPANS}
 
 
 def marked_rows() -> dict[str, pl.DataFrame]:
     """The rows behind the points that a reader marked: none until then."""
     return {MARKED_POINTS: _EMPTY_POINTS}
+
+
+def tell_bands(scene: Scene) -> str:
+    """What the bands mean, for those that there are."""
+    told = []
+    if not scene.transitory_spans.is_empty():
+        told.append("Grey bands: after a change of command.")
+    if not scene.suspect_spans.is_empty():
+        told.append("Red bands: suspect poses, left out of the medians.")
+    return " ".join(told)
 
 
 def tell_thinning(*lines: Thinned, kept: str) -> str:

@@ -38,7 +38,7 @@ def draw_split(scene: Scene) -> Drawing | None:
         x=alt.X(
             "mean_square:Q",
             scale=alt.Scale(domain=[span[0] - (room if span[0] < 0 else 0), span[1] + room], nice=False),
-            axis=alt.Axis(title="mean square of slip on command [m²/s²]", format="~g", tickCount=6),
+            axis=alt.Axis(title="mean square of slip on command [m²/s²]", format=",~r", tickCount=6),
         ),
     )
     bars = base.mark_bar(cornerRadiusEnd=2).encode(color=alt.Color("part:N", scale=scale, legend=legend))

@@ -82,7 +82,7 @@ def _extent(values: pl.Series) -> list[float]:
 
 
 def _axis(title: str) -> alt.Axis:
-    return alt.Axis(title=title, tickCount=5, format="~g", minExtent=parts.GUTTER - 20)
+    return alt.Axis(title=title, tickCount=5, format=",~r", minExtent=parts.GUTTER - 20)
 
 
 def describe_trajectory(scene: Scene) -> str:

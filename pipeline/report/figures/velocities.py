@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import altair as alt
 
-from pipeline.report import theme
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
 from pipeline.report.scene import COMPONENTS
@@ -33,8 +32,7 @@ def draw_velocities(scene: Scene) -> Drawing | None:
     chart = alt.vconcat(*panels).properties(usermeta=parts.brush_over_time())
     rows = {f"velocity_{component}": line.frame for component, line in there.items()}
     note = parts.tell_thinning(*there.values(), kept="lowest and highest of every bin")
-    shaded = "Grey bands: after a change of command."
-    return Drawing(chart, rows | parts.span_rows(scene), f"{shaded} {note}".strip())
+    return Drawing(chart, rows | parts.span_rows(scene), f"{parts.tell_bands(scene)} {note}".strip())
 
 
 def _draw_panel(scene: Scene, component: str, names: list[str], *, title: str | None = None) -> alt.LayerChart:
@@ -48,9 +46,7 @@ def _draw_panel(scene: Scene, component: str, names: list[str], *, title: str | 
             detail="piece:N",
         )
     )
-    shade = parts.shade_spans("transitory", theme.SHADE, opacity=0.55)
-    marked = parts.shade_spans(parts.MARKED_SPANS, theme.MARK, opacity=0.3)
-    return alt.layer(shade, marked, line).properties(width=parts.WIDTH, height=118, title=_TITLES[component])
+    return alt.layer(*parts.shade_spans(), line).properties(width=parts.WIDTH, height=118, title=_TITLES[component])
 
 
 def describe_velocities(scene: Scene) -> str:

@@ -28,6 +28,8 @@ def _list_norms(scene: Scene) -> dict[str, pl.Series]:
     windows = scene.report.table("windows")
     if windows is None:
         return {}
+    if "suspect" in windows.columns:
+        windows = windows.filter(~pl.col("suspect"))
     by_input = {
         name: windows.filter(pl.col("input").cast(pl.String) == name)["window_norm"] for name in scene.report.inputs
     }

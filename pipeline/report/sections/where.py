@@ -22,7 +22,7 @@ def render_where(page: Page) -> str:
     figures = page.render_figures(Section.WHERE)
     if not figures:
         return ""
-    regions = find_regions(page.scene.main_slip)
+    regions = find_regions(page.scene.sound_slip.get(page.report.main_input))
     told = ""
     if regions:
         words = INPUT_WORDS[page.report.main_input]
