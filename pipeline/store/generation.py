@@ -104,6 +104,23 @@ class Generation:
         )
         return checked.report
 
+    def read_table(self, name: str) -> pl.DataFrame:
+        """A table of this generation as it will be read later: without the rows that went to quarantine.
+
+        Raises:
+            StoreError: ``no_such_table``, it was neither written nor taken over so far.
+        """
+        import polars as pl  # noqa: PLC0415 - heavy, and `slip --help` imports this room
+
+        if name not in self._tables:
+            raise StoreError(
+                "no_such_table",
+                f"the generation holds no {name!r} so far",
+                where=self.run,
+                hint="Run the stage before, or analyze the whole log",
+            )
+        return pl.read_parquet(self._folder / self._tables[name].file, glob=False)
+
     def write_text(self, name: str, text: str) -> None:
         """Write a text file, UTF-8.
 
