@@ -104,6 +104,11 @@ class Generation:
         )
         return checked.report
 
+    @property
+    def table_names(self) -> tuple[str, ...]:
+        """Tables written or taken over so far."""
+        return tuple(self._tables)
+
     def read_table(self, name: str) -> pl.DataFrame:
         """A table of this generation as it will be read later: without the rows that went to quarantine.
 
