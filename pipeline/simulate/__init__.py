@@ -3,3 +3,68 @@
 A `Scenario` says everything about a run; `simulate_run` drives it and `write_log` records it. The
 physics is written here a second time, independently: nothing is shared with the models that are fitted.
 """
+
+from __future__ import annotations
+
+from pipeline.simulate.case_table import Case
+from pipeline.simulate.cases import (
+    find_case,
+    list_cases,
+    list_effects,
+    make_scenario,
+    simulate_case,
+    write_samples,
+)
+from pipeline.simulate.effects import EffectSpec, ParameterSpec
+from pipeline.simulate.errors import SimulateError
+from pipeline.simulate.layouts import LAYOUTS, CommandTopic, Layout, PoseTopic, WheelTopic
+from pipeline.simulate.record import write_log
+from pipeline.simulate.run import SimulatedRun, Truth, simulate_run
+from pipeline.simulate.scenario import (
+    Clock,
+    Disturbance,
+    Encoders,
+    Ground,
+    Imu,
+    PoseSensor,
+    Program,
+    Recording,
+    Scenario,
+    State,
+)
+from pipeline.simulate.vehicles import VEHICLES, Vehicle, find_vehicle
+
+__all__ = [
+    "LAYOUTS",
+    "VEHICLES",
+    "Case",
+    "Clock",
+    "CommandTopic",
+    "Disturbance",
+    "EffectSpec",
+    "Encoders",
+    "Ground",
+    "Imu",
+    "Layout",
+    "ParameterSpec",
+    "PoseSensor",
+    "PoseTopic",
+    "Program",
+    "Recording",
+    "Scenario",
+    "SimulateError",
+    "SimulatedRun",
+    "State",
+    "Truth",
+    "Vehicle",
+    "WheelTopic",
+    "find_case",
+    "find_vehicle",
+    "list_cases",
+    "list_effects",
+    "make_scenario",
+    "simulate_case",
+    "simulate_run",
+    "write_log",
+    "write_samples",
+]

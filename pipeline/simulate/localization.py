@@ -16,7 +16,7 @@ from pipeline.core.rigid import (
     rotate,
 )
 from pipeline.simulate.signals import make_coloured_noise
-from pipeline.simulate.streams import open_stream
+from pipeline.simulate.streams import open_stream, spread_times
 
 if TYPE_CHECKING:
     from pipeline.simulate.effects import Effects
@@ -141,17 +141,10 @@ def _add_noise(
     return position + slow, turned
 
 
-def _spread_times(count: int, duration_s: float, generator: np.random.Generator) -> Floats:
-    """One random time in each of ``count`` equal parts of the middle 80 %, so that faults stay apart."""
-    part = 0.8 * duration_s / max(count, 1)
-    times: Floats = 0.1 * duration_s + (np.arange(count) + generator.uniform(0.2, 0.8, count)) * part
-    return times
-
-
 def _add_jumps(sensor: PoseSensor, poses: Poses, duration_s: float, seed: int) -> Poses:
     generator = open_stream(seed, "pose jumps")
     yaw, shift = poses.correction_yaw.copy(), poses.correction.copy()
-    for at in _spread_times(sensor.jumps, duration_s, generator).tolist():
+    for at in spread_times(sensor.jumps, duration_s=duration_s, generator=generator).tolist():
         after = np.flatnonzero(poses.sampled_s >= at)
         if after.size == 0:
             continue
@@ -170,7 +163,7 @@ def _add_jumps(sensor: PoseSensor, poses: Poses, duration_s: float, seed: int) -
 def _rotate_stretches(sensor: PoseSensor, poses: Poses, duration_s: float, seed: int) -> Poses:
     generator = open_stream(seed, "pose stretches")
     turn = np.zeros(poses.stamp_s.size)
-    for start in _spread_times(sensor.rotated_stretches, duration_s, generator).tolist():
+    for start in spread_times(sensor.rotated_stretches, duration_s=duration_s, generator=generator).tolist():
         turn[(poses.sampled_s >= start) & (poses.sampled_s < start + _STRETCH_S)] = 0.5 * np.pi
     if not turn.any():
         return poses
@@ -190,7 +183,9 @@ def _invalidate(sensor: PoseSensor, poses: Poses, seed: int) -> Poses:
 
 def _drop_out(sensor: PoseSensor, poses: Poses, duration_s: float, seed: int) -> Poses:
     kept = np.ones(poses.stamp_s.size, dtype=bool)
-    starts = _spread_times(sensor.dropouts, duration_s, open_stream(seed, "pose dropouts"))
+    starts = spread_times(
+        sensor.dropouts, duration_s=duration_s, generator=open_stream(seed, "pose dropouts")
+    )
     for start in starts.tolist():
         kept &= (poses.stamp_s < start) | (poses.stamp_s >= start + sensor.dropout_s)
     return Poses(

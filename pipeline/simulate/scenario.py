@@ -219,6 +219,7 @@ class Recording:
             a ``calib_state`` topic says which part counts. None leaves that topic out.
         command_scale: factor on recorded wheel commands (a topic made with another vehicle's radius).
         command_latency_s: from a command's stamp to the recorder.
+        gaps: how many holes of ``gap_s`` the whole recording has.
     """
 
     layout: str | Layout = "husky"
@@ -228,6 +229,8 @@ class Recording:
     hand_driven_s: float | None = None
     command_scale: float = 1.0
     command_latency_s: float = 0.001
+    gaps: int = 0
+    gap_s: float = 2.0
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,154 @@
+"""Named scenarios with changes: what the command line asks for, made into a log."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, get_args
+
+from pipeline.simulate.case_table import CASES, Case
+from pipeline.simulate.effects import CATALOGUE, EffectSpec, resolve_effects
+from pipeline.simulate.errors import SimulateError, unknown_name
+from pipeline.simulate.layouts import choose_layout, find_layout
+from pipeline.simulate.record import write_log
+from pipeline.simulate.run import simulate_run
+from pipeline.simulate.scenario import Ground, ProgramName, Scenario
+from pipeline.simulate.vehicles import find_vehicle
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+_BY_NAME = {case.name: case for case in CASES}
+_SAMPLES = ("husky_tile", "warthog_ice", "ackermann_gravel")
+_LESSON_SLOPE_RAD = math.radians(8.0)
+
+
+def list_cases() -> tuple[Case, ...]:
+    """Every named case."""
+    return CASES
+
+
+def list_effects() -> tuple[EffectSpec, ...]:
+    """Every effect that can be asked for, in the order of a command's way."""
+    return tuple(CATALOGUE.values())
+
+
+def find_case(name: str) -> Case:
+    """The named case.
+
+    Raises:
+        SimulateError: ``unknown_case``.
+    """
+    if name not in _BY_NAME:
+        raise unknown_name("case", name, sorted(_BY_NAME))
+    return _BY_NAME[name]
+
+
+def simulate_case(
+    name: str | None,
+    effects: Mapping[str, Mapping[str, float] | float] | None = None,
+    *,
+    out: Path,
+    seed: int | None = None,
+    duration_s: float | None = None,
+    vehicle: str | None = None,
+    layout: str | None = None,
+    program: str | None = None,
+) -> Path:
+    """Simulate a named case, or a plain one, with changes, and write its log.
+
+    Args:
+        name: a case of `list_cases`; None for a plain vehicle without any effect.
+        effects: added to the case's own, or in place of them where the id is the same. An empty mapping means
+            the effect's usual size.
+        out: file to write, or a folder, which gets ``<case>.mcap``.
+        seed: in place of the case's; None keeps it, as with all that follow.
+        duration_s: length of the run.
+        vehicle: a name of `VEHICLES`; brings its usual layout along.
+        layout: a name of `LAYOUTS`.
+        program: what is driven.
+
+    Returns:
+        The file that was written.
+
+    Raises:
+        SimulateError: an unknown case, effect, parameter, vehicle, layout or program, an impossible value or
+            combination, or a folder that cannot be written.
+    """
+    scenario = make_scenario(
+        name, effects, seed=seed, duration_s=duration_s, vehicle=vehicle, layout=layout, program=program
+    )
+    target = out / f"{name or 'simulated'}.mcap" if out.is_dir() else out
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_log(simulate_run(scenario), target)
+    except OSError as problem:
+        raise SimulateError(
+            "cannot_write",
+            f"the log cannot be written ({problem.strerror})",
+            where=str(target),
+            hint="Choose another --out",
+        ) from problem
+    return target
+
+
+def make_scenario(
+    name: str | None,
+    effects: Mapping[str, Mapping[str, float] | float] | None = None,
+    *,
+    seed: int | None = None,
+    duration_s: float | None = None,
+    vehicle: str | None = None,
+    layout: str | None = None,
+    program: str | None = None,
+) -> Scenario:
+    """The scenario of a named case with changes; see `simulate_case`."""
+    scenario = Scenario() if name is None else find_case(name).scenario
+    if vehicle is not None:
+        chosen = find_vehicle(vehicle)
+        usual = choose_layout(chosen.name, chosen.kind)
+        scenario = replace(scenario, vehicle=chosen, recording=replace(scenario.recording, layout=usual))
+    if layout is not None:
+        find_layout(layout, scenario.vehicle.kind)
+        scenario = replace(scenario, recording=replace(scenario.recording, layout=layout))
+    if program is not None:
+        known = get_args(ProgramName)
+        if program not in known:
+            raise unknown_name("program", program, sorted(known))
+        scenario = replace(scenario, program=replace(scenario.program, name=program))  # type: ignore[arg-type]
+    asked = {**scenario.effects, **_fill_usual_sizes(effects or {})}
+    resolve_effects(asked, scenario.vehicle.kind)
+    ground = scenario.ground
+    if "slope_drift" in asked and ground == Ground():
+        # On level ground the effect would leave no trace at all.
+        ground = Ground(pitch_rad=_LESSON_SLOPE_RAD)
+    return replace(
+        scenario,
+        effects=asked,
+        ground=ground,
+        seed=scenario.seed if seed is None else seed,
+        duration_s=scenario.duration_s if duration_s is None else duration_s,
+    )
+
+
+def _fill_usual_sizes(
+    effects: Mapping[str, Mapping[str, float] | float],
+) -> dict[str, Mapping[str, float] | float]:
+    filled: dict[str, Mapping[str, float] | float] = dict(effects)
+    for name, given in effects.items():
+        if given == {} and name in CATALOGUE:
+            filled[name] = {
+                item.name: item.typical for item in CATALOGUE[name].parameters if not math.isnan(item.typical)
+            }
+    return filled
+
+
+def write_samples(directory: Path) -> list[Path]:
+    """Write the three sample logs into a folder, which is made if need be.
+
+    Returns:
+        The files written: ``husky_tile.mcap``, ``warthog_ice.mcap`` and ``ackermann_gravel.mcap``.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    return [simulate_case(name, out=directory / f"{name}.mcap") for name in _SAMPLES]

@@ -1,0 +1,26 @@
+"""From true seconds to the stamps of the robot's clock."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from pipeline.simulate.scenario import Clock
+
+Floats = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+
+def stamp_times(clock: Clock, time_s: Floats) -> Stamps:
+    """Nanoseconds that the clock shows at true times since the run's start [s], shape (n,).
+
+    A clock that shows less than zero shows zero: stamps are unsigned.
+    """
+    elapsed = np.rint(time_s * 1e9).astype(np.int64)
+    shown = np.where(time_s < clock.unset_s, elapsed, clock.start_ns + elapsed)
+    gone_back = time_s >= clock.backward_at_s
+    shown = np.where(gone_back, shown - round(clock.backward_s * 1e9), shown)
+    return np.maximum(shown, 0)
