@@ -4,9 +4,11 @@
   const page = JSON.parse(document.getElementById("page-data").textContent);
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const RIGHT = 16;
+  const NARROW = 480;
   const views = new Map();
   let spans = [];
   let points = [];
+  let zoom = null;
 
   const unpack = (columns) => {
     const names = Object.keys(columns);
@@ -37,7 +39,7 @@
     for (const layer of spec.layer ?? [])
       for (const axis of ["x", "y"]) {
         const scale = layer.encoding?.[axis]?.scale;
-        if (scale?.domain) scale.domain = domains[axis];
+        if (scale?.domain && domains[axis]) scale.domain = domains[axis];
       }
   };
 
@@ -51,7 +53,10 @@
       spec.height = Math.round(height);
       setDomains(spec, { x: widen(equal.x, scale * width), y: widen(equal.y, scale * height) });
     }
-    for (const part of spec.vconcat ?? [spec]) part.width = Math.floor(width);
+    for (const part of spec.vconcat ?? [spec]) {
+      part.width = Math.floor(width);
+      if (zoom && spec.usermeta?.brush === "time") setDomains(part, { x: zoom });
+    }
   };
 
   const namesIn = (value, found) => {
@@ -63,8 +68,10 @@
     return found;
   };
 
+  const fillsView = (span) => zoom !== null && span.t_start <= zoom[0] && span.t_end >= zoom[1];
+
   const rowsOf = (name) => {
-    if (name === "marked_spans") return spans.map((span) => ({ ...span }));
+    if (name === "marked_spans") return spans.filter((span) => !fillsView(span)).map((span) => ({ ...span }));
     if (name === "marked_points") return points.map((point) => ({ ...point }));
     return unpack(page.rows[name]);
   };
@@ -73,6 +80,7 @@
     const id = place.dataset.figure;
     const spec = swap(page.figures[id], dark.matches ? page.dark : {});
     fit(spec, width);
+    if (place.clientWidth < NARROW) spec.config.legend.columns = 1;
     spec.padding = { left: 2, right: RIGHT - 4, top: 4, bottom: 4 };
     const names = namesIn(spec, new Set());
     spec.datasets = Object.fromEntries([...names].map((name) => [name, rowsOf(name)]));
@@ -100,8 +108,8 @@
     place.classList.add("drawn");
   };
 
-  const drawAll = async () => {
-    for (const place of document.querySelectorAll(".plot[data-figure]")) await draw(place);
+  const drawAll = async (selector = ".plot[data-figure]") => {
+    for (const place of document.querySelectorAll(selector)) await draw(place);
     document.documentElement.dataset.drawn = "yes";
   };
 
@@ -113,8 +121,12 @@
   const to = document.getElementById("mark-to");
 
   const tell = () => {
-    bar.hidden = spans.length === 0;
-    if (!spans.length) return;
+    document.getElementById("zoom-in").hidden = document.getElementById("mark-clear").hidden = !spans.length;
+    bar.hidden = !spans.length && !zoom;
+    if (!spans.length) {
+      bar.firstElementChild.textContent = "Zoomed in";
+      return;
+    }
     const length = spans.reduce((sum, span) => sum + span.t_end - span.t_start, 0);
     const start = spans[0].t_start.toFixed(1);
     const end = spans[spans.length - 1].t_end.toFixed(1);
@@ -159,6 +171,8 @@
   const markPoints = (inside) => {
     points = track.filter(inside);
     spans = [];
+    if (from) from.value = "";
+    if (to) to.value = "";
     let open = null;
     track.forEach((row) => {
       if (!inside(row)) open = null;
@@ -189,12 +203,12 @@
   const locate = (place, view, event) => {
     const svg = place.querySelector("svg");
     const box = svg.getBoundingClientRect();
-    const zoom = box.width / svg.width.baseVal.value;
+    const ratio = box.width / svg.width.baseVal.value;
     const panel = findPanel(view);
     const at = (axis, pixel) => view.scale(panel.prefix + axis).invert(pixel);
     return {
-      x: at("x", (event.clientX - box.left) / zoom - panel.left),
-      y: () => at("y", (event.clientY - box.top) / zoom - panel.top),
+      x: at("x", (event.clientX - box.left) / ratio - panel.left),
+      y: () => at("y", (event.clientY - box.top) / ratio - panel.top),
     };
   };
 
@@ -253,7 +267,9 @@
     if (Number.isFinite(start) && Number.isFinite(end) && start !== end) markTime(start, end);
   });
   document.addEventListener("keydown", (event) => {
-    if (event.key === "Escape") clear();
+    if (event.key !== "Escape") return;
+    if (spans.length) clear();
+    else if (zoom) setZoom(null);
   });
 
   // Drawing again when room or colours change -----------------------------------------------------------------
@@ -264,9 +280,20 @@
   const again = () => {
     clearTimeout(timer);
     timer = setTimeout(() => {
-      queue = queue.then(drawAll);
+      queue = queue.then(() => drawAll());
     }, 150);
   };
+  const setZoom = (domain) => {
+    zoom = domain;
+    document.getElementById("zoom-out").hidden = zoom === null;
+    tell();
+    queue = queue.then(() => drawAll(".plot.brush-time"));
+  };
+  document.getElementById("zoom-in").addEventListener("click", () => {
+    const last = spans[spans.length - 1];
+    if (last && last.t_end > spans[0].t_start) setZoom([spans[0].t_start, last.t_end]);
+  });
+  document.getElementById("zoom-out").addEventListener("click", () => setZoom(null));
   addEventListener("resize", () => {
     if (document.documentElement.clientWidth === lastWidth) return;
     lastWidth = document.documentElement.clientWidth;

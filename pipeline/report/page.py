@@ -56,7 +56,7 @@ def _render_header(page: Page) -> str:
     ]
     facts = "".join(f"<li>{escape(part)}</li>" for part in line if part)
     strip = "".join(
-        f'<li class="{grade}"><a href="#health">{escape(words)}</a></li>' for grade, words in summarise_health(report)
+        f'<li class="grade-{grade}"><a href="#health">{escape(words)}</a></li>' for grade, words in summarise_health(report)
     )
     return (
         f'<header><h1>{escape(report.text("run") or "run")}</h1><ul class="line">{facts}</ul>'
@@ -117,5 +117,7 @@ def _read_own(name: str) -> str:
 
 
 _MARKED = (
-    '<div id="marked" role="status" hidden><span></span><button type="button" id="mark-clear">Clear</button></div>'
+    '<div id="marked" role="status" hidden><span></span><button type="button" id="zoom-in">Zoom</button>'
+    '<button type="button" id="mark-clear">Clear</button>'
+    '<button type="button" id="zoom-out" hidden>Whole run</button></div>'
 )

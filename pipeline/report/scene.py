@@ -11,12 +11,13 @@ import polars as pl
 from pipeline.report.run import RunReport
 from pipeline.report.thinning import find_spans, thin_series, thin_to_peaks
 
-LINE_BINS = 500
+LINE_BINS = 1200
 TRACK_BINS = 2400
 COMPONENTS = ("x", "y", "w")
 
 _DEFAULT_RATE_HZ = 20.0
 _HOLE_PERIODS = 2.5
+_WIDEST_PIXELS = 1200
 _CAP_QUANTILE = 0.98
 
 
@@ -142,7 +143,7 @@ class Scene:
     def _find_spans(self, flag: str) -> pl.DataFrame:
         if self.main_slip is None or self.time_domain is None:
             return pl.DataFrame(schema={"t_start": pl.Float64, "t_end": pl.Float64})
-        pixel = (self.time_domain[1] - self.time_domain[0]) / LINE_BINS
+        pixel = (self.time_domain[1] - self.time_domain[0]) / _WIDEST_PIXELS
         return find_spans(self.main_slip, flag, period=self.period, shortest_gap=pixel)
 
     def _number_pieces(self, frame: pl.DataFrame) -> pl.DataFrame:

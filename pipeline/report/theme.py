@@ -22,7 +22,7 @@ QUIET = "#6b757e"
 GRID = "#e6e9ec"
 SHADE = "#eceff1"
 SUSPECT = "#f8ddd6"
-MARK = "#f0b429"
+MARK = "#00b3d6"
 PAPER = "#ffffff"
 
 SLIP_RAMP = ("#b3c3cc", "#e2ad52", "#d06a30", "#9c2439", "#4a1035")
@@ -44,7 +44,7 @@ DARK_TWINS = MappingProxyType(
         GRID: "#2a3138",
         SHADE: "#20262c",
         SUSPECT: "#43252a",
-        MARK: "#ffd166",
+        MARK: "#3fd5f2",
         PAPER: "#14181c",
         SLIP_RAMP[0]: "#46535d",
         SLIP_RAMP[1]: "#90492f",

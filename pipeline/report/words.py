@@ -106,6 +106,7 @@ def build_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, caption: 
         lines.append(f'<tr><th scope="row">{row[0]}</th>{cells}</tr>')
     body = "\n".join(lines)
     return (
-        f'<div class="table" tabindex="0" role="region" aria-label="{escape(caption)}"><table>'
-        f"<caption>{escape(caption)}</caption><thead><tr>{titles}</tr></thead>\n<tbody>{body}</tbody></table></div>"
+        f'<p class="caption">{escape(caption)}</p>'
+        f'<div class="table" tabindex="0" role="region" aria-label="{escape(caption)}">'
+        f'<table aria-label="{escape(caption)}"><thead><tr>{titles}</tr></thead>\n<tbody>{body}</tbody></table></div>'
     )

@@ -21,7 +21,7 @@ def draw_modulus(scene: Scene) -> Drawing | None:
         return None
     line = (
         alt.Chart(alt.NamedData("modulus"))
-        .mark_line()
+        .mark_line(clip=True)
         .encode(
             x=parts.time_axis(scene),
             y=parts.value_axis(zero=True),

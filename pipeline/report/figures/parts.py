@@ -33,7 +33,7 @@ _EMPTY_POINTS = pl.DataFrame(schema={name: pl.Float64 for name in ("t", "x", "y"
 def time_axis(scene: Scene, *, title: str | None = "time since the start of the run [s]") -> alt.X:
     """The axis that every figure over time has; without a title its labels are left out too."""
     axis = alt.Axis(title=title, tickCount=8, labels=title is not None, grid=False, format=",~r")
-    return alt.X("t:Q", axis=axis, scale=alt.Scale(domain=list(scene.time_domain or (0, 1)), nice=False))
+    return alt.X("t:Q", axis=axis, scale=alt.Scale(domain=list(scene.time_domain or (0, 1)), nice=False, zero=False))
 
 
 def value_axis(**scale: object) -> alt.Y:
@@ -44,10 +44,10 @@ def value_axis(**scale: object) -> alt.Y:
 
 def shade_spans() -> list[alt.Chart]:
     """Bands over the full height of a panel: after a change of command, suspect, marked by the reader."""
-    bands = (("transitory", theme.SHADE, 1.0), ("suspect", theme.SUSPECT, 1.0), (MARKED_SPANS, theme.MARK, 0.3))
+    bands = (("transitory", theme.SHADE, 1.0), ("suspect", theme.SUSPECT, 1.0), (MARKED_SPANS, theme.MARK, 0.2))
     return [
         alt.Chart(alt.NamedData(name))
-        .mark_rect(color=colour, opacity=opacity)
+        .mark_rect(color=colour, opacity=opacity, clip=True)
         .encode(x=alt.X("t_start:Q"), x2="t_end:Q")
         for name, colour, opacity in bands
     ]
@@ -95,7 +95,7 @@ def tell_bands(scene: Scene) -> str:
     """What the bands mean, for those that there are."""
     told = []
     if not scene.transitory_spans.is_empty():
-        told.append("Grey bands: after a change of command.")
+        told.append("Grey bands: transitory, after a change of command.")
     if not scene.suspect_spans.is_empty():
         told.append("Red bands: suspect poses, left out of the medians.")
     return " ".join(told)

@@ -38,7 +38,7 @@ def draw_velocities(scene: Scene) -> Drawing | None:
 def _draw_panel(scene: Scene, component: str, names: list[str], *, title: str | None = None) -> alt.LayerChart:
     line = (
         alt.Chart(alt.NamedData(f"velocity_{component}"))
-        .mark_line()
+        .mark_line(clip=True)
         .encode(
             x=parts.time_axis(scene, title=title),
             y=parts.value_axis(),

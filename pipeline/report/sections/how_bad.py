@@ -31,7 +31,7 @@ def _render_card(name: str, numbers: Mapping[str, object]) -> str:
     transitory = number_in(numbers, "transitory_median_modulus")
     steady = number_in(numbers, "steady_median_modulus")
     split = (
-        f"<div><dt>after a change of command</dt><dd>{say_number(transitory)} m/s</dd></div>"
+        f"<div><dt>transitory</dt><dd>{say_number(transitory)} m/s</dd></div>"
         f"<div><dt>steady</dt><dd>{say_number(steady)} m/s</dd></div>"
         if transitory is not None or steady is not None
         else ""

@@ -55,7 +55,7 @@ def find_regions(slip: pl.DataFrame | None) -> list[tuple[str, float, float]]:
     candidates = {
         f"Asked to turn faster than {turning:g} rad/s": pl.col("f_w").abs() > turning,
         f"Asked to drive faster than {fast:g} m/s": pl.col("f_x").abs() > fast,
-        "Just after a change of command": pl.col("transitory"),
+        "The transitory time after a change of command": pl.col("transitory"),
         "Turning on the spot": spinning,
         "Reversing": pl.col("f_x") < -_SLOW,
     }
