@@ -1,1 +1,32 @@
-"""."""
+"""MCAP in and out: what a recording holds, its topics as columns, transforms, and writing.
+
+Reading is columnar and as fast as inflating the chunks; what is damaged is told, what is whole around it is
+read. Nothing here knows what the numbers mean.
+"""
+
+from pipeline.logs.columns import Ragged, RaggedStrings, Strings
+from pipeline.logs.definitions import bundled_types, definition_text, field_names
+from pipeline.logs.errors import LogError, Loss
+from pipeline.logs.index import ChannelInfo, LogIndex, hash_log, open_log
+from pipeline.logs.reader import LogData, TopicColumns, Wanted, read_topics
+from pipeline.logs.writer import LogWriter
+
+__all__ = [
+    "ChannelInfo",
+    "LogData",
+    "LogError",
+    "LogIndex",
+    "LogWriter",
+    "Loss",
+    "Ragged",
+    "RaggedStrings",
+    "Strings",
+    "TopicColumns",
+    "Wanted",
+    "bundled_types",
+    "definition_text",
+    "field_names",
+    "hash_log",
+    "open_log",
+    "read_topics",
+]

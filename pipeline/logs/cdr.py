@@ -1,0 +1,291 @@
+"""Reading many serialized messages at once: one cursor that stands in every row.
+
+All rows hold messages of one type. As long as they are laid out alike the cursor's place is one number and a
+field of all rows is one strided copy; where a length differs between rows it becomes an array and a field
+is one gather. Every read is checked against the end of its row first: rows that do not fit are named, none
+is read beyond its end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from pipeline.logs.schema import SIZES
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Ints = NDArray[np.int64]
+
+NUMBER_TYPES: Final[dict[str, np.dtype[np.generic]]] = {
+    name: np.dtype(code)
+    for name, code in {
+        "bool": "?",
+        "int8": "i1",
+        "uint8": "u1",
+        "int16": "i2",
+        "uint16": "u2",
+        "int32": "i4",
+        "uint32": "u4",
+        "int64": "i8",
+        "uint64": "u8",
+        "float32": "f4",
+        "float64": "f8",
+    }.items()
+}
+"""Array type of every number type, in this machine's byte order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """How numbers and sequences are laid out.
+
+    Attributes:
+        order: ``"<"`` or ``">"``, the byte order.
+        max_align: numbers are aligned to their size, at most to this; 8 in XCDR1, 4 in XCDR2, 1 in ROS 1.
+        header: bytes before the first field, which alignment does not count.
+        terminated: whether strings end in a null byte that their length counts.
+        sized: whether sequences of anything but numbers carry their size in bytes first (XCDR2).
+    """
+
+    order: str
+    max_align: int
+    header: int
+    terminated: bool
+    sized: bool
+
+
+DIALECTS: Final[dict[int, Dialect]] = {
+    0x0000: Dialect(">", 8, 4, terminated=True, sized=False),
+    0x0001: Dialect("<", 8, 4, terminated=True, sized=False),
+    0x0006: Dialect(">", 4, 4, terminated=True, sized=True),
+    0x0007: Dialect("<", 4, 4, terminated=True, sized=True),
+    0x0010: Dialect(">", 4, 4, terminated=True, sized=True),
+    0x0011: Dialect("<", 4, 4, terminated=True, sized=True),
+}
+"""Plain CDR encapsulations that are decoded, by their identifier (RTPS 2.5, section 10.2.1.2; XTypes 1.2)."""
+
+OTHER_ENCAPSULATIONS: Final[dict[int, str]] = {
+    0x0002: "PL_CDR_BE",
+    0x0003: "PL_CDR_LE",
+    0x0004: "XML",
+    0x0008: "D_CDR2_BE",
+    0x0009: "D_CDR2_LE",
+    0x000A: "PL_CDR2_BE",
+    0x000B: "PL_CDR2_LE",
+    0x0012: "PL_CDR2_BE",
+    0x0013: "PL_CDR2_LE",
+    0x0014: "D_CDR2_BE",
+    0x0015: "D_CDR2_LE",
+}
+"""Encapsulations that exist and are named, not decoded."""
+
+ROS1: Final = Dialect("<", 1, 0, terminated=False, sized=False)
+
+
+class MisfitError(Exception):
+    """Some rows do not hold what their type says.
+
+    Attributes:
+        rows: numbers of these rows.
+    """
+
+    def __init__(self, rows: Ints) -> None:
+        super().__init__(f"{rows.size} rows do not fit their type")
+        self.rows = rows
+
+
+class Vocabulary:
+    """The distinct strings of a field, in order of first appearance."""
+
+    def __init__(self) -> None:
+        self._codes: dict[bytes, int] = {}
+
+    def code(self, text: bytes) -> int:
+        """Code of a string, a new one when it was not met before."""
+        return self._codes.setdefault(text, len(self._codes))
+
+    def texts(self) -> tuple[str, ...]:
+        """The strings by code; bytes that are no UTF-8 are shown as replacement characters."""
+        return tuple(text.decode("utf-8", "replace") for text in self._codes)
+
+
+@dataclass(slots=True)
+class Cursor:
+    """A place in each of n rows.
+
+    Attributes:
+        data: the bytes all rows stand in, uint8, shape (m,).
+        base: where each row's alignment starts, int64, shape (n,).
+        limit: bytes of each row from its base, int64, shape (n,).
+        rows: the number of each row, to be named when it does not fit, int64, shape (n,).
+        stride: distance between neighbouring bases when it is the same everywhere, else None.
+        dialect: how the rows are laid out.
+        place: bytes from the base; one number, or int64 of shape (n,).
+    """
+
+    data: NDArray[np.uint8]
+    base: Ints
+    limit: Ints
+    rows: Ints
+    stride: int | None
+    dialect: Dialect
+    place: int | Ints = 0
+
+    def select(self, chosen: Ints) -> Cursor:
+        """A cursor on some of the rows."""
+        place = self.place if isinstance(self.place, int) else self.place[chosen]
+        return Cursor(
+            self.data, self.base[chosen], self.limit[chosen], self.rows[chosen], None, self.dialect, place
+        )
+
+    def align(self, size: int) -> None:
+        """Step to the next multiple of ``size``, as far as the dialect aligns."""
+        step = min(size, self.dialect.max_align)
+        self.place = (self.place + step - 1) // step * step if step > 1 else self.place
+
+    def require(self, size: int | Ints) -> None:
+        """Check that ``size`` bytes are left in every row.
+
+        Raises:
+            MisfitError: naming the rows where they are not.
+        """
+        self.reject(self.place + size > self.limit)
+
+    def reject(self, wrong: NDArray[np.bool_]) -> None:
+        """Name the rows where ``wrong`` holds.
+
+        Raises:
+            MisfitError: when there is one.
+        """
+        if wrong.any():
+            raise MisfitError(np.unique(self.rows[wrong]))
+
+    def advance(self, size: int | Ints) -> None:
+        """Step over ``size`` bytes that were required before."""
+        place = self.place + size
+        if not isinstance(place, int) and (place == place[0]).all():
+            place = int(place[0])
+        self.place = place
+
+    def read_numbers(self, kind: str, count: int) -> NDArray[np.generic]:
+        """The next ``count`` numbers of every row, shape (n, count)."""
+        size = SIZES[kind]
+        if count == 0:
+            return np.empty((self.base.size, 0), dtype=NUMBER_TYPES[kind])
+        self.align(size)
+        self.require(size * count)
+        values = self._peek(self._stored_type(kind), count)
+        self.advance(size * count)
+        return values.astype(np.bool_) if kind == "bool" else values
+
+    def read_lengths(self) -> int | Ints:
+        """The next length prefix (u32) of every row: one number when it is the same everywhere."""
+        lengths = self.read_numbers("uint32", 1)[:, 0].astype(np.int64)
+        first = int(lengths[0])
+        return first if (lengths == first).all() else lengths
+
+    def read_ragged(self, kind: str, counts: Ints) -> NDArray[np.generic]:
+        """The next ``counts[i]`` numbers of row i, all end to end."""
+        size = SIZES[kind]
+        before = self.place
+        self.align(size)
+        self.require(np.where(counts > 0, counts * size, before - self.place))
+        start = np.repeat(self.base + self.place, counts)
+        first = np.cumsum(counts) - counts
+        position = start + (np.arange(start.size) - np.repeat(first, counts)) * size
+        values = self._gather(self._stored_type(kind), 1, position)[:, 0]
+        self.place = np.where(counts > 0, self.place + counts * size, before)
+        self.advance(0)
+        return values.astype(np.bool_) if kind == "bool" else values
+
+    def skip_numbers(self, kind: str, count: int | Ints) -> None:
+        """Step over numbers."""
+        size = SIZES[kind]
+        before = self.place
+        self.align(size)
+        if isinstance(count, int):
+            if count == 0:
+                self.place = before
+                return
+            self.require(count * size)
+            self.advance(count * size)
+            return
+        taken = np.where(count > 0, self.place + count * size, before)
+        self.reject(taken > self.limit)
+        self.place = taken
+        self.advance(0)
+
+    def read_text(self, vocabulary: Vocabulary | None) -> NDArray[np.int32] | None:
+        """The next string of every row as codes, shape (n,); only stepped over without a vocabulary."""
+        lengths = self.read_lengths()
+        self.require(lengths)
+        tail = 1 if self.dialect.terminated else 0
+        if tail:
+            self._check_terminators(lengths)
+        codes = None
+        if vocabulary is not None:
+            if isinstance(lengths, int):
+                codes = self._code_equal(max(lengths - tail, 0), vocabulary)
+            else:
+                codes = self._code_unequal(np.maximum(lengths - tail, 0), vocabulary)
+        self.advance(lengths)
+        return codes
+
+    def _check_terminators(self, lengths: int | Ints) -> None:
+        if isinstance(lengths, int):
+            if lengths > 0:
+                last = self._peek(np.dtype("u1"), 1, shift=lengths - 1)[:, 0]
+                self.reject(last != 0)
+            return
+        some = np.flatnonzero(lengths > 0)
+        place = self.place if isinstance(self.place, int) else self.place[some]
+        wrong = np.zeros(self.base.size, dtype=np.bool_)
+        wrong[some] = self.data[self.base[some] + place + lengths[some] - 1] != 0
+        self.reject(wrong)
+
+    def _code_equal(self, length: int, vocabulary: Vocabulary) -> NDArray[np.int32]:
+        if length == 0:
+            return np.full(self.base.size, vocabulary.code(b""), dtype=np.int32)
+        texts = self._peek(np.dtype("u1"), length)
+        starts = np.flatnonzero(np.r_[True, (texts[1:] != texts[:-1]).any(axis=1)])
+        found = [vocabulary.code(texts[start].tobytes()) for start in starts.tolist()]
+        runs = np.diff(np.r_[starts, texts.shape[0]])
+        return np.repeat(np.array(found, dtype=np.int32), runs)
+
+    def _code_unequal(self, lengths: Ints, vocabulary: Vocabulary) -> NDArray[np.int32]:
+        starts = (self.base + self.place).tolist()
+        view = memoryview(self.data)
+        found = [
+            vocabulary.code(bytes(view[start : start + length]))
+            for start, length in zip(starts, lengths.tolist(), strict=True)
+        ]
+        return np.array(found, dtype=np.int32)
+
+    def _stored_type(self, kind: str) -> np.dtype[np.generic]:
+        return NUMBER_TYPES["uint8" if kind == "bool" else kind].newbyteorder(self.dialect.order)
+
+    def _peek(self, dtype: np.dtype[np.generic], count: int, *, shift: int = 0) -> NDArray[np.generic]:
+        if self.stride is None or not isinstance(self.place, int):
+            return self._gather(dtype, count, self.base + (self.place + shift))
+        strided: NDArray[np.generic] = np.ndarray(
+            (self.base.size, count),
+            dtype=dtype,
+            buffer=self.data.data,
+            offset=int(self.base[0]) + self.place + shift,
+            strides=(self.stride, dtype.itemsize),
+        )
+        return strided.astype(dtype.newbyteorder("="))
+
+    def _gather(self, dtype: np.dtype[np.generic], count: int, position: Ints) -> NDArray[np.generic]:
+        size = dtype.itemsize * count
+        if position.size == 0:
+            return np.empty((0, count), dtype=dtype.newbyteorder("="))
+        window: NDArray[np.void] = np.ndarray(
+            (self.data.size - size + 1,), dtype=f"V{size}", buffer=self.data.data, strides=(1,)
+        )
+        found = window[position].view(dtype).reshape(position.size, count)
+        return found.astype(dtype.newbyteorder("="), copy=False)

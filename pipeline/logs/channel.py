@@ -1,0 +1,174 @@
+"""Turning the payloads of one channel into columns, whatever they are encoded in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
+
+from pipeline.logs.assemble import ColumnParts
+from pipeline.logs.cdr import DIALECTS, OTHER_ENCAPSULATIONS, ROS1, Cursor, Dialect, Vocabulary
+from pipeline.logs.decode import Decoder, plan_fields, wanted_leaves
+from pipeline.logs.payloads import Block, Payloads, join_blocks
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.logs.columns import Column
+    from pipeline.logs.schema import Structure
+
+    Ints = NDArray[np.int64]
+
+_ENOUGH: Final = 4 << 20
+"""Payload bytes that are collected before they are decoded together."""
+
+_ENCAPSULATION: Final = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """Messages that could not be decoded.
+
+    Attributes:
+        kind: ``undecodable`` or ``unsupported_encoding``.
+        reason: why.
+        rows: their numbers in the channel, int64.
+        bytes: bytes of their payloads.
+    """
+
+    kind: str
+    reason: str
+    rows: Ints
+    bytes: int
+
+
+class PayloadDecoder(Protocol):
+    """Decodes the payloads of one channel batch by batch."""
+
+    def decode(self, ids: Ints, block: Block) -> None:
+        """Decode a block; ``ids`` are the numbers of its rows in the channel."""
+
+    def columns(self, rows: Ints) -> dict[str, Column]:
+        """Columns of the given rows, in their order."""
+
+    @property
+    def rejected(self) -> list[Rejected]:
+        """What could not be decoded."""
+
+
+class StructuredDecoder:
+    """Decodes CDR and ROS 1 payloads through the type's tree.
+
+    Args:
+        structure: the type.
+        paths: wanted leaf fields.
+        ros1: whether payloads are ROS 1's, without encapsulation.
+    """
+
+    def __init__(self, structure: Structure, paths: set[str], encoding: str) -> None:
+        self._plan = plan_fields(structure, paths)
+        self._ros1 = encoding == "ros1"
+        self._decoder = Decoder(self._plan, {})
+        self._parts = {path: ColumnParts(leaf) for path, leaf in wanted_leaves(self._plan)}
+        self.rejected: list[Rejected] = []
+
+    def decode(self, ids: Ints, block: Block) -> None:
+        """Decode a block; ``ids`` are the numbers of its rows in the channel."""
+        if self._ros1:
+            self._decode_alike(ids, block, ROS1, np.arange(ids.size))
+            return
+        short = block.size < _ENCAPSULATION
+        if short.any():
+            self._reject("undecodable", "shorter than an encapsulation header", ids, block, short)
+        kinds = np.full(ids.size, -1, dtype=np.int64)
+        whole = np.flatnonzero(~short)
+        kinds[whole] = (
+            block.data[block.start[whole]].astype(np.int64) << 8 | block.data[block.start[whole] + 1]
+        )
+        for kind in np.unique(kinds[whole]).tolist():
+            chosen = kinds == kind
+            if kind in DIALECTS:
+                self._decode_alike(ids, block, DIALECTS[kind], np.flatnonzero(chosen))
+            elif kind in OTHER_ENCAPSULATIONS:
+                reason = f"the encapsulation {OTHER_ENCAPSULATIONS[kind]} is not supported"
+                self._reject("unsupported_encoding", reason, ids, block, chosen)
+            else:
+                self._reject("undecodable", f"0x{kind:04x} is no encapsulation", ids, block, chosen)
+
+    def _decode_alike(self, ids: Ints, block: Block, dialect: Dialect, chosen: Ints) -> None:
+        base, limit = block.start + dialect.header, block.size - dialect.header
+        stride = block.stride
+        if chosen.size < ids.size:
+            base, limit, stride = base[chosen], limit[chosen], None
+        pieces, kept = self._decoder.decode(Cursor(block.data, base, limit, chosen, stride, dialect))
+        for path, piece in pieces.items():
+            self._parts[path].add(ids[kept], piece)
+        if kept.size < chosen.size:
+            missing = np.ones(ids.size, dtype=np.bool_)
+            missing[kept] = False
+            missing &= np.isin(np.arange(ids.size), chosen)
+            self._reject("undecodable", "the payload does not fit its type", ids, block, missing)
+
+    def _reject(self, kind: str, reason: str, ids: Ints, block: Block, wrong: NDArray[np.bool_]) -> None:
+        self.rejected.append(Rejected(kind, reason, ids[wrong], int(block.size[wrong].sum())))
+
+    def columns(self, rows: Ints) -> dict[str, Column]:
+        """Columns of the given rows, in their order."""
+        return {
+            path: parts.column(rows, self._decoder.vocabularies.get(path))
+            for path, parts in self._parts.items()
+        }
+
+
+@dataclass(slots=True)
+class ChannelBuffer:
+    """Collects the payloads of one channel and has them decoded a few megabytes at a time.
+
+    Attributes:
+        decoder: does the decoding.
+    """
+
+    decoder: PayloadDecoder
+    _log: list[Ints] = field(default_factory=list)
+    _publish: list[Ints] = field(default_factory=list)
+    _pending: list[tuple[Ints, Block]] = field(default_factory=list)
+    _pending_bytes: int = 0
+    _count: int = 0
+
+    def add(self, payloads: Payloads) -> None:
+        """Take the messages of the next span."""
+        self._log.append(payloads.log_time)
+        self._publish.append(payloads.publish_time)
+        for block in payloads.blocks:
+            self._pending.append((block.rows + self._count, block))
+            self._pending_bytes += block.data.size
+        self._count += payloads.log_time.size
+        if self._pending_bytes > _ENOUGH:
+            self._flush()
+
+    def _flush(self) -> None:
+        for ids, block in join_blocks(self._pending):
+            self.decoder.decode(ids, block)
+        self._pending = []
+        self._pending_bytes = 0
+
+    def finish(self) -> tuple[Ints, Ints, Ints]:
+        """Decode what is left: log and publish times [ns] of the decoded rows and their numbers, by log time."""
+        self._flush()
+        empty = np.empty(0, dtype=np.int64)
+        log = np.concatenate([empty, *self._log])
+        publish = np.concatenate([empty, *self._publish])
+        good = np.ones(log.size, dtype=np.bool_)
+        for rejected in self.decoder.rejected:
+            good[rejected.rows] = False
+        rows = np.flatnonzero(good)
+        order = rows[np.argsort(log[rows], kind="stable")]
+        return log[order], publish[order], order
+
+    def times_of(self, rows: Ints) -> tuple[int | None, int | None]:
+        """First and last log time [ns] of some rows."""
+        if not rows.size:
+            return None, None
+        log = np.concatenate(self._log)[rows]
+        return int(log.min()), int(log.max())

@@ -1,0 +1,88 @@
+"""Choosing how a channel is decoded from the encodings it declares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from pipeline.logs.channel import StructuredDecoder
+from pipeline.logs.definitions import bundled_structure
+from pipeline.logs.errors import LogError
+from pipeline.logs.fields import select_leaves
+from pipeline.logs.schema import SchemaError, Structure, contains_text, leaf_paths, parse_msg
+
+if TYPE_CHECKING:
+    from pipeline.logs.channel import PayloadDecoder
+    from pipeline.logs.index import ChannelInfo
+
+_STAMP: Final = ("header.stamp.sec", "header.stamp.nanosec")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recipe:
+    """How one channel is decoded.
+
+    Attributes:
+        decoder: does it.
+        leaves: every leaf field of the type; empty where only the messages know.
+        notes: what is worth knowing.
+    """
+
+    decoder: PayloadDecoder
+    leaves: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+def decoder_for(info: ChannelInfo, schema: bytes, fields: tuple[str, ...] | None, *, where: str) -> Recipe:
+    """Choose the decoder of a channel.
+
+    Args:
+        info: the channel.
+        schema: data of its schema.
+        fields: wanted field paths, None for all.
+        where: the log, for messages.
+
+    Raises:
+        LogError: ``unsupported_encoding``, ``field_not_found``.
+    """
+    place = f"{where}, topic {info.topic}"
+    structure, notes = _structure_of(info, schema, place)
+    leaves = tuple(leaf_paths(structure))
+    chosen = select_leaves(leaves, fields, where=place)
+    chosen |= {path for path in _STAMP if path in leaves}
+    return Recipe(StructuredDecoder(structure, chosen, info.message_encoding), leaves, notes)
+
+
+def _structure_of(info: ChannelInfo, schema: bytes, where: str) -> tuple[Structure, tuple[str, ...]]:
+    if info.message_encoding not in ("cdr", "ros1"):
+        raise LogError(
+            "unsupported_encoding",
+            f"messages are encoded as {info.message_encoding!r}",
+            where=where,
+            hint="Leave the topic out, or convert the log to cdr",
+        )
+    text = schema.decode("utf-8", "replace")
+    reason = "it carries no definition"
+    if text.strip() and info.schema_encoding in ("ros2msg", "ros1msg"):
+        try:
+            structure = parse_msg(info.type_name, text, dialect=info.schema_encoding)
+        except SchemaError as error:
+            reason = f"its definition is damaged ({error})"
+        else:
+            if contains_text(structure, "wstring"):
+                raise LogError(
+                    "unsupported_encoding",
+                    "the type holds wide strings, whose layout differs between vendors",
+                    where=where,
+                    hint="Leave the topic out",
+                )
+            return structure, ()
+    bundled = bundled_structure(info.type_name)
+    if bundled is None:
+        raise LogError(
+            "unsupported_encoding",
+            f"type {info.type_name or '(none)'}: {reason} and none is bundled",
+            where=where,
+            hint="Record it again with its definition, or leave the topic out",
+        )
+    return bundled, (f"{reason}; the bundled one of {info.type_name} was used",)

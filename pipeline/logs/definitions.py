@@ -1,0 +1,106 @@
+"""Definitions of the standard message types: for writing, and for logs that carry none.
+
+Each type is one line of fields, ``type name``, separated by semicolons.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Final
+
+from pipeline.logs.schema import SIZES, Structure, leaf_paths, parse_msg, short_name
+
+_HEADER: Final = "std_msgs/Header header"
+
+FIELDS: Final[dict[str, str]] = {
+    "ackermann_msgs/AckermannDrive": "float32 steering_angle; float32 steering_angle_velocity; "
+    "float32 speed; float32 acceleration; float32 jerk",
+    "ackermann_msgs/AckermannDriveStamped": f"{_HEADER}; ackermann_msgs/AckermannDrive drive",
+    "builtin_interfaces/Duration": "int32 sec; uint32 nanosec",
+    "builtin_interfaces/Time": "int32 sec; uint32 nanosec",
+    "geometry_msgs/Accel": "geometry_msgs/Vector3 linear; geometry_msgs/Vector3 angular",
+    "geometry_msgs/Point": "float64 x; float64 y; float64 z",
+    "geometry_msgs/Pose": "geometry_msgs/Point position; geometry_msgs/Quaternion orientation",
+    "geometry_msgs/Pose2D": "float64 x; float64 y; float64 theta",
+    "geometry_msgs/PoseStamped": f"{_HEADER}; geometry_msgs/Pose pose",
+    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose; float64[36] covariance",
+    "geometry_msgs/PoseWithCovarianceStamped": f"{_HEADER}; geometry_msgs/PoseWithCovariance pose",
+    "geometry_msgs/Quaternion": "float64 x; float64 y; float64 z; float64 w",
+    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation; geometry_msgs/Quaternion rotation",
+    "geometry_msgs/TransformStamped": f"{_HEADER}; string child_frame_id; geometry_msgs/Transform transform",
+    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear; geometry_msgs/Vector3 angular",
+    "geometry_msgs/TwistStamped": f"{_HEADER}; geometry_msgs/Twist twist",
+    "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist; float64[36] covariance",
+    "geometry_msgs/TwistWithCovarianceStamped": f"{_HEADER}; geometry_msgs/TwistWithCovariance twist",
+    "geometry_msgs/Vector3": "float64 x; float64 y; float64 z",
+    "geometry_msgs/Vector3Stamped": f"{_HEADER}; geometry_msgs/Vector3 vector",
+    "nav_msgs/Odometry": f"{_HEADER}; string child_frame_id; geometry_msgs/PoseWithCovariance pose; "
+    "geometry_msgs/TwistWithCovariance twist",
+    "nav_msgs/Path": f"{_HEADER}; geometry_msgs/PoseStamped[] poses",
+    "rosgraph_msgs/Clock": "builtin_interfaces/Time clock",
+    "sensor_msgs/Imu": f"{_HEADER}; geometry_msgs/Quaternion orientation; "
+    "float64[9] orientation_covariance; geometry_msgs/Vector3 angular_velocity; "
+    "float64[9] angular_velocity_covariance; geometry_msgs/Vector3 linear_acceleration; "
+    "float64[9] linear_acceleration_covariance",
+    "sensor_msgs/JointState": f"{_HEADER}; string[] name; float64[] position; float64[] velocity; "
+    "float64[] effort",
+    "std_msgs/Bool": "bool data",
+    "std_msgs/Float32": "float32 data",
+    "std_msgs/Float32MultiArray": "std_msgs/MultiArrayLayout layout; float32[] data",
+    "std_msgs/Float64": "float64 data",
+    "std_msgs/Float64MultiArray": "std_msgs/MultiArrayLayout layout; float64[] data",
+    "std_msgs/Header": "builtin_interfaces/Time stamp; string frame_id",
+    "std_msgs/Int32": "int32 data",
+    "std_msgs/Int64": "int64 data",
+    "std_msgs/MultiArrayDimension": "string label; uint32 size; uint32 stride",
+    "std_msgs/MultiArrayLayout": "std_msgs/MultiArrayDimension[] dim; uint32 data_offset",
+    "std_msgs/String": "string data",
+    "std_msgs/UInt8": "uint8 data",
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+}
+"""Fields of every bundled type, by ``package/Name``."""
+
+
+def definition_text(type_name: str) -> str | None:
+    """The concatenated ``ros2msg`` definition of a bundled type, None when it is not bundled.
+
+    Args:
+        type_name: ``package/msg/Name`` or ``package/Name``.
+    """
+    root = short_name(type_name)
+    if root not in FIELDS:
+        return None
+    order = [root]
+    for name in order:
+        for below in _types_below(name):
+            if below not in order:
+                order.append(below)
+    sections = [_lines(name) if name == root else f"MSG: {name}\n{_lines(name)}" for name in order]
+    return f"\n{'=' * 80}\n".join(sections) + "\n"
+
+
+@cache
+def bundled_structure(type_name: str) -> Structure | None:
+    """The tree of a bundled type, None when it is not bundled."""
+    text = definition_text(type_name)
+    return None if text is None else parse_msg(type_name, text)
+
+
+def bundled_types() -> tuple[str, ...]:
+    """Every bundled type as ``package/msg/Name``."""
+    return tuple(name.replace("/", "/msg/") for name in FIELDS)
+
+
+def field_names(type_name: str) -> tuple[str, ...]:
+    """Leaf field paths of a bundled type; empty when it is not bundled."""
+    structure = bundled_structure(type_name)
+    return () if structure is None else tuple(leaf_paths(structure))
+
+
+def _lines(name: str) -> str:
+    return "\n".join(field.strip() for field in FIELDS[name].split(";"))
+
+
+def _types_below(name: str) -> list[str]:
+    written = [field.split()[0].split("[")[0] for field in FIELDS[name].split(";")]
+    return [kind for kind in written if kind not in SIZES and kind != "string"]

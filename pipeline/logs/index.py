@@ -1,0 +1,248 @@
+"""What a recording holds, without decoding a message: channels, counts, times, damage."""
+
+from __future__ import annotations
+
+import os
+import re
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.logs.errors import LogError, Loss
+from pipeline.logs.part import catalog_file
+from pipeline.logs.source import FileSource, hash_sources
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.logs.records import ChannelRecord, SchemaRecord
+    from pipeline.logs.scan import Catalog
+    from pipeline.logs.source import ByteSource
+    from pipeline.logs.spans import Span
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelInfo:
+    """One channel of a recording.
+
+    Attributes:
+        id: its number in the recording (over all parts of a split one).
+        topic: name of the topic.
+        type_name: ``package/msg/Name``; empty when the channel has no schema.
+        schema_encoding: ``ros2msg``, ``ros2idl``, ``protobuf``, ...
+        message_encoding: ``cdr``, ``json``, ``protobuf``, ``ros1``, ...
+        message_count: messages in the readable part of the log.
+        metadata: as written by the recorder.
+    """
+
+    id: int
+    topic: str
+    type_name: str
+    schema_encoding: str
+    message_encoding: str
+    message_count: int
+    metadata: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One file of a recording, for the reader of this room.
+
+    Attributes:
+        path: the file.
+        spans: where its messages stand.
+        channels: channel records by the file's own number.
+        schemas: schema records by the file's own number.
+        numbers: the recording's channel number for each of the file's own.
+    """
+
+    path: Path
+    spans: tuple[Span, ...]
+    channels: Mapping[int, ChannelRecord]
+    schemas: Mapping[int, SchemaRecord]
+    numbers: Mapping[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class LogIndex:
+    """What a recording holds.
+
+    Attributes:
+        path: file or folder.
+        size_bytes: bytes of all its files.
+        profile: ``ros2``, ``ros1`` or what the recorder wrote.
+        library: what wrote it.
+        compressions: of its chunks, sorted; ``""`` is none.
+        chunk_count: chunks of all parts.
+        start_ns: first log time [ns], 0 when empty.
+        end_ns: last log time [ns], 0 when empty.
+        channels: by number.
+        metadata: name to record; of several with one name the last.
+        metadata_records: all of them in the order of the file.
+        attachments: names.
+        losses: damage seen without reading the messages.
+        notes: what is worth knowing and no loss.
+        parts: the files.
+    """
+
+    path: Path
+    size_bytes: int
+    profile: str
+    library: str
+    compressions: tuple[str, ...]
+    chunk_count: int
+    start_ns: int
+    end_ns: int
+    channels: tuple[ChannelInfo, ...]
+    metadata: Mapping[str, Mapping[str, str]]
+    metadata_records: tuple[tuple[str, Mapping[str, str]], ...]
+    attachments: tuple[str, ...]
+    losses: tuple[Loss, ...]
+    notes: tuple[str, ...]
+    parts: tuple[Part, ...] = field(repr=False)
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first message to the last [s]."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is known to be lost."""
+        return not self.losses
+
+    @property
+    def message_count(self) -> int:
+        """Messages of all channels."""
+        return sum(channel.message_count for channel in self.channels)
+
+    def topics(self) -> tuple[str, ...]:
+        """Names of all topics, sorted."""
+        return tuple(sorted({channel.topic for channel in self.channels}))
+
+
+def open_log(path: str | os.PathLike[str]) -> LogIndex:
+    """Find out what a recording holds.
+
+    Args:
+        path: an MCAP file, or the folder of a recording split over several (with or without the
+            ``metadata.yaml`` of rosbag2).
+
+    Raises:
+        LogError: ``log_not_found``, ``log_empty``, ``not_mcap``, ``not_a_recording``, ``log_unreadable``.
+    """
+    location = Path(path)
+    files, losses = find_parts(location)
+    catalogs: list[tuple[Path, int, Catalog]] = []
+    for file in files:
+        with FileSource(file) as source:
+            catalogs.append((file, source.size, catalog_file(source, threads=os.cpu_count() or 1)))
+    return _merge(location, catalogs, losses)
+
+
+def hash_log(path: str | os.PathLike[str]) -> str:
+    """SHA-256 (hex) of a recording's bytes; of a split one, of all its parts in order.
+
+    Raises:
+        LogError: as ``open_log``.
+    """
+    files, _ = find_parts(Path(path))
+    with ExitStack() as stack:
+        return hash_sources([stack.enter_context(FileSource(file)) for file in files])
+
+
+def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
+    """The files of a recording in order, and those that are missing as losses.
+
+    Raises:
+        LogError: ``not_a_recording``.
+    """
+    if not path.is_dir():
+        return [path], []
+    listing = path / "metadata.yaml"
+    here = sorted(path.glob("*.mcap"), key=_split_number)
+    if listing.is_file():
+        named = [path / name for name in _listed_files(listing.read_text("utf-8", "replace"))]
+        named = [file for file in named if file.suffix == ".mcap"]
+        found = [file for file in named if file.is_file()] or here
+        missing = [file.name for file in named if not file.is_file()]
+        if found:
+            losses = [
+                Loss("missing_part", f"{name} of the recording is not in its folder") for name in missing
+            ]
+            return found, losses
+    stems = {re.sub(r"_\d+$", "", file.stem) for file in here}
+    if here and len(stems) == 1:
+        return here, []
+    what = "the folder holds several recordings" if here else "the folder holds no MCAP recording"
+    raise LogError("not_a_recording", what, where=str(path), hint="Give one .mcap file or one rosbag2 folder")
+
+
+def _split_number(file: Path) -> tuple[str, int]:
+    match = re.search(r"_(\d+)$", file.stem)
+    return (file.stem[: match.start()], int(match[1])) if match else (file.stem, -1)
+
+
+def _listed_files(text: str) -> list[str]:
+    """Entries of ``relative_file_paths`` in a rosbag2 ``metadata.yaml``."""
+    block = re.search(r"^\s*relative_file_paths:\s*\n((?:\s*-\s.*\n?)*)", text, re.MULTILINE)
+    if block is None:
+        return []
+    entries = [line.strip()[1:].strip() for line in block[1].splitlines() if line.strip()]
+    return [entry.strip("\"'") for entry in entries]
+
+
+def _merge(path: Path, catalogs: Sequence[tuple[Path, int, Catalog]], losses: Sequence[Loss]) -> LogIndex:
+    channels: dict[tuple[object, ...], ChannelInfo] = {}
+    parts: list[Part] = []
+    alone = len(catalogs) == 1
+    for file, _, catalog in catalogs:
+        numbers: dict[int, int] = {}
+        for number, channel in sorted(catalog.channels.items()):
+            schema = catalog.schemas.get(channel.schema_id)
+            key: tuple[object, ...] = (
+                (number,)
+                if alone
+                else (
+                    channel.topic,
+                    channel.message_encoding,
+                    *((schema.name, schema.data) if schema else ()),
+                )
+            )
+            known = channels.get(key)
+            if known is None:
+                known = ChannelInfo(
+                    number if alone else len(channels) + 1,
+                    channel.topic,
+                    schema.name if schema else "",
+                    schema.encoding if schema else "",
+                    channel.message_encoding,
+                    0,
+                    dict(channel.metadata),
+                )
+            count = known.message_count + catalog.counts.get(number, 0)
+            channels[key] = replace(known, message_count=count)
+            numbers[number] = known.id
+        parts.append(Part(file, tuple(catalog.spans), dict(catalog.channels), dict(catalog.schemas), numbers))
+    every = [catalog for _, _, catalog in catalogs]
+    records = tuple((n, r) for catalog in every for n, r in catalog.metadata)
+    starts = [catalog.start_ns for catalog in every if catalog.start_ns is not None]
+    ends = [catalog.end_ns for catalog in every if catalog.end_ns is not None]
+    return LogIndex(
+        path=path,
+        size_bytes=sum(size for _, size, _ in catalogs),
+        profile=every[0].profile,
+        library=every[0].library,
+        compressions=tuple(sorted(set().union(*(catalog.compressions for catalog in every)))),
+        chunk_count=sum(span.kind.value != "loose" for catalog in every for span in catalog.spans),
+        start_ns=min(starts, default=0),
+        end_ns=max(ends, default=0),
+        channels=tuple(channels.values()),
+        metadata=dict(records),
+        metadata_records=records,
+        attachments=tuple(name for catalog in every for name in catalog.attachments),
+        losses=(*losses, *(loss for catalog in every for loss in catalog.losses)),
+        notes=tuple(note for catalog in every for note in catalog.notes),
+        parts=tuple(parts),
+    )

@@ -1,0 +1,140 @@
+"""From the stored bytes of a chunk to its records, never asking for more memory than is plausible."""
+
+from __future__ import annotations
+
+import threading
+import zlib
+from typing import TYPE_CHECKING, Final
+
+import zstandard
+
+if TYPE_CHECKING:
+    from pipeline.logs.records import Buffer
+
+MAX_CHUNK: Final = 1 << 30
+"""Largest chunk that is inflated [bytes]; recorders write 1 to 100 MB."""
+
+_MAX_RATIO: Final = {"": 1, "zstd": 40_000, "lz4": 260}
+"""No block of these formats can grow by more: zstd stores 128 KiB in four bytes, LZ4 255 bytes in one."""
+
+_per_thread = threading.local()
+
+
+class InflateError(ValueError):
+    """Stored bytes that do not inflate to what their chunk says."""
+
+
+def inflate(stored: Buffer, compression: str, size: int) -> Buffer:
+    """Inflate the records of a chunk.
+
+    Args:
+        stored: compressed bytes.
+        compression: ``""``, ``"zstd"`` or ``"lz4"``.
+        size: bytes that must come out.
+
+    Raises:
+        InflateError: another size comes out, or the bytes are damaged, or the size is absurd.
+    """
+    check_size(len(stored), compression, size)
+    if compression == "":
+        found: Buffer = stored
+    elif size == 0:
+        found = b""
+    elif compression == "zstd":
+        found = _inflate_zstd(stored, size)
+    else:
+        found = _inflate_lz4(stored, size)
+    if len(found) != size:
+        raise InflateError(f"{len(found)} bytes came out in place of {size}")
+    return found
+
+
+def check_size(stored: int, compression: str, size: int) -> None:
+    """Refuse a size that cannot be true before memory is asked for.
+
+    Raises:
+        InflateError: with the reason.
+    """
+    if compression not in _MAX_RATIO:
+        raise InflateError(f"the compression {compression[:20]!r} is not known")
+    if size > MAX_CHUNK or size > stored * _MAX_RATIO[compression] + 1024:
+        raise InflateError(f"{stored} bytes cannot hold {size}")
+
+
+def inflate_start(stored: Buffer, compression: str, size: int) -> Buffer:
+    """As much of the first ``size`` bytes as undamaged stored bytes give; never raises for damage."""
+    if compression == "":
+        return stored[:size]
+    try:
+        if compression == "zstd":
+            return _inflate_zstd_start(stored, size)
+        if compression == "lz4":
+            return _inflate_lz4_start(stored, size)
+    except (zstandard.ZstdError, OSError, ValueError):
+        pass
+    return b""
+
+
+def checksum(records: Buffer) -> int:
+    """CRC-32 as MCAP stores it."""
+    return zlib.crc32(records)
+
+
+def holds_own_checksum(stored: Buffer, compression: str) -> bool:
+    """Whether inflating these bytes has verified a checksum of the content in the format itself."""
+    if compression == "zstd":
+        try:
+            return bool(zstandard.get_frame_parameters(bytes(stored[:32])).has_checksum)
+        except zstandard.ZstdError:
+            return False
+    return False
+
+
+def _inflate_zstd(stored: Buffer, size: int) -> bytes:
+    decompressor: zstandard.ZstdDecompressor | None = getattr(_per_thread, "zstd", None)
+    if decompressor is None:
+        decompressor = _per_thread.zstd = zstandard.ZstdDecompressor()
+    try:
+        said = zstandard.frame_content_size(stored)
+        if said not in (-1, size):
+            raise InflateError(f"the zstd frame says {said} bytes, its chunk {size}")
+        return decompressor.decompress(stored, max_output_size=size)
+    except zstandard.ZstdError as error:
+        raise InflateError(str(error)) from None
+
+
+def _inflate_zstd_start(stored: Buffer, size: int) -> bytes:
+    parts: list[bytes] = []
+    total = 0
+    with zstandard.ZstdDecompressor().stream_reader(stored) as reader:
+        try:
+            while total < size and (part := reader.read(min(1 << 16, size - total))):
+                parts.append(part)
+                total += len(part)
+        except zstandard.ZstdError:
+            pass
+    return b"".join(parts)
+
+
+def _inflate_lz4(stored: Buffer, size: int) -> Buffer:
+    import pyarrow as pa  # noqa: PLC0415 - heavy, and few logs use lz4
+
+    try:
+        return memoryview(pa.Codec("lz4").decompress(stored, decompressed_size=size))
+    except (OSError, ValueError) as error:
+        raise InflateError(str(error)) from None
+
+
+def _inflate_lz4_start(stored: Buffer, size: int) -> bytes:
+    import pyarrow as pa  # noqa: PLC0415 - heavy, and few logs use lz4
+
+    parts: list[bytes] = []
+    total = 0
+    with pa.input_stream(pa.py_buffer(stored), compression="lz4", buffer_size=0) as reader:
+        try:
+            while total < size and (part := reader.read(min(1 << 12, size - total))):
+                parts.append(part)
+                total += len(part)
+        except OSError:
+            pass
+    return b"".join(parts)

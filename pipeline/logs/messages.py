@@ -1,0 +1,193 @@
+"""Finding the messages among the records of one inflated chunk.
+
+The message indexes beside a chunk say where its messages stand, so that no record has to be visited in
+Python; they are believed only as far as the records agree. What they leave uncovered is walked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from pipeline.logs import records as rec
+from pipeline.logs.resync import find_record
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.logs.records import Buffer
+
+    Ints = NDArray[np.int64]
+
+CHUNK_RECORDS: Final = (rec.SCHEMA, rec.CHANNEL, rec.MESSAGE)
+"""Kinds of record that stand in a chunk."""
+
+FIRST_PRIVATE: Final = 0x80
+"""Opcodes from here on are private; the specification says to step over them."""
+
+MESSAGE_HEAD: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+"""A message record before its payload."""
+
+MESSAGE_OVERHEAD: Final = MESSAGE_HEAD.itemsize
+"""Bytes of a message record before its payload."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Messages:
+    """The messages of a chunk in the order they stand there.
+
+    Attributes:
+        start: where each payload starts in the chunk, int64, shape (n,).
+        size: bytes of each payload, int64.
+        channel: channel number, int64.
+        log_time: [ns], int64.
+        publish_time: [ns], int64.
+        schemas: schema records of the chunk.
+        channels: channel records of the chunk.
+        damage: stretches (start, end) of the chunk that hold no readable record.
+    """
+
+    start: Ints
+    size: Ints
+    channel: Ints
+    log_time: Ints
+    publish_time: Ints
+    schemas: list[rec.SchemaRecord] = field(default_factory=list)
+    channels: list[rec.ChannelRecord] = field(default_factory=list)
+    damage: list[tuple[int, int]] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class _Found:
+    offsets: list[int] = field(default_factory=list)
+    schemas: list[rec.SchemaRecord] = field(default_factory=list)
+    channels: list[rec.ChannelRecord] = field(default_factory=list)
+    damage: list[tuple[int, int]] = field(default_factory=list)
+
+
+def locate_messages(chunk: Buffer, entries: Sequence[tuple[int, NDArray[np.void]]] | None) -> Messages:
+    """Find all messages of a chunk.
+
+    Args:
+        chunk: its inflated records.
+        entries: channel and entries of every message index beside it; None when there are none.
+    """
+    data = np.frombuffer(chunk, dtype=np.uint8)
+    found = _Found()
+    offsets = None if entries is None else _agreeing_offsets(data, entries)
+    if offsets is None:
+        _walk(chunk, 0, data.size, found)
+        offsets = np.array(found.offsets, dtype=np.int64)
+    else:
+        ends = offsets + rec.HEAD_SIZE + _heads(data, offsets)["length"].astype(np.int64)
+        starts = np.r_[offsets, data.size]
+        ends = np.r_[0, ends]
+        for gap in np.flatnonzero(starts > ends).tolist():
+            _walk(chunk, int(ends[gap]), int(starts[gap]), found)
+        if found.offsets:
+            offsets = np.sort(np.r_[offsets, np.array(found.offsets, dtype=np.int64)])
+    heads = _heads(data, offsets)
+    return Messages(
+        start=offsets + MESSAGE_OVERHEAD,
+        size=heads["length"].astype(np.int64) - (MESSAGE_OVERHEAD - rec.HEAD_SIZE),
+        channel=heads["channel"].astype(np.int64),
+        log_time=heads["log_time"].astype(np.int64),
+        publish_time=heads["publish_time"].astype(np.int64),
+        schemas=found.schemas,
+        channels=found.channels,
+        damage=found.damage,
+    )
+
+
+def _heads(data: NDArray[np.uint8], offsets: Ints) -> NDArray[np.void]:
+    if offsets.size == 0:
+        return np.empty(0, dtype=MESSAGE_HEAD)
+    window: NDArray[np.void] = np.ndarray(
+        (data.size - MESSAGE_HEAD.itemsize + 1,), dtype=MESSAGE_HEAD, buffer=data.data, strides=(1,)
+    )
+    return window[offsets]
+
+
+def _agreeing_offsets(
+    data: NDArray[np.uint8], entries: Sequence[tuple[int, NDArray[np.void]]]
+) -> Ints | None:
+    """Offsets of the index in ascending order, None unless every entry points to the message it names."""
+    counted = [(channel, entry) for channel, entry in entries if entry.size]
+    if not counted or data.size < MESSAGE_HEAD.itemsize:
+        return None
+    joined = np.concatenate([entry for _, entry in counted])
+    channel = np.repeat([channel for channel, _ in counted], [entry.size for _, entry in counted])
+    if (joined["offset"] > data.size - MESSAGE_HEAD.itemsize).any():
+        return None
+    offsets = joined["offset"].astype(np.int64)
+    heads = _heads(data, offsets)
+    room = (data.size - offsets - rec.HEAD_SIZE).astype(np.uint64)
+    agrees = (
+        (heads["opcode"] == rec.MESSAGE)
+        & (heads["channel"] == channel)
+        & (heads["log_time"] == joined["log_time"])
+        & (heads["length"] >= MESSAGE_HEAD.itemsize - rec.HEAD_SIZE)
+        & (heads["length"] <= room)
+    )
+    if not agrees.all():
+        return None
+    order = np.argsort(offsets, kind="stable")
+    offsets = offsets[order]
+    ends = offsets + rec.HEAD_SIZE + heads["length"][order].astype(np.int64)
+    return offsets if (offsets[1:] >= ends[:-1]).all() else None
+
+
+def _walk(chunk: Buffer, start: int, end: int, found: _Found) -> None:
+    unpack, head_size = rec.HEAD.unpack_from, rec.HEAD_SIZE
+    place = start
+    while place < end:
+        opcode, length = unpack(chunk, place) if place + head_size <= end else (0, 0)
+        after = place + head_size + length
+        if opcode == rec.MESSAGE and after <= end and length >= rec.LEAST_BODY[rec.MESSAGE]:
+            found.offsets.append(place)
+            place = after
+        elif opcode and after <= end and _take_side_record(opcode, chunk[place + head_size : after], found):
+            place = after
+        else:
+            place = _resume(chunk, start, place, end, found)
+
+
+def _take_side_record(opcode: int, body: Buffer, found: _Found) -> bool:
+    try:
+        if opcode == rec.SCHEMA:
+            found.schemas.append(rec.parse_schema(body))
+        elif opcode == rec.CHANNEL:
+            found.channels.append(rec.parse_channel(body))
+        else:
+            return opcode >= FIRST_PRIVATE
+    except rec.RecordError:
+        return False
+    return True
+
+
+def _resume(chunk: Buffer, start: int, place: int, end: int, found: _Found) -> int:
+    """Note damage at ``place`` and find where records go on.
+
+    When they go on inside the message before, its length was the damage and it is given up.
+    """
+    last = found.offsets[-1] if found.offsets else place
+    first = last + 1 if start <= last < place else place + 1
+    again = find_record(chunk, first, end, CHUNK_RECORDS)
+    if again < place:
+        found.offsets.pop()
+        place = last
+    found.damage.append((place, again))
+    return again

@@ -1,0 +1,239 @@
+"""What one file holds: from its summary where that is whole, else by walking its records."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from pipeline.logs import records as rec
+from pipeline.logs.errors import LogError, Loss
+from pipeline.logs.inflate import checksum
+from pipeline.logs.scan import Catalog, Scanner
+from pipeline.logs.spans import Loaded, Span, SpanKind, load_span
+from pipeline.logs.workers import map_in_order
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from pipeline.logs.source import ByteSource
+
+_MAX_SUMMARY: Final = 1 << 29
+
+
+class _NoSummaryError(Exception):
+    """The summary is absent or not whole; the text says which and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Summary:
+    start: int
+    statistics: rec.StatisticsRecord
+    chunks: list[rec.ChunkIndexRecord]
+
+
+def catalog_file(source: ByteSource, *, threads: int = 1) -> Catalog:
+    """Find out what a file holds.
+
+    Args:
+        source: the file.
+        threads: how many chunks are inflated at once where the summary is missing.
+
+    Raises:
+        LogError: ``not_mcap``.
+    """
+    catalog = Catalog()
+    start = _check_magic(source, catalog)
+    ends_well = source.read_at(max(0, source.size - len(rec.MAGIC)), len(rec.MAGIC)) == rec.MAGIC
+    stop = source.size - len(rec.MAGIC) if ends_well and source.size >= 2 * len(rec.MAGIC) else source.size
+    try:
+        summary = _read_summary(source, catalog)
+    except _NoSummaryError as reason:
+        damaged = catalog.losses
+        catalog = Catalog(losses=list(damaged))
+        _rebuild(source, catalog, start, stop, threads)
+        _say_why(catalog, str(reason))
+    else:
+        _scan_gaps(source, catalog, start, summary.start)
+        _take_statistics(source, catalog, summary, threads)
+    return catalog
+
+
+def _check_magic(source: ByteSource, catalog: Catalog) -> int:
+    head = source.read_at(0, len(rec.MAGIC))
+    if head == rec.MAGIC:
+        return len(rec.MAGIC)
+    alike = sum(a == b for a, b in zip(head, rec.MAGIC, strict=False))
+    if head.startswith(b"\x89MCAP0\n"):
+        raise LogError(
+            "not_mcap",
+            "a text-mode copy has changed the file's line ends and with them its data",
+            where=source.name,
+            hint="Copy the file again in binary mode",
+        )
+    if alike < len(rec.MAGIC) - 2:
+        raise LogError(
+            "not_mcap",
+            "the file does not begin as MCAP does",
+            where=source.name,
+            hint="Give an .mcap file, or convert the recording (`ros2 bag convert`, `mcap convert`)",
+        )
+    catalog.losses.append(Loss("damaged_record", "the file's first 8 bytes are damaged", bytes=8))
+    return len(rec.MAGIC)
+
+
+def _read_summary(source: ByteSource, catalog: Catalog) -> _Summary:
+    tail_size = rec.FOOTER_SIZE + len(rec.MAGIC)
+    tail = source.read_at(max(0, source.size - tail_size), tail_size)
+    if len(tail) < rec.FOOTER_SIZE + len(rec.MAGIC) or not tail.endswith(rec.MAGIC):
+        raise _NoSummaryError("the file does not end as MCAP does")
+    opcode, length = rec.HEAD.unpack_from(tail, 0)
+    if opcode != rec.FOOTER or length != rec.LEAST_BODY[rec.FOOTER]:
+        raise _NoSummaryError("the footer is damaged")
+    parser = rec.Parser(tail[rec.HEAD_SIZE :])
+    start, _offsets, crc = parser.number(8), parser.number(8), parser.number(4)
+    footer_at = source.size - rec.FOOTER_SIZE - len(rec.MAGIC)
+    if start == 0:
+        raise _NoSummaryError("there is no summary")
+    if not len(rec.MAGIC) <= start <= footer_at or footer_at - start > _MAX_SUMMARY:
+        raise _NoSummaryError("the footer is damaged")
+    body = source.read_at(start, footer_at - start)
+    if crc and checksum(body + tail[: rec.HEAD_SIZE + 16]) != crc:
+        raise _NoSummaryError("the summary is damaged")
+    try:
+        return _parse_summary(body, start, catalog)
+    except rec.RecordError as error:
+        raise _NoSummaryError(f"the summary is damaged ({error})") from None
+
+
+def _parse_summary(body: bytes, start: int, catalog: Catalog) -> _Summary:
+    statistics: rec.StatisticsRecord | None = None
+    chunks: list[rec.ChunkIndexRecord] = []
+    place = 0
+    view = memoryview(body)
+    while place < len(view):
+        if place + rec.HEAD_SIZE > len(view):
+            raise rec.RecordError("a record is cut")
+        opcode, length = rec.HEAD.unpack_from(view, place)
+        place += rec.HEAD_SIZE
+        if length > len(view) - place:
+            raise rec.RecordError("a record is cut")
+        record = view[place : place + length]
+        place += length
+        if opcode == rec.SCHEMA:
+            schema = rec.parse_schema(record)
+            catalog.schemas[schema.id] = schema
+        elif opcode == rec.CHANNEL:
+            channel = rec.parse_channel(record)
+            catalog.channels[channel.id] = channel
+        elif opcode == rec.STATISTICS:
+            statistics = rec.parse_statistics(record)
+        elif opcode == rec.CHUNK_INDEX:
+            chunks.append(rec.parse_chunk_index(record))
+    if statistics is None:
+        raise _NoSummaryError("the summary has no statistics")
+    _check_summary(statistics, chunks, start, catalog)
+    return _Summary(start, statistics, chunks)
+
+
+def _check_summary(
+    statistics: rec.StatisticsRecord, chunks: list[rec.ChunkIndexRecord], start: int, catalog: Catalog
+) -> None:
+    if len(chunks) != statistics.chunk_count:
+        raise _NoSummaryError("the summary does not list its chunks")
+    if sum(statistics.message_counts.values()) != statistics.message_count:
+        raise _NoSummaryError("the summary does not count its messages by channel")
+    if any(number not in catalog.channels for number in statistics.message_counts):
+        raise _NoSummaryError("the summary does not list its channels")
+    if any(c.schema_id and c.schema_id not in catalog.schemas for c in catalog.channels.values()):
+        raise _NoSummaryError("the summary does not list its schemas")
+    end = len(rec.MAGIC)
+    for chunk in sorted(chunks, key=lambda each: each.offset):
+        if chunk.offset < end or chunk.length < rec.LEAST_BODY[rec.CHUNK]:
+            raise _NoSummaryError("the summary places its chunks one over the other")
+        end = chunk.offset + chunk.length + chunk.index_length
+        catalog.compressions.add(chunk.compression)
+        known = frozenset(chunk.index_offsets) or None
+        catalog.spans.append(
+            Span(
+                SpanKind.CHUNK,
+                chunk.offset,
+                chunk.length,
+                chunk.index_length,
+                chunk.start_ns,
+                chunk.end_ns,
+                known,
+            )
+        )
+    if end > start:
+        raise _NoSummaryError("the summary places chunks beyond the data")
+
+
+def _scan_gaps(source: ByteSource, catalog: Catalog, start: int, stop: int) -> None:
+    """Walk what no chunk index vouches for: metadata, attachments, messages outside chunks."""
+    listed = list(catalog.spans)
+    found: list[Span] = []
+    place = start
+    for span in [*listed, None]:
+        until = stop if span is None else span.offset
+        if until > place:
+            catalog.spans = []
+            Scanner(source, catalog).scan(place, until)
+            found += catalog.spans
+        if span is not None:
+            place = span.offset + span.length + span.index_length
+    catalog.spans = sorted([*listed, *found], key=lambda each: each.offset)
+
+
+def _take_statistics(source: ByteSource, catalog: Catalog, summary: _Summary, threads: int) -> None:
+    statistics = summary.statistics
+    unlisted = {chunk.offset for chunk in summary.chunks}
+    extra = [s for s in catalog.spans if s.kind is not SpanKind.LOOSE and s.offset not in unlisted]
+    if extra:
+        catalog.notes.append(f"{len(extra)} chunks that the summary does not list were found")
+        _examine(source, catalog, threads)
+        return
+    catalog.counts = dict(statistics.message_counts)
+    if statistics.message_count:
+        catalog.start_ns, catalog.end_ns = statistics.start_ns, statistics.end_ns
+
+
+def _rebuild(source: ByteSource, catalog: Catalog, start: int, stop: int, threads: int) -> None:
+    Scanner(source, catalog).scan(start, stop)
+    _examine(source, catalog, threads)
+
+
+def _examine(source: ByteSource, catalog: Catalog, threads: int) -> None:
+    """Inflate every span for what no index tells: channels, counts, times."""
+    catalog.counts = {}
+    examined: list[Span] = []
+    for span, loaded in _load_all(source, catalog.spans, threads):
+        messages = loaded.messages
+        catalog.losses += [loss for loss in loaded.losses if loss not in catalog.losses]
+        for schema in messages.schemas:
+            catalog.schemas.setdefault(schema.id, schema)
+        for channel in messages.channels:
+            catalog.channels.setdefault(channel.id, channel)
+        numbers, counts = np.unique(messages.channel, return_counts=True)
+        for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
+            catalog.counts[number] = catalog.counts.get(number, 0) + count
+        if messages.log_time.size:
+            first, last = int(messages.log_time.min()), int(messages.log_time.max())
+            catalog.start_ns = first if catalog.start_ns is None else min(first, catalog.start_ns)
+            catalog.end_ns = last if catalog.end_ns is None else max(last, catalog.end_ns)
+            span = replace(span, start_ns=first, end_ns=last)  # noqa: PLW2901
+        examined.append(replace(span, channels=frozenset(numbers.tolist())))
+    catalog.spans = examined
+
+
+def _load_all(source: ByteSource, spans: list[Span], threads: int) -> Iterator[tuple[Span, Loaded]]:
+    loaded = map_in_order(lambda span: load_span(source, span), spans, threads)
+    return zip(spans, loaded, strict=True)
+
+
+def _say_why(catalog: Catalog, reason: str) -> None:
+    catalog.notes.append(f"{reason}; the index was rebuilt by walking the records")
+    missing = reason.startswith(("there is no summary", "the summary has no", "the summary does not"))
+    if not missing and not any(loss.kind == "truncated" for loss in catalog.losses):
+        catalog.losses.append(Loss("damaged_summary", f"{reason}; all records were walked in its place"))

@@ -1,0 +1,229 @@
+"""Reading the wanted topics of a recording as columns."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.logs.channel import ChannelBuffer
+from pipeline.logs.codecs import decoder_for
+from pipeline.logs.errors import LogError, Loss
+from pipeline.logs.fields import derive_columns
+from pipeline.logs.index import LogIndex, open_log
+from pipeline.logs.payloads import gather_payloads
+from pipeline.logs.source import FileSource, hash_sources
+from pipeline.logs.spans import SpanKind, load_span
+from pipeline.logs.workers import map_in_order
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.logs.codecs import Recipe
+    from pipeline.logs.columns import Column
+    from pipeline.logs.index import ChannelInfo, Part
+    from pipeline.logs.payloads import Payloads
+    from pipeline.logs.spans import Span
+
+    Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A topic to read.
+
+    Attributes:
+        topic: its name.
+        fields: paths of fields such as ``twist.twist.linear.x``, ``velocity``, ``velocity[0]`` or
+            ``transforms[].child_frame_id``; a path of a structure stands for all below it. None reads all.
+    """
+
+    topic: str
+    fields: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TopicColumns:
+    """The messages of one channel as columns, in the order of their log times.
+
+    Attributes:
+        topic: name of the topic.
+        channel_id: its channel's number in the recording.
+        type_name: ``package/msg/Name``.
+        log_time: when they were recorded [ns], int64, shape (n,).
+        publish_time: when they were published [ns], int64, shape (n,).
+        header_time: stamp of their headers [ns], int64, shape (n,); None when the type has no header.
+        fields: column of every wanted field.
+        notes: what is worth knowing and no loss.
+    """
+
+    topic: str
+    channel_id: int
+    type_name: str
+    log_time: Ints
+    publish_time: Ints
+    header_time: Ints | None
+    fields: Mapping[str, Column]
+    notes: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return self.log_time.size
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogData:
+    """What was read from a recording.
+
+    Attributes:
+        index: what it holds.
+        topics: columns of every channel of the wanted topics that could be decoded.
+        losses: everything that is known to be missing.
+        notes: what is worth knowing and no loss.
+        sha256: of the recording's bytes (hex).
+    """
+
+    index: LogIndex
+    topics: tuple[TopicColumns, ...]
+    losses: tuple[Loss, ...]
+    notes: tuple[str, ...]
+    sha256: str
+
+    def of(self, topic: str) -> list[TopicColumns]:
+        """Columns of every channel of a topic."""
+        return [columns for columns in self.topics if columns.topic == topic]
+
+
+def read_topics(
+    path: str | os.PathLike[str] | LogIndex,
+    wanted: Iterable[Wanted],
+    *,
+    threads: int | None = None,
+    sha256: str | None = None,
+) -> LogData:
+    """Read topics of a recording.
+
+    Args:
+        path: the recording, or what ``open_log`` said of it.
+        wanted: topics and fields.
+        threads: chunks inflated at once; as many as the machine has cores by default.
+        sha256: the recording's hash when it is known; otherwise it is computed beside the reading.
+
+    Raises:
+        LogError: as ``open_log``; ``topic_not_found``, ``field_not_found``, ``unsupported_encoding`` when
+            nothing of a wanted topic can be decoded.
+    """
+    index = path if isinstance(path, LogIndex) else open_log(path)
+    workers = threads or os.cpu_count() or 1
+    recipes = _choose_channels(index, list(wanted))
+    losses: dict[Loss, None] = dict.fromkeys(index.losses)
+    notes = list(index.notes)
+    with ExitStack() as stack:
+        sources = [stack.enter_context(FileSource(part.path)) for part in index.parts]
+        beside = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="hash"))
+        digest = None if sha256 is not None else beside.submit(hash_sources, sources)
+        unchecked = 0
+        for part, source in zip(index.parts, sources, strict=True):
+            for payloads, lost, free in _read_part(source, part, set(recipes), workers):
+                unchecked += free
+                losses.update(dict.fromkeys(lost))
+                for number, each in payloads.items():
+                    recipes[number].buffer.add(each)
+        found = digest.result() if digest is not None else (sha256 or "")
+    if unchecked:
+        notes.append(f"{unchecked} chunks carry no checksum: damage inside them cannot be seen")
+    topics: list[TopicColumns] = []
+    for recipe in recipes.values():
+        columns, lost = _finish(recipe, index)
+        losses.update(dict.fromkeys(lost))
+        topics.append(columns)
+    return LogData(index, tuple(topics), tuple(losses), tuple(notes), found)
+
+
+@dataclass(slots=True, eq=False)
+class _Job:
+    info: ChannelInfo
+    recipe: Recipe
+    buffer: ChannelBuffer
+    fields: tuple[str, ...] | None
+
+
+def _choose_channels(index: LogIndex, wanted: Sequence[Wanted]) -> dict[int, _Job]:
+    """Decoders of the wanted channels by the recording's channel number."""
+    jobs: dict[int, _Job] = {}
+    known = index.topics()
+    for want in wanted:
+        if want.topic not in known:
+            listed = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")  # noqa: PLR2004
+            raise LogError(
+                "topic_not_found",
+                f"there is no topic {want.topic}",
+                where=str(index.path),
+                hint=f"It holds: {listed or 'no topics'}",
+            )
+        for info in index.channels:
+            if info.topic == want.topic:
+                schema = _schema_of(index, info.id)
+                recipe = decoder_for(info, schema, want.fields, where=str(index.path))
+                jobs[info.id] = _Job(info, recipe, ChannelBuffer(recipe.decoder), want.fields)
+    return jobs
+
+
+def _schema_of(index: LogIndex, number: int) -> bytes:
+    for part in index.parts:
+        for own, channel in part.channels.items():
+            if part.numbers[own] == number:
+                schema = part.schemas.get(channel.schema_id)
+                return schema.data if schema else b""
+    return b""
+
+
+def _read_part(
+    source: FileSource, part: Part, wanted: set[int], threads: int
+) -> Iterator[tuple[dict[int, Payloads], list[Loss], bool]]:
+    own = {number for number, merged in part.numbers.items() if merged in wanted}
+    spans = [span for span in part.spans if span.channels is None or span.channels & own]
+
+    def read(span: Span) -> tuple[dict[int, Payloads], list[Loss], bool]:
+        loaded = load_span(source, span)
+        payloads = gather_payloads(loaded.chunk, loaded.messages, own)
+        merged = {part.numbers[number]: each for number, each in payloads.items()}
+        return merged, loaded.losses, loaded.unchecked and span.kind is SpanKind.CHUNK
+
+    return map_in_order(read, spans, threads)
+
+
+def _finish(job: _Job, index: LogIndex) -> tuple[TopicColumns, list[Loss]]:
+    log_time, publish_time, rows = job.buffer.finish()
+    leaves = job.recipe.decoder.columns(rows)
+    header_time = _header_time(leaves)
+    fields = derive_columns(leaves, job.fields, job.recipe.leaves)
+    losses = []
+    for rejected in job.recipe.decoder.rejected:
+        start, end = job.buffer.times_of(rejected.rows)
+        text = f"{rejected.rows.size} messages of {job.info.topic}: {rejected.reason}"
+        losses.append(Loss(rejected.kind, text, rejected.bytes, 0, start, end))
+    columns = TopicColumns(
+        job.info.topic,
+        job.info.id,
+        job.info.type_name,
+        log_time,
+        publish_time,
+        header_time,
+        fields,
+        job.recipe.notes,
+    )
+    return columns, losses
+
+
+def _header_time(leaves: Mapping[str, Column]) -> Ints | None:
+    seconds, nanoseconds = leaves.get("header.stamp.sec"), leaves.get("header.stamp.nanosec")
+    if not isinstance(seconds, np.ndarray) or not isinstance(nanoseconds, np.ndarray):
+        return None
+    stamp: Ints = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
+    return stamp

@@ -1,0 +1,245 @@
+"""Walking the records of a file where no index vouches for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from pipeline.logs import records as rec
+from pipeline.logs.errors import Loss
+from pipeline.logs.messages import FIRST_PRIVATE
+from pipeline.logs.resync import possible_places
+from pipeline.logs.spans import Span, SpanKind
+
+if TYPE_CHECKING:
+    from pipeline.logs.source import ByteSource
+
+_WINDOW: Final = 1 << 18
+_LOOSE_SPAN: Final = 1 << 22
+_SEARCH_BLOCK: Final = 1 << 20
+_KNOWN: Final = tuple(rec.LEAST_BODY)
+_CHAIN: Final = 3
+_MAX_SIDE_RECORD: Final = 1 << 26
+
+
+@dataclass(slots=True)
+class Catalog:
+    """What is known of a file.
+
+    ``metadata`` and ``attachments`` keep the order of the file; ``counts`` are messages by channel number.
+    """
+
+    profile: str = ""
+    library: str = ""
+    schemas: dict[int, rec.SchemaRecord] = field(default_factory=dict)
+    channels: dict[int, rec.ChannelRecord] = field(default_factory=dict)
+    spans: list[Span] = field(default_factory=list)
+    compressions: set[str] = field(default_factory=set)
+    metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
+    attachments: list[str] = field(default_factory=list)
+    counts: dict[int, int] = field(default_factory=dict)
+    start_ns: int | None = None
+    end_ns: int | None = None
+    losses: list[Loss] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    data_end: int | None = None
+    data_crc: int = 0
+    footer_seen: bool = False
+
+
+class Window:
+    """A moving view of a source, so that small neighbouring reads cost one."""
+
+    def __init__(self, source: ByteSource) -> None:
+        self._source = source
+        self._start = 0
+        self._bytes = memoryview(b"")
+
+    def view(self, offset: int, length: int) -> memoryview:
+        """Bytes at ``offset``; fewer than ``length`` only at the end of the file."""
+        inner = offset - self._start
+        if inner < 0 or inner + length > len(self._bytes):
+            self._bytes = memoryview(self._source.read_at(offset, max(length, _WINDOW)))
+            self._start, inner = offset, 0
+        return self._bytes[inner : inner + length]
+
+
+class Scanner:
+    """Walks records into a catalog.
+
+    Args:
+        source: the file.
+        catalog: filled with what is found.
+    """
+
+    def __init__(self, source: ByteSource, catalog: Catalog) -> None:
+        self._source = source
+        self._window = Window(source)
+        self._catalog = catalog
+        self._known = {span.offset for span in catalog.spans}
+
+    def scan(self, start: int, stop: int) -> None:
+        """Walk the records in [start, stop); damage is noted and stepped over."""
+        place = start
+        previous = start
+        while place < stop:
+            after = self._take(place, stop)
+            if after is None:
+                after, place = self._recover(previous, place, stop)
+            previous, place = place, after
+
+    def _take(self, place: int, stop: int) -> int | None:
+        """Take the record at ``place`` into the catalog; None when there is none."""
+        head = self._window.view(place, rec.HEAD_SIZE)
+        if len(head) < rec.HEAD_SIZE or place + rec.HEAD_SIZE > stop:
+            return None
+        opcode, length = rec.HEAD.unpack(head)
+        after: int = place + rec.HEAD_SIZE + length
+        if after > stop or length < rec.LEAST_BODY.get(opcode, 0):
+            return None
+        if opcode not in rec.LEAST_BODY:
+            return after if opcode >= FIRST_PRIVATE and self._goes_on(after, stop) else None
+        try:
+            return after if self._note(opcode, place, length) else None
+        except rec.RecordError:
+            return None
+
+    def _note(self, opcode: int, place: int, length: int) -> bool:
+        catalog = self._catalog
+        body_at = place + rec.HEAD_SIZE
+        if opcode == rec.MESSAGE:
+            self._note_message(place, rec.HEAD_SIZE + length)
+        elif opcode == rec.CHUNK:
+            head = rec.parse_chunk_head(self._window.view(body_at, min(length, 128)), length)
+            if head.body + head.compressed_size != rec.HEAD_SIZE + length:
+                return False
+            if place not in self._known:
+                catalog.compressions.add(head.compression)
+                catalog.spans.append(
+                    Span(SpanKind.CHUNK, place, rec.HEAD_SIZE + length, 0, head.start_ns, head.end_ns)
+                )
+        elif opcode == rec.MESSAGE_INDEX:
+            self._note_index(place, rec.HEAD_SIZE + length)
+        elif opcode == rec.ATTACHMENT:
+            catalog.attachments.append(
+                rec.parse_attachment_name(self._window.view(body_at, min(length, 1 << 12)))
+            )
+        elif length <= _MAX_SIDE_RECORD:
+            self._note_small(opcode, self._window.view(body_at, length))
+        return True
+
+    def _note_small(self, opcode: int, body: memoryview) -> None:
+        catalog = self._catalog
+        if opcode == rec.SCHEMA:
+            schema = rec.parse_schema(body)
+            catalog.schemas.setdefault(schema.id, schema)
+        elif opcode == rec.CHANNEL:
+            channel = rec.parse_channel(body)
+            catalog.channels.setdefault(channel.id, channel)
+        elif opcode == rec.METADATA:
+            catalog.metadata.append(rec.parse_metadata(body))
+        elif opcode == rec.HEADER:
+            catalog.profile, catalog.library = rec.parse_header(body)
+        elif opcode == rec.DATA_END:
+            catalog.data_crc = int.from_bytes(body[:4], "little")
+        elif opcode == rec.FOOTER:
+            catalog.footer_seen = True
+
+    def _note_message(self, place: int, length: int) -> None:
+        spans = self._catalog.spans
+        if spans and spans[-1].kind is SpanKind.LOOSE:
+            last = spans[-1]
+            if last.offset + last.length == place and last.length + length <= _LOOSE_SPAN:
+                spans[-1] = replace(last, length=last.length + length)
+                return
+        spans.append(Span(SpanKind.LOOSE, place, length))
+
+    def _note_index(self, place: int, length: int) -> None:
+        spans = self._catalog.spans
+        if not spans or spans[-1].kind is not SpanKind.CHUNK:
+            return
+        last = spans[-1]
+        if last.offset + last.length + last.index_length == place:
+            spans[-1] = replace(last, index_length=last.index_length + length)
+
+    def _goes_on(self, place: int, stop: int) -> bool:
+        for _ in range(_CHAIN):
+            if place == stop:
+                return True
+            head = self._window.view(place, rec.HEAD_SIZE)
+            if len(head) < rec.HEAD_SIZE:
+                return False
+            opcode, length = rec.HEAD.unpack(head)
+            if length < rec.LEAST_BODY.get(opcode, 1 << 62):
+                return False
+            place += rec.HEAD_SIZE + length
+            if place > stop:
+                return False
+            if opcode == rec.FOOTER:
+                return True
+        return True
+
+    def _recover(self, previous: int, place: int, stop: int) -> tuple[int, int]:
+        """Note damage at ``place``: (where records go on, where the damage starts)."""
+        last = self._catalog.spans[-1] if self._catalog.spans else None
+        again = self._find(place + 1, stop)
+        if last is not None and last.kind is SpanKind.LOOSE and previous < place:
+            inside = self._find(previous + 1, stop)
+            if inside < place:
+                self._drop_message(previous)
+                place, again = previous, inside
+        if again == stop and self._take_cut_chunk(place, stop):
+            return stop, place
+        self._note_damage(place, again, stop)
+        return again, place
+
+    def _drop_message(self, place: int) -> None:
+        last = self._catalog.spans.pop()
+        if place > last.offset:
+            self._catalog.spans.append(replace(last, length=place - last.offset))
+
+    def _find(self, start: int, stop: int) -> int:
+        for low in range(start, max(start, stop - rec.HEAD_SIZE + 1), _SEARCH_BLOCK):
+            block = np.frombuffer(
+                self._source.read_at(low, _SEARCH_BLOCK + rec.HEAD_SIZE - 1), dtype=np.uint8
+            )
+            high = min(block.size - rec.HEAD_SIZE + 1, stop - rec.HEAD_SIZE + 1 - low)
+            if high <= 0:
+                break
+            for inner in possible_places(block, 0, high, stop - low, _KNOWN).tolist():
+                if self._goes_on(low + inner, stop):
+                    return low + int(inner)
+        return stop
+
+    def _take_cut_chunk(self, place: int, stop: int) -> bool:
+        """Whether a chunk stands at ``place`` whose end is missing."""
+        head = self._window.view(place, 128)
+        if len(head) < rec.HEAD_SIZE or place + rec.HEAD_SIZE > stop:
+            return False
+        opcode, length = rec.HEAD.unpack_from(head, 0)
+        if opcode != rec.CHUNK or place + rec.HEAD_SIZE + length <= stop:
+            return False
+        try:
+            chunk = rec.parse_chunk_head(head[rec.HEAD_SIZE : stop - place], length)
+        except rec.RecordError:
+            return False
+        if chunk.body + chunk.compressed_size != rec.HEAD_SIZE + length:
+            return False
+        self._catalog.compressions.add(chunk.compression)
+        self._catalog.spans.append(
+            Span(SpanKind.CUT_CHUNK, place, stop - place, 0, chunk.start_ns, chunk.end_ns)
+        )
+        return True
+
+    def _note_damage(self, start: int, end: int, stop: int) -> None:
+        truncated = end == stop == self._source.size
+        before = [span.end_ns for span in self._catalog.spans if span.end_ns is not None]
+        kind = "truncated" if truncated else "damaged_record"
+        text = (
+            f"the file breaks off: its last {end - start} bytes hold no whole record"
+            if truncated
+            else f"bytes {start} to {end} hold no record"
+        )
+        self._catalog.losses.append(Loss(kind, text, bytes=end - start, start_ns=max(before, default=None)))

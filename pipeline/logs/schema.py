@@ -1,0 +1,207 @@
+"""Message types as trees, and the parser of ``ros2msg`` and ``ros1msg`` definitions."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+SEQUENCE: Final = -1
+"""``Member.count`` of a sequence of varying length."""
+
+SIZES: Final[Mapping[str, int]] = {
+    "bool": 1,
+    "int8": 1,
+    "uint8": 1,
+    "int16": 2,
+    "uint16": 2,
+    "int32": 4,
+    "uint32": 4,
+    "int64": 8,
+    "uint64": 8,
+    "float32": 4,
+    "float64": 8,
+}
+"""Bytes of every number type."""
+
+MAX_FIXED: Final = 1 << 24
+"""Longest fixed array taken seriously; a longer one in a definition is damage."""
+
+MAX_DEPTH: Final = 64
+
+_ALIASES: Final = {"byte": "uint8", "char": "uint8", "octet": "uint8", "boolean": "bool"}
+_ALIASES_ROS1: Final = {"byte": "int8", "char": "uint8"}
+_SEPARATOR: Final = re.compile(r"^={3,}[ \t]*$", re.MULTILINE)
+_FIELD: Final = re.compile(
+    r"^(?P<type>[A-Za-z][\w/]*)(?P<text_bound><=\d+)?(?P<array>\[(?P<bound><=)?(?P<count>\d*)\])?"
+    r"\s+(?P<name>[A-Za-z]\w*)(?P<rest>.*)$"
+)
+
+
+class SchemaError(ValueError):
+    """A definition that cannot be understood; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """One field of a structure.
+
+    Attributes:
+        name: field name.
+        element: number type, ``"string"``, ``"wstring"``, or the structure of the field or its elements.
+        count: None for a single value, ``SEQUENCE``, or the length of a fixed array.
+    """
+
+    name: str
+    element: str | Structure
+    count: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """A message type with everything below it resolved.
+
+    Attributes:
+        name: ``package/Name``.
+        members: fields in the order of serialization.
+    """
+
+    name: str
+    members: tuple[Member, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class RawField:
+    """A field before its type is looked up: name, type as written, count as in ``Member``."""
+
+    name: str
+    type: str
+    count: int | None
+
+
+RawTypes = dict[str, list[RawField]]
+
+
+def short_name(name: str) -> str:
+    """``package/Name`` of ``package/msg/Name`` or ``package::msg::Name``."""
+    parts = [part for part in name.replace("::", "/").split("/") if part]
+    return f"{parts[0]}/{parts[-1]}" if len(parts) > 1 else (parts[0] if parts else "")
+
+
+def parse_msg(name: str, text: str, *, dialect: str = "ros2msg") -> Structure:
+    """Parse a concatenated ``.msg`` definition.
+
+    Args:
+        name: type of the message, ``package/msg/Name``.
+        text: its definition, then those of the types below it behind ``===`` and ``MSG: package/Name`` lines.
+        dialect: ``ros2msg`` or ``ros1msg``.
+
+    Raises:
+        SchemaError: a line or a type that cannot be understood.
+    """
+    types: RawTypes = {}
+    for position, section in enumerate(_SEPARATOR.split(text)):
+        body = section.strip("\r\n ")
+        section_name = short_name(name)
+        if body.startswith("MSG:"):
+            head, _, body = body.partition("\n")
+            section_name = short_name(head[4:].strip())
+        elif position > 0:
+            continue
+        types.setdefault(section_name, list(_parse_fields(body, dialect)))
+    return resolve(short_name(name), types, dialect=dialect)
+
+
+def _parse_fields(body: str, dialect: str) -> Iterator[RawField]:
+    for raw_line in body.splitlines():
+        line = raw_line.split("#", 1)[0].strip()
+        if not line:
+            continue
+        match = _FIELD.match(line)
+        if match is None:
+            raise SchemaError(f"a line of the definition is no field: {line[:60]!r}")
+        if match["rest"].lstrip().startswith("="):
+            continue
+        count: int | None = None
+        if match["array"]:
+            fixed = bool(match["count"]) and not match["bound"]
+            count = int(match["count"]) if fixed else SEQUENCE
+        yield RawField(match["name"], _rename(match["type"], dialect), count)
+
+
+def _rename(type_name: str, dialect: str) -> str:
+    aliases = _ALIASES_ROS1 if dialect == "ros1msg" else _ALIASES
+    return aliases.get(type_name, type_name)
+
+
+def resolve(root: str, types: Mapping[str, list[RawField]], *, dialect: str = "ros2msg") -> Structure:
+    """Build the tree of ``root`` from flat definitions keyed by ``package/Name``.
+
+    Raises:
+        SchemaError: a type that is not defined, contains itself, or holds an absurd array.
+    """
+    known: dict[str, list[RawField]] = {**_builtin_times(dialect), **types}
+    built: dict[str, Structure] = {}
+
+    def build(name: str, depth: int) -> Structure:
+        if name in built:
+            return built[name]
+        if depth > MAX_DEPTH:
+            raise SchemaError(f"type {name} contains itself")
+        if name not in known:
+            raise SchemaError(f"type {name} is not defined")
+        package = name.split("/", 1)[0]
+        members = tuple(member(field, package, depth) for field in known[name])
+        built[name] = Structure(name, members)
+        return built[name]
+
+    def member(field: RawField, package: str, depth: int) -> Member:
+        if field.count is not None and field.count > MAX_FIXED:
+            raise SchemaError(f"field {field.name} is an array of {field.count} elements")
+        if field.type in SIZES or field.type in ("string", "wstring"):
+            return Member(field.name, field.type, field.count)
+        if field.type == "Header":
+            target = "std_msgs/Header"
+        elif field.type in ("time", "duration"):
+            target = f"builtin_interfaces/{field.type.capitalize()}"
+        elif "/" in field.type:
+            target = short_name(field.type)
+        else:
+            target = f"{package}/{field.type}"
+        return Member(field.name, build(target, depth + 1), field.count)
+
+    return build(root, 0)
+
+
+def _builtin_times(dialect: str) -> RawTypes:
+    if dialect == "ros1msg":
+        return {
+            "builtin_interfaces/Time": [RawField("sec", "uint32", None), RawField("nanosec", "uint32", None)],
+            "builtin_interfaces/Duration": [
+                RawField("sec", "int32", None),
+                RawField("nanosec", "int32", None),
+            ],
+        }
+    fields = [RawField("sec", "int32", None), RawField("nanosec", "uint32", None)]
+    return {"builtin_interfaces/Time": fields, "builtin_interfaces/Duration": fields}
+
+
+def leaf_paths(structure: Structure, prefix: str = "") -> Iterator[str]:
+    """Every leaf field of a type as a path, ``[]`` marking sequences of structures."""
+    for member in structure.members:
+        path = f"{prefix}{member.name}"
+        if isinstance(member.element, str):
+            yield path
+        else:
+            yield from leaf_paths(member.element, f"{path}{'[]' if member.count is not None else ''}.")
+
+
+def contains_text(structure: Structure, kind: str) -> bool:
+    """Whether ``kind`` (``"wstring"``, ...) occurs anywhere below ``structure``."""
+    return any(
+        member.element == kind if isinstance(member.element, str) else contains_text(member.element, kind)
+        for member in structure.members
+    )

@@ -1,0 +1,118 @@
+"""Where the bytes of a log come from: one small interface, and local files behind it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+
+from pipeline.logs.errors import LogError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from types import TracebackType
+    from typing import Self
+
+_HASH_BLOCK: Final = 1 << 20
+
+
+class ByteSource(Protocol):
+    """Bytes that can be read anywhere, from several threads at once."""
+
+    @property
+    def size(self) -> int:
+        """Count of bytes."""
+
+    @property
+    def name(self) -> str:
+        """What to call it in messages."""
+
+    def read_at(self, offset: int, length: int) -> bytes:
+        """The bytes from ``offset``; fewer than ``length`` only at the end."""
+
+
+class FileSource:
+    """A local file.
+
+    Args:
+        path: the file.
+
+    Raises:
+        LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            self._descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+        except FileNotFoundError:
+            raise LogError(
+                "log_not_found", "there is no such file", where=str(path), hint="Check the path"
+            ) from None
+        except OSError as error:
+            raise LogError(
+                "log_unreadable",
+                f"the file cannot be opened ({error.strerror})",
+                where=str(path),
+                hint="Check its permissions",
+            ) from None
+        self._size = os.fstat(self._descriptor).st_size
+        if self._size == 0:
+            self.close()
+            raise LogError(
+                "log_empty",
+                "the file holds no bytes",
+                where=str(path),
+                hint="The recorder was stopped before it wrote anything; leave it out",
+            )
+
+    @property
+    def size(self) -> int:
+        """Count of bytes when it was opened."""
+        return self._size
+
+    @property
+    def name(self) -> str:
+        """The path."""
+        return str(self._path)
+
+    def read_at(self, offset: int, length: int) -> bytes:
+        """The bytes from ``offset``; fewer than ``length`` only at the end."""
+        wanted = max(0, min(length, self._size - offset))
+        try:
+            found = os.pread(self._descriptor, wanted, offset) if wanted else b""
+            while len(found) < wanted:
+                more = os.pread(self._descriptor, wanted - len(found), offset + len(found))
+                if not more:
+                    break
+                found += more
+        except OSError as error:
+            raise LogError(
+                "log_unreadable",
+                f"bytes {offset} to {offset + wanted} cannot be read ({error.strerror})",
+                where=self.name,
+                hint="Copy the file from its origin again",
+            ) from None
+        return found
+
+    def close(self) -> None:
+        """Give the file back."""
+        os.close(self._descriptor)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def hash_sources(sources: Sequence[ByteSource]) -> str:
+    """SHA-256 (hex) of the bytes of the sources, one after the other."""
+    digest = hashlib.sha256()
+    for source in sources:
+        for offset in range(0, source.size, _HASH_BLOCK):
+            digest.update(source.read_at(offset, _HASH_BLOCK))
+    return digest.hexdigest()

@@ -1,0 +1,225 @@
+"""Stretches of a log that hold messages, and reading one of them.
+
+A span is a chunk with the message indexes behind it, or a stretch of messages that stand outside chunks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from pipeline.logs import records as rec
+from pipeline.logs.errors import Loss
+from pipeline.logs.inflate import (
+    InflateError,
+    check_size,
+    checksum,
+    holds_own_checksum,
+    inflate,
+    inflate_start,
+)
+from pipeline.logs.messages import Messages, locate_messages
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pipeline.logs.records import Buffer
+    from pipeline.logs.source import ByteSource
+
+
+_ZERO_TAIL: Final = 64
+"""So many zeros at the end of a chunk are bytes that were never written."""
+
+
+class SpanKind(Enum):
+    """What a span is."""
+
+    CHUNK = "chunk"
+    LOOSE = "loose"
+    CUT_CHUNK = "cut chunk"
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A stretch of the file that holds messages.
+
+    Attributes:
+        kind: what it is.
+        offset: first byte.
+        length: bytes, message indexes not counted.
+        index_length: bytes of the message indexes behind it.
+        start_ns: first log time as told by the summary or the chunk, None when unknown.
+        end_ns: last log time, None when unknown.
+        channels: numbers of the channels in it, None when unknown.
+    """
+
+    kind: SpanKind
+    offset: int
+    length: int
+    index_length: int = 0
+    start_ns: int | None = None
+    end_ns: int | None = None
+    channels: frozenset[int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """A span in memory.
+
+    Attributes:
+        chunk: inflated records; empty when nothing could be read.
+        messages: where its messages stand.
+        losses: what was lost in it.
+        unchecked: whether no checksum covered the records.
+    """
+
+    chunk: Buffer
+    messages: Messages
+    losses: list[Loss] = field(default_factory=list)
+    unchecked: bool = False
+
+
+def load_span(source: ByteSource, span: Span, *, trusts_data: bool = False) -> Loaded:
+    """Read, inflate and check one span.
+
+    Args:
+        source: the file.
+        span: which stretch.
+        trusts_data: whether a checksum over the whole data section holds, so that a chunk whose own
+            checksum differs was written so.
+    """
+    blob = memoryview(source.read_at(span.offset, span.length + span.index_length))
+    if span.kind is SpanKind.LOOSE:
+        messages = locate_messages(blob, None)
+        return Loaded(blob, messages, _damage_losses(span, messages, len(blob)), unchecked=True)
+    try:
+        opcode, size = rec.HEAD.unpack_from(blob, 0)
+        if opcode != rec.CHUNK:
+            raise rec.RecordError("no chunk stands there")
+        head = rec.parse_chunk_head(blob[rec.HEAD_SIZE : span.length], size)
+    except (rec.RecordError, rec.struct.error) as error:
+        return _lost(span, "damaged_record", str(error))
+    stored = blob[head.body : head.body + head.compressed_size]
+    if span.kind is SpanKind.CUT_CHUNK:
+        return _load_start(span, head, blob[head.body :], "the file ends inside it")
+    if span.start_ns is None and head.start_ns <= head.end_ns:
+        span = replace(span, start_ns=head.start_ns, end_ns=head.end_ns)
+    if len(stored) < head.compressed_size or size + rec.HEAD_SIZE != span.length:
+        return _lost(span, "damaged_record", "the chunk's length disagrees with its record")
+    try:
+        chunk = inflate(stored, head.compression, head.uncompressed_size)
+    except InflateError as error:
+        return _give_up(span, head, stored, "damaged_chunk", f"the chunk cannot be inflated: {error}")
+    entries = _read_entries(blob[span.length :])
+    losses: list[Loss] = []
+    computed = checksum(chunk) if head.crc else 0
+    if computed != head.crc:
+        reason = (
+            "the file's own checksum holds"
+            if trusts_data
+            else explain_checksum(head.crc, computed, stored, head.compression)
+        )
+        if reason is None:
+            reason = "the chunk's checksum does not match its records"
+            return _give_up(span, head, stored, "chunk_crc", reason)
+        losses.append(
+            _loss(
+                span,
+                "wrong_crc",
+                f"the chunk's checksum is wrong but its records are whole ({reason}); kept",
+                bytes_lost=0,
+            )
+        )
+    messages = locate_messages(chunk, entries)
+    losses += _damage_losses(span, messages, len(chunk))
+    return Loaded(chunk, messages, losses, unchecked=head.crc == 0)
+
+
+def explain_checksum(stored_crc: int, computed: int, stored: Buffer, compression: str) -> str | None:
+    """Why a chunk whose checksum does not match may be whole all the same, None when nothing says so.
+
+    A damaged byte in the records changes the CRC in all its bytes but with a chance of 2.4e-7; a
+    difference in one byte alone is damage of the stored CRC itself.
+    """
+    difference = stored_crc ^ computed
+    if holds_own_checksum(stored, compression):
+        return "the compression's checksum holds"
+    if sum(1 for shift in (0, 8, 16, 24) if difference >> shift & 0xFF) == 1:
+        return "one byte of the stored checksum differs"
+    if difference == 0xFFFFFFFF:
+        return "it is stored inverted"
+    if stored_crc == int.from_bytes(computed.to_bytes(4, "little"), "big"):
+        return "it is stored in the other byte order"
+    if compression and stored_crc == checksum(stored):
+        return "it was taken over the compressed bytes"
+    return None
+
+
+def _give_up(span: Span, head: rec.ChunkHead, stored: Buffer, kind: str, reason: str) -> Loaded:
+    """Drop a damaged chunk, but for one whose end was never written: zeros stand there."""
+    written = len(bytes(stored).rstrip(b"\0"))
+    if len(stored) - written >= _ZERO_TAIL:
+        return _load_start(span, head, stored[:written], f"its last {len(stored) - written} bytes are zero")
+    return _lost(span, kind, reason)
+
+
+def _load_start(span: Span, head: rec.ChunkHead, stored: Buffer, reason: str) -> Loaded:
+    """Keep the messages before the place where a chunk was cut."""
+    try:
+        check_size(head.compressed_size, head.compression, head.uncompressed_size)
+    except InflateError as error:
+        return _lost(span, "truncated", str(error))
+    chunk = inflate_start(stored, head.compression, head.uncompressed_size)
+    messages = locate_messages(chunk, None)
+    if not messages.start.size:
+        return _lost(span, "truncated", reason)
+    last = int(messages.log_time.max())
+    text = (
+        f"the chunk at {span.offset} is cut ({reason}): "
+        f"{messages.start.size} messages before the cut were read, unchecked"
+    )
+    loss = Loss("truncated", text, bytes=span.length, chunks=1, start_ns=last, end_ns=span.end_ns)
+    return Loaded(chunk, replace(messages, damage=[]), [loss], unchecked=True)
+
+
+def _read_entries(blob: Buffer) -> list[tuple[int, NDArray[np.void]]] | None:
+    entries: list[tuple[int, NDArray[np.void]]] = []
+    place = 0
+    while place + rec.HEAD_SIZE <= len(blob):
+        opcode, length = rec.HEAD.unpack_from(blob, place)
+        place += rec.HEAD_SIZE
+        if opcode != rec.MESSAGE_INDEX or length > len(blob) - place:
+            return None
+        try:
+            entries.append(rec.parse_message_index(blob[place : place + length]))
+        except rec.RecordError:
+            return None
+        place += length
+    return entries or None
+
+
+def _damage_losses(span: Span, messages: Messages, size: int) -> list[Loss]:
+    losses = []
+    for start, end in messages.damage:
+        before = messages.start < start
+        first = messages.log_time[before].max(initial=0) or span.start_ns
+        after = messages.log_time[messages.start >= end]
+        last = int(after.min()) if after.size else span.end_ns
+        text = f"bytes {start} to {end} of {size} of the {span.kind.value} at {span.offset} hold no record"
+        losses.append(
+            Loss("damaged_record", text, end - start, 1, None if first is None else int(first), last)
+        )
+    return losses
+
+
+def _loss(span: Span, kind: str, reason: str, *, bytes_lost: int | None = None) -> Loss:
+    text = f"{span.kind.value} of {span.length} bytes at {span.offset}: {reason}"
+    lost = span.length if bytes_lost is None else bytes_lost
+    return Loss(kind, text, bytes=lost, chunks=1, start_ns=span.start_ns, end_ns=span.end_ns)
+
+
+def _lost(span: Span, kind: str, reason: str) -> Loaded:
+    return Loaded(b"", locate_messages(b"", None), [_loss(span, kind, reason)])

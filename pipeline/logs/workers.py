@@ -1,0 +1,39 @@
+"""Doing independent reads on several threads with bounded memory."""
+
+from __future__ import annotations
+
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def map_in_order(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
+    """Apply ``function`` to every item; results in order, at most ``threads + 1`` waiting at a time.
+
+    Args:
+        function: called on other threads; with one thread it is called on this one.
+        items: its arguments.
+        threads: how many calls run at once.
+    """
+    if threads <= 1:
+        for item in items:
+            yield function(item)
+        return
+    with ThreadPoolExecutor(threads, thread_name_prefix="log") as pool:
+        waiting: deque[Future[Result]] = deque()
+        try:
+            for item in items:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) > threads:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
