@@ -1,0 +1,143 @@
+"""A disk that refuses: one clear error, nothing half visible, and the same command works afterwards."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+from typing import TYPE_CHECKING
+
+import pytest
+from store_samples import make_slip, read_seed, write_generation
+
+from pipeline.store import Store, StoreError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+RUN = "2026/husky"
+OLD, NEW = 1, 2
+
+
+class FailingDisk:
+    """Lets the system calls of `os` fail from the ``allowed``-th on."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, code: int, allowed: int) -> None:
+        self.left = allowed
+        self.code = code
+        for name in ("fsync", "mkdir", "rename", "replace", "link"):
+            monkeypatch.setattr(os, name, self.wrap(getattr(os, name)))
+
+    def wrap(self, call):  # noqa: ANN001, ANN201 - any system call
+        def failing(*arguments, **named):  # noqa: ANN002, ANN003, ANN202
+            self.left -= 1
+            if self.left < 0:
+                raise OSError(self.code, os.strerror(self.code))
+            return call(*arguments, **named)
+
+        return failing
+
+
+def catch_refusal(store: Store) -> StoreError | None:
+    try:
+        write_generation(store, RUN, "new", NEW)
+    except StoreError as error:
+        return error
+    return None
+
+
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [(errno.ENOSPC, "disk_full"), (errno.EROFS, "read_only"), (errno.EACCES, "permission_denied")],
+)
+def test_refused_at_every_system_call_the_run_is_whole(
+    store: Store, monkeypatch: pytest.MonkeyPatch, number: int, code: str
+) -> None:
+    write_generation(store, RUN, "old", OLD)
+    refused = 0
+    for allowed in range(100):
+        with monkeypatch.context() as patch:
+            FailingDisk(patch, number, allowed)
+            error = catch_refusal(store)
+        if error is None:
+            break
+        refused += 1
+        assert error.code == code
+        assert str(store.root) in error.where
+        assert read_seed(store, RUN) in (OLD, NEW)
+        assert store.verify() == ()
+    assert refused > 10
+    write_generation(store, RUN, "new", NEW)
+    assert read_seed(store, RUN) == NEW
+    assert not list(store.root.rglob(".tmp-*"))
+
+
+def test_message_of_a_full_disk_says_what_where_and_what_to_do(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    FailingDisk(monkeypatch, errno.ENOSPC, 12)
+    with pytest.raises(StoreError) as caught:
+        write_generation(store, RUN, "new", NEW)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert "disk of the results is full" in message
+    assert "--out" in message
+
+
+def test_errors_of_the_caller_stay_what_they_are(store: Store) -> None:
+    with pytest.raises(FileNotFoundError), store.open_generation(RUN, "new"):
+        raise FileNotFoundError(errno.ENOENT, "the log")
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 512 kB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=512k", "tmpfs", str(place)]
+    try:
+        mounted = subprocess.run(mount, capture_output=True, check=False)
+    except FileNotFoundError:
+        pytest.skip("there is no mount command")
+    if mounted.returncode:
+        pytest.skip("mounting a small disk is not allowed here")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+def test_really_full_disk(small_disk: Path) -> None:
+    store = Store(small_disk / "results")
+    write_generation(store, RUN, "old", OLD)
+    with pytest.raises(StoreError) as caught, store.open_generation(RUN, "new") as generation:
+        generation.write_table("slip", make_slip(RUN, NEW, rows=20_000))
+    assert caught.value.code == "disk_full"
+    assert read_seed(store, RUN) == OLD
+    assert store.verify() == ()
+    write_generation(store, RUN, "new", NEW)
+    assert read_seed(store, RUN) == NEW
+
+
+def test_really_read_only_disk(small_disk: Path) -> None:
+    store = Store(small_disk / "results")
+    write_generation(store, RUN, "old", OLD)
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    with pytest.raises(StoreError) as caught:
+        write_generation(store, RUN, "new", NEW)
+    assert caught.value.code == "read_only"
+    assert read_seed(store, RUN) == OLD
+    assert store.query("SELECT count(*) AS n FROM slip")["n"].to_list() == [500]
+
+
+def test_copies_where_links_are_impossible(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = write_generation(store, RUN, "old", OLD)
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EXDEV, os.strerror(errno.EXDEV))
+
+    monkeypatch.setattr(os, "link", refuse)
+    with store.open_generation(RUN, "new") as generation:
+        generation.reuse_table("slip")
+        second = generation.commit({})
+    assert second.path("slip").read_bytes() == first.path("slip").read_bytes()
+    assert second.path("slip").stat().st_ino != first.path("slip").stat().st_ino

@@ -1,0 +1,118 @@
+"""A writer killed at any moment leaves the old results or the new ones; finishing later gives the same."""
+
+from __future__ import annotations
+
+import random
+import signal
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+from store_samples import read_seed, write_generation
+
+from pipeline.store import STEPS, Store
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from conftest import StartWriter
+
+RUN = "2026/husky"
+OLD, NEW = 1, 2
+
+FILES = 4
+"""Files a generation of `store_samples.write_generation` has: two tables, a quarantine, a text."""
+
+MOMENTS = [("new", step, 1) for step in STEPS if step != "file_written"]
+MOMENTS += [("new", "file_written", count) for count in range(1, FILES + 1)]
+MOMENTS += [("old", step, 1) for step in STEPS[STEPS.index("folder_synced") :]]
+"""Key, step and count; before the commit it does not matter whether the key is the current one."""
+
+
+def assert_tidy(store: Store) -> None:
+    manifest = store.manifest(RUN)
+    assert manifest is not None
+    home = manifest.folder.parent
+    expected = {manifest.folder.name, *manifest.earlier, "manifest.json", "latest", ".lock"}
+    assert {path.name for path in home.iterdir()} == expected
+    assert (home / "latest").resolve() == manifest.folder
+
+
+def tables_of(store: Store) -> dict[str, bytes]:
+    manifest = store.manifest(RUN)
+    assert manifest is not None
+    return {path.name: path.read_bytes() for path in manifest.folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    store = Store(tmp_path_factory.mktemp("undisturbed") / "results")
+    write_generation(store, RUN, "new", NEW)
+    return tables_of(store)
+
+
+@pytest.mark.parametrize("moment", MOMENTS, ids=lambda moment: "-".join(map(str, moment)))
+def test_killed_at_a_step_the_run_is_whole_and_can_be_finished(
+    store: Store, start_writer: StartWriter, undisturbed: dict[str, bytes], moment: tuple[str, str, int]
+) -> None:
+    key, step, count = moment
+    write_generation(store, RUN, "old", OLD)
+    writer = start_writer("die", store.root, RUN, key, NEW, step, count)
+    assert writer.wait(30) == -signal.SIGKILL
+
+    is_published = STEPS.index(step) >= STEPS.index("manifest_replaced")
+    assert read_seed(store, RUN) == (NEW if is_published else OLD)
+    assert store.verify() == ()
+
+    write_generation(store, RUN, key, NEW)
+    assert read_seed(store, RUN) == NEW
+    assert tables_of(store) == undisturbed
+    assert_tidy(store)
+
+
+def kill_at_random(store: Store, start_writer: StartWriter, *, rounds: int, seed: int) -> None:
+    chance = random.Random(seed)  # noqa: S311 - moments, not secrets
+    begun = 0
+    seen = -1
+    for _ in range(rounds):
+        writer = start_writer("loop", store.root, RUN, begun, 10_000)
+        assert writer.stdout is not None
+        assert writer.stdout.readline() == "ready\n"
+        time.sleep(chance.uniform(0.0, 0.12))
+        writer.kill()
+        assert writer.wait(30) == -signal.SIGKILL
+        now = read_seed(store, RUN)
+        assert store.verify() == ()
+        if now is not None:
+            assert now >= seen
+            seen, begun = now, now + 1
+    write_generation(store, RUN, "last", seen + 1)
+    assert read_seed(store, RUN) == seen + 1
+    assert seen > 0
+    assert_tidy(store)
+
+
+def test_killed_at_random_moments_the_run_is_whole(store: Store, start_writer: StartWriter) -> None:
+    kill_at_random(store, start_writer, rounds=20, seed=7)
+
+
+@pytest.mark.long
+def test_killed_at_two_hundred_random_moments_the_run_is_whole(
+    store: Store, start_writer: StartWriter
+) -> None:
+    kill_at_random(store, start_writer, rounds=200, seed=11)
+
+
+def test_exception_leaves_the_old_results_and_nothing_else(store: Store, tmp_path: Path) -> None:
+    write_generation(store, RUN, "old", OLD)
+    before = sorted(tmp_path.rglob("*"))
+
+    def interrupt() -> None:
+        with store.open_generation(RUN, "new") as generation:
+            generation.write_text("summary.json", "half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupt()
+    assert sorted(tmp_path.rglob("*")) == before
+    assert read_seed(store, RUN) == OLD
