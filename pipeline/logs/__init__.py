@@ -9,6 +9,7 @@ from pipeline.logs.definitions import bundled_types, definition_text, field_name
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.index import ChannelInfo, LogIndex, hash_log, open_log
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, read_topics
+from pipeline.logs.transforms import TransformBuffer, TransformSeries, wanted_transforms
 from pipeline.logs.writer import LogWriter
 
 __all__ = [
@@ -22,6 +23,8 @@ __all__ = [
     "RaggedStrings",
     "Strings",
     "TopicColumns",
+    "TransformBuffer",
+    "TransformSeries",
     "Wanted",
     "bundled_types",
     "definition_text",
@@ -29,4 +32,5 @@ __all__ = [
     "hash_log",
     "open_log",
     "read_topics",
+    "wanted_transforms",
 ]

@@ -1,0 +1,322 @@
+"""Transforms between frames out of ``/tf`` and ``/tf_static``, as whole series.
+
+Every frame has one parent. A chain is answered at the stamps of its last moving link, the one next to the
+child; slower links above it, such as map to odom, are interpolated there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from pipeline.core.rigid import interpolate_poses, invert_quaternions, multiply_quaternions, rotate
+from pipeline.logs.columns import Ragged, RaggedStrings
+from pipeline.logs.errors import LogError
+from pipeline.logs.reader import Wanted
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from pipeline.logs.reader import TopicColumns
+
+    Ints = NDArray[np.int64]
+    Floats = NDArray[np.float64]
+
+_TRANSFORM: Final = "transforms[]."
+_PARTS: Final = {
+    "translation": ("x", "y", "z"),
+    "rotation": ("x", "y", "z", "w"),
+}
+_LEAST_NORM: Final = 1e-6
+_HELD_INTERVALS: Final = 3.0
+
+TRANSFORM_FIELDS: Final = (
+    f"{_TRANSFORM}header",
+    f"{_TRANSFORM}child_frame_id",
+    f"{_TRANSFORM}transform",
+)
+"""Fields of a TFMessage that ``build_transforms`` needs."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Link:
+    """A frame in its parent.
+
+    Attributes:
+        parent: frame the transform is given in.
+        child: frame it places.
+        fixed: whether it never moves; then there is one row.
+        time: stamps [ns], int64, strictly increasing, shape (n,).
+        log_time: when they were recorded [ns], int64.
+        position: [m], shape (n, 3).
+        quaternion: unit, shape (n, 4).
+    """
+
+    parent: str
+    child: str
+    fixed: bool
+    time: Ints
+    log_time: Ints
+    position: Floats
+    quaternion: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TransformSeries:
+    """Pose of one frame in another over time.
+
+    Attributes:
+        parent: frame the poses are given in.
+        child: frame they place.
+        time: stamps [ns], int64, strictly increasing, shape (n,).
+        log_time: when the link next to the child was recorded [ns], int64, shape (n,).
+        position: [m], shape (n, 3).
+        quaternion: (x, y, z, w), unit, shape (n, 4).
+        notes: what was held, left out, or ambiguous.
+    """
+
+    parent: str
+    child: str
+    time: Ints
+    log_time: Ints
+    position: Floats
+    quaternion: Floats
+    notes: tuple[str, ...]
+
+
+def wanted_transforms(topics: Iterable[str]) -> list[Wanted]:
+    """What to read for a buffer, of the topics of a log: those named ``tf`` or ``tf_static``."""
+    return [Wanted(topic, TRANSFORM_FIELDS) for topic in topics if _base_name(topic) in ("tf", "tf_static")]
+
+
+class TransformBuffer:
+    """All transforms of a recording.
+
+    Args:
+        topics: columns of TFMessage topics; those named ``tf_static`` never move, wherever in the recording
+            they stand.
+    """
+
+    def __init__(self, topics: Iterable[TopicColumns]) -> None:
+        self._links: dict[str, Link] = {}
+        self._notes: list[str] = []
+        self._collect(list(topics))
+
+    def frames(self) -> tuple[str, ...]:
+        """All frames, sorted."""
+        return tuple(sorted({name for link in self._links.values() for name in (link.parent, link.child)}))
+
+    def links(self) -> tuple[Link, ...]:
+        """All links, by child."""
+        return tuple(self._links[child] for child in sorted(self._links))
+
+    def chain(self, parent: str, child: str) -> tuple[str, ...]:
+        """Frames from ``parent`` to ``child``, both included.
+
+        Raises:
+            LogError: ``frame_not_found`` when a frame is unknown or the two are not connected.
+        """
+        up_child = self._ancestors(_clean(child))
+        up_parent = self._ancestors(_clean(parent))
+        shared = [frame for frame in up_parent if frame in up_child]
+        if not shared:
+            raise self._missing(parent, child)
+        down = up_child[: up_child.index(shared[0])]
+        return (*up_parent[: up_parent.index(shared[0]) + 1], *reversed(down))
+
+    def lookup_series(self, parent: str, child: str, *, at: Ints | None = None) -> TransformSeries:
+        """Pose of ``child`` in ``parent`` over time.
+
+        Args:
+            parent: frame the poses are given in.
+            child: frame they place.
+            at: stamps [ns] to answer at; by default those of the moving link next to the child.
+
+        Returns:
+            Poses where every link of the chain is known. Between its stamps a link is interpolated; beyond
+            its first and last it is held for three of its intervals and for as long as its stamps run ahead
+            of their recording (a future-dated map to odom), rows further out are left out.
+
+        Raises:
+            LogError: ``frame_not_found``.
+        """
+        steps = self._steps(self.chain(parent, child))
+        leading = next((link for link, _ in reversed(steps) if not link.fixed), None)
+        if at is None:
+            time = leading.time if leading is not None else np.zeros(1, dtype=np.int64)
+        else:
+            time = np.asarray(at, dtype=np.int64)
+        known = np.ones(time.size, dtype=np.bool_)
+        for link, _ in steps:
+            known &= _covers(link, time)
+        notes = list(self._notes)
+        if not known.all():
+            notes.append(f"{int((~known).sum())} of {known.size} stamps lie where the chain is not known")
+        time = time[known]
+        position, quaternion = np.zeros((time.size, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (time.size, 1))
+        for link, forward in steps:
+            step_position, step_quaternion = _pose_at(link, time)
+            if not forward:
+                step_quaternion = invert_quaternions(step_quaternion)
+                step_position = -rotate(step_quaternion, step_position)
+            position = position + rotate(quaternion, step_position)
+            quaternion = multiply_quaternions(quaternion, step_quaternion)
+        if leading is not None and at is None:
+            log_time = leading.log_time[known]
+        else:
+            log_time = time
+        return TransformSeries(
+            _clean(parent), _clean(child), time, log_time, position, quaternion, tuple(notes)
+        )
+
+    def _steps(self, chain: tuple[str, ...]) -> list[tuple[Link, bool]]:
+        steps: list[tuple[Link, bool]] = []
+        for upper, lower in zip(chain[:-1], chain[1:], strict=True):
+            link = self._links.get(lower)
+            if link is not None and link.parent == upper:
+                steps.append((link, True))
+            else:
+                steps.append((self._links[upper], False))
+        return steps
+
+    def _ancestors(self, frame: str) -> list[str]:
+        found = [frame]
+        while found[-1] in self._links and self._links[found[-1]].parent not in found:
+            found.append(self._links[found[-1]].parent)
+        return found
+
+    def _missing(self, parent: str, child: str) -> LogError:
+        frames = self.frames()
+        unknown = [frame for frame in (parent, child) if _clean(frame) not in frames]
+        what = (
+            f"there is no frame {' and no frame '.join(unknown)}"
+            if unknown
+            else f"no chain of transforms leads from {parent} to {child}"
+        )
+        hint = f"Known frames: {', '.join(frames)}" if frames else "The log holds no transforms"
+        return LogError("frame_not_found", what, hint=hint)
+
+    def _collect(self, topics: list[TopicColumns]) -> None:
+        rows: dict[str, list[_Rows]] = {}
+        for columns in topics:
+            for row in _split_by_child(columns, fixed=_base_name(columns.topic) == "tf_static"):
+                rows.setdefault(row.child, []).append(row)
+        for child, several in rows.items():
+            moving = [row for row in several if not row.fixed and row.time.size]
+            chosen = moving or [row for row in several if row.time.size]
+            if not chosen:
+                self._notes.append(f"every transform of {child} is invalid")
+                continue
+            parent = max(chosen, key=lambda row: row.time.size).parent
+            others = sorted({row.parent for row in chosen} - {parent})
+            if others:
+                self._notes.append(
+                    f"{child} has several parents; {parent} was taken, not {', '.join(others)}"
+                )
+            invalid = sum(row.invalid for row in several)
+            if invalid:
+                self._notes.append(f"{invalid} transforms of {child} are invalid and were left out")
+            self._links[child] = _join([row for row in chosen if row.parent == parent], fixed=not moving)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    parent: str
+    child: str
+    fixed: bool
+    time: Ints
+    log_time: Ints
+    position: Floats
+    quaternion: Floats
+    invalid: int
+
+
+def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[_Rows]:
+    parents = columns.fields[f"{_TRANSFORM}header.frame_id"]
+    children = columns.fields[f"{_TRANSFORM}child_frame_id"]
+    if not isinstance(parents, RaggedStrings) or not isinstance(children, RaggedStrings):
+        raise TypeError(f"{columns.topic} is no topic of transforms")
+    seconds = _values(columns, "header.stamp.sec").astype(np.int64)
+    time = seconds * 1_000_000_000 + _values(columns, "header.stamp.nanosec").astype(np.int64)
+    position, quaternion = (
+        np.stack([_values(columns, f"transform.{part}.{axis}").astype(np.float64) for axis in axes], axis=1)
+        if time.size
+        else np.empty((0, len(axes)))
+        for part, axes in _PARTS.items()
+    )
+    log_time = np.repeat(columns.log_time, np.diff(children.offsets))
+    norm = np.linalg.norm(quaternion, axis=1)
+    valid = np.isfinite(position).all(axis=1) & np.isfinite(norm) & (norm > _LEAST_NORM)
+    found: list[_Rows] = []
+    pairs = np.stack((parents.codes, children.codes), axis=1)
+    for parent, child in np.unique(pairs, axis=0).tolist():
+        here = (pairs == (parent, child)).all(axis=1)
+        chosen = here & valid
+        found.append(
+            _Rows(
+                _clean(parents.values[parent]),
+                _clean(children.values[child]),
+                fixed,
+                time[chosen],
+                log_time[chosen],
+                position[chosen],
+                quaternion[chosen] / norm[chosen, None],
+                int((here & ~valid).sum()),
+            )
+        )
+    return found
+
+
+def _values(columns: TopicColumns, path: str) -> NDArray[np.generic]:
+    column = columns.fields[f"{_TRANSFORM}{path}"]
+    if not isinstance(column, Ragged):
+        raise TypeError(f"{columns.topic} is no topic of transforms")
+    return column.values
+
+
+def _join(rows: list[_Rows], *, fixed: bool) -> Link:
+    time = np.concatenate([row.time for row in rows])
+    log_time = np.concatenate([row.log_time for row in rows])
+    position = np.concatenate([row.position for row in rows])
+    quaternion = np.concatenate([row.quaternion for row in rows])
+    order = np.argsort(time, kind="stable")
+    last = np.flatnonzero(np.r_[np.diff(time[order]) > 0, True])
+    chosen = order[-1:] if fixed else order[last]
+    return Link(
+        rows[0].parent,
+        rows[0].child,
+        fixed,
+        time[chosen],
+        log_time[chosen],
+        position[chosen],
+        quaternion[chosen],
+    )
+
+
+def _covers(link: Link, time: Ints) -> NDArray[np.bool_]:
+    """Where a link can answer: between its stamps, and as far beyond as it may be held."""
+    if link.fixed or link.time.size == 1:
+        return np.ones(time.size, dtype=np.bool_)
+    interval = float(np.median(np.diff(link.time)))
+    lead = max(0.0, float(np.median(link.time - link.log_time)))
+    held = int(_HELD_INTERVALS * interval + lead)
+    return (time >= link.time[0] - held) & (time <= link.time[-1] + held)
+
+
+def _pose_at(link: Link, time: Ints) -> tuple[Floats, Floats]:
+    start = link.time[0]
+    return interpolate_poses(
+        (time - start) * 1e-9, (link.time - start) * 1e-9, link.position, link.quaternion
+    )
+
+
+def _clean(frame: str) -> str:
+    return frame.lstrip("/")
+
+
+def _base_name(topic: str) -> str:
+    return topic.rstrip("/").rsplit("/", 1)[-1]
