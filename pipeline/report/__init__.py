@@ -1,7 +1,7 @@
 """Figures and one offline page for a run.
 
-A figure is one file in `pipeline.report.figures`, a function from tables to an Altair chart; a section of the page
-is a function from the report to HTML. Nothing is computed here that a table could hold: the report only draws.
+A figure is one file in `pipeline.report.figures`, a function from tables to an Altair chart; a section of
+the page is a function from the report to HTML. Numbers come from the tables and the summary.
 """
 
 from pipeline.report.bundle import warm_bundle

@@ -1,7 +1,7 @@
 """The JavaScript that draws: Vega, Vega-Lite and Vega-Embed, out of the Python package that ships them.
 
-Bundling takes most of a second and always gives the same text, so it is kept in the user's cache folder. The cache
-is only a shortcut: a missing, damaged or read-only one costs that second and nothing else.
+Bundling takes most of a second and always gives the same text, so it is kept in the user's cache folder. The
+cache is only a shortcut: a missing, damaged or read-only one costs that second and nothing else.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 _DIGEST_LENGTH = 64
+_EXPOSE = "window.vegaEmbed = vegaEmbed;"
 
 
 def load_bundle() -> str:
@@ -27,7 +28,9 @@ def load_bundle() -> str:
     import vl_convert  # noqa: PLC0415 - starting its JavaScript engine is what the cache avoids
 
     # A closing tag inside a string literal would end the element that holds the script.
-    script: str = vl_convert.javascript_bundle().replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    script: str = (
+        vl_convert.javascript_bundle(_EXPOSE).replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    )
     _write_checked(path, script)
     return script
 
@@ -35,14 +38,14 @@ def load_bundle() -> str:
 def warm_bundle() -> None:
     """Bundle in a process of its own, so that it overlaps with reading the log.
 
-    The bundler holds the interpreter's lock for as long as it works, so a thread would gain nothing. Returns at
-    once; does nothing where the cache is filled or cannot be written.
+    The bundler holds the interpreter's lock for as long as it works, so a thread would gain nothing. Returns
+    at once; does nothing where the cache is filled or cannot be written.
     """
     path = cache_path()
     if path.is_file() or not _can_write(path.parent):
         return
     with contextlib.suppress(OSError):
-        subprocess.Popen(  # noqa: S603 - our own interpreter and module
+        subprocess.Popen(
             [sys.executable, "-c", "from pipeline.report.bundle import load_bundle; load_bundle()"],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,

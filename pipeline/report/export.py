@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pipeline.report.errors import ReportError
 from pipeline.report.figures import list_figures
-from pipeline.report.run import RunReport
 from pipeline.report.scene import Scene
 from pipeline.report.specs import fill_spec
+
+if TYPE_CHECKING:
+    from pipeline.report.run import RunReport
 
 FORMATS = ("svg", "pdf", "png")
 
 _PNG_SCALE = 2.0
 
 
-def write_figures(report: RunReport, folder: Path, format: Literal["svg", "pdf", "png"]) -> list[Path]:  # noqa: A002
+def write_figures(
+    report: RunReport,
+    folder: Path,
+    format: Literal["svg", "pdf", "png"],  # noqa: A002 - the word people use for it
+) -> list[Path]:
     """Write every figure that the run has rows for.
 
     Args:
@@ -32,7 +38,9 @@ def write_figures(report: RunReport, folder: Path, format: Literal["svg", "pdf",
     """
     if format not in FORMATS:
         raise ReportError(
-            "figure_format_unknown", f"no figure can be written as {format!r}", hint=f"Use one of {', '.join(FORMATS)}"
+            "figure_format_unknown",
+            f"no figure can be written as {format!r}",
+            hint=f"Use one of {', '.join(FORMATS)}",
         )
     import vl_convert  # noqa: PLC0415 - starts a JavaScript engine
 
@@ -56,7 +64,9 @@ def write_figures(report: RunReport, folder: Path, format: Literal["svg", "pdf",
             path.write_bytes(content.encode() if isinstance(content, str) else content)
         except OSError as error:
             raise ReportError(
-                "figure_not_written", f"a figure cannot be written: {error.strerror}", where=str(path),
+                "figure_not_written",
+                f"a figure cannot be written: {error.strerror}",
+                where=str(path),
                 hint="Choose a folder that can be written with --out",
             ) from error
         written.append(path)

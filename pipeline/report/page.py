@@ -1,7 +1,7 @@
 """The page: one file that asks the network for nothing.
 
-Scripts run only if their hash stands in the page's content security policy, so a text out of a log could not run
-even if it escaped its place. Vega evaluates its expressions with its own interpreter, without `eval`.
+Scripts run only if their hash stands in the page's content security policy, so a text out of a log could not
+run even if it escaped its place. Vega evaluates its expressions with its own interpreter, without `eval`.
 """
 
 from __future__ import annotations
@@ -9,16 +9,19 @@ from __future__ import annotations
 import base64
 import hashlib
 from importlib.resources import files
+from typing import TYPE_CHECKING
 
 from pipeline.report import theme
 from pipeline.report.bundle import load_bundle
 from pipeline.report.figures import list_figures
-from pipeline.report.run import RunReport
 from pipeline.report.scene import Scene
 from pipeline.report.sections import SECTIONS, Page
 from pipeline.report.sections.health import summarise_health
 from pipeline.report.specs import build_spec, share_rows
 from pipeline.report.words import encode_json, escape, say_date, say_distance, say_duration
+
+if TYPE_CHECKING:
+    from pipeline.report.run import RunReport
 
 
 def render_report(report: RunReport) -> str:
@@ -56,7 +59,8 @@ def _render_header(page: Page) -> str:
     ]
     facts = "".join(f"<li>{escape(part)}</li>" for part in line if part)
     strip = "".join(
-        f'<li class="grade-{grade}"><a href="#health">{escape(words)}</a></li>' for grade, words in summarise_health(report)
+        f'<li class="grade-{grade}"><a href="#health">{escape(words)}</a></li>'
+        for grade, words in summarise_health(report)
     )
     return (
         f'<header><h1>{escape(report.text("run") or "run")}</h1><ul class="line">{facts}</ul>'

@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
+import numpy as np
 import polars as pl
 
-from pipeline.report.run import RunReport
-from pipeline.report.thinning import find_spans, thin_series, thin_to_peaks
+from pipeline.report.thinning import drop_flat_rows, find_spans, thin_series, thin_to_peaks
 
-LINE_BINS = 1200
+if TYPE_CHECKING:
+    from pipeline.report.run import RunReport
+
+LINE_BINS = 1000
 TRACK_BINS = 2400
 COMPONENTS = ("x", "y", "w")
 
@@ -71,6 +75,11 @@ class Scene:
         sound = {name: frame.filter(~pl.col("suspect")) for name, frame in self.slip.items()}
         return {name: frame for name, frame in sound.items() if not frame.is_empty()}
 
+    def median_modulus(self, name: str) -> float | None:
+        """Median slip modulus on an input [m/s], suspect stretches left out."""
+        frame = self.sound_slip.get(name)
+        return None if frame is None else float(np.median(frame["modulus"].to_numpy()))
+
     @cached_property
     def main_slip(self) -> pl.DataFrame | None:
         """Slip of the leading input."""
@@ -115,8 +124,8 @@ class Scene:
             asked = asked.unique(["stamp", "segment"], maintain_order=True)
             joined = places.join(asked, on=["stamp", "segment"], how="left", maintain_order="left")
         joined = joined.drop("stamp", "segment")
-        peaks = joined.with_columns(segment=pl.col("piece"), peak=pl.col("modulus").fill_null(-1.0))
-        thinned = thin_to_peaks(peaks, "peak", bins=TRACK_BINS).drop("segment", "peak")
+        peaks = joined.with_columns(peak=pl.col("modulus").fill_null(-1.0))
+        thinned = thin_to_peaks(peaks, "peak", bins=TRACK_BINS).drop("peak")
         return Thinned(thinned, joined.height)
 
     @cached_property
@@ -128,7 +137,9 @@ class Scene:
         """Measured and ideal velocity over time of `x`, `y` or `w`, long: ``t value series piece``."""
         measured = self.velocities if self.velocities is not None else self.main_slip
         lines = [] if measured is None else [(measured, f"v_{component}", "velocity")]
-        return self._join_lines([(frame, f"f_{component}", name) for name, frame in self.slip.items()] + lines)
+        return self._join_lines(
+            [(frame, f"f_{component}", name) for name, frame in self.slip.items()] + lines
+        )
 
     @cached_property
     def transitory_spans(self) -> pl.DataFrame:
@@ -155,12 +166,13 @@ class Scene:
     def _join_lines(self, lines: list[tuple[pl.DataFrame, str, str]]) -> Thinned | None:
         if not lines:
             return None
-        parts = []
+        parts, total = [], 0
         for frame, column, series in lines:
-            line = frame.select("t", value=pl.col(column), segment=pl.col("piece"))
-            thinned = thin_series(line, ["value"], bins=LINE_BINS)
-            parts.append(thinned.select("t", "value", pl.lit(series).alias("series"), piece="segment"))
-        return Thinned(pl.concat(parts), sum(frame.height for frame, _, _ in lines))
+            # Flat stretches go first, so that a held command keeps its edges where they were.
+            line = drop_flat_rows(frame.select("t", "piece", value=pl.col(column)), "value")
+            parts.append(thin_series(line, "value", bins=LINE_BINS).with_columns(series=pl.lit(series)))
+            total += line.height
+        return Thinned(pl.concat(parts), total)
 
 
 def round_up(value: float) -> float:

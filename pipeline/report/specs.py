@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import polars as pl
@@ -10,6 +9,8 @@ import polars as pl
 from pipeline.report import theme
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from pipeline.report.figures import Drawing
 
 _DIGITS = 4
@@ -60,4 +61,3 @@ def _pack_columns(frame: pl.DataFrame) -> Columns:
 
 def _round_floats(frame: pl.DataFrame) -> pl.DataFrame:
     return frame.with_columns(pl.col(pl.Float64, pl.Float32).round(_DIGITS) + 0.0)
-

@@ -1,8 +1,8 @@
 """One look for every figure: colours, type, axes.
 
-The categorical colours follow Okabe and Ito (2008) and stay apart under the common colour blindnesses; the ramp of
-slip grows monotonously in lightness, so that it also survives a grey print. A figure is drawn in the light colours; the page exchanges
-each for its dark twin where the reader's system asks for it.
+The categorical colours follow Okabe and Ito (2008) and stay apart under the common colour blindnesses; the
+ramp of slip is monotonous in lightness, so that it also survives a grey print. A figure is drawn in the light
+colours; the page exchanges each for its dark twin where the reader's system asks for it.
 """
 
 from __future__ import annotations

@@ -6,8 +6,11 @@ import html
 import json
 import math
 import unicodedata
-from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
 
 _MISSING = "\u2013"
 _MINUTE, _HOUR = 60.0, 3600.0
@@ -16,7 +19,10 @@ _EARLIEST_YEAR = 2000
 
 
 def escape(text: object) -> str:
-    """A text as HTML, safe in content and in quoted attributes; control characters (also those that turn the writing direction) become visible marks."""
+    """A text as HTML, safe in content and in quoted attributes.
+
+    Control characters, also those that turn the writing direction, become visible marks.
+    """
     visible = "".join("\ufffd" if _is_control(mark) else mark for mark in str(text))
     return html.escape(visible, quote=True)
 
@@ -86,7 +92,9 @@ def say_bytes(count: float | None) -> str:
     return f"{count:.0f} B"
 
 
-def build_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str, numeric: Sequence[int] = ()) -> str:
+def build_table(
+    head: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str, numeric: Sequence[int] = ()
+) -> str:
     """An HTML table from cells that are HTML already; the first column is the row's header.
 
     Args:
@@ -108,5 +116,6 @@ def build_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, caption: 
     return (
         f'<p class="caption">{escape(caption)}</p>'
         f'<div class="table" tabindex="0" role="region" aria-label="{escape(caption)}">'
-        f'<table aria-label="{escape(caption)}"><thead><tr>{titles}</tr></thead>\n<tbody>{body}</tbody></table></div>'
+        f'<table aria-label="{escape(caption)}"><thead><tr>{titles}</tr></thead>\n'
+        f"<tbody>{body}</tbody></table></div>"
     )

@@ -24,7 +24,7 @@ _SMALLEST_BOUND = 0.1
 def draw_command_space(scene: Scene) -> Drawing | None:
     """A heat map: colour is the median modulus of the samples in a cell; empty cells stay empty."""
     slip = scene.sound_slip.get(scene.report.main_input)
-    if slip is None or scene.track is None:
+    if slip is None:
         return None
     cells = _count_cells(slip)
     bounds = {name: _bound(slip, name) for name in ("f_x", "f_w")}
@@ -45,7 +45,11 @@ def draw_command_space(scene: Scene) -> Drawing | None:
     ]
     base = alt.Chart(alt.NamedData("command_cells"))
     heat = base.mark_rect().encode(
-        x=alt.X("w_low:Q"), x2="w_high:Q", y=alt.Y("x_low:Q"), y2="x_high:Q", color=parts.slip_colour(scene),
+        x=alt.X("w_low:Q"),
+        x2="w_high:Q",
+        y=alt.Y("x_low:Q"),
+        y2="x_high:Q",
+        color=parts.slip_colour(scene),
         tooltip=tooltip,
     )
     marked = (
@@ -74,7 +78,10 @@ def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
         low, high = _bound(slip, name)
         size = (high - low) / _CELLS
         number = ((pl.col(name) - low) / size).floor().clip(0, _CELLS - 1)
-        columns += [(low + number * size).alias(f"{short}_low"), (low + (number + 1) * size).alias(f"{short}_high")]
+        columns += [
+            (low + number * size).alias(f"{short}_low"),
+            (low + (number + 1) * size).alias(f"{short}_high"),
+        ]
     edges = ["x_low", "x_high", "w_low", "w_high"]
     return (
         slip.select(*columns, "modulus")

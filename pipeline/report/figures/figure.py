@@ -5,16 +5,19 @@ from __future__ import annotations
 import functools
 import importlib
 import pkgutil
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
     import altair as alt
     import polars as pl
 
     from pipeline.report.scene import Scene
+
+    Picture: TypeAlias = alt.Chart | alt.LayerChart | alt.FacetChart | alt.VConcatChart
 
 
 class Section(Enum):
@@ -42,7 +45,7 @@ class Drawing:
         note: what the reader must know to trust it, for example that points were left out; may be empty.
     """
 
-    chart: alt.Chart | alt.LayerChart | alt.VConcatChart
+    chart: Picture
     rows: Mapping[str, pl.DataFrame]
     note: str = ""
 

@@ -9,6 +9,7 @@ import altair as alt
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
 from pipeline.report.run import INPUT_WORDS
+from pipeline.report.words import say_number
 
 if TYPE_CHECKING:
     from pipeline.report.scene import Scene
@@ -24,7 +25,7 @@ def draw_modulus(scene: Scene) -> Drawing | None:
         .mark_line(clip=True)
         .encode(
             x=parts.time_axis(scene),
-            y=parts.value_axis(zero=True),
+            y=parts.value_axis(),
             color=parts.series_colour(list(scene.slip), INPUT_WORDS),
             detail="piece:N",
         )
@@ -32,8 +33,10 @@ def draw_modulus(scene: Scene) -> Drawing | None:
     chart = alt.layer(*parts.shade_spans(), line).properties(
         width=parts.WIDTH, height=150, title="slip modulus [m/s]", usermeta=parts.brush_over_time()
     )
-    note = parts.tell_thinning(lines, kept="lowest and highest of every bin")
-    return Drawing(chart, {"modulus": lines.frame} | parts.span_rows(scene), f"{parts.tell_bands(scene)} {note}".strip())
+    note = parts.tell_thinning(lines, kept="first, last, lowest and highest of every bin")
+    return Drawing(
+        chart, {"modulus": lines.frame} | parts.span_rows(scene), f"{parts.tell_bands(scene)} {note}".strip()
+    )
 
 
 def describe_modulus(scene: Scene) -> str:
@@ -42,8 +45,8 @@ def describe_modulus(scene: Scene) -> str:
     for name, frame in scene.sound_slip.items():
         row = frame.row(frame["modulus"].arg_max() or 0, named=True)
         told.append(
-            f"{INPUT_WORDS[name]} its median is {frame['modulus'].median():.2f} m/s and it is highest, "
-            f"{row['modulus']:.2f} m/s, at {row['t']:.0f} s"
+            f"{INPUT_WORDS[name]} its median is {say_number(scene.median_modulus(name))} m/s "
+            f"and it is highest, {row['modulus']:.2f} m/s, at {row['t']:.0f} s"
         )
     return "Slip modulus over time: " + "; ".join(told) + "."
 

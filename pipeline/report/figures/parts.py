@@ -27,24 +27,30 @@ MARKED_SPANS = "marked_spans"
 MARKED_POINTS = "marked_points"
 
 _EMPTY_SPANS = pl.DataFrame(schema={"t_start": pl.Float64, "t_end": pl.Float64})
-_EMPTY_POINTS = pl.DataFrame(schema={name: pl.Float64 for name in ("t", "x", "y", "f_x", "f_w", "modulus")})
+_EMPTY_POINTS = pl.DataFrame(schema=dict.fromkeys(("t", "x", "y", "f_x", "f_w", "modulus"), pl.Float64))
 
 
 def time_axis(scene: Scene, *, title: str | None = "time since the start of the run [s]") -> alt.X:
     """The axis that every figure over time has; without a title its labels are left out too."""
     axis = alt.Axis(title=title, tickCount=8, labels=title is not None, grid=False, format=",~r")
-    return alt.X("t:Q", axis=axis, scale=alt.Scale(domain=list(scene.time_domain or (0, 1)), nice=False, zero=False))
+    return alt.X(
+        "t:Q", axis=axis, scale=alt.Scale(domain=list(scene.time_domain or (0, 1)), nice=False, zero=False)
+    )
 
 
-def value_axis(**scale: object) -> alt.Y:
+def value_axis() -> alt.Y:
     """A vertical axis without a title of its own (the panel's title names quantity and unit)."""
     axis = alt.Axis(title=None, tickCount=4, format=",~r", minExtent=GUTTER - 10)
-    return alt.Y("value:Q", axis=axis, scale=alt.Scale(**scale))
+    return alt.Y("value:Q", axis=axis, scale=alt.Scale(zero=True))
 
 
 def shade_spans() -> list[alt.Chart]:
     """Bands over the full height of a panel: after a change of command, suspect, marked by the reader."""
-    bands = (("transitory", theme.SHADE, 1.0), ("suspect", theme.SUSPECT, 1.0), (MARKED_SPANS, theme.MARK, 0.2))
+    bands = (
+        ("transitory", theme.SHADE, 1.0),
+        ("suspect", theme.SUSPECT, 1.0),
+        (MARKED_SPANS, theme.MARK, 0.2),
+    )
     return [
         alt.Chart(alt.NamedData(name))
         .mark_rect(color=colour, opacity=opacity, clip=True)
@@ -65,9 +71,15 @@ def slip_colour(scene: Scene, field: str = "modulus") -> alt.Color:
     """The ramp of slip modulus, the same in every figure of a run."""
     words = INPUT_WORDS[scene.report.main_input]
     legend = alt.Legend(
-        title=f"slip modulus {words} [m/s]", gradientLength=150, gradientThickness=8, tickCount=3, format=",~r"
+        title=f"slip modulus {words} [m/s]",
+        gradientLength=150,
+        gradientThickness=8,
+        tickCount=3,
+        format=",~r",
     )
-    scale = alt.Scale(domain=[0.0, scene.modulus_cap], range=list(theme.SLIP_RAMP), clamp=True, interpolate="rgb")
+    scale = alt.Scale(
+        domain=[0.0, scene.modulus_cap], range=list(theme.SLIP_RAMP), clamp=True, interpolate="rgb"
+    )
     return alt.Color(f"{field}:Q", scale=scale, legend=legend)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import altair as alt
 import numpy as np
 import polars as pl
@@ -9,6 +11,9 @@ import polars as pl
 from pipeline.report import theme
 from pipeline.report.figures import parts
 from pipeline.report.run import INPUT_WORDS
+
+if TYPE_CHECKING:
+    from pipeline.report.figures.figure import Picture
 
 _POINTS = 201
 _HIGHEST_SHOWN = 0.995
@@ -33,8 +38,8 @@ def tabulate_shares(values: dict[str, pl.Series]) -> tuple[pl.DataFrame, pl.Data
     return pl.concat(curves), pl.DataFrame(medians)
 
 
-def draw_shares(name: str, medians: pl.DataFrame, *, title: str) -> alt.LayerChart:
-    """The chart of curves called ``name`` and medians called ``<name>_medians``; the legend tells the medians."""
+def draw_shares(name: str, medians: pl.DataFrame, *, title: str) -> Picture:
+    """The chart of curves called ``name`` and medians called ``<name>_medians``, told in the legend."""
     words = {
         row["series"]: f"{INPUT_WORDS[row['series']]}, median {row['value']:.2f} m/s"
         for row in medians.iter_rows(named=True)

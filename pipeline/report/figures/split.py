@@ -48,7 +48,7 @@ def draw_split(scene: Scene) -> Drawing | None:
     chart = alt.layer(bars, *words).properties(
         width=640, height=34 * 3 * rows["subset"].n_unique() // 2 + 40, usermeta={"gutter": 74}
     )
-    note = "Vectors add, moduli do not: the shares are of the mean square; the cross term is twice the mean product."
+    note = "Vectors add, moduli do not: shares of the mean square; the cross term is twice the mean product."
     return Drawing(chart, {"split": rows}, note)
 
 
@@ -73,7 +73,9 @@ def _list_parts(scene: Scene) -> pl.DataFrame | None:
         .unpivot(list(_PARTS), index=["subset", "total"], variable_name="part", value_name="mean_square")
         .with_columns(share=pl.col("mean_square") / pl.col("total"))
         .drop("total")
-        .sort(pl.col("subset").replace_strict({name: i for i, name in enumerate(_SUBSETS)}), maintain_order=True)
+        .sort(
+            pl.col("subset").replace_strict({name: i for i, name in enumerate(_SUBSETS)}), maintain_order=True
+        )
     )
 
 

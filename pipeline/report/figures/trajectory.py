@@ -46,18 +46,27 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
         .encode(x="x:Q", y="y:Q")
     )
     ends = alt.Chart(alt.NamedData("track_ends")).encode(x="x:Q", y="y:Q")
-    spots = ends.mark_point(size=85, filled=True, fill=theme.PAPER, stroke=theme.INK, strokeWidth=2, opacity=1).encode(
-        shape=alt.Shape("place:N", scale=alt.Scale(domain=["start", "end"], range=["circle", "square"]), legend=None)
+    spots = ends.mark_point(
+        size=85, filled=True, fill=theme.PAPER, stroke=theme.INK, strokeWidth=2, opacity=1
+    ).encode(
+        shape=alt.Shape(
+            "place:N", scale=alt.Scale(domain=["start", "end"], range=["circle", "square"]), legend=None
+        )
     )
     words = ends.mark_text(align="left", dx=10, dy=-9, fontWeight=600, color=theme.INK).encode(text="place:N")
     meta = parts.brush_over_plane("x", "y") | {
         "equal": {"x": extent[0], "y": extent[1], "lowest": _LOWEST, "highest": _HIGHEST}
     }
     chart = alt.layer(path, marked, dots, spots, words).properties(width=_WIDTH, height=height, usermeta=meta)
-    first, last = frame.head(1).with_columns(place=pl.lit("start")), frame.tail(1).with_columns(place=pl.lit("end"))
+    first, last = (
+        frame.head(1).with_columns(place=pl.lit("start")),
+        frame.tail(1).with_columns(place=pl.lit("end")),
+    )
     rows = {"track": frame, "track_ends": pl.concat([first, last])} | parts.marked_rows()
     note = parts.tell_thinning(track, kept="the highest slip of every bin")
-    return Drawing(chart, rows, f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile. {note}".strip())
+    return Drawing(
+        chart, rows, f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile. {note}".strip()
+    )
 
 
 def fit_equal_aspect(

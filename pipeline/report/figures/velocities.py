@@ -11,6 +11,7 @@ from pipeline.report.figures.figure import Drawing, Figure, Section, Width
 from pipeline.report.scene import COMPONENTS
 
 if TYPE_CHECKING:
+    from pipeline.report.figures.figure import Picture
     from pipeline.report.scene import Scene
 
 _TITLES = {
@@ -31,11 +32,11 @@ def draw_velocities(scene: Scene) -> Drawing | None:
     panels[-1] = _draw_panel(scene, COMPONENTS[-1], names, title="time since the start of the run [s]")
     chart = alt.vconcat(*panels).properties(usermeta=parts.brush_over_time())
     rows = {f"velocity_{component}": line.frame for component, line in there.items()}
-    note = parts.tell_thinning(*there.values(), kept="lowest and highest of every bin")
+    note = parts.tell_thinning(*there.values(), kept="first, last, lowest and highest of every bin")
     return Drawing(chart, rows | parts.span_rows(scene), f"{parts.tell_bands(scene)} {note}".strip())
 
 
-def _draw_panel(scene: Scene, component: str, names: list[str], *, title: str | None = None) -> alt.LayerChart:
+def _draw_panel(scene: Scene, component: str, names: list[str], *, title: str | None = None) -> Picture:
     line = (
         alt.Chart(alt.NamedData(f"velocity_{component}"))
         .mark_line(clip=True)
@@ -46,7 +47,9 @@ def _draw_panel(scene: Scene, component: str, names: list[str], *, title: str | 
             detail="piece:N",
         )
     )
-    return alt.layer(*parts.shade_spans(), line).properties(width=parts.WIDTH, height=118, title=_TITLES[component])
+    return alt.layer(*parts.shade_spans(), line).properties(
+        width=parts.WIDTH, height=118, title=_TITLES[component]
+    )
 
 
 def describe_velocities(scene: Scene) -> str:

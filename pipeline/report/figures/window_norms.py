@@ -31,7 +31,8 @@ def _list_norms(scene: Scene) -> dict[str, pl.Series]:
     if "suspect" in windows.columns:
         windows = windows.filter(~pl.col("suspect"))
     by_input = {
-        name: windows.filter(pl.col("input").cast(pl.String) == name)["window_norm"] for name in scene.report.inputs
+        name: windows.filter(pl.col("input").cast(pl.String) == name)["window_norm"]
+        for name in scene.report.inputs
     }
     return {name: norms for name, norms in by_input.items() if not norms.is_empty()}
 

@@ -1,6 +1,7 @@
-"""The page from top to bottom: how bad, where, why, what now, then the log's health and where it all came from.
+"""The page from top to bottom: how bad, where, why, what now, then health and provenance.
 
-A section is a function from the page to HTML; one that has nothing to say returns an empty text and is left out.
+A section is a function from the page to HTML; one that has nothing to say returns an empty text and is left
+out.
 """
 
 from pipeline.report.sections.health import render_health

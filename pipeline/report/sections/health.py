@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from pipeline.report.run import RunReport, mapping_in, number_in, objects_in
-from pipeline.report.sections.page import Page
 from pipeline.report.words import build_table, escape, say_bytes, say_number, say_share
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.report.sections.page import Page
 
 _RANK = {"error": 0, "warning": 1, "info": 2}
 _SEVERITY_WORDS = {"error": "do not trust", "warning": "take care", "info": "note"}
@@ -24,7 +28,7 @@ def list_findings(report: RunReport) -> list[Mapping[str, object]]:
     found = report.items("findings")
     table = report.table("findings")
     if not found and table is not None:
-        found = table.to_dicts()
+        found = list(table.iter_rows(named=True))
     return sorted(found, key=lambda finding: _RANK.get(str(finding.get("severity")), len(_RANK)))
 
 
@@ -40,7 +44,9 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
         strip.append(("good", "no gaps") if gaps <= 0 else ("note", f"{int(segments):,} segments"))
     held = _held_share(report)
     if held is not None:
-        strip.append(("good", "no held poses") if held == 0 else ("note", f"{say_share(held)} of the poses held"))
+        strip.append(
+            ("good", "no held poses") if held == 0 else ("note", f"{say_share(held)} of the poses held")
+        )
     findings = [str(finding.get("severity")) for finding in list_findings(report)]
     for severity, word in (("error", "error"), ("warning", "warning")):
         count = findings.count(severity)
@@ -79,7 +85,8 @@ def _render_finding(finding: Mapping[str, object]) -> str:
     where = f' <span class="where">{joined}</span>' if place else ""
     return (
         f'<li class="{grade}"><span class="grade">{_SEVERITY_WORDS[grade]}</span>'
-        f'<div>{escape(finding.get("text", ""))}{where} <code>{escape(finding.get("id", ""))}</code></div></li>'
+        f"<div>{escape(finding.get('text', ''))}{where} "
+        f"<code>{escape(finding.get('id', ''))}</code></div></li>"
     )
 
 
@@ -107,11 +114,12 @@ def _render_topics(report: RunReport) -> str:
     topics = report.part("topics")
     rows = []
     for key, words in _TOPICS.items():
-        entry = topics.get(key)
-        chosen = mapping_in(topics, key) if isinstance(entry, Mapping) else {"topic": entry}
-        topic = chosen.get("topic")
-        if not topic and not chosen.get("reason"):
+        chosen = mapping_in(topics, key) or {"topic": topics.get(key)}
+        topic, reason = chosen.get("topic"), chosen.get("reason")
+        if not topic and not reason:
             continue
         shown = f"<code>{escape(topic)}</code>" if topic else "none"
-        rows.append([words, shown, escape(chosen.get("reason") or "")])
-    return build_table(["used as", "topic", "why this one"], rows, caption="Topics used") if rows else ""
+        because = f' <span class="because">{escape(reason)}</span>' if reason else ""
+        rows.append(f"<div><dt>{words}</dt><dd>{shown}{because}</dd></div>")
+    joined = "".join(rows)
+    return f'<p class="caption">Topics used, and why these</p><dl class="facts">{joined}</dl>' if rows else ""

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from pipeline.report.figures.figure import Section
 from pipeline.report.run import INPUT_WORDS, RunReport, mapping_in, number_in, numbers_in
-from pipeline.report.sections.page import Page
 from pipeline.report.words import build_table, escape, say_number
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.report.sections.page import Page
 
 
 def render_how_bad(page: Page) -> str:
     """Cards with the medians, slip over time, distributions, table of both inputs."""
     report = page.report
     cards = "".join(_render_card(name, _numbers_of(report, name)) for name in report.inputs)
-    lead = f'<div class="cards">{cards}</div>' if cards else '<p class="lead">No slip could be worked out.</p>'
+    lead = (
+        f'<div class="cards">{cards}</div>' if cards else '<p class="lead">No slip could be worked out.</p>'
+    )
     return lead + page.render_figures(Section.HOW_BAD) + _render_table(report)
 
 
@@ -44,33 +50,34 @@ def _render_card(name: str, numbers: Mapping[str, object]) -> str:
 
 
 def _render_table(report: RunReport) -> str:
-    rows = []
-    for name in report.inputs:
-        numbers = _numbers_of(report, name)
-        rms = (numbers_in(numbers, "rms") + [None] * 3)[:3]
-        samples = number_in(numbers, "samples")
-        rows.append(
-            [
-                INPUT_WORDS[name],
-                "\u2013" if samples is None else f"{samples:,.0f}",
-                say_number(number_in(numbers, "median_modulus")),
-                say_number(number_in(numbers, "median_window_norm")),
-                *(say_number(value) for value in rms),
-            ]
-        )
-    if not rows:
+    columns = [_list_numbers(_numbers_of(report, name)) for name in report.inputs]
+    if not columns:
         return ""
     scale = report.number("length_scale_m")
-    caption = "Slip g = f(u) \u2212 v of the ideal model"
-    if scale is not None:
-        caption += f"; modulus with L = {scale:g} m"
-    head = [
-        "u",
-        "time steps",
-        "median modulus <small>m/s</small>",
-        "median window norm <small>m/s</small>",
-        "rms g<sub>x</sub> <small>m/s</small>",
-        "rms g<sub>y</sub> <small>m/s</small>",
-        "rms g<sub>w</sub> <small>rad/s</small>",
+    caption = "Slip g = f(u) \u2212 v of the ideal model" + (
+        f"; modulus with L = {scale:g} m" if scale is not None else ""
+    )
+    rows = [[words, *(column[i] for column in columns)] for i, words in enumerate(_QUANTITIES)]
+    head = ["u", *(INPUT_WORDS[name] for name in report.inputs)]
+    return build_table(head, rows, caption=caption, numeric=range(1, len(head)))
+
+
+_QUANTITIES = (
+    "median modulus <small>m/s</small>",
+    "median 2 s window norm <small>m/s</small>",
+    "rms g<sub>x</sub>, forward <small>m/s</small>",
+    "rms g<sub>y</sub>, sideways <small>m/s</small>",
+    "rms g<sub>w</sub>, yaw rate <small>rad/s</small>",
+    "time steps",
+)
+
+
+def _list_numbers(numbers: Mapping[str, object]) -> list[str]:
+    """Cells in the order of the quantities."""
+    rms = [*numbers_in(numbers, "rms"), None, None, None][:3]
+    medians = [number_in(numbers, name) for name in ("median_modulus", "median_window_norm")]
+    samples = number_in(numbers, "samples")
+    return [
+        *(say_number(value) for value in medians + rms),
+        "\u2013" if samples is None else f"{samples:,.0f}",
     ]
-    return build_table(head, rows, caption=caption, numeric=range(1, 7))

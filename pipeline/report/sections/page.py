@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from pipeline.report.figures import Drawing, Figure
-from pipeline.report.figures.figure import Section
-from pipeline.report.run import RunReport
-from pipeline.report.scene import Scene
 from pipeline.report.words import escape
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from pipeline.report.figures import Drawing, Figure
+    from pipeline.report.figures.figure import Section
+    from pipeline.report.run import RunReport
+    from pipeline.report.scene import Scene
 
 
 @dataclass(frozen=True)

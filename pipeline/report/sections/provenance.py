@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from pipeline.report.run import mapping_in
-from pipeline.report.sections.page import Page
 from pipeline.report.words import escape
+
+if TYPE_CHECKING:
+    from pipeline.report.sections.page import Page
 
 
 def render_provenance(page: Page) -> str:
@@ -19,7 +22,9 @@ def render_provenance(page: Page) -> str:
     facts += [(f"version of {name}", value) for name, value in mapping_in(origin, "versions").items()]
     facts += [(f"key of {name}", value) for name, value in mapping_in(origin, "keys").items()]
     items = "".join(
-        f"<div><dt>{escape(name)}</dt><dd><code>{escape(value)}</code></dd></div>" for name, value in facts if value
+        f"<div><dt>{escape(name)}</dt><dd><code>{escape(value)}</code></dd></div>"
+        for name, value in facts
+        if value
     )
     return f'<dl class="facts">{items}</dl>' + _render_configuration(origin.get("configuration"))
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import shlex
+from typing import TYPE_CHECKING
 
-from pipeline.report.sections.page import Page
 from pipeline.report.words import escape
+
+if TYPE_CHECKING:
+    from pipeline.report.sections.page import Page
 
 
 def render_what_now(page: Page) -> str:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import polars as pl
 
 from pipeline.report.figures.figure import Section
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.scene import round_up
-from pipeline.report.sections.page import Page
 from pipeline.report.words import say_share
+
+if TYPE_CHECKING:
+    from pipeline.report.sections.page import Page
 
 _MOST_REGIONS = 3
 _WORTH_TELLING = 1.15
@@ -27,7 +31,8 @@ def render_where(page: Page) -> str:
     if regions:
         words = INPUT_WORDS[page.report.main_input]
         lines = "".join(
-            f"<li><b>{region}</b> carries {say_share(slip)} of the squared slip {words} in {say_share(time)} of the time</li>"
+            f"<li><b>{region}</b> carries {say_share(slip)} of the squared slip {words} "
+            f"in {say_share(time)} of the time</li>"
             for region, slip, time in regions
         )
         told = f'<ul class="regions">{lines}</ul>'

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from pipeline.report.figures.figure import Section
 from pipeline.report.run import number_in
-from pipeline.report.sections.page import Page
 from pipeline.report.words import say_share
+
+if TYPE_CHECKING:
+    from pipeline.report.sections.page import Page
 
 
 def render_why(page: Page) -> str:

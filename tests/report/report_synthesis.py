@@ -10,6 +10,7 @@ from pipeline.report import RunReport
 from schemas import contract_of
 
 RATE_HZ = 20.0
+STEP_S = 6.0
 START_NS = 1_725_000_000_000_000_000
 
 Floats = NDArray[np.float64]
@@ -31,7 +32,7 @@ def make_tables(
     t = np.arange(int(duration_s * RATE_HZ)) / RATE_HZ
     t = t[(t < 0.4 * duration_s) | (t > 0.4 * duration_s + 3.0)]
     segment = (t > 0.4 * duration_s).astype(np.int32)
-    step = (t // 6.0).astype(np.int32)
+    step = (t // STEP_S).astype(np.int32)
     steps = int(step.max()) + 1
     asked = np.column_stack((rng.uniform(-1.0, 4.0, steps), np.zeros(steps), rng.uniform(-1.6, 1.6, steps)))
     command = asked[step]
@@ -54,8 +55,7 @@ def make_tables(
     pose = {"x": x, "y": y, "z": zero, "roll": zero, "pitch": zero, "yaw": yaw}
     velocities = _frame(identity, {**grid, **pose, **velocity, "v_w_imu": body[:, 2]})
     ideal = {"command": command} | ({"measured": wheels} if measured else {})
-    late = (t % 6.0) < 2.0
-    slip = pl.concat([_slip(identity, grid, name, f, body, step, late) for name, f in ideal.items()])
+    slip = pl.concat([_slip(identity, grid, name, f, body) for name, f in ideal.items()])
     tables = {
         "velocities": velocities,
         "slip": slip,
@@ -118,7 +118,10 @@ def make_summary(tables: dict[str, pl.DataFrame], names: dict[str, str]) -> dict
         "topics": {
             "command": {"topic": names.get("topic", "/cmd_vel"), "reason": "what the controller received"},
             "wheels": {"topic": "/joint_states", "reason": "four wheel joints by name"},
-            "pose": {"topic": "/mapping/icp_odom", "reason": "the only localization that is no wheel odometry"},
+            "pose": {
+                "topic": "/mapping/icp_odom",
+                "reason": "the only localization that is no wheel odometry",
+            },
             "imu": {"topic": None, "reason": names.get("reason", "no IMU in the log")},
         },
         "provenance": {
@@ -147,15 +150,15 @@ def _slip(
     name: str,
     ideal: Floats,
     body: Floats,
-    step: NDArray[np.int32],
-    transitory: NDArray[np.bool_],
 ) -> pl.DataFrame:
     gap = ideal - body
-    parts: dict[str, object] = {"step": step, "transitory": transitory}
+    t = np.asarray(grid["t"])
+    step = (t // STEP_S).astype(np.int32)
+    parts: dict[str, object] = {"step": step, "transitory": (t % STEP_S) < 2.0}
     for i, axis in enumerate("xyw"):
         parts |= {f"f_{axis}": ideal[:, i], f"v_{axis}": body[:, i], f"g_{axis}": gap[:, i]}
     parts["modulus"] = np.linalg.norm(gap, axis=1)
-    parts["suspect"] = (step == 1) & (np.arange(step.size) % 120 > 90)
+    parts["suspect"] = (step == 1) & ((t % STEP_S) > 4.5)
     return _frame(identity, {**grid, **parts}).with_columns(input=pl.lit(name))
 
 
@@ -163,7 +166,7 @@ def _windows(slip: pl.DataFrame) -> pl.DataFrame:
     square = (pl.col("modulus") ** 2).mean()
     keys = ["run", "dataset", "vehicle", "terrain", "input", "segment", "step"]
     return (
-        slip.with_columns(window=(pl.col("t") % 6.0 // 2.0))
+        slip.with_columns(window=(pl.col("t") % STEP_S // 2.0))
         .group_by(*keys, "window", maintain_order=True)
         .agg(
             t_start=pl.col("t").min(),
@@ -192,9 +195,17 @@ def _aggregates(slip: pl.DataFrame, drive: Floats, ground: Floats, *, measured: 
                 | {"median_window_norm": 6.3 * (part["modulus"] ** 2).mean() ** 0.5}
                 | {f"rms_{axis}": (part[f"g_{axis}"] ** 2).mean() ** 0.5 for axis in "xyw"}
                 | {"mean_square": (part["modulus"] ** 2).mean()}
-                | {"drivetrain_mean_square": float((drive[chosen] ** 2).sum(axis=1).mean()) if split else None}
+                | {
+                    "drivetrain_mean_square": float((drive[chosen] ** 2).sum(axis=1).mean())
+                    if split
+                    else None
+                }
                 | {"ground_mean_square": float((ground[chosen] ** 2).sum(axis=1).mean()) if split else None}
-                | {"cross_mean_square": float(2 * (drive * ground)[chosen].sum(axis=1).mean()) if split else None}
+                | {
+                    "cross_mean_square": float(2 * (drive * ground)[chosen].sum(axis=1).mean())
+                    if split
+                    else None
+                }
                 | {"distance": 1421.0, "duration": part.height / RATE_HZ, "height_rate": 0.1}
                 | {"largest_kinetic_energy": 3100.0, "length_scale": 1.0}
             )
@@ -203,7 +214,12 @@ def _aggregates(slip: pl.DataFrame, drive: Floats, ground: Floats, *, measured: 
 
 def _findings(identity: dict[str, str], names: dict[str, str]) -> pl.DataFrame:
     rows = [
-        ("extract", "held_poses", "info", "52 % of the poses repeat the one before: a slow ICP sampled at 20 Hz"),
+        (
+            "extract",
+            "held_poses",
+            "info",
+            "52 % of the poses repeat the one before: a slow ICP sampled at 20 Hz",
+        ),
         ("extract", "imu_sign", "warning", names.get("finding", "The IMU's yaw rate has the opposite sign.")),
         ("velocity", "pose_jump", "info", "1 jump of the pose: a correction of the map, not a motion"),
     ]

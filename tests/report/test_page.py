@@ -1,0 +1,270 @@
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import re
+from html.parser import HTMLParser
+
+import polars as pl
+import pytest
+from report_synthesis import make_report
+
+from pipeline.report import RunReport, render_report
+from pipeline.report.figures import list_figures
+from pipeline.report.words import encode_json, escape, say_date, say_duration, say_number, say_share
+
+HOSTILE = "</script><script>alert(1)</script><!-- <img src=x onerror=alert(2)> \u2028 \" ' & \u202e"
+
+# Names of formats and an unused link to an editor inside the bundle; nothing fetches them.
+INERT = re.compile(
+    r"https?://(www\.w3\.org/|vega\.github\.io/(schema|editor)/|github\.com/vega/vega-lite/issues/)"
+)
+VOID = {"meta", "input", "br", "img", "link", "hr"}
+
+
+class Outline(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.headings: list[str] = []
+        self.scripts: list[tuple[dict[str, str | None], str]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        found = dict(attrs)
+        self.tags.append((tag, found))
+        if found.get("id"):
+            self.ids.append(str(found["id"]))
+        if tag == "script":
+            self.scripts.append((found, ""))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] in {"h1", "h2", "h3"}:
+            self.headings.append(f"{self.open[-1]} {data}")
+        if self.open and self.open[-1] == "script":
+            attributes, text = self.scripts[-1]
+            self.scripts[-1] = (attributes, text + data)
+
+
+def outline_of(page: str) -> Outline:
+    outline = Outline()
+    outline.feed(page)
+    outline.close()
+    return outline
+
+
+def data_of(outline: Outline) -> dict[str, dict[str, dict[str, object]]]:
+    texts = [text for attributes, text in outline.scripts if attributes.get("id") == "page-data"]
+    found: dict[str, dict[str, dict[str, object]]] = json.loads(texts[0])
+    return found
+
+
+@pytest.fixture(scope="module")
+def report() -> RunReport:
+    return make_report()
+
+
+@pytest.fixture(scope="module")
+def page(report: RunReport) -> str:
+    return render_report(report)
+
+
+@pytest.fixture(scope="module")
+def outline(page: str) -> Outline:
+    return outline_of(page)
+
+
+def test_page_answers_the_questions_from_top_to_bottom(outline: Outline) -> None:
+    questions = [words for words in outline.headings if words.startswith("h2")]
+    assert questions == [
+        "h2 How bad",
+        "h2 Where",
+        "h2 Why",
+        "h2 What now",
+        "h2 Data health",
+        "h2 Provenance",
+    ]
+    assert outline.headings[0] == "h1 field/2026-11-02_warthog"
+    assert outline.open == [], "every element is closed"
+    assert len(outline.ids) == len(set(outline.ids))
+
+
+def test_every_figure_has_a_place_and_words_for_those_who_cannot_see_it(outline: Outline) -> None:
+    places = {str(found["data-figure"]): found for _, found in outline.tags if "data-figure" in found}
+    assert list(places) == [figure.id for figure in list_figures()]
+    for found in places.values():
+        assert found["role"] == "img"
+        assert len(str(found["aria-label"])) > 40
+    assert set(data_of(outline)["figures"]) == set(places)
+
+
+def test_every_row_block_that_a_figure_names_is_there_once(outline: Outline) -> None:
+    data = data_of(outline)
+    named = set(re.findall(r'"data":\{"name":"(\w+)"', json.dumps(data["figures"], separators=(",", ":"))))
+    assert named == set(data["rows"])
+    for name, columns in data["rows"].items():
+        lengths = {len(c["codes"] if isinstance(c, dict) else c) for c in columns.values()}  # type: ignore[arg-type]
+        assert len(lengths) == 1, name
+
+
+def test_numbers_of_both_inputs_are_told(page: str, report: RunReport) -> None:
+    by_input = report.part("by_input")
+    for name in ("command", "measured"):
+        numbers = by_input[name]
+        assert isinstance(numbers, dict)
+        for key in ("median_modulus", "median_window_norm", "steady_median_modulus"):
+            assert say_number(numbers[key]) in page
+
+
+def test_medians_of_the_figures_leave_suspect_stretches_out(report: RunReport, page: str) -> None:
+    slip = report.tables["slip"].filter(pl.col("input").cast(str) == "command")
+    sound = slip.filter(~pl.col("suspect"))["modulus"].median()
+    assert isinstance(sound, float)
+    assert slip["suspect"].any()
+    assert f"on command, median {sound:.2f} m/s" in page
+
+
+def test_no_request_can_leave_the_page(outline: Outline, page: str) -> None:
+    policy = [found for tag, found in outline.tags if found.get("http-equiv") == "Content-Security-Policy"]
+    told = str(policy[0]["content"])
+    assert told.startswith("default-src 'none';")
+    assert "unsafe-eval" not in told
+    assert "http" not in told
+    assert "'unsafe-inline'" not in told.split("script-src")[1].split(";", maxsplit=1)[0]
+    for tag, found in outline.tags:
+        assert tag not in {"link", "iframe", "object", "embed", "base", "img"}
+        assert "src" not in found
+        assert str(found.get("href", "#")).startswith("#")
+        assert not any(name.startswith("on") for name in found)
+    urls = re.findall(r"https?://[^\s\"'`)\\<]+", page)
+    assert [url for url in urls if not INERT.match(url)] == []
+
+
+def test_only_our_scripts_may_run(outline: Outline) -> None:
+    policy = next(str(found["content"]) for _, found in outline.tags if found.get("http-equiv"))
+    runnable = [text for attributes, text in outline.scripts if attributes.get("type") is None]
+    assert len(runnable) == 2
+    allowed = re.findall(r"'sha256-([^']+)'", policy)
+    assert allowed == [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in runnable]
+
+
+@pytest.mark.parametrize(
+    "key", ["run", "vehicle", "terrain", "dataset", "topic", "reason", "finding", "where"]
+)
+def test_text_out_of_a_log_stays_text(key: str) -> None:
+    page = render_report(make_report(duration_s=20.0, names={key: HOSTILE}))
+    outline = outline_of(page)
+    assert len(outline.scripts) == 3
+    assert not any(tag == "img" for tag, _ in outline.tags)
+    assert outline.open == []
+    assert "alert(1)</script>" not in page
+    assert "\u202e" not in page
+    assert html.escape("<img src=x onerror=alert(2)>") in page or key == "dataset"
+    data_of(outline)
+
+
+def test_json_for_a_script_element_can_neither_end_it_nor_start_a_comment() -> None:
+    packed = encode_json({HOSTILE: [HOSTILE]})
+    assert not set("<>&\u2028\u2029") & set(packed)
+    assert json.loads(packed) == {HOSTILE: [HOSTILE]}
+    assert escape("a\x00b\u202ec") == "a\ufffdb\ufffdc"
+
+
+def test_same_tables_give_the_same_bytes(page: str) -> None:
+    assert render_report(make_report()) == page
+
+
+def test_a_long_log_stays_small() -> None:
+    page = render_report(make_report(duration_s=1350.0))
+    assert len(page.encode()) < 3_000_000
+    assert "Drawn from" in page
+
+
+def test_a_short_log_is_drawn_whole() -> None:
+    page = render_report(make_report(duration_s=20.0))
+    assert "Drawn from" not in outline_text(page)
+
+
+def outline_text(page: str) -> str:
+    return page.split("<script", 1)[0]
+
+
+@pytest.mark.parametrize(
+    "gone", ["velocities", "slip", "windows", "aggregates", "findings"], ids=lambda name: f"without_{name}"
+)
+@pytest.mark.parametrize("empty", [True, False], ids=["empty", "missing"])
+def test_a_missing_or_empty_table_costs_only_its_figures(
+    report: RunReport, gone: str, *, empty: bool
+) -> None:
+    tables = {name: frame for name, frame in report.tables.items() if name != gone}
+    if empty:
+        tables[gone] = report.tables[gone].clear()
+    outline = outline_of(render_report(RunReport(report.summary, tables)))
+    drawn = {str(found["data-figure"]) for _, found in outline.tags if "data-figure" in found}
+    lost: dict[str, set[str]] = {
+        "velocities": {"trajectory"},
+        "slip": {"modulus", "distribution", "command_space"},
+        "windows": {"window_norms"},
+        "aggregates": {"split"},
+        "findings": set(),
+    }
+    assert {figure.id for figure in list_figures()} - drawn == lost[gone]
+    assert "h2 How bad" in outline.headings
+
+
+def test_a_run_of_which_nothing_is_known_still_has_a_page() -> None:
+    outline = outline_of(render_report(RunReport({}, {})))
+    assert outline.open == []
+    assert "h2 How bad" in outline.headings
+    assert [attributes for attributes, _ in outline.scripts if attributes.get("type") is None] == []
+
+
+def test_summary_of_odd_kinds_is_no_reason_to_fail() -> None:
+    odd = {
+        "run": 7,
+        "log": None,
+        "by_input": [],
+        "split": "no",
+        "findings": {"a": 1},
+        "topics": 3,
+        "held_poses": "x",
+    }
+    assert outline_of(render_report(RunReport(odd, {}))).open == []
+
+
+def test_without_measured_wheels_nothing_is_said_about_the_ground() -> None:
+    page = outline_text(render_report(make_report(duration_s=20.0, measured=False)))
+    assert "on measured wheels" not in page
+    assert 'id="why"' not in page
+
+
+def test_losses_and_findings_are_told_gravest_first(page: str) -> None:
+    assert "log has losses (1)" in page
+    assert "48.2 kB" in page
+    assert page.index("take care") < page.index(">note<")
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [(1234.5, "1,234"), (0.0534, "0.0534"), (-2.0, "\u22122.00"), (None, "\u2013"), (0.0, "0")],
+)
+def test_numbers_keep_three_digits(value: float | None, words: str) -> None:
+    assert say_number(value) == words
+
+
+def test_durations_shares_and_dates_are_said_in_words() -> None:
+    assert say_duration(648.2) == "10 min 48 s"
+    assert say_duration(3.25) == "3.2 s"
+    assert say_duration(7380.0) == "2 h 03 min"
+    assert say_share(0.385) == "38\u202f%"
+    assert say_date(0) == ""
+    assert say_date(2**62) == "2116-02-20 23:53 UTC"
