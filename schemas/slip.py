@@ -40,6 +40,8 @@ class Slip(Table):
         metadata={"unit": "m/s", "frame": "base_link", "description": "norm of (g_x, g_y, L g_w)"},
     )
 
+    suspect = fields.flag("in a stretch with a rotated heading or a frozen position; left out of medians")
+
     @dy.rule()
     def slip_is_ideal_minus_measured(cls) -> pl.Expr:  # noqa: N805 - dataframely rules receive the class
         wrong = [(pl.col(f"f_{c}") - pl.col(f"v_{c}") - pl.col(f"g_{c}")).abs() for c in "xyw"]

@@ -23,6 +23,7 @@ class Windows(Table):
     segment = fields.segment()
     step = fields.step()
     transitory = fields.flag("the window is the first of its command step")
+    suspect = fields.flag("in a stretch with a rotated heading or a frozen position; left out of medians")
     samples = dy.Int32(min=1, metadata={"description": "grid steps in the window"})
     rms_modulus = dy.Float64(
         min=0.0, metadata={"unit": "m/s", "description": "root mean square of the slip modulus"}

@@ -1,1 +1,11 @@
-"""."""
+"""One log through all stages and its report; keys of what is done.
+
+A job settles what a log is and which topics serve, runs the stages whose key has changed, and publishes
+tables, summary and report in one moment.
+"""
+
+from pipeline.job.errors import JobError
+from pipeline.job.keys import STAGES
+from pipeline.job.options import INPUTS, Options
+
+__all__ = ["INPUTS", "STAGES", "JobError", "Options"]

@@ -1,0 +1,51 @@
+"""The `slip` program: its verbs, and what errors become."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import sys
+from collections.abc import Sequence
+
+from cyclopts import App, CycloptsError
+
+import pipeline.cli
+from pipeline.cli.output import FAILED, USAGE, print_error
+from pipeline.core.errors import SlipError
+
+HELP = """How far was the motion from the ideal model, and why?
+
+Reads MCAP logs of field robots, computes slip per time step, and writes tables, a summary and a report.
+"""
+
+
+def build_app() -> App:
+    """The program with every verb found in this folder; a verb is a module with a `register` function."""
+    app = App(name="slip", help=HELP, version_flags=["--version"], result_action="return_value")
+    for module in sorted(pkgutil.iter_modules(pipeline.cli.__path__), key=lambda found: found.name):
+        if module.name.startswith("verb_"):
+            importlib.import_module(f"pipeline.cli.{module.name}").register(app)
+    return app
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one verb and exit: 0 clean, 1 failed, 2 usage, 3 done with losses."""
+    # Results must not depend on how many threads a library takes, and short jobs lose time with more.
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    try:
+        code = build_app()(arguments, exit_on_error=False)
+    except CycloptsError:
+        sys.exit(USAGE)
+    except SlipError as error:
+        print_error(error)
+        sys.exit(FAILED)
+    except BrokenPipeError:
+        # The reader of a pipe has gone (`slip ... | head`): nobody is left to tell.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(FAILED)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted; nothing was left half-written\n")
+        sys.exit(130)
+    sys.exit(code if isinstance(code, int) else 0)

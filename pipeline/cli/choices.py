@@ -1,0 +1,77 @@
+"""Options that several verbs share: the vehicle, the inputs, where results go."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+from cyclopts.types import PositiveFloat
+
+from pipeline.job.options import INPUTS, Options
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choices:
+    """What may be said on the command line in place of a configuration file."""
+
+    vehicle: Annotated[str | None, Parameter(help="vehicle preset, for example husky_a200")] = None
+    wheel_radius: Annotated[PositiveFloat | None, Parameter(help="wheel radius [m], in place of a vehicle")] = None
+    track_width: Annotated[PositiveFloat | None, Parameter(help="track width [m], in place of a vehicle")] = None
+    dataset: Annotated[str | None, Parameter(help="dataset the run belongs to")] = None
+    terrain: Annotated[str | None, Parameter(help="terrain driven on")] = None
+    input: Annotated[
+        Literal["command", "measured", "both"], Parameter(help="what the ideal model is fed with")
+    ] = "both"
+    config: Annotated[Path | None, Parameter(help="configuration file in place of run.toml beside the log")] = None
+    yaw: Annotated[
+        Literal["pose", "imu"] | None, Parameter(help="whose yaw rate the slip tables use (default: pose)")
+    ] = None
+    interval: Annotated[
+        Literal["recorded", "all"], Parameter(help="live intervals as the log says, or all of it")
+    ] = "recorded"
+    out: Annotated[Path, Parameter(help="results folder")] = Path("results")
+
+
+def build_options(
+    choices: Choices,
+    *,
+    report: bool = False,
+    figures: str | None = None,
+    force: bool = False,
+    through: str = "aggregate",
+) -> Options:
+    """Options of a job from the choices on the command line."""
+    return Options(
+        out=choices.out,
+        config=choices.config,
+        overrides=_list_overrides(choices),
+        inputs=INPUTS if choices.input == "both" else (choices.input,),
+        report=report,
+        figures=figures,
+        force=force,
+        through=through,
+    )
+
+
+def _list_overrides(choices: Choices) -> Mapping[str, object]:
+    """Configuration values that were said on the command line."""
+    said: dict[str, dict[str, object]] = {
+        "vehicle": {
+            "preset": choices.vehicle,
+            "wheel_radius_m": choices.wheel_radius,
+            "track_width_m": choices.track_width,
+        },
+        "run": {"dataset": choices.dataset, "terrain": choices.terrain},
+        "velocity": {"yaw": choices.yaw},
+    }
+    kept: dict[str, object] = {}
+    for section, values in said.items():
+        given = {key: value for key, value in values.items() if value is not None}
+        if given:
+            kept[section] = given
+    if choices.interval == "all":
+        kept["use_intervals"] = "all"
+    return kept

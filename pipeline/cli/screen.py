@@ -1,0 +1,138 @@
+"""The one-screen summary of a run, for a tired person."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import cast
+
+Summary = Mapping[str, object]
+
+_LABEL = 26
+_SHOWN = 6
+
+
+def describe_run(summary: Summary, *, unchanged: bool) -> str:
+    """The summary of one run as lines of text."""
+    lines = [
+        *_describe_head(summary),
+        *_describe_slip(summary),
+        *_describe_topics(summary),
+        *_describe_findings(summary),
+        *_describe_end(summary, unchanged=unchanged),
+    ]
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def _part(summary: Summary, key: str) -> Mapping[str, object]:
+    found = summary.get(key)
+    return found if isinstance(found, Mapping) else {}
+
+
+def _number(content: Mapping[str, object], key: str, digits: int = 3, missing: str = "-") -> str:
+    value = content.get(key)
+    return f"{value:.{digits}g}" if isinstance(value, (int, float)) else missing
+
+
+def _row(label: str, text: str) -> str:
+    return f"{label:<{_LABEL}}{text}"
+
+
+def _describe_head(summary: Summary) -> list[str]:
+    log = _part(summary, "log")
+    seconds = float(cast("float", log.get("duration_s") or 0.0))
+    distance = summary.get("distance_m")
+    facts = [str(summary["vehicle"]), str(summary["terrain"]), format_duration(seconds)]
+    if isinstance(distance, (int, float)):
+        facts.append(format_distance(float(distance)))
+    head = [_row("run", f"{summary['run']}    {' · '.join(facts)}")]
+    losses = cast("Sequence[Mapping[str, object]]", log.get("losses") or [])
+    gaps = [f for f in _findings(summary) if f["id"] == "pose_gap"]
+    state = "complete" if not losses else "with losses"
+    holes = f", {gaps[0]['count']} gaps in the poses (longest {gaps[0]['value']:.2g} s)" if gaps else ""
+    segments = cast("int", summary["segments"])
+    head.append(_row("log", f"{state}{holes}, {segments} segment{'s' if segments != 1 else ''}"))
+    head += [_row("  lost", str(loss["text"])) for loss in losses[:_SHOWN]]
+    return head
+
+
+def _describe_slip(summary: Summary) -> list[str]:
+    by_input = _part(summary, "by_input")
+    words = {"command": "on command", "measured": "on measured wheels"}
+    shown = [name for name in words if name in by_input]
+    medians = "    ".join(
+        f"{_number(_part(by_input, name), 'median_modulus')} m/s {words[name]}" for name in shown
+    )
+    norms = " | ".join(_number(_part(by_input, name), "median_window_norm") for name in shown)
+    scale = _number(summary, "length_scale_m")
+    lines = [_row(f"slip modulus (L = {scale} m)", f"median {medians}    (2 s window norm {norms})")]
+    split = _part(summary, "split")
+    detail = []
+    if split:
+        detail.append("   ".join(f"{name} {float(cast('float', value)):.0%}" for name, value in split.items()))
+    lead = _part(by_input, str(summary.get("leading_input")))
+    detail.append(
+        f"transitory {_number(lead, 'transitory_median_modulus')} | "
+        f"steady {_number(lead, 'steady_median_modulus')} m/s"
+    )
+    lines.append(_row("", "      ".join(detail)))
+    return lines
+
+
+def _describe_topics(summary: Summary) -> list[str]:
+    topics = _part(summary, "topics")
+    lines = []
+    for role in ("command", "wheels", "pose", "imu", "interval"):
+        source = _part(topics, role)
+        if source:
+            lines.append(_row("" if lines else "topics", f"{role:<9}{source['topic']}    {source['reason']}"))
+    return lines
+
+
+def _findings(summary: Summary) -> list[Mapping[str, object]]:
+    return cast("list[Mapping[str, object]]", summary.get("findings") or [])
+
+
+def _describe_findings(summary: Summary) -> list[str]:
+    findings = _findings(summary)
+    serious = [found for found in findings if found["severity"] != "info"]
+    lines = []
+    for found in serious[:_SHOWN]:
+        mark = "!!" if found["severity"] == "error" else "! "
+        lines.append(_row("" if lines else "findings", f"{mark} {found['text']}"))
+    rest = len(findings) - len(serious[:_SHOWN])
+    if rest:
+        lines.append(_row("" if lines else "findings", f"   {rest} more in the report and in findings.parquet"))
+    return lines
+
+
+def _describe_end(summary: Summary, *, unchanged: bool) -> list[str]:
+    lines = []
+    if unchanged:
+        lines.append(_row("unchanged", "log and configuration are as before: nothing was computed (--force does)"))
+    report = summary.get("report")
+    if isinstance(report, str):
+        lines.append(_row("report", _relative(report)))
+    return lines
+
+
+def _relative(path: str) -> str:
+    try:
+        return str(Path(path).resolve().relative_to(Path.cwd()))
+    except ValueError:
+        return path
+
+
+def format_duration(seconds: float) -> str:
+    """Seconds in words: `10 min 48 s`."""
+    whole = round(seconds)
+    hours, rest = divmod(whole, 3600)
+    minutes, left = divmod(rest, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {left} s" if minutes else f"{left} s"
+
+
+def format_distance(metres: float) -> str:
+    """Metres in words: `1.42 km`."""
+    return f"{metres / 1000.0:.2f} km" if metres >= 1000.0 else f"{metres:.0f} m"  # noqa: PLR2004 - a kilometre

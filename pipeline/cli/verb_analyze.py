@@ -1,0 +1,89 @@
+"""`slip analyze`: all stages and the report for each log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from pipeline.cli.choices import Choices, build_options
+from pipeline.cli.output import describe_error, exit_code, print_error, print_json, show_progress
+from pipeline.core.errors import SlipError
+
+if TYPE_CHECKING:
+    from pipeline.job.analyze import Outcome
+    from pipeline.job.options import Options
+
+
+def register(app: App) -> None:
+    """Add the verb."""
+    app.command(analyze)
+
+
+def analyze(  # noqa: D417 - the shared choices document themselves
+    logs: Annotated[list[Path], Parameter(help="logs, MCAP files or folders of a split recording")],
+    /,
+    *,
+    choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
+    diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis", show=False)] = True,
+    report: Annotated[bool, Parameter(negative="--no-report")] = True,
+    figures: Literal["svg", "pdf", "png"] | None = None,
+    force: bool = False,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Analyze logs: slip per time step into tables, a one-screen summary and a report.
+
+    Args:
+        report: write report.html.
+        figures: also write the figures in this format, for papers.
+        force: compute again what is already there.
+        json: print one JSON object instead of the summary.
+        quiet: print no progress and no summary.
+    """
+    del diagnosis  # No effect is named yet: asking for none changes nothing.
+    options = build_options(choices, report=report, figures=figures, force=force)
+    outcomes, errors = _analyze_all(logs, options, quiet=quiet or json)
+    if json:
+        print_json({"runs": [dict(outcome.summary) for outcome in outcomes], "errors": errors})
+    elif not quiet:
+        _print_outcomes(outcomes)
+    return exit_code(errors, lossy=any(outcome.lossy for outcome in outcomes))
+
+
+def _analyze_all(
+    logs: list[Path], options: Options, *, quiet: bool
+) -> tuple[list[Outcome], list[dict[str, str]]]:
+    """Analyze one log after the other; an error costs one log."""
+    if options.report:
+        _warm_report()
+    from pipeline.job.analyze import analyze_log, update_datasets  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    outcomes: list[Outcome] = []
+    errors: list[dict[str, str]] = []
+    for log in logs:
+        try:
+            with show_progress(log.name, quiet=quiet) as progress:
+                outcomes.append(analyze_log(log, options, progress))
+        except SlipError as error:
+            print_error(error)
+            errors.append(describe_error(str(log), error))
+    if any(outcome.computed for outcome in outcomes):
+        update_datasets(Store(options.out))
+    return outcomes, errors
+
+
+def _warm_report() -> None:
+    """Fetch the report's drawing code in the background while the log is read."""
+    from pipeline.report.bundle import warm_bundle  # noqa: PLC0415 - only for reports
+
+    warm_bundle()
+
+
+def _print_outcomes(outcomes: list[Outcome]) -> None:
+    from pipeline.cli.screen import describe_run  # noqa: PLC0415 - only for people
+
+    for outcome in outcomes:
+        print(describe_run(outcome.summary, unchanged=not outcome.computed))

@@ -1,0 +1,153 @@
+"""Cutting a series of poses where something broke: holes in time, jumps of the pose.
+
+A segment is a stretch in which time runs forward without a hole and the pose moves continuously. Nothing is
+interpolated or differentiated across a segment's ends.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core import rigid
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+
+_GAUSSIAN = 1.4826
+_SIDE = 4
+
+
+def find_gaps(times: Floats, smallest: float) -> Flags:
+    """Whether a hole in time lies before each sample.
+
+    A hole is longer than three median periods and than ``smallest`` [s].
+
+    Args:
+        times: sample times [s], shape (n,), increasing.
+        smallest: the shortest hole that counts [s].
+
+    Returns:
+        Flags of shape (n,); the first is False.
+    """
+    if times.size < 2:  # noqa: PLR2004 - one sample has no period
+        return np.zeros(times.size, dtype=bool)
+    period = np.diff(times)
+    limit = max(3.0 * float(np.median(period)), smallest)
+    return np.concatenate(([False], period > limit * (1.0 + 1e-9)))
+
+
+def find_held(position: Floats, quaternion: Floats) -> Flags:
+    """Whether each pose repeats the one before it exactly; shapes (n, 3), (n, 4) -> (n,)."""
+    same = np.all(np.diff(position, axis=0) == 0.0, axis=1) & np.all(np.diff(quaternion, axis=0) == 0.0, axis=1)
+    return np.concatenate((np.zeros(min(1, position.shape[0]), dtype=bool), same))
+
+
+def select_fresh_poses(times: Floats, held: Flags) -> Integers:
+    """Indices of the poses that carry information: those that changed, and those of a vehicle at rest.
+
+    A localization slower than its topic repeats its last estimate; such repeats are dropped. A vehicle that
+    stands still repeats its pose too, for longer than the localization ever waits: those repeats are kept,
+    but for the last waiting time before the next change, which may be old again.
+
+    Args:
+        times: sample times [s], shape (n,).
+        held: repeats of the pose before, shape (n,).
+    """
+    fresh = np.flatnonzero(~held)
+    if fresh.size == held.size or fresh.size < 3:  # noqa: PLR2004 - too few changes to know the waiting time
+        return fresh.astype(np.int64)
+    waits = np.diff(times[fresh])
+    longest_wait = 3.0 * float(np.median(waits))
+    previous = np.maximum.accumulate(np.where(held, 0, np.arange(held.size)))
+    following = np.searchsorted(fresh, np.arange(held.size), side="right")
+    next_fresh = np.append(times[fresh], np.inf)[following]
+    stands = held & (next_fresh - times[previous] > longest_wait)
+    old_again = next_fresh - times < float(np.median(waits)) * 1.5
+    return np.flatnonzero(~held | (stands & ~old_again)).astype(np.int64)
+
+
+def find_jumps(times: Floats, position: Floats, quaternion: Floats, *, metres: float, radians: float) -> Flags:
+    """Whether the pose jumps before each sample: a correction of the map, not a motion.
+
+    A jump stays; vibration, and poses that are stamped late, come back. So the body's own odometer over four
+    poses before and four after is fitted by a straight line with a step in the middle, and the step counts
+    where it exceeds both eight robust standard deviations of all such steps and the given floor.
+
+    Args:
+        times: sample times [s], shape (n,), strictly increasing.
+        position: shape (n, 3) [m].
+        quaternion: shape (n, 4), unit length.
+        metres: smallest translation that counts as a jump [m].
+        radians: smallest rotation that counts as a jump [rad].
+
+    Returns:
+        Flags of shape (n,); False for the first and last poses that lack neighbours.
+    """
+    flags = np.zeros(times.size, dtype=bool)
+    if times.size < 2 * _SIDE:
+        return flags
+    move, turn = measure_increments(position, quaternion)
+    for increment, floor in ((move, metres), (turn, radians)):
+        size = np.linalg.norm(_fit_steps(times, increment), axis=1)
+        limit = max(8.0 * _GAUSSIAN * float(np.median(size)), floor)
+        # The fits around a jump see it too; the jump is where the step is largest.
+        padded = np.pad(size, _SIDE - 1)
+        tallest = np.lib.stride_tricks.sliding_window_view(padded, 2 * _SIDE - 1).max(axis=1)
+        flags[_SIDE : _SIDE + size.size] |= (size > limit) & (size >= tallest)
+    return flags
+
+
+def _fit_steps(times: Floats, increment: Floats) -> Floats:
+    """Step in the middle of every 2 x 4 poses, beside a straight line; shape (n - 7, 3)."""
+    odometer = np.concatenate((np.zeros((1, 3)), np.cumsum(increment, axis=0)))
+    windows = np.lib.stride_tricks.sliding_window_view(odometer, 2 * _SIDE, axis=0)
+    stamps = np.lib.stride_tricks.sliding_window_view(times, 2 * _SIDE)
+    side = np.repeat([0.0, 1.0], _SIDE)
+    after = np.broadcast_to(side - side.mean(), stamps.shape)
+    along = stamps - stamps.mean(axis=1, keepdims=True)
+    # Frisch and Waugh: the step's coefficient is that of the step cleared of the line.
+    cleared = after - along * (np.sum(along * after, axis=1) / np.sum(along**2, axis=1))[:, None]
+    steps: Floats = np.einsum("nw,ncw->nc", cleared, windows) / np.sum(cleared**2, axis=1)[:, None]
+    return steps
+
+
+def measure_increments(position: Floats, quaternion: Floats) -> tuple[Floats, Floats]:
+    """Body-frame increments between consecutive poses, as constant twists over each interval.
+
+    The logarithm on SE(3): moving with the returned twist for one interval leads exactly from one pose to
+    the next, so a circle gives no false lateral motion (start-frame differencing would add dt v w / 2).
+
+    Args:
+        position: shape (n, 3) [m].
+        quaternion: shape (n, 4), unit length.
+
+    Returns:
+        Translations [m] and rotations [rad] in the body frame, each of shape (n - 1, 3).
+    """
+    inverse = rigid.invert_quaternions(quaternion[:-1])
+    turn = rigid.rotation_vectors(rigid.multiply_quaternions(inverse, quaternion[1:]))
+    moved = rigid.rotate(inverse, np.diff(position, axis=0))
+    angle = np.linalg.norm(turn, axis=1, keepdims=True)
+    # Inverse left Jacobian of SO(3) (Sola et al., arXiv:1812.01537, eq. 146), with its series near zero.
+    safe = np.maximum(angle, 1e-4)
+    third = np.where(
+        angle < 1e-4,  # noqa: PLR2004 - below it the series is exact to rounding
+        1.0 / 12.0,
+        1.0 / safe**2 - 1.0 / (2.0 * safe * np.tan(safe / 2.0)),
+    )
+    half = np.cross(turn, moved)
+    return moved - 0.5 * half + third * np.cross(turn, half), turn
+
+
+def number_segments(breaks: Flags) -> Integers:
+    """Segment number of each sample from flags that say a break lies before it."""
+    numbers: Integers = np.cumsum(breaks, dtype=np.int64)
+    return numbers
+
+
+def find_runs(flags: Flags) -> list[tuple[int, int]]:
+    """Stretches of True as (first, one past last) index pairs."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], flags.astype(np.int8), [0]))))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

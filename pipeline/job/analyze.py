@@ -1,0 +1,208 @@
+"""One log through all stages, its summary and its report."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import msgspec
+
+from pipeline.job.keys import STAGES, hash_json, key_stages
+from pipeline.job.subject import Subject, describe_subject, name_run
+from pipeline.job.summary import summarize_run
+from pipeline.job.work import Progress, Work, read_subject, stored_contexts, stored_keys
+from pipeline.logs import LogData
+from pipeline.store import JSON, LogIdentities, Manifest, Store, see_log
+
+if TYPE_CHECKING:
+    from pipeline.job.options import Options
+    from pipeline.store import Generation
+
+SUMMARY = "summary.json"
+REPORT = "report.html"
+_PACKAGES = ("slip-pipeline", "mcap", "mcap-ros2-support", "numpy", "polars", "pyarrow")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one log.
+
+    Attributes:
+        summary: the JSON object of the run; empty when a single stage was run.
+        manifest: the generation that is current now.
+        computed: stages that were computed; empty when nothing had changed.
+    """
+
+    summary: Mapping[str, JSON]
+    manifest: Manifest
+    computed: tuple[str, ...]
+
+    @property
+    def lossy(self) -> bool:
+        """Whether the log had losses."""
+        return bool(stored_contexts(self.manifest).get("extract", {}).get("losses"))
+
+
+def _ignore(stage: str) -> None:
+    del stage
+
+
+def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> Outcome:
+    """Take one log through the stages, reusing what has not changed.
+
+    Args:
+        path: the recording.
+        options: what the user asked for.
+        progress: told the name of each stage that is computed.
+
+    Raises:
+        SlipError: the log, the configuration or a stage cannot go on; nothing of this run is changed then.
+    """
+    store = Store(options.out)
+    subject = describe_subject(path, options)
+    sha256, data = _identify(path, subject, store, progress)
+    run = name_run(path, sha256, store)
+    keys = key_stages(run, sha256, subject, options.inputs)
+    current = store.manifest(run)
+    if current is not None and not options.force and _is_done(current, keys, options):
+        return Outcome(_read_summary(current, options), current, ())
+    done = keys[options.through]
+    with store.open_generation(run, hash_json([done, options.through])) as generation:
+        work = Work(run, subject, options, generation, keys, data, progress)
+        work.run_stages()
+        log = _describe_log(subject, sha256, work)
+        if options.through == STAGES[-1]:
+            _write_outputs(work, log, options, progress)
+        manifest = generation.commit(_details(work, log, sha256))
+    return Outcome(_read_summary(manifest, options), manifest, tuple(work.computed))
+
+
+def _identify(path: Path, subject: Subject, store: Store, progress: Progress) -> tuple[str, LogData | None]:
+    """Hash of the log: remembered, or computed beside reading it."""
+    identities = LogIdentities(store)
+    known = identities.lookup(path)
+    if known is not None:
+        return known, None
+    progress("read")
+    seen = see_log(path)
+    data = read_subject(subject)
+    identities.remember(path, data.sha256, seen=seen)
+    return data.sha256, data
+
+
+def _is_done(manifest: Manifest, keys: Mapping[str, str], options: Options) -> bool:
+    """Whether the results there are hold all that is asked for."""
+    wanted = STAGES[: STAGES.index(options.through) + 1]
+    stored = stored_keys(manifest)
+    if any(stored.get(stage) != keys[stage] for stage in wanted):
+        return False
+    if options.through != STAGES[-1]:
+        return True
+    files = set(manifest.files)
+    has_report = REPORT in files or not options.report
+    figures = options.figures
+    has_figures = figures is None or any(name.endswith(f".{figures}") for name in files)
+    return SUMMARY in files and has_report and has_figures
+
+
+def _describe_log(subject: Subject, sha256: str, work: Work) -> dict[str, JSON]:
+    losses = work.contexts["extract"].get("losses", [])
+    return {
+        "path": str(subject.path.resolve()),
+        "sha256": sha256,
+        "duration_s": round(subject.index.duration_s, 6),
+        "complete": not losses,
+        "losses": losses,
+    }
+
+
+def _write_outputs(work: Work, log: Mapping[str, JSON], options: Options, progress: Progress) -> None:
+    """Summary, report and figures of a finished run."""
+    summary = summarize_run(work, log)
+    summary["report"] = REPORT if options.report else None
+    summary["provenance"] = {"versions": versions(), "keys": dict(work.keys), "configuration": _configuration(work)}
+    generation = work.generation
+    if options.report or options.figures:
+        # Drawing is most of the start-up time; who wants neither does not pay for it.
+        from pipeline.report import RunReport, render_report  # noqa: PLC0415
+
+        progress("report")
+        tables = {name: generation.read_table(name) for name in generation.table_names}
+        report = RunReport(summary, tables)
+        if options.report:
+            generation.write_text(REPORT, render_report(report))
+        if options.figures:
+            _write_figures(report, options.figures, generation)
+    generation.write_text(SUMMARY, json.dumps(summary, indent=1, sort_keys=False) + "\n")
+
+
+def _write_figures(report: object, kind: str, generation: Generation) -> None:
+    import tempfile  # noqa: PLC0415 - only where figures are asked for
+
+    from pipeline.report import RunReport, write_figures  # noqa: PLC0415 - heavy
+
+    with tempfile.TemporaryDirectory() as folder:
+        for path in write_figures(cast("RunReport", report), Path(folder), kind):
+            generation.write_bytes(f"figures/{path.name}", path.read_bytes())
+
+
+def _details(work: Work, log: Mapping[str, JSON], sha256: str) -> dict[str, JSON]:
+    stages: dict[str, JSON] = {
+        stage: {"key": work.keys[stage], "context": dict(context)} for stage, context in work.contexts.items()
+    }
+    return {
+        "log": {**log, "sha256": sha256},
+        "stages": stages,
+        "inputs": list(work.options.inputs),
+        "configuration": _configuration(work),
+        "vehicle": msgspec.to_builtins(work.subject.vehicle),
+        "terrain": work.subject.terrain,
+        "dataset": work.subject.dataset,
+        "versions": cast("JSON", versions()),
+    }
+
+
+def _configuration(work: Work) -> JSON:
+    plain: JSON = msgspec.to_builtins(work.subject.configuration)
+    return plain
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computes the numbers."""
+    found = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    return {"python": platform.python_version(), **found}
+
+
+def _read_summary(manifest: Manifest, options: Options) -> dict[str, JSON]:
+    """The stored summary with the report's place in this results folder."""
+    if SUMMARY not in manifest.files or options.through != STAGES[-1]:
+        return {}
+    summary: dict[str, JSON] = json.loads(manifest.path(SUMMARY).read_text(encoding="utf-8"))
+    has_report = REPORT in manifest.files
+    summary["report"] = str(manifest.path(REPORT)) if has_report else None
+    return summary
+
+
+def update_datasets(store: Store) -> None:
+    """Pool the runs of the results into `datasets.parquet`; equal content counts once."""
+    import polars as pl  # noqa: PLC0415 - heavy
+
+    from pipeline.stages.aggregate import pool_datasets  # noqa: PLC0415 - heavy
+
+    keys: dict[str, str] = {}
+    seen: set[str] = set()
+    for manifest in store.manifests():
+        log = manifest.details.get("log")
+        sha256 = str(log.get("sha256")) if isinstance(log, dict) else manifest.run
+        if "aggregates" in manifest.tables and sha256 not in seen:
+            seen.add(sha256)
+            keys[manifest.run] = manifest.key
+    if not keys:
+        return
+    aggregates = store.scan("aggregates").filter(pl.col("run").is_in(list(keys))).collect()
+    store.write_results_table("datasets", pool_datasets(aggregates, keys))

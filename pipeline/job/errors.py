@@ -1,0 +1,9 @@
+"""What can keep a job from its work."""
+
+from __future__ import annotations
+
+from pipeline.core.errors import SlipError
+
+
+class JobError(SlipError):
+    """A run that is not there, or a log that lacks what the analysis needs."""

@@ -1,0 +1,34 @@
+"""What the user asked of an analysis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+INPUTS = ("command", "measured")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of `slip analyze` and of the stage verbs.
+
+    Attributes:
+        out: results folder.
+        config: configuration file in place of the one beside the log.
+        overrides: configuration values from the command line, nested like the file.
+        inputs: which inputs to compute slip for.
+        report: whether to write `report.html`.
+        figures: format of figures for papers (`svg`, `pdf`, `png`); None for none.
+        force: compute again what is already there.
+        through: last stage to run.
+    """
+
+    out: Path = Path("results")
+    config: Path | None = None
+    overrides: Mapping[str, object] = field(default_factory=dict)
+    inputs: tuple[str, ...] = INPUTS
+    report: bool = True
+    figures: str | None = None
+    force: bool = False
+    through: str = "aggregate"

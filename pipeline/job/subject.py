@@ -1,0 +1,111 @@
+"""The subject of a job: one log, its configuration, its vehicle and its name among the runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.job.errors import JobError
+from pipeline.logs import LogIndex, open_log
+from pipeline.vehicles import (
+    Configuration,
+    Sources,
+    Vehicle,
+    choose_sources,
+    load_configuration,
+    resolve_vehicle,
+)
+
+if TYPE_CHECKING:
+    from pipeline.job.options import Options
+    from pipeline.store import Store
+
+UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Everything known about a log before its messages are read."""
+
+    path: Path
+    index: LogIndex
+    configuration: Configuration
+    vehicle: Vehicle
+    terrain: str
+    dataset: str
+    sources: Sources
+
+
+def describe_subject(path: Path, options: Options) -> Subject:
+    """Open a log and settle configuration, vehicle and topics.
+
+    Args:
+        path: the recording.
+        options: what the user asked for.
+
+    Raises:
+        LogError: the log cannot be read.
+        ConfigurationError: the configuration is wrong or the vehicle unknown.
+        JobError: the log has no pose, or neither command nor measured wheels.
+    """
+    index = open_log(path)
+    configuration = load_configuration(path, given=options.config, overrides=options.overrides)
+    recorded = index.metadata.get("deployment", {})
+    if not index.channels:
+        raise JobError(
+            "log_without_messages",
+            "the log holds no message",
+            where=str(path),
+            hint="Check that the recording was not cut off before its first message.",
+        )
+    vehicle = resolve_vehicle(configuration.vehicle, recorded=recorded.get("vehicle"), where=str(path))
+    terrain = configuration.run.terrain or recorded.get("terrain") or UNKNOWN
+    dataset = configuration.run.dataset or f"{vehicle.id}_{terrain}"
+    sources = choose_sources(index.channels, configuration, vehicle, where=str(path))
+    _require_sources(sources, index, options)
+    return Subject(path, index, configuration, vehicle, terrain, dataset, sources)
+
+
+def _require_sources(sources: Sources, index: LogIndex, options: Options) -> None:
+    there = ", ".join(sorted({f"{channel.topic} ({channel.type_name})" for channel in index.channels}))
+    if sources.pose is None:
+        raise JobError(
+            "no_pose",
+            "no topic can serve as pose (Odometry, PoseStamped, PoseWithCovarianceStamped or transforms)",
+            where=str(index.path),
+            hint=f"Name it in run.toml ([pose] topic = ...). The log has: {there}.",
+        )
+    wanted = {"command": sources.command, "measured": sources.wheels}
+    if all(wanted[name] is None for name in options.inputs):
+        roles = " or ".join("command" if name == "command" else "measured wheels" for name in options.inputs)
+        raise JobError(
+            "no_command",
+            f"no topic can serve as {roles}",
+            where=str(index.path),
+            hint=f"Name it in run.toml ([command] topic = ... or left_topic, right_topic). The log has: {there}.",
+        )
+
+
+def name_run(path: Path, sha256: str, store: Store) -> str:
+    """Name of the run of a log: folder/stem, with eight digits of its hash where another run has that name.
+
+    Equal content counts once: a copy of a log that has results already gets their name.
+    """
+    absolute = path.resolve()
+    plain = f"{absolute.parent.name}/{absolute.stem}" if absolute.parent.name else absolute.stem
+    manifest = store.manifest(plain)
+    if manifest is None:
+        for known in store.manifests():
+            if _log_of(known.details).get("sha256") == sha256:
+                return known.run
+        return plain
+    before = _log_of(manifest.details)
+    if before.get("sha256") == sha256 or before.get("path") == str(absolute):
+        return plain
+    return f"{plain}-{sha256[:8]}"
+
+
+def _log_of(details: object) -> dict[str, object]:
+    log = details.get("log") if isinstance(details, dict) else None
+    return log if isinstance(log, dict) else {}

@@ -1,0 +1,240 @@
+"""The stages of one run at work: each reads the tables of the one before and writes its own.
+
+A stage whose key has not changed is not computed: its tables and findings are taken over as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import polars as pl
+
+from pipeline.job.keys import STAGES, TABLES
+from pipeline.logs import LogData, read_topics
+from pipeline.stages import aggregate, checks, slip, velocity
+from pipeline.stages.extract import extract_tables, list_wanted
+from pipeline.stages.finding import Finding, tabulate_findings
+from pipeline.store import JSON
+from pipeline.vehicles import DriveForm
+from schemas import contract_of
+
+if TYPE_CHECKING:
+    from pipeline.job.options import Options
+    from pipeline.job.subject import Subject
+    from pipeline.store import Generation, Manifest, TableReport
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class StageOutcome:
+    """What a stage gives beside its tables: findings and facts for the summary."""
+
+    findings: tuple[Finding, ...]
+    context: Mapping[str, JSON] = field(default_factory=dict)
+
+
+@dataclass
+class Work:
+    """One run's stages in progress.
+
+    Attributes:
+        run: name of the run.
+        subject: the log and its configuration.
+        options: what the user asked for.
+        generation: where tables go.
+        keys: key of every stage.
+        data: columns of the log, where they have been read already.
+        progress: told what is being done.
+    """
+
+    run: str
+    subject: Subject
+    options: Options
+    generation: Generation
+    keys: Mapping[str, str]
+    data: LogData | None
+    progress: Progress
+    contexts: dict[str, Mapping[str, JSON]] = field(default_factory=dict)
+    findings: list[pl.DataFrame] = field(default_factory=list)
+    computed: list[str] = field(default_factory=list)
+
+    def run_stages(self) -> None:
+        """Run every stage up to the last one asked for, reusing what has not changed."""
+        stages: Mapping[str, Callable[[], StageOutcome]] = {
+            "extract": self._extract,
+            "velocity": self._velocity,
+            "slip": self._slip,
+            "aggregate": self._aggregate,
+        }
+        before = self.generation.previous
+        done = stored_keys(before)
+        for stage in STAGES[: STAGES.index(self.options.through) + 1]:
+            if before is not None and done.get(stage) == self.keys[stage] and not self.options.force:
+                self._take_over(stage, before)
+                continue
+            self.progress(stage)
+            outcome = stages[stage]()
+            self.contexts[stage] = outcome.context
+            self.computed.append(stage)
+            self._keep_findings(stage, outcome.findings)
+        self.write("findings", pl.concat(self.findings))
+
+    def _take_over(self, stage: str, before: Manifest) -> None:
+        for table in TABLES[stage]:
+            if table in before.tables:
+                self.generation.reuse_table(table)
+        self.contexts[stage] = stored_contexts(before).get(stage, {})
+        self.findings.append(before.read("findings").filter(pl.col("stage") == stage))
+
+    def _keep_findings(self, stage: str, findings: tuple[Finding, ...]) -> None:
+        frame = tabulate_findings(stage, findings)
+        self.findings.append(self._identify("findings", frame))
+
+    def write(self, table: str, frame: pl.DataFrame) -> TableReport:
+        """Write a table of this run, with the run's own columns."""
+        return self.generation.write_table(table, self._identify(table, frame))
+
+    def _identify(self, table: str, frame: pl.DataFrame) -> pl.DataFrame:
+        who = {
+            "run": self.run,
+            "dataset": self.subject.dataset,
+            "vehicle": self.subject.vehicle.id,
+            "terrain": self.subject.terrain,
+        }
+        columns = contract_of(table).schema.columns()
+        labelled = frame.with_columns(pl.lit(text).alias(name) for name, text in who.items())
+        return labelled.select(list(columns))
+
+    def _read(self, table: str) -> pl.DataFrame:
+        """A table of the stages before; an empty frame where the log has nothing for it."""
+        if table in self.generation.table_names:
+            return self.generation.read_table(table)
+        return pl.DataFrame()
+
+    def _extract(self) -> StageOutcome:
+        data = self.data if self.data is not None else read_subject(self.subject)
+        subject = self.subject
+        made = extract_tables(
+            data, subject.sources, subject.configuration, subject.vehicle, where=str(subject.path)
+        )
+        quarantined = {}
+        for name, frame in made.tables.items():
+            if not frame.is_empty():
+                report = self.write(name, frame)
+                if report.quarantined:
+                    quarantined[name] = {"rows": report.quarantined, "rules": dict(report.rules)}
+        found = [
+            Finding(
+                "quarantined_rows",
+                "warning",
+                f"{entry['rows']} rows of {name} break the contract ({', '.join(sorted(entry['rules']))}): "
+                f"they stand in quarantine_{name}",
+                where=name,
+                count=int(entry["rows"]),
+            )
+            for name, entry in quarantined.items()
+        ]
+        notes = [Finding("log_note", "info", note, where="log") for note in data.notes]
+        held = made.tables["poses"]["held"] if not made.tables["poses"].is_empty() else pl.Series([0])
+        context: dict[str, JSON] = {
+            "start_ns": made.start_ns,
+            "clocks": {topic: dict(clock) for topic, clock in made.clocks.items()},
+            "held_poses": round(float(held.mean() or 0.0), 6),  # type: ignore[arg-type]
+            "quarantined": quarantined,
+            "losses": [describe_loss(loss, data.index.start_ns) for loss in data.losses],
+        }
+        return StageOutcome((*made.findings, *found, *notes), context)
+
+    def _velocity(self) -> StageOutcome:
+        settings = self.subject.configuration.velocity
+        made = velocity.compute_velocities(
+            self._read("poses"), self._read("imu"), settings, where=str(self.subject.path)
+        )
+        self.write("velocities", made.table)
+        gyro = None if made.gyro is None else {
+            "usable": made.gyro.usable,
+            "sign": made.gyro.sign,
+            "scale": round(made.gyro.scale, 6),
+            "bias_radps": round(made.gyro.bias, 6),
+            "pose_delay_s": round(made.gyro.pose_delay_s, 4),
+            "correlation": round(made.gyro.correlation, 4),
+        }  # fmt: skip
+        return StageOutcome(made.findings, {"gyro": gyro})
+
+    def _slip(self) -> StageOutcome:
+        subject = self.subject
+        velocities = self._read("velocities")
+        made = slip.compute_slip(
+            velocities,
+            self._read("commands"),
+            self._read("wheels"),
+            vehicle=subject.vehicle,
+            configuration=subject.configuration,
+            inputs=self.options.inputs,
+            where=str(subject.path),
+        )
+        self.write("slip", made.slip)
+        self.write("windows", made.windows)
+        command = subject.sources.command
+        body = command is not None and command.form in {DriveForm.BODY, DriveForm.BODY_SIGNALS}
+        samples = checks.gather_samples(velocities, made.slip, body_commanded=body)
+        return StageOutcome((*made.findings, *checks.run_checks(samples, subject.vehicle)))
+
+    def _aggregate(self) -> StageOutcome:
+        made = aggregate.aggregate_run(
+            self._read("slip"),
+            self._read("windows"),
+            self._read("velocities"),
+            vehicle=self.subject.vehicle,
+            length=self.subject.configuration.slip.length_scale_m,
+        )
+        self.write("aggregates", made)
+        return StageOutcome(())
+
+
+def read_subject(subject: Subject) -> LogData:
+    """Read the columns that a run needs."""
+    types = {channel.topic: channel.type_name for channel in subject.index.channels}
+    return read_topics(subject.path, list_wanted(subject.sources, types))
+
+
+def describe_loss(loss: object, start_ns: int) -> dict[str, JSON]:
+    """A loss as JSON, its times in seconds since the log's start."""
+    content = vars(loss) if hasattr(loss, "__dict__") else {
+        name: getattr(loss, name) for name in ("kind", "bytes", "chunks", "start_ns", "end_ns", "text")
+    }  # fmt: skip
+
+    def since(value: object) -> float | None:
+        return None if not isinstance(value, int) else round((value - start_ns) / 1e9, 6)
+
+    return {
+        "kind": content["kind"],
+        "bytes": content["bytes"],
+        "chunks": content["chunks"],
+        "start_s": since(content["start_ns"]),
+        "end_s": since(content["end_ns"]),
+        "text": content["text"],
+    }
+
+
+def stored_keys(manifest: Manifest | None) -> dict[str, str]:
+    """Stage keys of the results there are."""
+    stages = manifest.details.get("stages") if manifest is not None else None
+    if not isinstance(stages, dict):
+        return {}
+    return {name: str(entry["key"]) for name, entry in stages.items() if isinstance(entry, dict)}
+
+
+def stored_contexts(manifest: Manifest) -> dict[str, Mapping[str, JSON]]:
+    """Stage contexts of the results there are."""
+    stages = manifest.details.get("stages")
+    if not isinstance(stages, dict):
+        return {}
+    return {
+        name: entry["context"]
+        for name, entry in stages.items()
+        if isinstance(entry, dict) and isinstance(entry.get("context"), dict)
+    }

@@ -1,0 +1,288 @@
+"""Checks of a whole run: does the vehicle move at all, do encoders, command and pose fit together.
+
+Each check is a function from the samples of a run to findings. They look at displacements over half a second,
+where neither smoothing nor vibration matters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from pipeline.stages.delays import estimate_delay
+from pipeline.stages.finding import Finding
+from pipeline.vehicles import Vehicle
+
+Floats = NDArray[np.float64]
+
+_GAIN_OF_NO_MOTION = 0.05
+_NET_OF_NO_MOTION = 0.5
+_PATH_OF_MOTION = 5.0
+_LIVE = 0.02
+_ROUNDING = 2e-3
+_FEWEST = 100
+_FEWEST_STEPS = 6
+_SCALED = 0.18
+_DISAGREES = 0.2
+_SKEW = 0.05
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples of one run on its grid; ideals are NaN where unknown.
+
+    Attributes:
+        times: [s], shape (n,).
+        segment: number of the segment, shape (n,).
+        steady: outside transitory spans, shape (n,).
+        step: number of the command step, shape (n,).
+        position: x, y of base_link [m], shape (n, 2).
+        velocity: (v_x, v_y, v_w), shape (n, 3).
+        gyro: yaw rate of the gyro, NaN without one, shape (n,).
+        command: ideal velocity of the command, shape (n, 3); None without commands.
+        measured: ideal velocity of the measured wheels, shape (n, 3); None without encoders.
+        body_commanded: whether the command was a body command.
+    """
+
+    times: Floats
+    segment: NDArray[np.int32]
+    steady: NDArray[np.bool_]
+    step: NDArray[np.int32]
+    position: Floats
+    velocity: Floats
+    gyro: Floats
+    command: Floats | None
+    measured: Floats | None
+    body_commanded: bool
+
+
+def gather_samples(velocities: pl.DataFrame, slip: pl.DataFrame, *, body_commanded: bool) -> Samples:
+    """Arrange the tables of a run for the checks."""
+    ideals: dict[str, Floats | None] = {"command": None, "measured": None}
+    steady = np.zeros(velocities.height, dtype=bool)
+    step = np.full(velocities.height, -1, dtype=np.int32)
+    stamps = velocities["stamp"].to_numpy()
+    for name in ideals:
+        part = slip.filter(pl.col("input") == name)
+        if part.is_empty():
+            continue
+        values = np.full((velocities.height, 3), np.nan)
+        place = np.searchsorted(stamps, part["stamp"].to_numpy())
+        values[place] = part.select("f_x", "f_y", "f_w").to_numpy()
+        steady[place] |= ~part["transitory"].to_numpy()
+        step[place] = part["step"].to_numpy()
+        ideals[name] = values
+    gyro = velocities["v_w_imu"].cast(pl.Float64).fill_null(np.nan).to_numpy()
+    return Samples(
+        velocities["t"].to_numpy(),
+        velocities["segment"].to_numpy(),
+        steady,
+        step,
+        velocities.select("x", "y").to_numpy(),
+        velocities.select("v_x", "v_y", "v_w").to_numpy(),
+        gyro,
+        ideals["command"],
+        ideals["measured"],
+        body_commanded,
+    )
+
+
+def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
+    """All checks; where the vehicle does not move, only the ones that say so."""
+    stuck = check_dead_wheels(samples, vehicle) + check_motion(samples, vehicle)
+    if stuck:
+        return stuck
+    checks: tuple[Callable[[Samples, Vehicle], list[Finding]], ...] = (
+        check_independence,
+        check_command_scale,
+        check_limits,
+        check_delays,
+    )
+    return [finding for check in checks for finding in check(samples, vehicle)]
+
+
+def check_dead_wheels(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
+    """Encoders that say zero throughout under live commands: an emergency stop, or dead encoders."""
+    if samples.measured is None or samples.command is None:
+        return []
+    both = np.isfinite(samples.measured).all(axis=1) & np.isfinite(samples.command).all(axis=1)
+    live = both & (np.abs(samples.command) > _LIVE).any(axis=1)
+    if live.sum() < _FEWEST or float(np.abs(samples.measured[both]).max()) > 0.0:
+        return []
+    text = (
+        "the measured wheels are zero throughout while commands are live: "
+        "an emergency stop was pressed, or the encoders are dead"
+    )
+    return [Finding("wheels_dead", "error", text, where="wheels", count=int(live.sum()))]
+
+
+def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
+    """A vehicle that does not move: wheels in the air, or standing under commands.
+
+    The gain of displacement on the ideal's is below 5 % both ahead and in turning, or the run's net
+    displacement is below half a metre over more than five metres of wheel path. The pose's own path is
+    no test: its noise alone sums to tens of metres.
+    """
+    ideal = samples.measured if samples.measured is not None else samples.command
+    if samples.measured is not None and not np.nanmax(np.abs(samples.measured), initial=0.0) > 0.0:
+        ideal = samples.command
+    if ideal is None:
+        return []
+    known = np.isfinite(ideal).all(axis=1)
+    if known.sum() < _FEWEST:
+        return []
+    period = float(np.median(np.diff(samples.times)))
+    path = float(np.abs(ideal[known, 0]).sum() * period)
+    turned = float(np.abs(ideal[known, 2]).sum() * period)
+    if path < _NET_OF_NO_MOTION and turned < _NET_OF_NO_MOTION:
+        text = f"the vehicle was hardly asked to move: {path:.2g} m of path in the whole run"
+        return [Finding("not_moving", "error", text, value=path)]
+    gains = [
+        float(np.sum(samples.velocity[known, i] * ideal[known, i]) / max(float(np.sum(ideal[known, i] ** 2)), 1e-12))
+        for i in (0, 2)
+    ]
+    reach = samples.position[known]
+    net = float(np.linalg.norm(reach.max(axis=0) - reach.min(axis=0)))
+    still = all(abs(gain) < _GAIN_OF_NO_MOTION for gain in gains)
+    nowhere = net < _NET_OF_NO_MOTION and path > _PATH_OF_MOTION
+    if not still and not (nowhere and abs(gains[1]) < 10.0 * _GAIN_OF_NO_MOTION):
+        return []
+    text = (
+        f"the vehicle does not move: of {path:.0f} m that the wheels turned it covered {gains[0]:.1%}, "
+        f"within {net:.2g} m (wheels in the air, blocked, or stopped)"
+    )
+    return [Finding("not_moving", "error", text, value=gains[0])]
+
+
+def check_independence(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
+    """A pose that is integrated from the wheels gives zero slip by construction."""
+    if samples.measured is None:
+        return []
+    known = np.isfinite(samples.measured).all(axis=1) & samples.steady
+    if known.sum() < _FEWEST:
+        return []
+    residual = samples.measured[known] - samples.velocity[known]
+    moved = float(np.sqrt(np.mean(samples.velocity[known] ** 2)))
+    share = float(np.median(np.abs(residual[:, (0, 2)]).max(axis=1))) / max(moved, 1e-9)
+    sideways = float(np.median(np.abs(samples.velocity[known, 1])))
+    if share > _ROUNDING or sideways > _ROUNDING * moved:
+        return []
+    text = (
+        "the poses follow the measured wheels to within rounding: they are wheel odometry, not a localization, "
+        "and the slip is zero by construction: draw no conclusion from it"
+    )
+    return [Finding("pose_from_wheels", "error", text, where="pose", value=share)]
+
+
+def check_command_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
+    """Steady commanded wheel speeds against measured ones: a wrong scale, or a controller's own track width.
+
+    Only the slower half of the steps counts: there nothing saturates, and a wrong scale is the same in all.
+    """
+    if samples.measured is None or samples.command is None:
+        return []
+    both = np.isfinite(samples.measured).all(axis=1) & np.isfinite(samples.command).all(axis=1) & samples.steady
+    if not both.any():
+        return []
+    asked, got = _average_steps(samples.step[both], samples.command[both], samples.measured[both])
+    forward = _slow_ratio(asked[:, 0], got[:, 0])
+    turning = _slow_ratio(asked[:, 2], got[:, 2])
+    if forward is None:
+        return []
+    if abs(np.log(forward)) > _SCALED:
+        text = (
+            f"in slow steady steps the wheels turn {forward:.2f} times as fast as commanded: the recorded command is "
+            "scaled wrongly (another vehicle's wheel radius, or a unit)"
+        )
+        return [Finding("command_scale", "warning", text, where="command", value=forward)]
+    if turning is None or not samples.body_commanded or np.log(turning / forward) < _SCALED:
+        return []
+    multiplier = turning / forward * vehicle.controller_track_multiplier
+    text = (
+        f"in slow steady turns the wheels differ {turning / forward:.2f} times as much as the command asks with the "
+        f"nominal track width: set vehicle.controller_track_multiplier = {multiplier:.3g}"
+    )
+    return [Finding("controller_multiplier", "warning", text, where="command", value=multiplier)]
+
+
+def _average_steps(step: NDArray[np.int32], command: Floats, measured: Floats) -> tuple[Floats, Floats]:
+    """Mean command and mean measured wheels of every command step, each of shape (steps, 3)."""
+    _, label, count = np.unique(step, return_inverse=True, return_counts=True)
+    means = [
+        np.stack([np.bincount(label, values[:, i]) / count for i in range(3)], axis=-1)
+        for values in (command, measured)
+    ]
+    return means[0], means[1]
+
+
+def _slow_ratio(asked: Floats, got: Floats) -> float | None:
+    """Median ratio of measured to asked over the slower half of the steps; None where they disagree."""
+    size = np.abs(asked)
+    slow = (size > max(0.1 * float(size.max()), _LIVE)) & (size < 0.5 * float(size.max()))
+    if slow.sum() < _FEWEST_STEPS:
+        return None
+    ratio = got[slow] / asked[slow]
+    middle = float(np.median(ratio))
+    spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
+    return middle if middle > _LIVE and spread < _DISAGREES * middle else None
+
+
+def check_limits(samples: Samples, vehicle: Vehicle) -> list[Finding]:
+    """Commands beyond what the vehicle's controller lets through."""
+    if samples.command is None:
+        return []
+    findings = []
+    for axis, limit, unit in ((0, vehicle.max_speed_mps, "m/s"), (2, vehicle.max_yaw_rate_radps, "rad/s")):
+        asked = np.abs(samples.command[np.isfinite(samples.command[:, axis]), axis])
+        if limit is None or asked.size == 0:
+            continue
+        share = float(np.mean(asked > limit * 1.02))
+        if share > 0.01:  # noqa: PLR2004 - a hundredth of the samples is no accident
+            name = "speed" if axis == 0 else "yaw rate"
+            text = (
+                f"{share:.0%} of the commands ask for more than the vehicle's largest {name} "
+                f"({limit:g} {unit}): its controller may clip them"
+            )
+            findings.append(Finding("command_beyond_limit", "info", text, where=f"command {name}", value=share))
+    return findings
+
+
+def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
+    """Delays of the poses and of the encoders, and a heading that is later than the position."""
+    ideal = samples.measured if samples.measured is not None else samples.command
+    if ideal is None:
+        return []
+    findings = []
+    known = np.isfinite(ideal).all(axis=1)
+    along = _delay_of(samples.velocity[:, 0], ideal[:, 0], known, samples)
+    turning = _delay_of(samples.velocity[:, 2], ideal[:, 2], known, samples)
+    if along is not None and turning is not None and samples.measured is not None:
+        skew = turning[0] - along[0]
+        if abs(skew) > max(_SKEW, 3.0 * np.hypot(along[1], turning[1])):
+            later = "later" if skew > 0.0 else "earlier"
+            text = (
+                f"against the wheels the heading is {abs(skew) * 1e3:.0f} ms {later} than the position: "
+                "a skew of the localization (it looks like lateral skid) or inertia of the body"
+            )
+            findings.append(Finding("heading_skew", "warning", text, where="pose", value=skew))
+    if samples.measured is not None and np.isfinite(samples.gyro).any():
+        usable = known & np.isfinite(samples.gyro)
+        late = _delay_of(samples.measured[:, 2], samples.gyro, usable, samples)
+        # The other way round, a body that follows its wheels late is physics, not an encoder.
+        if late is not None and late[0] > _SKEW:
+            text = f"the encoders are {late[0] * 1e3:.0f} ms late against the gyro (a filter or a clock)"
+            findings.append(Finding("wheels_delay", "info", text, where="wheels", value=late[0]))
+    return findings
+
+
+def _delay_of(signal: Floats, reference: Floats, known: NDArray[np.bool_], samples: Samples) -> tuple[float, float] | None:
+    """Delay and its uncertainty [s] of a signal against a reference, None where they do not correlate."""
+    times = samples.times[known]
+    found = estimate_delay(times, signal[known], times, reference[known])
+    if found is None or abs(found.correlation) < 0.7:  # noqa: PLR2004 - below it the lag means nothing
+        return None
+    return found.seconds, found.half_width

@@ -1,0 +1,210 @@
+"""One time base for all topics of a log.
+
+Every topic has the recorder's log time; most have a header stamp, set where the data were taken. Stamps are
+preferred, since recording delays do not reach them. A clock that jumps while the recorder's runs on is put
+right again through the log time; the place is remembered, so that no segment crosses it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.stages.finding import Finding
+
+Stamps = NDArray[np.int64]
+
+DAY_NS = 86_400 * 10**9
+_JUMP_NS = 500_000_000
+_BACKWARD_NS = 20_000_000
+_EARLY_NS = 5_000_000
+_APART_NS = 1_000_000_000
+_AROUND = 20
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Times of one topic's messages, in nanoseconds, in log-time order.
+
+    Attributes:
+        topic: name of the topic.
+        log_time: when the recorder wrote each message.
+        publish_time: when it was published.
+        header_time: the header's stamp; None for types without one.
+        clock: the time the configuration asks for; None to choose.
+    """
+
+    topic: str
+    log_time: Stamps
+    publish_time: Stamps
+    header_time: Stamps | None
+    clock: str | None = None
+
+
+@dataclass(frozen=True)
+class TopicClock:
+    """What became of one topic's times.
+
+    Attributes:
+        topic: name of the topic.
+        clock: `header`, `log` or `publish`.
+        stamp: chosen times [ns] in the common time base, in message order.
+        usable: whether each stamp means anything.
+        breaks: log times [ns] at which the topic's clock jumped.
+        latency_s: median of log time minus stamp.
+    """
+
+    topic: str
+    clock: str
+    stamp: Stamps
+    usable: NDArray[np.bool_]
+    breaks: tuple[int, ...] = ()
+    latency_s: float = 0.0
+    findings: tuple[Finding, ...] = field(default=())
+
+
+def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock], list[Finding]]:
+    """Choose one time a topic and bring all topics to one time base.
+
+    Args:
+        recorded: times of each role's topic, by a key of the caller's.
+
+    Returns:
+        The clocks by the same keys, and what was noticed.
+    """
+    clocks = {key: _read_clock(times) for key, times in recorded.items()}
+    findings = [found for clock in clocks.values() for found in clock.findings]
+    findings += _check_early_stamps(clocks)
+    shifted, more = _join_time_bases(clocks, recorded)
+    return shifted, findings + more
+
+
+def _read_clock(times: Recorded) -> TopicClock:
+    """The chosen time of one topic, its jumps mended."""
+    log_known = times.log_time > DAY_NS if np.median(times.log_time) > DAY_NS else np.ones(times.log_time.size, bool)
+    if times.clock == "publish":
+        return TopicClock(times.topic, "publish", times.publish_time, times.publish_time > 0)
+    header = times.header_time
+    if times.clock == "log" or header is None or not header.any():
+        found: list[Finding] = []
+        if header is not None and not header.any():
+            found.append(
+                Finding(
+                    "no_header_stamp",
+                    "warning",
+                    f"the header stamps of {times.topic} are all zero: log times were used",
+                    where=times.topic,
+                )
+            )
+        found += _flag_unset(times.topic, ~log_known)
+        return TopicClock(times.topic, "log", times.log_time, log_known, findings=tuple(found))
+    stamp, usable, breaks, found = _mend_jumps(times.topic, header, times.log_time, log_known)
+    trusted = usable & log_known
+    delays = times.log_time[trusted] - stamp[trusted]
+    latency = float(np.median(delays)) / 1e9 if delays.size else 0.0
+    return TopicClock(times.topic, "header", stamp, usable, breaks, latency, tuple(found))
+
+
+def _flag_unset(topic: str, unset: NDArray[np.bool_]) -> list[Finding]:
+    count = int(unset.sum())
+    if not count:
+        return []
+    text = f"{count} messages of {topic} are stamped before the clock was set (1970): they were left out"
+    return [Finding("clock_unset", "warning", text, where=topic, count=count)]
+
+
+def _mend_jumps(
+    topic: str, header: Stamps, log_time: Stamps, log_known: NDArray[np.bool_]
+) -> tuple[Stamps, NDArray[np.bool_], tuple[int, ...], list[Finding]]:
+    """Shift each stretch of constant clock offset onto the longest one."""
+    offset = np.where(log_known, header - log_time, 0)
+    usable = np.where(log_known, np.ones(header.size, dtype=bool), header > DAY_NS)
+    known = np.flatnonzero(log_known)
+    if known.size < 2:  # noqa: PLR2004 - one message shows no jump
+        return header, usable, (), _flag_unset(topic, ~usable)
+    candidates = np.flatnonzero(
+        (np.abs(np.diff(offset[known])) > _JUMP_NS) | (np.diff(header[known]) < -_BACKWARD_NS)
+    )
+    edges = [0]
+    for place in candidates:
+        before = np.median(offset[known[max(edges[-1], place + 1 - _AROUND) : place + 1]])
+        after = np.median(offset[known[place + 1 : place + 1 + _AROUND]])
+        moved = after - before
+        if abs(moved) > _JUMP_NS or moved < -_BACKWARD_NS:
+            edges.append(int(place) + 1)
+    edges.append(known.size)
+    spans = [known[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    home = float(np.median(offset[max(spans, key=len)]))
+    stamp = header.copy()
+    found: list[Finding] = []
+    largest, jumps = 0.0, 0
+    for span in spans:
+        shift = home - float(np.median(offset[span]))
+        if abs(shift) < _BACKWARD_NS:
+            continue
+        stamp[span] += round(shift)
+        if header[span[0]] < DAY_NS < stamp[span[0]]:
+            text = (
+                f"{span.size} stamps of {topic} come from before the clock was set (1970): "
+                "they were placed by their log times"
+            )
+            found.append(Finding("clock_unset", "warning", text, where=topic, count=int(span.size)))
+        else:
+            jumps += 1
+            largest = max(largest, abs(shift))
+    if jumps:
+        text = (
+            f"the clock of {topic} jumped by up to {largest / 1e9:.3g} s while the recorder's ran on: "
+            "its stamps were put right by their log times, and segments end there"
+        )
+        found.append(Finding("clock_jump", "warning", text, where=topic, value=largest / 1e9, count=jumps))
+    breaks = tuple(int(log_time[span[0]]) for span in spans[1:])
+    return stamp, usable, breaks, found + _flag_unset(topic, ~usable)
+
+
+def _check_early_stamps(clocks: Mapping[str, TopicClock]) -> list[Finding]:
+    """A stamp later than the time at which it was recorded proves that two clocks disagree."""
+    return [
+        Finding(
+            "stamp_after_log_time",
+            "warning",
+            f"the stamps of {clock.topic} lie {-clock.latency_s * 1e3:.0f} ms after the time they were recorded: "
+            "its clock runs ahead",
+            where=clock.topic,
+            value=clock.latency_s,
+        )
+        for clock in clocks.values()
+        if clock.clock == "header" and clock.latency_s * 1e9 < -_EARLY_NS
+    ]
+
+
+def _join_time_bases(
+    clocks: dict[str, TopicClock], recorded: Mapping[str, Recorded]
+) -> tuple[dict[str, TopicClock], list[Finding]]:
+    """Bring clocks that lie more than a second apart together, through the log time that all share."""
+    stamped = {key: clock for key, clock in clocks.items() if clock.clock == "header"}
+    if not stamped:
+        return clocks, []
+    findings = []
+    home = float(np.median([clock.latency_s for clock in stamped.values()]))
+    joined = dict(clocks)
+    for key, clock in clocks.items():
+        away = clock.latency_s - home
+        if abs(away) * 1e9 < _APART_NS:
+            continue
+        if clock.clock == "header":
+            shift = round(away * 1e9)
+            text = f"the stamps of {clock.topic} lie {-away:.3g} s from those of the other topics: they were shifted"
+        else:
+            shift = round(-home * 1e9)
+            text = (
+                f"the recorder's clock lies {home:.3g} s from the stamps: {clock.topic}, which has no stamp, was shifted"
+            )
+        findings.append(Finding("clock_offset", "warning", text, where=clock.topic, value=away))
+        joined[key] = TopicClock(
+            clock.topic, clock.clock, clock.stamp + shift, clock.usable, clock.breaks, clock.latency_s
+        )
+    return joined, findings

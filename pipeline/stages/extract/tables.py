@@ -1,0 +1,353 @@
+"""The extract stage: from the columns of a log to tables of commands, wheels, poses and gyro.
+
+All times come to one base (see `clocks`); nothing is resampled here. Rows that break their contract are
+written all the same: the store moves them to quarantine, where they can be looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from pipeline.logs import LogData, TopicColumns
+from pipeline.stages.errors import StageError
+from pipeline.stages.extract import localization, reading
+from pipeline.stages.extract.clocks import Recorded, TopicClock, align_clocks
+from pipeline.stages.extract.drive import (
+    Drive,
+    is_single_topic,
+    read_body,
+    read_joints,
+    read_sides,
+    read_steering,
+)
+from pipeline.stages.extract.intervals import Span, find_spans_given, find_spans_of_state, is_inside
+from pipeline.stages.extract.transforms import pose_from_transforms, to_base_link
+from pipeline.stages.finding import Finding
+from pipeline.vehicles import (
+    DEFAULT_INTERVAL,
+    Configuration,
+    DriveForm,
+    DriveSection,
+    DriveSource,
+    Sources,
+    Vehicle,
+)
+
+Floats = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Extracted:
+    """What the extract stage makes of a log.
+
+    Attributes:
+        tables: commands, wheels, poses, imu; those whose source is missing are empty.
+        findings: what was noticed.
+        start_ns: stamp at which t is zero.
+        clocks: by topic: which time was used and how late messages were recorded [s].
+    """
+
+    tables: Mapping[str, pl.DataFrame]
+    findings: tuple[Finding, ...]
+    start_ns: int
+    clocks: Mapping[str, Mapping[str, str | float]]
+
+
+def extract_tables(
+    data: LogData, sources: Sources, configuration: Configuration, vehicle: Vehicle, *, where: str
+) -> Extracted:
+    """Make the stage's tables.
+
+    Args:
+        data: columns of the wanted topics (see `reading.list_wanted`).
+        sources: which topic serves in which role.
+        configuration: units, signs, clocks, intervals.
+        vehicle: geometry for body commands and speeds in m/s.
+        where: the log, for error messages.
+
+    Raises:
+        StageError: a role's topic holds nothing usable.
+    """
+    return _Extraction(data, sources, configuration, vehicle, where).run()
+
+
+class _Extraction:
+    """One log's extraction: columns, common clocks, and what was noticed on the way."""
+
+    def __init__(
+        self, data: LogData, sources: Sources, configuration: Configuration, vehicle: Vehicle, where: str
+    ) -> None:
+        self.data = data
+        self.sources = sources
+        self.configuration = configuration
+        self.vehicle = vehicle
+        self.where = where
+        self.findings: list[Finding] = []
+        self.columns = {
+            topic: found
+            for topic in dict.fromkeys(columns.topic for columns in data.topics)
+            if (found := self._join_channels(topic)) is not None
+        }
+        self.clocks = self._align()
+        self.start_ns = self._find_start()
+
+    def run(self) -> Extracted:
+        """All four tables."""
+        spans = self._find_spans()
+        tables = {
+            "poses": self._poses(spans),
+            "commands": self._drive_table(self.sources.command, self.configuration.command, spans, held=True),
+            "wheels": self._drive_table(self.sources.wheels, self.configuration.wheels, spans, held=False),
+            "imu": self._imu(spans),
+        }
+        clocks = {
+            clock.topic: {"clock": clock.clock, "latency_s": round(clock.latency_s, 6)}
+            for clock in self.clocks.values()
+        }
+        return Extracted(tables, tuple(self.findings), self.start_ns, clocks)
+
+    def _join_channels(self, topic: str) -> TopicColumns | None:
+        channels = [columns for columns in self.data.of(topic) if columns.log_time.size]
+        if len(channels) > 1:
+            text = f"{topic} was recorded on {len(channels)} channels: the one with most messages was used"
+            self.findings.append(
+                Finding("several_channels", "warning", text, where=topic, count=len(channels))
+            )
+        return max(channels, key=lambda columns: columns.log_time.size, default=None)
+
+    def _align(self) -> dict[str, TopicClock]:
+        asked = self._asked_clocks()
+        recorded = {
+            topic: Recorded(
+                topic, columns.log_time, columns.publish_time, columns.header_time, asked.get(topic)
+            )
+            for topic, columns in self.columns.items()
+            if "transforms[].child_frame_id" not in columns.fields
+        }
+        clocks, findings = align_clocks(recorded)
+        self.findings += findings
+        return clocks
+
+    def _asked_clocks(self) -> dict[str, str | None]:
+        asked: dict[str, str | None] = {}
+        for source, section in (
+            (self.sources.command, self.configuration.command),
+            (self.sources.wheels, self.configuration.wheels),
+        ):
+            for signal in source.signals if source else ():
+                asked[signal.topic] = section.time
+        if self.sources.pose:
+            asked[self.sources.pose.topic] = self.configuration.pose.time
+        if self.sources.imu:
+            asked[self.sources.imu.topic] = self.configuration.imu.time
+        return asked
+
+    def _find_start(self) -> int:
+        firsts = [int(clock.stamp[clock.usable].min()) for clock in self.clocks.values() if clock.usable.any()]
+        if self.sources.pose and self.sources.pose.from_transforms and self.sources.pose.topic in self.columns:
+            firsts.append(int(self.columns[self.sources.pose.topic].log_time.min()))
+        return min(firsts, default=0)
+
+    def _seconds(self, stamp: Stamps) -> Floats:
+        return (stamp - self.start_ns).astype(np.float64) / 1e9
+
+    def _ordered(self, topic: str) -> tuple[TopicColumns, TopicClock, NDArray[np.int64]] | None:
+        """A topic with its clock, and the order of its usable messages in time."""
+        columns, clock = self.columns.get(topic), self.clocks.get(topic)
+        if columns is None or clock is None:
+            return None
+        usable = np.flatnonzero(clock.usable)
+        order = usable[np.argsort(clock.stamp[usable], kind="stable")]
+        self._note_disorder(topic, clock.stamp[usable])
+        return columns, clock, order
+
+    def _note_disorder(self, topic: str, stamp: Stamps) -> None:
+        late = int((np.diff(stamp) < 0).sum())
+        twice = int((np.diff(np.sort(stamp)) == 0).sum())
+        if late:
+            text = f"{late} messages of {topic} arrived out of order: sorted by their stamps"
+            self.findings.append(Finding("out_of_order", "info", text, where=topic, count=late))
+        if twice:
+            text = f"{twice} messages of {topic} share their stamp with another"
+            self.findings.append(Finding("duplicate_stamps", "warning", text, where=topic, count=twice))
+
+    def _find_spans(self) -> list[Span] | None:
+        """Spans in which commands are live; None when nothing restricts them."""
+        sections = self.configuration.interval
+        spans = find_spans_given(sections, self.where)
+        source = self.sources.interval
+        if self.configuration.use_intervals == "all" or (source is None and not sections):
+            return None
+        if source is not None:
+            found = self._ordered(source.topic)
+            value = next((s.equals for s in sections if s.topic and s.equals), DEFAULT_INTERVAL[1])
+            if found is not None:
+                columns, clock, order = found
+                states = reading.texts(columns, "data")
+                spans += find_spans_of_state(
+                    self._seconds(clock.stamp[order]), [states[i] for i in order.tolist()], value
+                )
+            text = f"only stretches in which {source.topic} says {value!r} were used ({len(spans)} of them)"
+            self.findings.append(
+                Finding("interval_applied", "info", text, where=source.topic, count=len(spans))
+            )
+        return spans
+
+    def _poses(self, spans: Sequence[Span] | None) -> pl.DataFrame:
+        source = self.sources.pose
+        if source is None:
+            return pl.DataFrame()
+        if source.from_transforms:
+            chained = pose_from_transforms(list(self.data.topics), source, self.where)
+            self.findings += chained.findings
+            stamp, log_time, arrays = chained.stamp, chained.stamp, chained.arrays
+            breaks = np.zeros(stamp.size, dtype=bool)
+        else:
+            found = self._ordered(source.topic)
+            if found is None:
+                raise self._nothing("pose", source.topic)
+            columns, clock, order = found
+            recorded = reading.read_pose_topic(columns)
+            stamp, log_time = clock.stamp[order], columns.log_time[order]
+            arrays = reading.PoseArrays(
+                recorded.position[order], recorded.quaternion[order], recorded.parent, recorded.child
+            )
+            breaks = np.zeros(order.size, dtype=bool)
+            for jump in clock.breaks:
+                place = np.flatnonzero(log_time >= jump)
+                breaks[place[:1]] = True
+            arrays, more = to_base_link(arrays, list(self.data.topics), source.topic)
+            self.findings += more
+        times = self._seconds(stamp)
+        track = localization.cut_track(
+            times, arrays.position, arrays.quaternion, breaks, self.configuration.velocity, source.topic
+        )
+        self.findings += track.findings
+        return pl.DataFrame(
+            {
+                **self._time_columns(times, stamp, log_time),
+                "segment": track.segment.astype(np.int32),
+                **{name: track.position[:, i] for i, name in enumerate("xyz")},
+                **{f"q_{name}": track.quaternion[:, i] for i, name in enumerate("xyzw")},
+                "held": track.held,
+                "active": is_inside(times, spans),
+            }
+        )
+
+    def _time_columns(self, times: Floats, stamp: Stamps, log_time: Stamps) -> dict[str, NDArray[np.generic]]:
+        return {"t": times, "stamp": stamp, "log_time": log_time}
+
+    def _nothing(self, role: str, topic: str) -> StageError:
+        return StageError(
+            f"no_{role}",
+            f"the topic {topic!r} chosen as {role} has no readable message",
+            where=self.where,
+            hint=f"Choose another with {role}.topic in run.toml; `slip inspect` lists what there is.",
+        )
+
+    def _drive_table(
+        self, source: DriveSource | None, section: DriveSection, spans: Sequence[Span] | None, *, held: bool
+    ) -> pl.DataFrame:
+        if source is None:
+            return pl.DataFrame()
+        found = self._ordered(source.signals[0].topic)
+        if found is None:
+            raise self._nothing("command" if held else "wheels", source.signals[0].topic)
+        columns, clock, order = found
+        if is_single_topic(source.form):
+            drive = self._read_single(source, section, columns, self._seconds(clock.stamp))
+            drive = _take(drive, order)
+            stamp, log_time = clock.stamp[order], columns.log_time[order]
+        else:
+            stamp, log_time, pair = self._read_pair(source, held=held)
+            drive = self._read_pair_as_drive(source, section, pair)
+        self.findings += drive.findings
+        times = self._seconds(stamp)
+        empty = np.full(times.size, np.nan)
+        values = {
+            name: empty if (series := getattr(drive, name)) is None else series
+            for name in ("left", "right", "speed", "steering", "body_x", "body_w")
+            if held or not name.startswith("body")
+        }
+        absent = [name for name in values if getattr(drive, name) is None]
+        frame = pl.DataFrame(
+            {**self._time_columns(times, stamp, log_time), **values, "active": is_inside(times, spans)}
+        )
+        return frame.with_columns(pl.lit(None, dtype=pl.Float64).alias(name) for name in absent)
+
+    def _read_single(
+        self, source: DriveSource, section: DriveSection, columns: TopicColumns, times: Floats
+    ) -> Drive:
+        if source.form is DriveForm.JOINTS:
+            return read_joints(columns, times, section, self.vehicle)
+        types = {columns.topic: columns.type_name}
+        first, second = (
+            reading.numbers(columns, signal.field) for signal in reading.drive_fields(source, types)
+        )
+        reader = read_body if source.form is DriveForm.BODY else read_steering
+        return reader(first, second, section, self.vehicle)
+
+    def _read_pair(self, source: DriveSource, *, held: bool) -> tuple[Stamps, Stamps, tuple[Floats, Floats]]:
+        """Two signals at common times: held commands at the stamps of either, measurements at the first's."""
+        series = []
+        for signal in source.signals:
+            found = self._ordered(signal.topic)
+            if found is None:
+                raise self._nothing("command" if held else "wheels", signal.topic)
+            columns, clock, order = found
+            values = reading.numbers(columns, signal.field)[order]
+            series.append((clock.stamp[order], columns.log_time[order], values))
+        (first, log_first, a), (second, log_second, b) = series
+        if np.array_equal(first, second):
+            return first, log_first, (a, b)
+        if not held:
+            inside = (first >= second[0]) & (first <= second[-1])
+            return first[inside], log_first[inside], (a[inside], np.interp(first[inside], second, b))
+        union, index = np.unique(np.concatenate((first, second)), return_index=True)
+        log_time = np.concatenate((log_first, log_second))[index]
+        known = union >= max(first[0], second[0])
+        union, log_time = union[known], log_time[known]
+        at = [np.searchsorted(stamps, union, side="right") - 1 for stamps in (first, second)]
+        return union, log_time, (a[at[0]], b[at[1]])
+
+    def _read_pair_as_drive(
+        self, source: DriveSource, section: DriveSection, pair: tuple[Floats, Floats]
+    ) -> Drive:
+        readers = {
+            DriveForm.SIDES: read_sides,
+            DriveForm.BODY_SIGNALS: read_body,
+            DriveForm.STEERING_SIGNALS: read_steering,
+        }
+        return readers[source.form](pair[0], pair[1], section, self.vehicle)
+
+    def _imu(self, spans: Sequence[Span] | None) -> pl.DataFrame:
+        source = self.sources.imu
+        found = self._ordered(source.topic) if source else None
+        if found is None:
+            return pl.DataFrame()
+        columns, clock, order = found
+        rates, forces = reading.read_imu(columns)
+        times = self._seconds(clock.stamp[order])
+        return pl.DataFrame(
+            {
+                **self._time_columns(times, clock.stamp[order], columns.log_time[order]),
+                **{f"rate_{axis}": rates[order, i] for i, axis in enumerate("xyz")},
+                **{f"acceleration_{axis}": forces[order, i] for i, axis in enumerate("xyz")},
+                "active": is_inside(times, spans),
+            }
+        )
+
+
+def _take(drive: Drive, order: NDArray[np.int64]) -> Drive:
+    """A drive's signals in another order."""
+    series = {
+        name: None if (values := getattr(drive, name)) is None else values[order]
+        for name in ("left", "right", "speed", "steering", "body_x", "body_w")
+    }
+    return Drive(**series, findings=drive.findings)

@@ -1,0 +1,54 @@
+"""Findings: what a stage noticed, with an id that stays the same for scripts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import polars as pl
+
+Severity = Literal["info", "warning", "error"]
+
+_TYPES = {
+    "stage": pl.String,
+    "id": pl.String,
+    "severity": pl.Enum(["info", "warning", "error"]),
+    "text": pl.String,
+    "where": pl.String,
+    "t_start": pl.Float64,
+    "t_end": pl.Float64,
+    "value": pl.Float64,
+    "count": pl.Int64,
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing noticed.
+
+    Attributes:
+        id: stable identifier in snake_case.
+        severity: info, warning, or error: results of this run are not to be trusted.
+        text: one sentence.
+        where: topic, column or channel; empty for the whole run.
+        t_start: start of the stretch it concerns [s since the run's start].
+        t_end: its end [s].
+        value: the number behind it, in the unit that the text gives.
+        count: how often.
+    """
+
+    id: str
+    severity: Severity
+    text: str
+    where: str = ""
+    t_start: float | None = None
+    t_end: float | None = None
+    value: float | None = None
+    count: int | None = None
+
+
+def tabulate_findings(stage: str, findings: Sequence[Finding]) -> pl.DataFrame:
+    """Findings of one stage as a table (without the run's columns)."""
+    rows = [{"stage": stage, **vars(finding)} for finding in findings]
+    return pl.DataFrame(rows, schema=_TYPES, orient="row")

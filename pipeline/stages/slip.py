@@ -1,0 +1,210 @@
+"""The slip stage: g = f(u) - v on the grid of the velocities, for the command and for the measured wheels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from pipeline.core import timegrid
+from pipeline.motion.ideal import predict_ackermann, predict_differential
+from pipeline.stages import steps
+from pipeline.stages.errors import StageError
+from pipeline.stages.finding import Finding
+from pipeline.stages.stretches import find_bad_stretches
+from pipeline.vehicles import Configuration, Vehicle
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+WINDOW_S = 2.0
+PUBLISHED_SAMPLES = 40
+_SHORTEST_HOLD = 0.5
+_LONGEST_WHEEL_GAP = 0.25
+_PERIODS = 5.0
+
+
+@dataclass(frozen=True)
+class SlipResult:
+    """Tables `slip` and `windows`, and what was noticed."""
+
+    slip: pl.DataFrame
+    windows: pl.DataFrame
+    findings: tuple[Finding, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class Ideal:
+    """Ideal velocities of one input on the grid.
+
+    Attributes:
+        velocity: (f_x, f_y, f_w), NaN where the input is not known, shape (n, 3).
+        stale: samples whose last command is too old to count, shape (n,).
+        active: samples in an interval with live commands.
+    """
+
+    velocity: Floats
+    stale: Flags
+    active: Flags
+
+
+def compute_slip(
+    velocities: pl.DataFrame,
+    commands: pl.DataFrame,
+    wheels: pl.DataFrame,
+    *,
+    vehicle: Vehicle,
+    configuration: Configuration,
+    inputs: Sequence[str],
+    where: str,
+) -> SlipResult:
+    """Slip of every asked input.
+
+    Args:
+        velocities: table `velocities`.
+        commands: table `commands`; may be empty.
+        wheels: table `wheels`; may be empty.
+        vehicle: for the ideal model.
+        configuration: length scale, transitory span, hold time.
+        inputs: `command`, `measured`, or both.
+        where: the run, for error messages.
+
+    Raises:
+        StageError: none of the asked inputs gives a single sample.
+    """
+    times = velocities["t"].to_numpy()
+    found: dict[str, Ideal] = {}
+    if "command" in inputs and not commands.is_empty():
+        found["command"] = hold_commands(times, commands, vehicle, configuration.command.hold_s)
+    if "measured" in inputs and not wheels.is_empty():
+        found["measured"] = interpolate_wheels(times, wheels, vehicle)
+    found = {name: ideal for name, ideal in found.items() if np.isfinite(ideal.velocity[ideal.active]).any()}
+    if not found:
+        raise StageError(
+            "no_command",
+            "no command and no measured wheel speed falls together with a pose",
+            where=where,
+            hint="Name the command topic in run.toml ([command] topic = ...); `slip inspect` lists what there is.",
+        )
+    leading = found.get("command") or found["measured"]
+    length = configuration.slip.length_scale_m
+    segment = velocities["segment"].to_numpy()
+    step = steps.number_steps(times, segment, leading.velocity, length)
+    transitory = steps.mark_transitory(times, step, configuration.slip.transitory_s)
+    base = velocities.select("t", "stamp", "segment", "v_x", "v_y", "v_w").with_columns(
+        step=pl.Series(step), transitory=pl.Series(transitory)
+    )
+    suspect, findings = find_bad_stretches(velocities, {name: ideal.velocity for name, ideal in found.items()}, step)
+    findings += _describe_stale(times, found)
+    parts = [_tabulate(base, name, ideal, suspect, length) for name, ideal in found.items()]
+    slip = pl.concat(parts)
+    windows = pl.concat([cut_windows(part, configuration.velocity.rate_hz) for part in parts])
+    return SlipResult(slip, windows, tuple(findings))
+
+
+def hold_commands(times: Floats, commands: pl.DataFrame, vehicle: Vehicle, hold: float | None) -> Ideal:
+    """Ideal velocities of the last command at each time, for as long as it counts.
+
+    Args:
+        times: grid [s].
+        commands: table `commands`, sorted by time.
+        vehicle: for the ideal model.
+        hold: how long a command counts [s]; by default five periods, at least half a second.
+    """
+    stamps = commands["t"].to_numpy()
+    if hold is None:
+        hold = max(_SHORTEST_HOLD, _PERIODS * _median_period(stamps))
+    index = timegrid.hold_indices(times, stamps)
+    known = index >= 0
+    last = np.maximum(index, 0)
+    stale = known & (times - stamps[last] > hold)
+    velocity = _predict(commands, vehicle)[last]
+    velocity[~known | stale] = np.nan
+    active = commands["active"].to_numpy()[last] & known
+    return Ideal(velocity, stale & active, active)
+
+
+def interpolate_wheels(times: Floats, wheels: pl.DataFrame, vehicle: Vehicle) -> Ideal:
+    """Ideal velocities of the measured wheels, interpolated; unknown inside holes of the encoders."""
+    stamps = wheels["t"].to_numpy()
+    values = timegrid.interpolate_linearly(times, stamps, _predict(wheels, vehicle))
+    left = timegrid.hold_indices(times, stamps)
+    right = np.minimum(left + 1, stamps.size - 1)
+    longest = max(_LONGEST_WHEEL_GAP, _PERIODS * _median_period(stamps))
+    on_sample = np.abs(times - stamps[np.maximum(left, 0)]) < 1e-6  # noqa: PLR2004 - a microsecond is the same time
+    known = (left >= 0) & (on_sample | ((right > left) & (stamps[right] - stamps[left] <= longest)))
+    values[~known] = np.nan
+    active = wheels["active"].to_numpy()[np.maximum(left, 0)] & (left >= 0)
+    return Ideal(values, np.zeros(times.size, dtype=bool), active)
+
+
+def _predict(drive: pl.DataFrame, vehicle: Vehicle) -> Floats:
+    if vehicle.kind == "ackermann":
+        return predict_ackermann(drive["speed"].to_numpy(), drive["steering"].to_numpy(), vehicle)
+    return predict_differential(drive["left"].to_numpy(), drive["right"].to_numpy(), vehicle)
+
+
+def _median_period(stamps: Floats) -> float:
+    return float(np.median(np.diff(stamps))) if stamps.size > 1 else 0.0
+
+
+def _tabulate(base: pl.DataFrame, name: str, ideal: Ideal, suspect: Flags, length: float) -> pl.DataFrame:
+    """Table `slip` of one input: samples with a known input inside live intervals."""
+    velocity = ideal.velocity
+    kept = np.isfinite(velocity).all(axis=1) & ideal.active
+    slip = velocity - base.select("v_x", "v_y", "v_w").to_numpy()
+    modulus = np.sqrt(slip[:, 0] ** 2 + slip[:, 1] ** 2 + (length * slip[:, 2]) ** 2)
+    return base.with_columns(
+        pl.lit(name, dtype=pl.Enum(["command", "measured"])).alias("input"),
+        *(pl.Series(f"f_{axis}", velocity[:, i]) for i, axis in enumerate("xyw")),
+        *(pl.Series(f"g_{axis}", slip[:, i]) for i, axis in enumerate("xyw")),
+        pl.Series("modulus", modulus),
+        pl.Series("suspect", suspect),
+    ).filter(pl.Series(kept))
+
+
+def cut_windows(slip: pl.DataFrame, rate: float) -> pl.DataFrame:
+    """Table `windows` of one input: full 2 s windows from each step's start, the remainder dropped.
+
+    A window norm is sqrt(40) times the root mean square of the modulus, whatever the rate: with the
+    published 20 Hz it is the Frobenius norm of the window's slip matrix.
+    """
+    size = max(round(WINDOW_S * rate), 1)
+    indexed = slip.with_columns(
+        # A sample left out inside a step (stale, outside an interval) ends the stretch as a step would.
+        (pl.col("t").diff().fill_null(0.0) > 1.5 / rate).cum_sum().alias("stretch"),  # 1.5: half a period of doubt
+    ).with_columns(
+        ((pl.col("t") - pl.col("t").min().over("step")) * rate / size + 1e-6).floor().cast(pl.Int32).alias("window")
+    )
+    grouped = indexed.group_by("step", "stretch", "window", maintain_order=True).agg(
+        pl.col("input").first(),
+        pl.col("t").min().alias("t_start"),
+        (pl.col("t").max() + 1.0 / rate).alias("t_end"),
+        pl.col("segment").first(),
+        pl.col("suspect").any(),
+        pl.len().cast(pl.Int32).alias("samples"),
+        (pl.col("modulus") ** 2).mean().sqrt().alias("rms_modulus"),
+    )
+    return (
+        grouped.filter(pl.col("samples") == size)
+        .with_columns(
+            (pl.col("rms_modulus") * PUBLISHED_SAMPLES**0.5).alias("window_norm"),
+            (pl.col("window") == 0).alias("transitory"),
+        )
+        .drop("stretch", "window")
+    )
+
+
+def _describe_stale(times: Floats, found: dict[str, Ideal]) -> list[Finding]:
+    ideal = found.get("command")
+    if ideal is None or not ideal.stale.any():
+        return []
+    count = int(ideal.stale.sum())
+    text = (
+        f"for {count} time steps the last command was too old to count (set command.hold_s to hold it longer): left out"
+    )
+    first = float(times[np.flatnonzero(ideal.stale)[0]])
+    return [Finding("stale_command", "warning", text, where="command", t_start=first, count=count)]

@@ -1,0 +1,118 @@
+"""The velocity stage: body velocities on a uniform grid, from poses, segment by segment.
+
+Held poses are left out; the increments between the remaining ones are taken on SE(3), so that neither a turn
+nor a tilted ground leaves a false velocity; their running sum is the vehicle's own odometer, and a local
+quadratic fit of that odometer gives the velocity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from pipeline.core import rigid, segments, timegrid
+from pipeline.stages.errors import StageError
+from pipeline.stages.finding import Finding
+from pipeline.stages.gyro import GyroFit, fit_gyro, rate_of_gyro
+from pipeline.vehicles.configuration import VelocitySection
+
+Floats = NDArray[np.float64]
+
+_SHORTEST_SPAN = 0.5
+
+
+@dataclass(frozen=True)
+class VelocityResult:
+    """Velocities, what was noticed, and how the gyro fits the poses (None without one)."""
+
+    table: pl.DataFrame
+    findings: tuple[Finding, ...] = field(default=())
+    gyro: GyroFit | None = None
+
+
+def compute_velocities(poses: pl.DataFrame, imu: pl.DataFrame, settings: VelocitySection, *, where: str) -> VelocityResult:
+    """Differentiate poses into body velocities.
+
+    Args:
+        poses: table `poses`.
+        imu: table `imu`; may be empty.
+        settings: grid rate [Hz], width of the fit [s], whose yaw rate to use.
+        where: the run, for error messages.
+
+    Raises:
+        StageError: no segment is long enough, or the gyro is asked for and there is no usable one.
+    """
+    pieces, skipped = [], 0
+    for piece in poses.sort("segment", "t").partition_by("segment", maintain_order=True):
+        made = _differentiate_segment(piece, settings)
+        if made is None:
+            skipped += 1
+        else:
+            pieces.append(made)
+    if not pieces:
+        raise StageError(
+            "no_segment",
+            "the poses hold no stretch of half a second without a gap or a jump",
+            where=where,
+            hint="Check the pose topic with `slip inspect`; velocity.gap_s and velocity.jump_m may be widened.",
+        )
+    findings = []
+    if skipped:
+        text = f"{skipped} segments are shorter than {_SHORTEST_SPAN} s or hold one pose: left out"
+        findings.append(Finding("short_segments", "info", text, count=skipped))
+    table = pl.concat(pieces)
+    fit = None
+    if not imu.is_empty():
+        fit, more = fit_gyro(table, imu, settings.window_s)
+        findings += more
+    rate = rate_of_gyro(table["t"].to_numpy(), imu, fit, settings.window_s) if fit and fit.usable else None
+    column = pl.Series("v_w_imu", rate, dtype=pl.Float64) if rate is not None else pl.lit(None, pl.Float64).alias("v_w_imu")
+    table = table.with_columns(column)
+    if settings.yaw == "imu":
+        if rate is None:
+            raise StageError(
+                "no_gyro",
+                "--yaw imu was asked for, but the log has no gyro that agrees with the poses",
+                where=where,
+                hint="Use --yaw pose (the default).",
+            )
+        table = table.with_columns(pl.coalesce(pl.col("v_w_imu"), pl.col("v_w")).alias("v_w"))
+    return VelocityResult(table, tuple(findings), fit)
+
+
+def _differentiate_segment(piece: pl.DataFrame, settings: VelocitySection) -> pl.DataFrame | None:
+    """Velocities of one segment; None when it is too short."""
+    times = piece["t"].to_numpy()
+    fresh = segments.select_fresh_poses(times, piece["held"].to_numpy())
+    fresh = fresh[np.diff(times[fresh], prepend=-np.inf) > 0.0]
+    if fresh.size < 2:  # noqa: PLR2004 - one pose has no velocity
+        return None
+    kept = times[fresh]
+    # The grid spans the whole segment, repeats included: a vehicle may stand at its end.
+    if times[-1] - times[0] < _SHORTEST_SPAN:
+        return None
+    position = piece.select("x", "y", "z").to_numpy()[fresh]
+    quaternion = piece.select("q_x", "q_y", "q_z", "q_w").to_numpy()[fresh]
+    move, turn = segments.measure_increments(position, quaternion)
+    odometer = np.concatenate((np.zeros((1, 3)), np.cumsum(np.column_stack((move[:, :2], turn[:, 2])), axis=0)))
+    grid = timegrid.make_grid(times[0], times[-1], settings.rate_hz)
+    inside = np.clip(grid, kept[0], kept[-1])
+    velocity = timegrid.differentiate_locally(inside, kept, odometer, settings.window_s)
+    at, attitude = rigid.interpolate_poses(inside, kept, position, quaternion)
+    roll, pitch, yaw = rigid.euler_from_quaternions(attitude)
+    stamp = piece["stamp"][0] + np.round((grid - times[0]) * 1e9).astype(np.int64)
+    return pl.DataFrame(
+        {
+            "t": grid,
+            "stamp": stamp,
+            "segment": np.full(grid.size, piece["segment"][0], dtype=np.int32),
+            **{name: at[:, i] for i, name in enumerate("xyz")},
+            "roll": roll,
+            "pitch": pitch,
+            "yaw": rigid.unwrap_yaw(yaw),
+            **{name: velocity[:, i] for i, name in enumerate(("v_x", "v_y", "v_w"))},
+        }
+    )

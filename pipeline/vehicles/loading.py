@@ -1,0 +1,143 @@
+"""Finding and merging configurations: presets < fleet.toml < run.toml < the command line."""
+
+from __future__ import annotations
+
+import fnmatch
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import msgspec
+
+from pipeline.vehicles.configuration import Configuration
+from pipeline.vehicles.errors import ConfigurationError
+
+Tree = Mapping[str, object]
+
+FLEET_FILE = "fleet.toml"
+RUN_FILE = "run.toml"
+
+
+def load_configuration(log: Path, *, given: Path | None = None, overrides: Tree | None = None) -> Configuration:
+    """The configuration of one log.
+
+    Every `fleet.toml` from the file system's root down to the log's folder is read, nearer ones winning;
+    then `run.toml` or `<log's stem>.toml` beside the log, or the file given in their place; then overrides.
+
+    Args:
+        log: the recording.
+        given: a configuration file that replaces the one beside the log.
+        overrides: values from the command line, nested like the file.
+
+    Raises:
+        ConfigurationError: a file is missing, not TOML, or has an unknown key or a wrong value.
+    """
+    folder = log.resolve().parent
+    layers: list[Tree] = []
+    for place in (*reversed(folder.parents), folder):
+        fleet = place / FLEET_FILE
+        if fleet.is_file():
+            layers += _match_fleet(fleet, log.resolve())
+    if given is not None:
+        layers.append(_checked(read_toml(given), given))
+    else:
+        for beside in (folder / RUN_FILE, folder / f"{log.stem}.toml"):
+            if beside.is_file():
+                layers.append(_checked(read_toml(beside), beside))
+    if overrides:
+        layers.append(overrides)
+    return convert(merge(layers), "the command line")
+
+
+def merge(layers: Iterable[Tree]) -> dict[str, object]:
+    """Merge nested tables; later layers win, lists are replaced whole."""
+    merged: dict[str, object] = {}
+    for layer in layers:
+        for key, value in layer.items():
+            below = merged.get(key)
+            if isinstance(value, Mapping) and isinstance(below, Mapping):
+                merged[key] = merge([below, value])
+            else:
+                merged[key] = value
+    return merged
+
+
+def convert(tree: Tree, where: str) -> Configuration:
+    """Check a merged table and make a `Configuration` of it.
+
+    Raises:
+        ConfigurationError: unknown key or wrong value, with its place.
+    """
+    try:
+        return msgspec.convert(tree, Configuration)
+    except msgspec.ValidationError as error:
+        raise ConfigurationError(
+            "config_invalid",
+            f"the configuration is not valid: {_readable(str(error))}",
+            where=where,
+            hint="README.md, Configuration, lists the keys and their units.",
+        ) from None
+
+
+def _readable(message: str) -> str:
+    return message.replace("Object contains unknown field", "unknown key").replace(" - at `$.", " in `").replace(
+        "`$`", "the top level"
+    )
+
+
+def read_toml(path: Path) -> dict[str, object]:
+    """Parse a TOML file.
+
+    Raises:
+        ConfigurationError: the file is missing, unreadable or not TOML (with the line).
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigurationError(
+            "config_not_found", "there is no such configuration file", where=str(path), hint="Check the path."
+        ) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigurationError(
+            "config_not_toml", f"not a valid TOML file: {error}", where=str(path), hint="Mend that line."
+        ) from None
+    except OSError as error:
+        raise ConfigurationError(
+            "config_unreadable",
+            f"cannot be read: {error.strerror}",
+            where=str(path),
+            hint="Check its permissions.",
+        ) from None
+
+
+def _checked(tree: dict[str, object], path: Path) -> dict[str, object]:
+    """Check one file alone first, so that an error names the file it stands in."""
+    convert(tree, str(path))
+    return tree
+
+
+def _match_fleet(path: Path, log: Path) -> list[Tree]:
+    """Layers that a fleet file gives for one log: its plain keys, then every match in order."""
+    tree = read_toml(path)
+    matches = tree.pop("match", [])
+    layers: list[Tree] = [_checked(tree, path)]
+    relative = log.relative_to(path.parent).as_posix()
+    if not isinstance(matches, list):
+        raise _bad_match(path, 1)
+    for number, match in enumerate(matches, start=1):
+        if not isinstance(match, dict) or not isinstance(match.get("glob"), str):
+            raise _bad_match(path, number)
+        values = {key: value for key, value in match.items() if key != "glob"}
+        _checked(values, path)
+        if fnmatch.fnmatchcase(relative, match["glob"]) or fnmatch.fnmatchcase(log.name, match["glob"]):
+            layers.append(values)
+    return layers
+
+
+def _bad_match(path: Path, number: int) -> ConfigurationError:
+    return ConfigurationError(
+        "config_invalid",
+        f"[[match]] number {number} has no `glob`",
+        where=str(path),
+        hint='Write: [[match]] glob = "2026/*/warthog*" and the keys it sets.',
+    )

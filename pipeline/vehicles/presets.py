@@ -1,0 +1,127 @@
+"""Vehicles: presets found by being in the `presets` folder, and what a configuration makes of them."""
+
+from __future__ import annotations
+
+import functools
+import tomllib
+from importlib import resources
+from typing import Annotated
+
+import msgspec
+
+from pipeline.vehicles.configuration import Kind, Positive, VehicleSection
+from pipeline.vehicles.errors import ConfigurationError
+
+
+class UsualTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Topic names that a vehicle usually has, by role; the first is preferred."""
+
+    command: list[str] = []
+    wheels: list[str] = []
+    pose: list[str] = []
+    imu: list[str] = []
+
+
+class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A vehicle's geometry and limits; units are in the names.
+
+    Attributes:
+        id: name in tables and file names, lower case with underscores.
+    """
+
+    id: str
+    name: str
+    kind: Kind
+    wheel_radius_m: Positive
+    track_width_m: Positive | None = None
+    wheelbase_m: Positive | None = None
+    base_to_rear_axle_m: float = 0.0
+    mass_kg: Positive | None = None
+    max_speed_mps: Positive | None = None
+    max_yaw_rate_radps: Positive | None = None
+    max_steering_rad: Positive | None = None
+    controller_track_multiplier: Positive = 1.0
+    aliases: Annotated[list[str], msgspec.Meta(description="other names")] = []
+    topics: UsualTopics = UsualTopics()
+
+
+@functools.cache
+def list_presets() -> tuple[Vehicle, ...]:
+    """All presets, sorted by id."""
+    folder = resources.files("pipeline.vehicles") / "presets"
+    found = []
+    for entry in sorted(folder.iterdir(), key=lambda item: item.name):
+        if entry.name.endswith(".toml"):
+            content = tomllib.loads(entry.read_text(encoding="utf-8"))
+            found.append(msgspec.convert({"id": entry.name[:-5], **content}, Vehicle))
+    return tuple(found)
+
+
+def find_preset(name: str) -> Vehicle | None:
+    """The preset of that id or alias, ignoring case, spaces and dashes; None when there is none."""
+    wanted = _plain(name)
+    for vehicle in list_presets():
+        if wanted in {_plain(vehicle.id), *map(_plain, vehicle.aliases)}:
+            return vehicle
+    return None
+
+
+def _plain(name: str) -> str:
+    return name.strip().lower().replace("-", "_").replace(" ", "_")
+
+
+def resolve_vehicle(section: VehicleSection, *, recorded: str | None, where: str) -> Vehicle:
+    """The vehicle of a run.
+
+    Args:
+        section: what the configuration and the command line say.
+        recorded: vehicle named in the log's `deployment` record, used when the configuration names none.
+        where: the log, for the error message.
+
+    Raises:
+        ConfigurationError: no vehicle is named, the name is unknown, or a value that its kind needs is missing.
+    """
+    values = {key: value for key, value in msgspec.structs.asdict(section).items() if value is not None}
+    named = values.pop("preset", None)
+    # A full geometry needs no preset; a vehicle that the log names but nobody knows is then only a name.
+    base = find_preset(named or recorded or "")
+    if named and base is None:
+        raise ConfigurationError(
+            "vehicle_unknown", f"no vehicle preset is called {named!r}", where=where, hint=_how_to_choose()
+        )
+    if base is None:
+        if "wheel_radius_m" not in values:
+            said = f"the log names {recorded!r}, which is no preset" if recorded else "the log does not name one"
+            raise ConfigurationError(
+                "vehicle_unknown",
+                f"the vehicle cannot be determined: {said}",
+                where=where,
+                hint=_how_to_choose(),
+            )
+        label = str(values.pop("name", None) or recorded or "vehicle")
+        values = {"kind": "differential", "id": _plain(label), "name": label, **values}
+        return _check_geometry(msgspec.convert(values, Vehicle), where)
+    if "name" in values:
+        values["id"] = _plain(str(values["name"]))
+    return _check_geometry(msgspec.structs.replace(base, **values), where)
+
+
+def _check_geometry(vehicle: Vehicle, where: str) -> Vehicle:
+    needed = "track_width_m" if vehicle.kind == "differential" else "wheelbase_m"
+    if getattr(vehicle, needed) is None:
+        raise ConfigurationError(
+            "vehicle_incomplete",
+            f"a vehicle of kind {vehicle.kind!r} needs {needed}",
+            where=where,
+            hint=f"Set vehicle.{needed} in run.toml"
+            + (" or give --track-width." if needed == "track_width_m" else "."),
+        )
+    return vehicle
+
+
+def _how_to_choose() -> str:
+    known = ", ".join(vehicle.id for vehicle in list_presets())
+    return (
+        f"Say which: --vehicle NAME (make: VEHICLE=NAME) with one of {known}; "
+        "or --wheel-radius and --track-width in metres."
+    )

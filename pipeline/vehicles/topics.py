@@ -1,0 +1,289 @@
+"""Choosing topics by configuration, type and name.
+
+What the configuration names is taken. Otherwise the candidates of a role are those of a fitting type; names
+that vehicles usually have, and words such as `cmd` or `status`, rank them. The choice carries its reason.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from typing import TypeVar
+
+from pipeline.logs import ChannelInfo
+from pipeline.vehicles.configuration import Configuration, DriveSection, IntervalSection
+from pipeline.vehicles.errors import ConfigurationError
+from pipeline.vehicles.presets import Vehicle
+from pipeline.vehicles.sources import DriveForm, DriveSource, PoseSource, Signal, Sources, TopicSource
+
+JOINTS = "sensor_msgs/JointState"
+BODY_TYPES = ("geometry_msgs/Twist", "geometry_msgs/TwistStamped")
+ACKERMANN_TYPES = ("ackermann_msgs/AckermannDrive", "ackermann_msgs/AckermannDriveStamped")
+FLOAT_TYPES = ("std_msgs/Float64", "std_msgs/Float32")
+POSE_TYPES = (
+    "nav_msgs/Odometry",
+    "geometry_msgs/PoseStamped",
+    "geometry_msgs/PoseWithCovarianceStamped",
+)
+TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
+IMU_TYPE = "sensor_msgs/Imu"
+STRING_TYPE = "std_msgs/String"
+DEFAULT_INTERVAL = ("/drive/calib_state", "calib")
+
+_COMMANDED = re.compile(r"cmd|command|setpoint|target|desired|reference")
+_MEASURED = re.compile(r"status|state|feedback|measured|encoder|actual")
+_RECEIVED = re.compile(r"controller|mux/cmd|cmd_vel_out|platform/cmd|drive/cmd|base/cmd|vehicle/")
+_UPSTREAM = re.compile(r"joy|teleop|nav|web|key|interactive|plan|raw|key_vel")
+_LOCALIZED = re.compile(r"icp|slam|lidar|laser|map|locali|loam|gnss|gps|rtk|ground_truth|truth|mocap|vicon|optitrack|amcl|vio|lio")
+_DEAD_RECKONED = re.compile(r"controller|wheel|encoder|diff_drive|drive_odom|platform/odom|dead")
+_NOT_A_POSE = re.compile(r"goal|initialpose|initial_pose|target|waypoint|desired|reference|setpoint|cmd")
+
+
+Source = TypeVar("Source", DriveSource, PoseSource, TopicSource)
+
+
+def plain_type(type_name: str) -> str:
+    """ROS 1 and ROS 2 spellings of a type made one: `sensor_msgs/Imu`."""
+    return type_name.replace("/msg/", "/")
+
+
+def choose_sources(
+    channels: Sequence[ChannelInfo], configuration: Configuration, vehicle: Vehicle, *, where: str
+) -> Sources:
+    """Choose the topics of every role.
+
+    Args:
+        channels: what the log holds.
+        configuration: what the user says.
+        vehicle: whose usual topics are preferred.
+        where: the log, for error messages.
+
+    Raises:
+        ConfigurationError: a configured topic is not in the log, or needs a field path.
+    """
+    chooser = _Chooser([channel for channel in channels if channel.message_count != 0], vehicle, where)
+    return Sources(
+        command=chooser.choose_drive(configuration.command, commanded=True),
+        wheels=chooser.choose_drive(configuration.wheels, commanded=False),
+        pose=chooser.choose_pose(configuration.pose.topic, configuration.pose.frames),
+        imu=chooser.choose_imu(configuration.imu.topic),
+        interval=chooser.choose_interval(configuration),
+        notes=tuple(chooser.notes),
+    )
+
+
+class _Chooser:
+    """One log's candidates."""
+
+    def __init__(self, channels: list[ChannelInfo], vehicle: Vehicle, where: str) -> None:
+        self.types = {channel.topic: plain_type(channel.type_name) for channel in channels}
+        self.counts = {channel.topic: channel.message_count or 0 for channel in channels}
+        self.vehicle = vehicle
+        self.where = where
+        self.notes: list[str] = []
+
+    def of_type(self, *types: str) -> list[str]:
+        """Topics of any of the types."""
+        return [topic for topic, kind in self.types.items() if kind in types]
+
+    def require(self, text: str, role: str) -> Signal:
+        """A configured signal, or an error when its topic is not in the log."""
+        signal = Signal.parse(text)
+        if signal.topic not in self.types:
+            raise ConfigurationError(
+                "topic_not_found",
+                f"the topic {signal.topic!r} configured as {role} is not in the log (or is empty)",
+                where=self.where,
+                hint=f"It has: {', '.join(sorted(self.types)) or 'no topics'}.",
+            )
+        return signal
+
+    def require_number(self, text: str, role: str) -> Signal:
+        """A configured signal that must come to one number."""
+        signal = self.require(text, role)
+        if signal.field:
+            return signal
+        if self.types[signal.topic] in FLOAT_TYPES:
+            return Signal(signal.topic, "data")
+        raise ConfigurationError(
+            "field_needed",
+            f"the topic {signal.topic!r} configured as {role} is of type {self.types[signal.topic]}",
+            where=self.where,
+            hint=f"Name the field: {signal.topic}.field or {signal.topic}.array[0].",
+        )
+
+    def choose_drive(self, section: DriveSection, *, commanded: bool) -> DriveSource | None:
+        """Commands (or measured wheels) by configuration, else by type and name."""
+        role = "command" if commanded else "wheels"
+        configured = self._configured_drive(section, role)
+        if configured is not None:
+            return configured
+        usual = self.vehicle.topics.command if commanded else self.vehicle.topics.wheels
+        candidates = list(self._drive_candidates(section, commanded=commanded))
+        return self._best(candidates, usual, role)
+
+    def _configured_drive(self, section: DriveSection, role: str) -> DriveSource | None:
+        reason = "configured"
+        if section.left_topic and section.right_topic:
+            sides = (section.left_topic, section.right_topic)
+            return DriveSource(
+                DriveForm.SIDES, tuple(self.require_number(side, role) for side in sides), reason
+            )
+        if section.speed_topic and (section.yaw_rate_topic or section.steering_topic):
+            form = DriveForm.BODY_SIGNALS if section.yaw_rate_topic else DriveForm.STEERING_SIGNALS
+            pair = (section.speed_topic, section.yaw_rate_topic or section.steering_topic or "")
+            return DriveSource(form, tuple(self.require_number(text, role) for text in pair), reason)
+        if section.topic:
+            signal = self.require(section.topic, role)
+            form = self._form_of(signal.topic)
+            if form is None:
+                raise ConfigurationError(
+                    "type_not_usable",
+                    f"the topic {signal.topic!r} of type {self.types[signal.topic]} cannot serve as {role} alone",
+                    where=self.where,
+                    hint=f"Give {role}.left_topic and {role}.right_topic with field paths.",
+                )
+            return DriveSource(form, (signal,), reason)
+        return None
+
+    def _form_of(self, topic: str) -> DriveForm | None:
+        kind = self.types[topic]
+        if kind == JOINTS:
+            return DriveForm.JOINTS
+        if kind in BODY_TYPES:
+            return DriveForm.BODY
+        return DriveForm.ACKERMANN if kind in ACKERMANN_TYPES else None
+
+    def _drive_candidates(
+        self, section: DriveSection, *, commanded: bool
+    ) -> Iterable[tuple[float, DriveSource]]:
+        """Candidates with their rank: wheel commands before body commands, since the drive received them."""
+        wanted, unwanted = (_COMMANDED, _MEASURED) if commanded else (_MEASURED, _COMMANDED)
+        ackermann = self.vehicle.kind == "ackermann"
+        steered = bool(section.steering_joint) or not ackermann
+        for topic in self.of_type(JOINTS) if steered else []:
+            says_command = bool(_COMMANDED.search(topic.lower()))
+            if says_command == commanded:
+                word = "says command" if says_command else "does not say command"
+                yield 3.0, DriveSource(
+                    DriveForm.JOINTS, (Signal(topic),), f"JointState whose name {word}"
+                )
+        for left, right in [] if ackermann else self._pairs():
+            name = left.lower()
+            fits, misfits = bool(wanted.search(name)), bool(unwanted.search(name))
+            if fits and not misfits:
+                reason, rank = "a pair of sides whose name fits the role", 3.0
+            elif commanded and not misfits:
+                reason, rank = "a pair of sides that does not say it is measured", 2.5
+            else:
+                continue
+            signals = (Signal(left, "data"), Signal(right, "data"))
+            yield rank, DriveSource(DriveForm.SIDES, signals, reason)
+        for topic in self.of_type(*ACKERMANN_TYPES) if ackermann else []:
+            if bool(_MEASURED.search(topic.lower())) != commanded:
+                yield 3.0, DriveSource(DriveForm.ACKERMANN, (Signal(topic),), "speed and steering angle")
+        for topic in self.of_type(*BODY_TYPES) if commanded else []:
+            yield self._rank_body(topic)
+
+    def _rank_body(self, topic: str) -> tuple[float, DriveSource]:
+        name = topic.lower()
+        if _MEASURED.search(name):
+            rank, reason = 0.5, "a twist whose name says it is measured"
+        elif _RECEIVED.search(name) and not _UPSTREAM.search(name):
+            rank, reason = 2.0, "the body command that the controller received"
+        elif _UPSTREAM.search(name):
+            rank, reason = 1.0, "a body command upstream of the controller"
+        else:
+            rank, reason = 1.5, "a body command"
+        return rank, DriveSource(DriveForm.BODY, (Signal(topic),), reason)
+
+    def _pairs(self) -> list[tuple[str, str]]:
+        """Topics of one number whose names differ in left and right."""
+        floats = set(self.of_type(*FLOAT_TYPES))
+        return [
+            (topic, topic.replace("left", "right"))
+            for topic in sorted(floats)
+            if "left" in topic and topic.replace("left", "right") in floats
+        ]
+
+    def choose_pose(self, topic: str | None, frames: list[str] | None) -> PoseSource | None:
+        """The localization: configured, else the best named one, else transforms, else any odometry."""
+        transforms = self._dynamic_transforms()
+        if frames:
+            if not transforms:
+                raise ConfigurationError(
+                    "topic_not_found",
+                    "pose.frames is configured, but the log has no transforms",
+                    where=self.where,
+                    hint="Configure pose.topic.",
+                )
+            return PoseSource(transforms, "configured", from_transforms=True, frames=(frames[0], frames[1]))
+        if topic:
+            name = self.require(topic, "pose").topic
+            if self.types[name] in TRANSFORM_TYPES:
+                return PoseSource(name, "configured", from_transforms=True)
+            if self.types[name] not in POSE_TYPES:
+                raise ConfigurationError(
+                    "type_not_usable",
+                    f"the topic {name!r} of type {self.types[name]} cannot serve as pose",
+                    where=self.where,
+                    hint=f"Use one of: {', '.join(POSE_TYPES)}; or pose.frames.",
+                )
+            return PoseSource(name, "configured")
+        candidates = [
+            ranked for name in self.of_type(*POSE_TYPES) if (ranked := self._rank_pose(name)) is not None
+        ]
+        if transforms:
+            candidates.append((2.5, PoseSource(transforms, "the chain of transforms", from_transforms=True)))
+        return self._best(candidates, self.vehicle.topics.pose, "pose")
+
+    def _dynamic_transforms(self) -> str:
+        found = [name for name in self.of_type(*TRANSFORM_TYPES) if "static" not in name]
+        return found[0] if found else ""
+
+    def _rank_pose(self, topic: str) -> tuple[float, PoseSource] | None:
+        name = topic.lower()
+        if _NOT_A_POSE.search(name):
+            return None
+        if _DEAD_RECKONED.search(name):
+            return 0.5, PoseSource(topic, "an odometry whose name says it comes from the wheels")
+        if _LOCALIZED.search(name):
+            return 3.0, PoseSource(topic, "a localization by its name")
+        return 2.0, PoseSource(topic, "a pose by its type")
+
+    def choose_imu(self, topic: str | None) -> TopicSource | None:
+        """The gyro: configured, else the usual one, else the one with most messages."""
+        if topic:
+            return TopicSource(self.require(topic, "imu").topic, "configured")
+        candidates = [(1.0, TopicSource(name, "an IMU by its type")) for name in self.of_type(IMU_TYPE)]
+        return self._best(candidates, self.vehicle.topics.imu, "imu")
+
+    def choose_interval(self, configuration: Configuration) -> TopicSource | None:
+        """The topic that says when commands are live."""
+        sections: list[IntervalSection] = configuration.interval
+        configured = [section.topic for section in sections if section.topic]
+        if configured:
+            return TopicSource(self.require(configured[0], "interval").topic, "configured")
+        topic, value = DEFAULT_INTERVAL
+        if sections or configuration.use_intervals == "all" or self.types.get(topic) != STRING_TYPE:
+            return None
+        return TopicSource(topic, f"commands are live only while it says {value!r}; --interval all takes all")
+
+    def _best(
+        self, candidates: list[tuple[float, Source]], usual: list[str], role: str
+    ) -> Source | None:
+        """The candidate of highest rank; a vehicle's usual name breaks ties, then the number of messages."""
+        if not candidates:
+            return None
+
+        def order(candidate: tuple[float, Source]) -> tuple[float, int, int, str]:
+            rank, source = candidate
+            topic = source.signals[0].topic if isinstance(source, DriveSource) else source.topic
+            place = usual.index(topic) if topic in usual else len(usual)
+            return -rank, place, -self.counts[topic], topic
+
+        ranked = sorted(candidates, key=order)
+        others = ", ".join(str(source) for _, source in ranked[1:])
+        if others:
+            self.notes.append(f"{role}: {ranked[0][1]} was preferred to {others}")
+        return ranked[0][1]
