@@ -18,6 +18,7 @@ from pipeline.simulate.cases import (
 from pipeline.simulate.effects import EffectSpec, ParameterSpec
 from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.layouts import LAYOUTS, CommandTopic, Layout, PoseTopic, WheelTopic
+from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
 from pipeline.simulate.record import write_log
 from pipeline.simulate.run import SimulatedRun, Truth, simulate_run
 from pipeline.simulate.scenario import (
@@ -36,6 +37,7 @@ from pipeline.simulate.vehicles import VEHICLES, Vehicle, find_vehicle
 
 __all__ = [
     "LAYOUTS",
+    "MACHINES",
     "VEHICLES",
     "Case",
     "Clock",
@@ -54,6 +56,7 @@ __all__ = [
     "Scenario",
     "SimulateError",
     "SimulatedRun",
+    "SkidSteer",
     "State",
     "Truth",
     "Vehicle",
@@ -65,6 +68,7 @@ __all__ = [
     "make_scenario",
     "simulate_case",
     "simulate_run",
+    "simulate_skid_steer",
     "write_log",
     "write_samples",
 ]

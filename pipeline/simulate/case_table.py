@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer
 from pipeline.simulate.scenario import (
     Clock,
     Disturbance,
@@ -15,17 +16,19 @@ from pipeline.simulate.scenario import (
     Program,
     Recording,
     Scenario,
+    State,
 )
 from pipeline.simulate.vehicles import VEHICLES
 
 
 @dataclass(frozen=True)
 class Case:
-    """A named scenario and what it shows, in one line."""
+    """A named scenario and what it shows, in one line; a machine when it is built of rigid bodies."""
 
     name: str
     shows: str
     scenario: Scenario
+    machine: SkidSteer | None = None
 
 
 _ICP = PoseSensor(
@@ -44,19 +47,24 @@ _WARTHOG = replace(
     vehicle=VEHICLES["warthog"],
     program=Program(speed_scale=0.6, turn_scale=0.7),
     disturbance=Disturbance(0.03, 0.04),
-    recording=Recording("warthog"),
 )
 _CAR = replace(
     _HUSKY,
     vehicle=VEHICLES["car"],
     disturbance=Disturbance(0.02, 0.02),
-    recording=Recording("ackermann"),
 )
 _SKID = {"effective_track": 1.8, "drive_lag": 0.3}
 
 
 def _on(scenario: Scenario, terrain: str) -> Scenario:
     return replace(scenario, recording=replace(scenario.recording, terrain=terrain))
+
+
+def _ride_oval_wheel(state: State) -> tuple[float, float, float]:
+    # An out-of-round left wheel: 4 % of radius, once a turn.
+    uneven = 0.04 * math.sin(state.left_angle)
+    rim = _HUSKY.vehicle.wheel_radius_m * state.left_speed
+    return 0.5 * uneven * rim, 0.0, -uneven * rim / _HUSKY.vehicle.track_width_m
 
 
 CASES: tuple[Case, ...] = (
@@ -184,5 +192,52 @@ CASES: tuple[Case, ...] = (
             pose=replace(_ICP, dropouts=3, invalid=4),
             seed=31,
         ),
+    ),
+    Case(
+        "husky_controller_multiplier",
+        "the controller widens the track 1.875 times, so that a body command hides the effective track",
+        _on(
+            replace(
+                _HUSKY,
+                vehicle=replace(VEHICLES["husky"], controller_track_multiplier=1.875),
+                effects=_SKID,
+                recording=Recording("husky_body_command"),
+                seed=32,
+            ),
+            "asphalt",
+        ),
+    ),
+    Case(
+        "husky_oval_wheel",
+        "a wheel out of round: physics that no catalogue has, and that must stay unexplained",
+        _on(replace(_HUSKY, extra=_ride_oval_wheel, effects=_SKID, seed=33), "tile"),
+    ),
+    Case(
+        "husky_lidar_pose",
+        "the pose is of the lidar; its place on the robot stands in tf_static",
+        replace(
+            _HUSKY,
+            effects=_SKID,
+            pose=replace(_ICP, child_frame="lidar", mount_x_m=0.3, mount_y_m=0.05, mount_yaw_rad=0.1),
+            seed=34,
+        ),
+    ),
+    Case(
+        "rigid_husky",
+        "rigid bodies and friction in place of formulas (needs the extra `sim`)",
+        _on(replace(_HUSKY, disturbance=Disturbance(), seed=41), "concrete"),
+        MACHINES["husky"],
+    ),
+    Case(
+        "rigid_husky_payload",
+        "rigid bodies with 35 kg at the back: the centre of rotation moves (needs the extra `sim`)",
+        _on(replace(_HUSKY, disturbance=Disturbance(), seed=42), "concrete"),
+        replace(MACHINES["husky"], payload_kg=35.0, payload_x_m=-0.15),
+    ),
+    Case(
+        "rigid_warthog_low_grip",
+        "rigid bodies on ice: wheels spin before the body follows (needs the extra `sim`)",
+        _on(replace(_WARTHOG, disturbance=Disturbance(), seed=43), "ice"),
+        replace(MACHINES["warthog"], friction=0.1),
     ),
 )

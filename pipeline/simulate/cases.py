@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, get_args
 from pipeline.simulate.case_table import CASES, Case
 from pipeline.simulate.effects import CATALOGUE, EffectSpec, resolve_effects
 from pipeline.simulate.errors import SimulateError, unknown_name
-from pipeline.simulate.layouts import choose_layout, find_layout
+from pipeline.simulate.layouts import find_layout
+from pipeline.simulate.mujoco_vehicle import simulate_skid_steer
 from pipeline.simulate.record import write_log
 from pipeline.simulate.run import simulate_run
 from pipeline.simulate.scenario import Ground, ProgramName, Scenario
@@ -82,7 +83,9 @@ def simulate_case(
     target = out / f"{name or 'simulated'}.mcap" if out.is_dir() else out
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        write_log(simulate_run(scenario), target)
+        machine = None if name is None else find_case(name).machine
+        run = simulate_run(scenario) if machine is None else simulate_skid_steer(scenario, machine)
+        write_log(run, target)
     except OSError as problem:
         raise SimulateError(
             "cannot_write",
@@ -105,13 +108,19 @@ def make_scenario(
 ) -> Scenario:
     """The scenario of a named case with changes; see `simulate_case`."""
     scenario = Scenario() if name is None else find_case(name).scenario
+    if vehicle is not None and name is not None and find_case(name).machine is not None:
+        raise SimulateError(
+            "wrong_vehicle",
+            "a case of rigid bodies keeps its own vehicle",
+            where=name,
+            hint="Leave the vehicle out or choose another case",
+        )
     if vehicle is not None:
-        chosen = find_vehicle(vehicle)
-        usual = choose_layout(chosen.name, chosen.kind)
-        scenario = replace(scenario, vehicle=chosen, recording=replace(scenario.recording, layout=usual))
+        usual = replace(scenario.recording, layout="usual")
+        scenario = replace(scenario, vehicle=find_vehicle(vehicle), recording=usual)
     if layout is not None:
-        find_layout(layout, scenario.vehicle.kind)
         scenario = replace(scenario, recording=replace(scenario.recording, layout=layout))
+    find_layout(scenario.recording.layout, scenario.vehicle)
     if program is not None:
         known = get_args(ProgramName)
         if program not in known:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from pipeline.simulate.errors import SimulateError, unknown_name
 
 if TYPE_CHECKING:
-    from pipeline.simulate.vehicles import Kind
+    from pipeline.simulate.vehicles import Kind, Vehicle
 
 CommandForm = Literal[
     "joint_state", "float_sides", "twist", "twist_stamped", "ackermann", "float_speed_steering"
@@ -156,28 +156,35 @@ LAYOUTS: dict[str, Layout] = {
 }
 
 
-def find_layout(layout: str | Layout, kind: Kind) -> Layout:
+def find_layout(layout: str | Layout, vehicle: Vehicle) -> Layout:
     """The layout of that name, or the one given, if it fits the vehicle.
+
+    Args:
+        layout: a name of `LAYOUTS`, ``usual`` for what such a vehicle usually has, or a layout.
+        vehicle: whose log it shall be.
 
     Raises:
         SimulateError: ``unknown_layout`` or ``wrong_vehicle``.
     """
-    if isinstance(layout, str) and layout not in LAYOUTS:
-        raise unknown_name("layout", layout, sorted(LAYOUTS))
-    found = LAYOUTS[layout] if isinstance(layout, str) else layout
-    if found.kind != kind:
-        fitting = sorted(name for name, item in LAYOUTS.items() if item.kind == kind)
+    if isinstance(layout, str):
+        name = _choose_usual(vehicle) if layout == "usual" else layout
+        if name not in LAYOUTS:
+            raise unknown_name("layout", name, ["usual", *sorted(LAYOUTS)])
+        found = LAYOUTS[name]
+    else:
+        name, found = "layout", layout
+    if found.kind != vehicle.kind:
+        fitting = sorted(key for key, item in LAYOUTS.items() if item.kind == vehicle.kind)
         raise SimulateError(
             "wrong_vehicle",
-            f"this layout is for {found.kind} vehicles, this one is {kind}",
-            where=layout if isinstance(layout, str) else "layout",
+            f"this layout is for {found.kind} vehicles, this one is {vehicle.kind}",
+            where=name,
             hint=f"Choose one of {', '.join(fitting)}",
         )
     return found
 
 
-def choose_layout(vehicle_name: str, kind: Kind) -> str:
-    """The layout a vehicle usually has."""
-    if kind == "ackermann":
+def _choose_usual(vehicle: Vehicle) -> str:
+    if vehicle.kind == "ackermann":
         return "ackermann"
-    return {"husky_a200": "husky", "warthog": "warthog"}.get(vehicle_name, "tf")
+    return {"husky_a200": "husky", "warthog": "warthog"}.get(vehicle.name, "tf")

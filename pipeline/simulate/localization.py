@@ -69,6 +69,7 @@ def report_poses(sensor: PoseSensor, path: Path, effects: Effects, *, duration_s
     """
     published, sampled = _choose_times(sensor, duration_s, seed)
     position, quaternion = _sample_path(path, effects, sampled)
+    position, quaternion = _mount_frame(sensor, position, quaternion)
     position, quaternion = _add_noise(sensor, sampled, position, quaternion, seed)
     which = np.searchsorted(sampled, published, side="right") - 1
     late = open_stream(seed, "pose latency").standard_normal(published.size) * sensor.latency_jitter_s
@@ -112,6 +113,14 @@ def _sample_path(path: Path, effects: Effects, at: Floats) -> tuple[Floats, Floa
         twist = quaternions_from_yaw(np.full(at.size, effects.value("yaw_misalignment", "psi")))
         quaternion = multiply_quaternions(quaternion, twist)
     return position, quaternion
+
+
+def _mount_frame(sensor: PoseSensor, position: Floats, quaternion: Floats) -> tuple[Floats, Floats]:
+    if sensor.child_frame == "base_link":
+        return position, quaternion
+    arm = np.broadcast_to(np.array([sensor.mount_x_m, sensor.mount_y_m, 0.0]), position.shape)
+    twist = quaternions_from_yaw(np.full(position.shape[0], sensor.mount_yaw_rad))
+    return position + rotate(quaternion, arm), multiply_quaternions(quaternion, twist)
 
 
 def _add_noise(

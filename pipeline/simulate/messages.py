@@ -153,8 +153,30 @@ def pose_sheets(run: SimulatedRun, topic: PoseTopic) -> list[Sheet]:
     fields = _name_pose(prefix, "position", "orientation", position, quaternion)
     fields["header.frame_id"] = "map"
     if topic.form == "odometry":
-        fields["child_frame_id"] = "base_link"
+        fields["child_frame_id"] = run.scenario.pose.child_frame
     return [Sheet(topic.topic, name, poses.log_s, poses.stamp_s, fields)]
+
+
+def static_sheets(run: SimulatedRun, layout: Layout) -> list[Sheet]:
+    """Where sensors are mounted, as far as readers need it."""
+    sensor = run.scenario.pose
+    mounted: list[tuple[str, tuple[float, float], float]] = []
+    if layout.pose.form == "tf" and run.imu is not None:
+        mounted.append(("imu_link", (0.0, 0.0), 0.0))
+    if sensor.child_frame != "base_link":
+        mounted.append((sensor.child_frame, (sensor.mount_x_m, sensor.mount_y_m), sensor.mount_yaw_rad))
+    return [
+        Sheet(
+            "/tf_static",
+            "tf2_msgs/msg/TFMessage",
+            np.zeros(1),
+            np.zeros(1),
+            _name_transform(
+                "base_link", name, np.array([[*place, 0.0]]), quaternions_from_yaw(np.array([yaw]))
+            ),
+        )
+        for name, place, yaw in mounted
+    ]
 
 
 def _name_pose(prefix: str, place: str, turn: str, position: Floats, quaternion: Floats) -> dict[str, Field]:
@@ -172,16 +194,10 @@ def _write_tf(run: SimulatedRun, topic: str) -> list[Sheet]:
     turn = quaternions_from_yaw(poses.correction_yaw[which])
     corrections = _name_transform("map", "odom", poses.correction[which], turn)
     name = "tf2_msgs/msg/TFMessage"
-    sheets = [
+    return [
         Sheet(topic, name, poses.log_s, poses.stamp_s, odometry),
         Sheet(topic, name, time + _LATE_S, time + _FUTURE_S, corrections),
     ]
-    if run.imu is not None:
-        mounting = _name_transform(
-            "base_link", "imu_link", np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]])
-        )
-        sheets.append(Sheet("/tf_static", name, np.zeros(1), np.zeros(1), mounting))
-    return sheets
 
 
 def _name_transform(parent: str, child: str, position: Floats, quaternion: Floats) -> dict[str, Field]:

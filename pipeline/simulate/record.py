@@ -12,6 +12,7 @@ from pipeline.simulate.messages import (
     imu_sheets,
     pose_sheets,
     state_sheets,
+    static_sheets,
     wheel_sheets,
 )
 from pipeline.simulate.stamps import stamp_times
@@ -36,11 +37,12 @@ def write_log(run: SimulatedRun, path: Path) -> None:
     from pipeline.logs import LogWriter  # noqa: PLC0415
 
     scenario = run.scenario
-    layout = find_layout(scenario.recording.layout, scenario.vehicle.kind)
+    layout = find_layout(scenario.recording.layout, scenario.vehicle)
     sheets = [
         *command_sheets(run, layout),
         *wheel_sheets(run, layout),
         *pose_sheets(run, layout.pose),
+        *static_sheets(run, layout),
         *imu_sheets(run, layout),
         *state_sheets(run),
         *decoy_sheets(run),

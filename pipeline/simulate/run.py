@@ -13,6 +13,7 @@ from pipeline.simulate.body import BodyMotion, move_body
 from pipeline.simulate.drivetrain import Drive, apply_ideal_model, drive_wheels
 from pipeline.simulate.effects import Effects, resolve_effects
 from pipeline.simulate.errors import SimulateError
+from pipeline.simulate.layouts import find_layout
 from pipeline.simulate.localization import Poses, report_poses
 from pipeline.simulate.path import Path, integrate_path
 from pipeline.simulate.programs import Commands, make_commands
@@ -107,8 +108,11 @@ def record_truth(scenario: Scenario, truth: Truth) -> SimulatedRun:
     """Let the scenario's sensors look at what happened, whoever computed it.
 
     Raises:
-        SimulateError: ``encoders_needed`` when the pose is wheel odometry and there are no encoders.
+        SimulateError: ``encoders_needed`` when the pose is wheel odometry and there are no encoders;
+            ``bad_value`` for another child frame in messages that cannot name it; a layout that is unknown
+            or does not fit.
     """
+    _check_frame(scenario)
     duration, seed = scenario.duration_s, scenario.seed
     wheels = imu = None
     if scenario.encoders is not None:
@@ -127,6 +131,17 @@ def record_truth(scenario: Scenario, truth: Truth) -> SimulatedRun:
         seen = integrate_odometry(scenario.vehicle, wheels, start=scenario.start_pose)
     poses = report_poses(scenario.pose, seen, truth.effects, duration_s=duration, seed=seed)
     return SimulatedRun(scenario, truth, _as_recorded(scenario, truth.commands), poses, wheels, imu)
+
+
+def _check_frame(scenario: Scenario) -> None:
+    layout = find_layout(scenario.recording.layout, scenario.vehicle)
+    if scenario.pose.child_frame != "base_link" and layout.pose.form != "odometry":
+        raise SimulateError(
+            "bad_value",
+            f"a pose as {layout.pose.form} cannot be of {scenario.pose.child_frame}",
+            where="pose.child_frame",
+            hint="Choose a layout whose pose is an odometry message",
+        )
 
 
 def integrate_odometry(vehicle: Vehicle, wheels: WheelReadings, *, start: tuple[float, float, float]) -> Path:

@@ -123,6 +123,8 @@ class PoseSensor:
         jumps: how many corrections of ``jump_m`` and ``jump_rad`` happen at once.
         invalid: how many single poses are NaN or have a zero quaternion.
         rotated_stretches: how many stretches of 2 s report a heading that is off by 90 degrees.
+        child_frame: what the pose is of; another frame than ``base_link`` is mounted at ``mount_x_m``,
+            ``mount_y_m``, ``mount_yaw_rad`` on it, which ``/tf_static`` tells. Odometry messages only.
     """
 
     source: Literal["localization", "wheels"] = "localization"
@@ -146,6 +148,10 @@ class PoseSensor:
     jump_rad: float = 0.1
     invalid: int = 0
     rotated_stretches: int = 0
+    child_frame: str = "base_link"
+    mount_x_m: float = 0.0
+    mount_y_m: float = 0.0
+    mount_yaw_rad: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -211,7 +217,7 @@ class Recording:
     """What the log holds.
 
     Attributes:
-        layout: the topics: a name of ``layouts.LAYOUTS``, or a layout of one's own.
+        layout: the topics: a name of ``layouts.LAYOUTS``, ``usual`` for the vehicle's, or a layout.
         deployment: whether and how the deployment record is written: vehicle and terrain, or nothing.
         terrain: name of the ground in that record.
         decoys: topics that a hasty reader takes for the right ones.
@@ -222,7 +228,7 @@ class Recording:
         gaps: how many holes of ``gap_s`` the whole recording has.
     """
 
-    layout: str | Layout = "husky"
+    layout: str | Layout = "usual"
     deployment: Literal["written", "absent"] = "written"
     terrain: str = "simulated"
     decoys: Literal["none", "odometry", "commands", "both"] = "none"

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.simulate import (
-    LAYOUTS,
     VEHICLES,
     Program,
     Scenario,
@@ -61,6 +60,7 @@ def test_every_effect_of_the_catalogue_can_be_asked_for() -> None:
         ({"layout": "hosky"}, "unknown_layout", "husky"),
         ({"layout": "ackermann"}, "wrong_vehicle", "husky"),
         ({"program": "driving"}, "unknown_program", "drive_steps"),
+        ({"name": "rigid_husky", "vehicle": "car"}, "wrong_vehicle", "own vehicle"),
         ({"duration_s": 0.1}, "bad_value", "duration_s"),
     ],
     ids=str,
@@ -107,7 +107,7 @@ def test_slope_drift_brings_a_slope_along() -> None:
 def test_a_vehicle_brings_a_layout_that_fits() -> None:
     for name, vehicle in VEHICLES.items():
         scenario = make_scenario(None, vehicle=name)
-        assert find_layout(scenario.recording.layout, vehicle.kind).kind == vehicle.kind
+        assert find_layout(scenario.recording.layout, vehicle).kind == vehicle.kind
     assert find_vehicle("husky_a200") is find_vehicle("husky")
 
 
@@ -116,9 +116,10 @@ def test_every_case_can_be_made() -> None:
     assert {"husky_tile", "warthog_ice", "ackermann_gravel"} <= set(names)
     assert len(set(names)) == len(names)
     for case in list_cases():
+        if case.machine is not None:
+            continue
         run = simulate_run(replace(case.scenario, duration_s=12.0))
         assert run.poses.stamp_s.size > 50
-        assert case.scenario.recording.layout in LAYOUTS
 
 
 @pytest.mark.parametrize(

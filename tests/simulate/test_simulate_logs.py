@@ -13,6 +13,7 @@ from mcap_ros2.decoder import DecoderFactory
 from pipeline.simulate import (
     LAYOUTS,
     VEHICLES,
+    Case,
     Clock,
     CommandTopic,
     Encoders,
@@ -166,6 +167,26 @@ def test_transforms_chain_to_the_pose_and_step_at_a_jump(tmp_path: Path) -> None
     assert topics["/tf_static"][0].body.transforms[0].child_frame_id == "imu_link"
 
 
+def test_a_pose_of_another_frame_is_told_by_name_and_mounting(tmp_path: Path) -> None:
+    mounted = PoseSensor(
+        child_frame="lidar", mount_x_m=0.3, mount_y_m=-0.1, mount_yaw_rad=0.5, noise_m=0, noise_rad=0
+    )
+    run, topics = record(replace(SHORT, pose=mounted), tmp_path / "a.mcap")
+    odometry = topics["/mapping/icp_odom"][200].body
+    edge = topics["/tf_static"][0].body.transforms[0]
+    assert odometry.child_frame_id == edge.child_frame_id == "lidar"
+    at = run.poses.sampled_s[200]
+    path = run.truth.path
+    yaw = np.interp(
+        at, path.time_s, np.unwrap(2.0 * np.arctan2(path.quaternion[:, 2], path.quaternion[:, 3]))
+    )
+    x = np.interp(at, path.time_s, path.position[:, 0]) + 0.3 * np.cos(yaw) + 0.1 * np.sin(yaw)
+    assert odometry.pose.pose.position.x == pytest.approx(x, abs=1e-6)
+    assert edge.transform.rotation.z == pytest.approx(np.sin(0.25))
+    with pytest.raises(SimulateError, match="cannot be of lidar"):
+        simulate_run(replace(in_layout("tf"), pose=mounted))
+
+
 def test_stamps_tell_latency_and_an_offset_clock(tmp_path: Path) -> None:
     late = replace(SHORT, effects={"clock_offset": 0.3})
     _, topics = record(late, tmp_path / "a.mcap")
@@ -273,9 +294,11 @@ def test_a_place_that_cannot_be_written_is_one_clear_line(tmp_path: Path) -> Non
         simulate_case(None, out=tmp_path / "file" / "x.mcap", duration_s=5.0)
 
 
-@pytest.mark.parametrize("name", [case.name for case in list_cases()])
-def test_every_case_is_written_and_read(name: str, tmp_path: Path) -> None:
-    topics = read_back(simulate_case(name, out=tmp_path / "a.mcap", duration_s=12.0))
+@pytest.mark.parametrize("case", list_cases(), ids=lambda case: case.name)
+def test_every_case_is_written_and_read(case: Case, tmp_path: Path) -> None:
+    if case.machine is not None:
+        pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+    topics = read_back(simulate_case(case.name, out=tmp_path / "a.mcap", duration_s=12.0))
     assert sum(len(messages) for messages in topics.values()) > 500
 
 

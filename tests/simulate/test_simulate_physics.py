@@ -106,7 +106,7 @@ DELTA, SPEED = 0.6 * CAR.max_steering_rad, 0.6 * CAR.max_speed_mps
     ids=str,
 )
 def test_a_car_turns_as_the_bicycle_model_says(effects: Asked, rate: float) -> None:
-    car = replace(CIRCLE, vehicle=CAR, recording=replace(CIRCLE.recording, layout="ackermann"))
+    car = replace(CIRCLE, vehicle=CAR)
     np.testing.assert_allclose(steady_velocity(effects, car), (SPEED, 0.0, rate), atol=1e-6)
 
 
