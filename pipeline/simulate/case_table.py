@@ -51,6 +51,7 @@ _WARTHOG = replace(
 _CAR = replace(
     _HUSKY,
     vehicle=VEHICLES["car"],
+    program=Program(speed_scale=0.5),
     disturbance=Disturbance(0.02, 0.02),
 )
 _SKID = {"effective_track": 1.8, "drive_lag": 0.3}
@@ -94,7 +95,7 @@ CASES: tuple[Case, ...] = (
         _on(
             replace(
                 _CAR,
-                effects={"steering_offset": 0.03, "understeer": 0.04, "drive_lag": 0.4},
+                effects={"steering_offset": 0.03, "understeer": 0.04, "drive_lag": 0.7},
                 duration_s=240.0,
                 seed=13,
             ),

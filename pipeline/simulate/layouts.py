@@ -137,7 +137,7 @@ LAYOUTS: dict[str, Layout] = {
         "ackermann",
         (CommandTopic("ackermann", ("/ackermann_cmd",)),),
         _JOINTS,
-        PoseTopic("odometry", "/localization/odometry"),
+        _ICP,
         "/imu/data",
     ),
     "ackermann_status": Layout(

@@ -58,9 +58,15 @@ VEHICLES: dict[str, Vehicle] = {
     "husky": Vehicle("husky_a200", "differential", 0.165, 0.55, 0.512, 1.0, max_turn_radps=1.0),
     "warthog": Vehicle("warthog", "differential", 0.30, 1.08, 0.916, 5.0, max_turn_radps=2.0),
     "jackal": Vehicle("jackal", "differential", 0.098, 0.37559, 0.262, 2.0, max_turn_radps=2.0),
-    "car": Vehicle("ackermann_car", "ackermann", 0.10, 0.45, 0.60, 3.0, max_steering_rad=0.45),
+    "marmotte": Vehicle(
+        "marmotte_hd2", "differential", 0.116, 0.5927, 0.6, 1.2, max_turn_radps=1.5, wheels_per_side=1
+    ),
+    "turtlebot3": Vehicle(
+        "turtlebot3_burger", "differential", 0.033, 0.16, 0.08, 0.22, max_turn_radps=2.0, wheels_per_side=1
+    ),
+    "car": Vehicle("ackermann_car", "ackermann", 0.31, 1.5, 2.6, 8.0, max_steering_rad=0.5),
 }
-_ALIASES = {"husky_a200": "husky", "ackermann_car": "car", "ackermann": "car"}
+_ALIASES = {vehicle.name: key for key, vehicle in VEHICLES.items()} | {"ackermann": "car"}
 
 
 def find_vehicle(name: str) -> Vehicle:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -76,6 +78,17 @@ def test_a_wrong_question_gets_one_clear_line(ask: dict[str, object], code: str,
 def test_spins_are_refused_to_a_car() -> None:
     with pytest.raises(SimulateError, match="cannot spin"):
         simulate_run(make_scenario(None, vehicle="car", program="spins", duration_s=5.0))
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=lambda vehicle: vehicle.name)
+def test_a_vehicle_has_the_geometry_of_the_preset_that_its_logs_name(vehicle: Vehicle) -> None:
+    preset = Path(__file__).parents[2] / "pipeline" / "vehicles" / "presets" / f"{vehicle.name}.toml"
+    numbers = tomllib.loads(preset.read_text())
+    assert numbers["kind"] == vehicle.kind
+    assert numbers["wheel_radius_m"] == vehicle.wheel_radius_m
+    assert numbers["track_width_m"] == vehicle.track_width_m
+    if vehicle.kind == "ackermann":
+        assert numbers["wheelbase_m"] == vehicle.wheelbase_m
 
 
 def test_an_impossible_vehicle_is_refused() -> None:

@@ -219,3 +219,27 @@ def test_poses_on_a_slope_have_height_roll_and_pitch() -> None:
     np.testing.assert_allclose(position[:, 2], -math.tan(0.2) * position[:, 0], atol=1e-9)
     up = rotate(quaternion, np.tile([0.0, 0.0, 1.0], (position.shape[0], 1)))
     np.testing.assert_allclose(up, np.tile([math.sin(0.2), 0.0, math.cos(0.2)], (up.shape[0], 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("effects", "expected"),
+    [
+        ({"heading_skew": 0.1}, (0.6 * math.cos(0.06), 0.6 * math.sin(0.06), 0.6)),
+        ({"yaw_misalignment": 0.05}, (0.6 * math.cos(0.05), -0.6 * math.sin(0.05), 0.6)),
+        ({"lever_arm": {"l_x": 0.2, "l_y": 0.1}}, (0.6 - 0.1 * 0.6, 0.2 * 0.6, 0.6)),
+    ],
+    ids=str,
+)
+def test_what_is_reported_on_a_circle_has_the_signs_of_the_formulas(
+    effects: dict[str, float], expected: tuple[float, float, float]
+) -> None:
+    circle = replace(SHORT, program=Program("circle"), pose=replace(CLEAN, rate_hz=100.0), effects=effects)
+    run = simulate_run(circle)
+    position, yaw = reported(run)
+    steady = (run.poses.stamp_s > 10.0) & (run.poses.stamp_s < 50.0)
+    step = np.diff(position[steady, :2], axis=0) * 100.0
+    turned = wrap_angle(np.diff(yaw[steady]))
+    heading = yaw[steady][:-1] + 0.5 * turned
+    along = step[:, 0] * np.cos(heading) + step[:, 1] * np.sin(heading)
+    across = step[:, 1] * np.cos(heading) - step[:, 0] * np.sin(heading)
+    np.testing.assert_allclose([along.mean(), across.mean(), turned.mean() * 100.0], expected, atol=1e-4)
