@@ -27,12 +27,17 @@ def write_new_file(path: Path, data: bytes) -> None:
 
     Raises:
         FileExistsError: there is a file already.
-        OSError: the disk is full, read-only, ...; a half-written file may remain.
+        OSError: the disk is full, read-only, ...; no half-written file remains.
     """
     with path.open("xb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+        try:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        except BaseException:
+            with suppress(OSError):
+                path.unlink()
+            raise
 
 
 def _do_nothing() -> None:

@@ -25,6 +25,7 @@ from pipeline.store.manifest import (
     TableReport,
     file_missing,
     hash_bytes,
+    hash_file,
 )
 from pipeline.store.manifest_file import encode_manifest, load_manifest
 from pipeline.store.names import check_file_name
@@ -241,7 +242,7 @@ class Generation:
         source = self._require_previous(name).folder / name
         with name_disk_errors(source):
             try:
-                found = hash_bytes(source.read_bytes())
+                found = hash_file(source)
             except FileNotFoundError as error:
                 raise file_missing(source) from error
             if found != sha256:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pipeline.store.errors import StoreError
-from pipeline.store.manifest import hash_bytes
+from pipeline.store.manifest import hash_file
 from pipeline.store.manifest_file import load_manifest
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def _verify_files(manifest: Manifest) -> tuple[Problem, ...]:
     for name, sha256 in sorted(expected.items()):
         path = manifest.folder / name
         try:
-            found = hash_bytes(path.read_bytes())
+            found = hash_file(path)
         except FileNotFoundError:
             problems.append(
                 Problem(run=manifest.run, path=path, code="file_missing", what="the file is gone")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import subprocess
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -14,7 +15,6 @@ from pipeline.store import Store, StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 RUN = "2026/husky"
 OLD, NEW = 1, 2
@@ -141,3 +141,38 @@ def test_copies_where_links_are_impossible(store: Store, monkeypatch: pytest.Mon
         second = generation.commit({})
     assert second.path("slip").read_bytes() == first.path("slip").read_bytes()
     assert second.path("slip").stat().st_ino != first.path("slip").stat().st_ino
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="needs /proc to name what was synced")
+def test_everything_is_on_the_disk_before_it_is_pointed_to(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[tuple[str, str]] = []
+    sync, rename, replace = os.fsync, os.rename, os.replace
+
+    def note_sync(descriptor: int) -> None:
+        calls.append(("sync", Path(f"/proc/self/fd/{descriptor}").readlink().name))
+        sync(descriptor)
+
+    def note_rename(source: Path, target: Path) -> None:
+        calls.append(("rename", Path(target).name))
+        rename(source, target)
+
+    def note_replace(source: Path, target: Path) -> None:
+        calls.append(("replace", Path(target).name))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", note_sync)
+    monkeypatch.setattr(os, "rename", note_rename)
+    monkeypatch.setattr(os, "replace", note_replace)
+    manifest = write_generation(store, RUN, "key", NEW)
+
+    published, pointed = calls.index(("rename", "key")), calls.index(("replace", "manifest.json"))
+    synced = {name for kind, name in calls[:published] if kind == "sync"}
+    assert {path.name for path in manifest.folder.iterdir()} <= synced
+    assert any(name.startswith(".tmp-") for name in synced)
+    home = manifest.folder.parent.name
+    assert ("sync", home) in calls[published:pointed]
+    assert ("sync", home) in calls[pointed:]
+    assert calls[pointed - 1][0] == "sync"
+    assert calls[pointed - 1][1].startswith(".tmp-")
