@@ -9,7 +9,7 @@ is read beyond its end.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class Dialect:
         sized: whether sequences of anything but numbers carry their size in bytes first (XCDR2).
     """
 
-    order: str
+    order: Literal["<", ">"]
     max_align: int
     header: int
     terminated: bool
@@ -258,7 +258,7 @@ class Cursor:
 
     def _code_unequal(self, lengths: Ints, vocabulary: Vocabulary) -> NDArray[np.int32]:
         starts = (self.base + self.place).tolist()
-        view = memoryview(self.data)
+        view = self.data.data
         found = [
             vocabulary.code(bytes(view[start : start + length]))
             for start, length in zip(starts, lengths.tolist(), strict=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 import numpy as np
 
 from pipeline.logs.assemble import ColumnParts
-from pipeline.logs.cdr import DIALECTS, OTHER_ENCAPSULATIONS, ROS1, Cursor, Dialect, Vocabulary
+from pipeline.logs.cdr import DIALECTS, OTHER_ENCAPSULATIONS, ROS1, Cursor, Dialect
 from pipeline.logs.decode import Decoder, plan_fields, wanted_leaves
 from pipeline.logs.payloads import Block, Payloads, join_blocks
 
@@ -154,7 +154,7 @@ class ChannelBuffer:
         self._pending_bytes = 0
 
     def finish(self) -> tuple[Ints, Ints, Ints]:
-        """Decode what is left: log and publish times [ns] of the decoded rows and their numbers, by log time."""
+        """Decode what is left: log and publish times [ns] and numbers of the good rows, by log time."""
         self._flush()
         empty = np.empty(0, dtype=np.int64)
         log = np.concatenate([empty, *self._log])

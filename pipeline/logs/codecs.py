@@ -9,12 +9,15 @@ from pipeline.logs.channel import StructuredDecoder
 from pipeline.logs.definitions import bundled_structure
 from pipeline.logs.errors import LogError
 from pipeline.logs.fields import select_leaves
+from pipeline.logs.idl import parse_idl
+from pipeline.logs.objects import ObjectDecoder, decode_json, protobuf_decoder
 from pipeline.logs.schema import SchemaError, Structure, contains_text, leaf_paths, parse_msg
 
 if TYPE_CHECKING:
     from pipeline.logs.channel import PayloadDecoder
     from pipeline.logs.index import ChannelInfo
 
+_EMPTY: Final = "the schema is empty"
 _STAMP: Final = ("header.stamp.sec", "header.stamp.nanosec")
 
 
@@ -46,14 +49,21 @@ def decoder_for(info: ChannelInfo, schema: bytes, fields: tuple[str, ...] | None
         LogError: ``unsupported_encoding``, ``field_not_found``.
     """
     place = f"{where}, topic {info.topic}"
-    structure, notes = _structure_of(info, schema, place)
+    if info.message_encoding == "json":
+        return Recipe(ObjectDecoder(decode_json, fields, where=place), ())
+    if info.message_encoding == "protobuf":
+        decode = protobuf_decoder(schema, info.type_name, where=place)
+        return Recipe(ObjectDecoder(decode, fields, where=place), ())
+    structure, notes = _structure_of(info, schema, fields, place)
     leaves = tuple(leaf_paths(structure))
     chosen = select_leaves(leaves, fields, where=place)
     chosen |= {path for path in _STAMP if path in leaves}
     return Recipe(StructuredDecoder(structure, chosen, info.message_encoding), leaves, notes)
 
 
-def _structure_of(info: ChannelInfo, schema: bytes, where: str) -> tuple[Structure, tuple[str, ...]]:
+def _structure_of(
+    info: ChannelInfo, schema: bytes, fields: tuple[str, ...] | None, where: str
+) -> tuple[Structure, tuple[str, ...]]:
     if info.message_encoding not in ("cdr", "ros1"):
         raise LogError(
             "unsupported_encoding",
@@ -61,28 +71,39 @@ def _structure_of(info: ChannelInfo, schema: bytes, where: str) -> tuple[Structu
             where=where,
             hint="Leave the topic out, or convert the log to cdr",
         )
-    text = schema.decode("utf-8", "replace")
-    reason = "it carries no definition"
-    if text.strip() and info.schema_encoding in ("ros2msg", "ros1msg"):
-        try:
-            structure = parse_msg(info.type_name, text, dialect=info.schema_encoding)
-        except SchemaError as error:
-            reason = f"its definition is damaged ({error})"
-        else:
-            if contains_text(structure, "wstring"):
-                raise LogError(
-                    "unsupported_encoding",
-                    "the type holds wide strings, whose layout differs between vendors",
-                    where=where,
-                    hint="Leave the topic out",
-                )
-            return structure, ()
-    bundled = bundled_structure(info.type_name)
-    if bundled is None:
+    structure, reason = _parse(info, schema)
+    if structure is None:
+        structure = bundled_structure(info.type_name) if info.message_encoding == "cdr" else None
+        if structure is None and reason == _EMPTY and not fields:
+            return Structure(info.type_name, ()), (f"{_EMPTY}; of its messages only the times were read",)
+        if structure is None:
+            raise LogError(
+                "unsupported_encoding",
+                f"type {info.type_name or '(none)'}: {reason}, and none is bundled",
+                where=where,
+                hint="Record it again with its definition, or leave the topic out",
+            )
+        return structure, (f"{reason}; the bundled one of {info.type_name} was used",)
+    if contains_text(structure, "wstring"):
         raise LogError(
             "unsupported_encoding",
-            f"type {info.type_name or '(none)'}: {reason} and none is bundled",
+            "the type holds wide strings, whose layout differs between vendors",
             where=where,
-            hint="Record it again with its definition, or leave the topic out",
+            hint="Leave the topic out",
         )
-    return bundled, (f"{reason}; the bundled one of {info.type_name} was used",)
+    return structure, ()
+
+
+def _parse(info: ChannelInfo, schema: bytes) -> tuple[Structure | None, str]:
+    """The type as its schema defines it, or None and why not."""
+    text = schema.decode("utf-8", "replace")
+    if not text.strip():
+        return None, _EMPTY
+    try:
+        if info.schema_encoding == "ros2idl":
+            return parse_idl(info.type_name, text), ""
+        if info.schema_encoding in ("ros2msg", "ros1msg"):
+            return parse_msg(info.type_name, text, dialect=info.schema_encoding), ""
+    except SchemaError as error:
+        return None, f"the definition cannot be read ({error})"
+    return None, f"the schema encoding {info.schema_encoding!r} is not known"

@@ -45,6 +45,7 @@ FIELDS: Final[dict[str, str]] = {
     "sensor_msgs/JointState": f"{_HEADER}; string[] name; float64[] position; float64[] velocity; "
     "float64[] effort",
     "std_msgs/Bool": "bool data",
+    "std_msgs/Empty": "",
     "std_msgs/Float32": "float32 data",
     "std_msgs/Float32MultiArray": "std_msgs/MultiArrayLayout layout; float32[] data",
     "std_msgs/Float64": "float64 data",
@@ -102,5 +103,5 @@ def _lines(name: str) -> str:
 
 
 def _types_below(name: str) -> list[str]:
-    written = [field.split()[0].split("[")[0] for field in FIELDS[name].split(";")]
+    written = [field.split()[0].split("[")[0] for field in FIELDS[name].split(";") if field]
     return [kind for kind in written if kind not in SIZES and kind != "string"]

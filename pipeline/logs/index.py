@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from pipeline.logs.records import ChannelRecord, SchemaRecord
     from pipeline.logs.scan import Catalog
-    from pipeline.logs.source import ByteSource
     from pipeline.logs.spans import Span
 
 
@@ -55,6 +54,8 @@ class Part:
         channels: channel records by the file's own number.
         schemas: schema records by the file's own number.
         numbers: the recording's channel number for each of the file's own.
+        data_end: where the data section ends, None when unknown.
+        data_crc: checksum of the data section, 0 when there is none.
     """
 
     path: Path
@@ -62,6 +63,8 @@ class Part:
     channels: Mapping[int, ChannelRecord]
     schemas: Mapping[int, SchemaRecord]
     numbers: Mapping[int, int]
+    data_end: int | None = None
+    data_crc: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,7 +227,17 @@ def _merge(path: Path, catalogs: Sequence[tuple[Path, int, Catalog]], losses: Se
             count = known.message_count + catalog.counts.get(number, 0)
             channels[key] = replace(known, message_count=count)
             numbers[number] = known.id
-        parts.append(Part(file, tuple(catalog.spans), dict(catalog.channels), dict(catalog.schemas), numbers))
+        parts.append(
+            Part(
+                file,
+                tuple(catalog.spans),
+                dict(catalog.channels),
+                dict(catalog.schemas),
+                numbers,
+                catalog.data_end,
+                catalog.data_crc,
+            )
+        )
     every = [catalog for _, _, catalog in catalogs]
     records = tuple((n, r) for catalog in every for n, r in catalog.metadata)
     starts = [catalog.start_ns for catalog in every if catalog.start_ns is not None]

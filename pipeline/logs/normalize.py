@@ -29,9 +29,9 @@ def normalize_columns(
 ) -> dict[str, Column]:
     """Bring given values into the columns that reading would return.
 
-    A single number or string stands for all messages. For a field in a sequence of structures, one value a
-    message makes sequences of one, an array (n, k) sequences of k; the sequences of one message are equally
-    long.
+    A single number or string stands for all messages, and so does one list of strings for a sequence of
+    strings. For a field in a sequence of structures, one value a message makes sequences of one, an array
+    (n, k) sequences of k; the sequences of one message are equally long.
 
     Args:
         structure: the type.
@@ -55,7 +55,7 @@ def normalize_columns(
     columns: dict[str, Column] = {}
     for path, leaf in wanted.items():
         try:
-            columns[path] = _normalize(fields[path], leaf, rows)
+            columns[path] = _normalize(fields[path], leaf, rows, inside="[]." in path)
         except (ValueError, TypeError, OverflowError) as error:
             raise LogError(
                 "bad_column",
@@ -67,16 +67,16 @@ def normalize_columns(
     return columns
 
 
-def _normalize(given: Given, leaf: Leaf, rows: int) -> Column:
+def _normalize(given: Given, leaf: Leaf, rows: int, *, inside: bool) -> Column:
     if leaf.text:
-        return _normalize_texts(given, leaf, rows)
+        return _normalize_texts(given, leaf, rows, inside=inside)
     if isinstance(given, Ragged):
         return Ragged(_cast(given.values, leaf.nothing.dtype), _check_offsets(given.offsets, rows))
     if leaf.ragged and isinstance(given, Sequence) and not isinstance(given, str):
-        counts = {np.size(each) for each in given}
-        if len(counts) > 1:
-            sizes = [np.size(each) for each in given]
-            joined = np.concatenate([np.atleast_1d(np.asarray(each)) for each in given])
+        each_row = [np.atleast_1d(np.asarray(each)) for each in given]
+        sizes = [row.size for row in each_row]
+        if len(set(sizes)) > 1:
+            joined = np.concatenate(each_row)
             return Ragged(_cast(joined, leaf.nothing.dtype), _check_offsets(np.r_[0, np.cumsum(sizes)], rows))
     values = _cast(np.asarray(given), leaf.nothing.dtype)
     width = leaf.nothing.shape[1:]
@@ -91,7 +91,7 @@ def _normalize(given: Given, leaf: Leaf, rows: int) -> Column:
     return np.broadcast_to(values, (rows, *width))
 
 
-def _normalize_texts(given: Given, leaf: Leaf, rows: int) -> Column:
+def _normalize_texts(given: Given, leaf: Leaf, rows: int, *, inside: bool) -> Column:
     if isinstance(given, RaggedStrings):
         _check_offsets(given.offsets, rows)
         return given if leaf.ragged else Strings(given.codes, given.values)
@@ -103,24 +103,28 @@ def _normalize_texts(given: Given, leaf: Leaf, rows: int) -> Column:
         return RaggedStrings(given.codes, given.values, np.arange(rows + 1, dtype=np.int64))
     if isinstance(given, str):
         codes = np.zeros(rows, dtype=np.int32)
-        return _normalize_texts(Strings(codes, (given,)), leaf, rows)
+        return _normalize_texts(Strings(codes, (given,)), leaf, rows, inside=inside)
     if not isinstance(given, Sequence | np.ndarray):
         raise TypeError(f"{given!r} is no string")
     items = given.tolist() if isinstance(given, np.ndarray) else list(given)
     nested = bool(items) and not isinstance(items[0], str)
-    if leaf.ragged and not nested and len(items) != rows:
+    if leaf.ragged and not nested and (not inside or len(items) != rows):
         items, nested = [items] * rows, True
     if len(items) != rows:
         raise ValueError(f"{len(items)} strings for {rows} messages")
-    lists: list[list[str]] = (
-        [[str(text) for text in each] for each in items] if nested else [[str(e)] for e in items]
-    )
+    lists = [_as_list(each) for each in items]
     numbers: dict[str, int] = {}
     codes = np.array([numbers.setdefault(t, len(numbers)) for each in lists for t in each], dtype=np.int32)
     if not leaf.ragged:
         return Strings(codes, tuple(numbers))
     offsets = np.r_[0, np.cumsum([len(each) for each in lists], dtype=np.int64)]
     return RaggedStrings(codes, tuple(numbers), offsets)
+
+
+def _as_list(given: object) -> list[str]:
+    if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str):
+        return [str(text) for text in given]
+    return [str(given)]
 
 
 def _cast(values: NDArray[np.generic], kind: np.dtype[np.generic]) -> NDArray[np.generic]:

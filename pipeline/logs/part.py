@@ -11,7 +11,7 @@ from pipeline.logs import records as rec
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import checksum
 from pipeline.logs.scan import Catalog, Scanner
-from pipeline.logs.spans import Loaded, Span, SpanKind, load_span
+from pipeline.logs.spans import Loaded, Span, SpanKind, StoredAs, load_span
 from pipeline.logs.workers import map_in_order
 
 if TYPE_CHECKING:
@@ -164,6 +164,7 @@ def _check_summary(
                 chunk.start_ns,
                 chunk.end_ns,
                 known,
+                StoredAs(chunk.compression, chunk.compressed_size, chunk.uncompressed_size),
             )
         )
     if end > start:

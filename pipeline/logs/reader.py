@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import cache
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -16,12 +18,12 @@ from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.fields import derive_columns
 from pipeline.logs.index import LogIndex, open_log
 from pipeline.logs.payloads import gather_payloads
-from pipeline.logs.source import FileSource, hash_sources
+from pipeline.logs.source import ByteSource, FileSource, hash_sources
 from pipeline.logs.spans import SpanKind, load_span
 from pipeline.logs.workers import map_in_order
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -32,6 +34,10 @@ if TYPE_CHECKING:
     from pipeline.logs.spans import Span
 
     Ints = NDArray[np.int64]
+
+_CRC_BLOCK: Final = 1 << 20
+_LISTED: Final = 12
+"""So many topics are named in an error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,31 +121,31 @@ def read_topics(
         sha256: the recording's hash when it is known; otherwise it is computed beside the reading.
 
     Raises:
-        LogError: as ``open_log``; ``topic_not_found``, ``field_not_found``, ``unsupported_encoding`` when
-            nothing of a wanted topic can be decoded.
+        LogError: as ``open_log``; ``topic_not_found``, ``field_not_found``. A topic in an encoding that is
+            not supported is a loss, not an error: the others are read.
     """
     index = path if isinstance(path, LogIndex) else open_log(path)
     workers = threads or os.cpu_count() or 1
-    recipes = _choose_channels(index, list(wanted))
     losses: dict[Loss, None] = dict.fromkeys(index.losses)
     notes = list(index.notes)
+    jobs = _choose_channels(index, wanted, losses, notes)
     with ExitStack() as stack:
         sources = [stack.enter_context(FileSource(part.path)) for part in index.parts]
         beside = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="hash"))
         digest = None if sha256 is not None else beside.submit(hash_sources, sources)
         unchecked = 0
         for part, source in zip(index.parts, sources, strict=True):
-            for payloads, lost, free in _read_part(source, part, set(recipes), workers):
+            for payloads, lost, free in _read_part(source, part, set(jobs), workers):
                 unchecked += free
                 losses.update(dict.fromkeys(lost))
                 for number, each in payloads.items():
-                    recipes[number].buffer.add(each)
+                    jobs[number].buffer.add(each)
         found = digest.result() if digest is not None else (sha256 or "")
     if unchecked:
         notes.append(f"{unchecked} chunks carry no checksum: damage inside them cannot be seen")
     topics: list[TopicColumns] = []
-    for recipe in recipes.values():
-        columns, lost = _finish(recipe, index)
+    for job in jobs.values():
+        columns, lost = _finish(job)
         losses.update(dict.fromkeys(lost))
         topics.append(columns)
     return LogData(index, tuple(topics), tuple(losses), tuple(notes), found)
@@ -153,25 +159,51 @@ class _Job:
     fields: tuple[str, ...] | None
 
 
-def _choose_channels(index: LogIndex, wanted: Sequence[Wanted]) -> dict[int, _Job]:
+def _choose_channels(
+    index: LogIndex, wanted: Iterable[Wanted], losses: dict[Loss, None], notes: list[str]
+) -> dict[int, _Job]:
     """Decoders of the wanted channels by the recording's channel number."""
     jobs: dict[int, _Job] = {}
-    known = index.topics()
-    for want in wanted:
-        if want.topic not in known:
-            listed = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")  # noqa: PLR2004
-            raise LogError(
-                "topic_not_found",
-                f"there is no topic {want.topic}",
-                where=str(index.path),
-                hint=f"It holds: {listed or 'no topics'}",
-            )
-        for info in index.channels:
-            if info.topic == want.topic:
-                schema = _schema_of(index, info.id)
-                recipe = decoder_for(info, schema, want.fields, where=str(index.path))
-                jobs[info.id] = _Job(info, recipe, ChannelBuffer(recipe.decoder), want.fields)
+    for topic, fields in _merge_wanted(wanted).items():
+        infos = [info for info in index.channels if info.topic == topic]
+        if not infos:
+            raise _no_topic(index, topic)
+        refused: list[LogError] = []
+        for info in infos:
+            try:
+                recipe = decoder_for(info, _schema_of(index, info.id), fields, where=str(index.path))
+                jobs[info.id] = _Job(info, recipe, ChannelBuffer(recipe.decoder), fields)
+            except LogError as error:
+                refused.append(error)
+                if error.code == "unsupported_encoding" and info.message_count:
+                    text = f"{info.message_count} messages of {topic}: {error.what}"
+                    losses[Loss(error.code, text, start_ns=index.start_ns, end_ns=index.end_ns)] = None
+        unfit = [error for error in refused if error.code != "unsupported_encoding"]
+        if unfit and len(refused) == len(infos):
+            raise unfit[0]
+        notes += [f"{topic} has several channels; {error.what} in one of them" for error in unfit]
     return jobs
+
+
+def _merge_wanted(wanted: Iterable[Wanted]) -> dict[str, tuple[str, ...] | None]:
+    """Fields by topic; a topic that is wanted twice gets the fields of both."""
+    merged: dict[str, tuple[str, ...] | None] = {}
+    for want in wanted:
+        before = merged.get(want.topic, ())
+        both = None if before is None or want.fields is None else dict.fromkeys((*before, *want.fields))
+        merged[want.topic] = None if both is None else tuple(both)
+    return merged
+
+
+def _no_topic(index: LogIndex, topic: str) -> LogError:
+    known = index.topics()
+    listed = ", ".join(known[:_LISTED]) + (", ..." if len(known) > _LISTED else "")
+    return LogError(
+        "topic_not_found",
+        f"there is no topic {topic}",
+        where=str(index.path),
+        hint=f"It holds: {listed or 'no topics'}",
+    )
 
 
 def _schema_of(index: LogIndex, number: int) -> bytes:
@@ -184,13 +216,17 @@ def _schema_of(index: LogIndex, number: int) -> bytes:
 
 
 def _read_part(
-    source: FileSource, part: Part, wanted: set[int], threads: int
+    source: ByteSource, part: Part, wanted: set[int], threads: int
 ) -> Iterator[tuple[dict[int, Payloads], list[Loss], bool]]:
     own = {number for number, merged in part.numbers.items() if merged in wanted}
     spans = [span for span in part.spans if span.channels is None or span.channels & own]
 
+    @cache
+    def trusts_data() -> bool:
+        return _data_is_whole(source, part)
+
     def read(span: Span) -> tuple[dict[int, Payloads], list[Loss], bool]:
-        loaded = load_span(source, span)
+        loaded = load_span(source, span, trusts_data)
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)
         merged = {part.numbers[number]: each for number, each in payloads.items()}
         return merged, loaded.losses, loaded.unchecked and span.kind is SpanKind.CHUNK
@@ -198,11 +234,21 @@ def _read_part(
     return map_in_order(read, spans, threads)
 
 
-def _finish(job: _Job, index: LogIndex) -> tuple[TopicColumns, list[Loss]]:
+def _data_is_whole(source: ByteSource, part: Part) -> bool:
+    """Whether the file carries a checksum over its data section that holds."""
+    if part.data_end is None or part.data_crc == 0:
+        return False
+    crc = 0
+    for offset in range(0, part.data_end, _CRC_BLOCK):
+        crc = zlib.crc32(source.read_at(offset, min(_CRC_BLOCK, part.data_end - offset)), crc)
+    return crc == part.data_crc
+
+
+def _finish(job: _Job) -> tuple[TopicColumns, list[Loss]]:
     log_time, publish_time, rows = job.buffer.finish()
     leaves = job.recipe.decoder.columns(rows)
     header_time = _header_time(leaves)
-    fields = derive_columns(leaves, job.fields, job.recipe.leaves)
+    fields = derive_columns(leaves, job.fields, job.recipe.leaves or tuple(leaves))
     losses = []
     for rejected in job.recipe.decoder.rejected:
         start, end = job.buffer.times_of(rejected.rows)

@@ -39,7 +39,7 @@ def find_record(buffer: Buffer, start: int, end: int, opcodes: Sequence[int]) ->
         high = min(low + _BLOCK, end - rec.HEAD_SIZE + 1)
         for place in possible_places(data, low, high, end, opcodes).tolist():
             if _goes_on(buffer, place, end, opcodes):
-                return place
+                return int(place)
     return end
 
 

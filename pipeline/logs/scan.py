@@ -127,6 +127,8 @@ class Scanner:
                 rec.parse_attachment_name(self._window.view(body_at, min(length, 1 << 12)))
             )
         elif length <= _MAX_SIDE_RECORD:
+            if opcode == rec.DATA_END:
+                catalog.data_end = place
             self._note_small(opcode, self._window.view(body_at, length))
         return True
 

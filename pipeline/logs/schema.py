@@ -143,37 +143,40 @@ def resolve(root: str, types: Mapping[str, list[RawField]], *, dialect: str = "r
     Raises:
         SchemaError: a type that is not defined, contains itself, or holds an absurd array.
     """
-    known: dict[str, list[RawField]] = {**_builtin_times(dialect), **types}
-    built: dict[str, Structure] = {}
+    return _Resolver({**_builtin_times(dialect), **types}).build(root, 0)
 
-    def build(name: str, depth: int) -> Structure:
-        if name in built:
-            return built[name]
+
+class _Resolver:
+    def __init__(self, known: Mapping[str, list[RawField]]) -> None:
+        self._known = known
+        self._built: dict[str, Structure] = {}
+
+    def build(self, name: str, depth: int) -> Structure:
+        if name in self._built:
+            return self._built[name]
         if depth > MAX_DEPTH:
             raise SchemaError(f"type {name} contains itself")
-        if name not in known:
+        if name not in self._known:
             raise SchemaError(f"type {name} is not defined")
         package = name.split("/", 1)[0]
-        members = tuple(member(field, package, depth) for field in known[name])
-        built[name] = Structure(name, members)
-        return built[name]
+        members = tuple(self._member(field, package, depth) for field in self._known[name])
+        self._built[name] = Structure(name, members)
+        return self._built[name]
 
-    def member(field: RawField, package: str, depth: int) -> Member:
+    def _member(self, field: RawField, package: str, depth: int) -> Member:
         if field.count is not None and field.count > MAX_FIXED:
             raise SchemaError(f"field {field.name} is an array of {field.count} elements")
         if field.type in SIZES or field.type in ("string", "wstring"):
             return Member(field.name, field.type, field.count)
-        if field.type == "Header":
-            target = "std_msgs/Header"
-        elif field.type in ("time", "duration"):
-            target = f"builtin_interfaces/{field.type.capitalize()}"
-        elif "/" in field.type:
-            target = short_name(field.type)
-        else:
-            target = f"{package}/{field.type}"
-        return Member(field.name, build(target, depth + 1), field.count)
+        return Member(field.name, self.build(_full_name(field.type, package), depth + 1), field.count)
 
-    return build(root, 0)
+
+def _full_name(type_name: str, package: str) -> str:
+    if type_name == "Header":
+        return "std_msgs/Header"
+    if type_name in ("time", "duration"):
+        return f"builtin_interfaces/{type_name.capitalize()}"
+    return short_name(type_name) if "/" in type_name else f"{package}/{type_name}"
 
 
 def _builtin_times(dialect: str) -> RawTypes:

@@ -5,11 +5,10 @@ A span is a chunk with the message indexes behind it, or a stretch of messages t
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Final
-
-import numpy as np
 
 from pipeline.logs import records as rec
 from pipeline.logs.errors import Loss
@@ -24,12 +23,17 @@ from pipeline.logs.inflate import (
 from pipeline.logs.messages import Messages, locate_messages
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
     from numpy.typing import NDArray
 
     from pipeline.logs.records import Buffer
     from pipeline.logs.source import ByteSource
 
 
+_CRC_IN_HEAD: Final = 24
+_INVERTED: Final = 0xFFFFFFFF
 _ZERO_TAIL: Final = 64
 """So many zeros at the end of a chunk are bytes that were never written."""
 
@@ -40,6 +44,15 @@ class SpanKind(Enum):
     CHUNK = "chunk"
     LOOSE = "loose"
     CUT_CHUNK = "cut chunk"
+
+
+@dataclass(frozen=True, slots=True)
+class StoredAs:
+    """How the summary says a chunk is stored."""
+
+    compression: str
+    compressed_size: int
+    uncompressed_size: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +67,7 @@ class Span:
         start_ns: first log time as told by the summary or the chunk, None when unknown.
         end_ns: last log time, None when unknown.
         channels: numbers of the channels in it, None when unknown.
+        told: how the summary says it is stored, None when it does not.
     """
 
     kind: SpanKind
@@ -63,6 +77,7 @@ class Span:
     start_ns: int | None = None
     end_ns: int | None = None
     channels: frozenset[int] | None = None
+    told: StoredAs | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,60 +97,105 @@ class Loaded:
     unchecked: bool = False
 
 
-def load_span(source: ByteSource, span: Span, *, trusts_data: bool = False) -> Loaded:
+class _SpanError(Exception):
+    """A chunk that cannot be opened: kind of loss and reason."""
+
+    def __init__(self, kind: str, reason: str) -> None:
+        super().__init__(reason)
+        self.kind = kind
+        self.reason = reason
+
+
+def load_span(source: ByteSource, span: Span, trusts_data: Callable[[], bool] = bool) -> Loaded:
     """Read, inflate and check one span.
 
     Args:
         source: the file.
         span: which stretch.
-        trusts_data: whether a checksum over the whole data section holds, so that a chunk whose own
-            checksum differs was written so.
+        trusts_data: asked when a chunk's checksum differs: whether a checksum over the whole data section
+            holds, so that the chunk was written so.
     """
     blob = memoryview(source.read_at(span.offset, span.length + span.index_length))
     if span.kind is SpanKind.LOOSE:
         messages = locate_messages(blob, None)
         return Loaded(blob, messages, _damage_losses(span, messages, len(blob)), unchecked=True)
     try:
+        head, losses = _open_chunk(span, blob)
+        if span.start_ns is None and head.start_ns <= head.end_ns:
+            span = replace(span, start_ns=head.start_ns, end_ns=head.end_ns)
+        stored = blob[head.body : head.body + head.compressed_size]
+        if span.kind is SpanKind.CUT_CHUNK:
+            return _load_start(span, head, stored, "the file ends inside it")
+        chunk = _inflate_checked(span, head, stored, trusts_data, losses)
+    except _SpanError as error:
+        return _lost(span, error.kind, error.reason)
+    if chunk is None:
+        written = memoryview(bytes(stored).rstrip(b"\0"))
+        return _load_start(span, head, written, f"its last {len(stored) - len(written)} bytes are zero")
+    messages = locate_messages(chunk, _read_entries(blob[span.length :]))
+    losses += _damage_losses(span, messages, len(chunk))
+    return Loaded(chunk, messages, losses, unchecked=head.crc == 0)
+
+
+def _open_chunk(span: Span, blob: memoryview) -> tuple[rec.ChunkHead, list[Loss]]:
+    """The head of a chunk; as the summary tells it where the chunk's own is damaged."""
+    head: rec.ChunkHead | None = None
+    reason = "the head of the chunk disagrees with the summary"
+    try:
         opcode, size = rec.HEAD.unpack_from(blob, 0)
-        if opcode != rec.CHUNK:
-            raise rec.RecordError("no chunk stands there")
         head = rec.parse_chunk_head(blob[rec.HEAD_SIZE : span.length], size)
-    except (rec.RecordError, rec.struct.error) as error:
-        return _lost(span, "damaged_record", str(error))
-    stored = blob[head.body : head.body + head.compressed_size]
-    if span.kind is SpanKind.CUT_CHUNK:
-        return _load_start(span, head, blob[head.body :], "the file ends inside it")
-    if span.start_ns is None and head.start_ns <= head.end_ns:
-        span = replace(span, start_ns=head.start_ns, end_ns=head.end_ns)
-    if len(stored) < head.compressed_size or size + rec.HEAD_SIZE != span.length:
-        return _lost(span, "damaged_record", "the chunk's length disagrees with its record")
+        whole = opcode == rec.CHUNK and head.body + head.compressed_size <= rec.HEAD_SIZE + size
+        whole &= span.kind is SpanKind.CUT_CHUNK or rec.HEAD_SIZE + size == span.length <= len(blob)
+    except (rec.RecordError, struct.error) as error:
+        whole, reason = False, str(error)
+    told = span.told
+    if told is None:
+        if head is None or not whole:
+            raise _SpanError("damaged_record", reason)
+        return head, []
+    expected = rec.ChunkHead(
+        span.start_ns or 0,
+        span.end_ns or 0,
+        told.uncompressed_size,
+        head.crc if head is not None else 0,
+        told.compression,
+        told.compressed_size,
+        rec.HEAD_SIZE + rec.LEAST_BODY[rec.CHUNK] + len(told.compression),
+    )
+    if whole and expected == head:
+        return expected, []
+    crc_at = rec.HEAD_SIZE + _CRC_IN_HEAD
+    crc = int.from_bytes(blob[crc_at : crc_at + 4], "little")
+    if crc == 0 or expected.body + expected.compressed_size > len(blob):
+        raise _SpanError("damaged_record", reason)
+    text = f"{reason}; its records are whole and were kept"
+    return replace(expected, crc=crc), [_loss(span, "damaged_record", text, bytes_lost=0)]
+
+
+def _inflate_checked(
+    span: Span, head: rec.ChunkHead, stored: Buffer, trusts_data: Callable[[], bool], losses: list[Loss]
+) -> Buffer | None:
+    """Records of a chunk; None where its end was never written. Notes a checksum that is wrong alone."""
+    unwritten = len(stored) >= _ZERO_TAIL and not any(stored[-_ZERO_TAIL:])
     try:
         chunk = inflate(stored, head.compression, head.uncompressed_size)
     except InflateError as error:
-        return _give_up(span, head, stored, "damaged_chunk", f"the chunk cannot be inflated: {error}")
-    entries = _read_entries(blob[span.length :])
-    losses: list[Loss] = []
+        if unwritten:
+            return None
+        raise _SpanError("damaged_chunk", f"it cannot be inflated: {error}") from None
     computed = checksum(chunk) if head.crc else 0
-    if computed != head.crc:
-        reason = (
-            "the file's own checksum holds"
-            if trusts_data
-            else explain_checksum(head.crc, computed, stored, head.compression)
-        )
-        if reason is None:
-            reason = "the chunk's checksum does not match its records"
-            return _give_up(span, head, stored, "chunk_crc", reason)
-        losses.append(
-            _loss(
-                span,
-                "wrong_crc",
-                f"the chunk's checksum is wrong but its records are whole ({reason}); kept",
-                bytes_lost=0,
-            )
-        )
-    messages = locate_messages(chunk, entries)
-    losses += _damage_losses(span, messages, len(chunk))
-    return Loaded(chunk, messages, losses, unchecked=head.crc == 0)
+    if computed == head.crc:
+        return chunk
+    reason = explain_checksum(head.crc, computed, stored, head.compression)
+    if reason is None and trusts_data():
+        reason = "the checksum of the whole file holds"
+    if reason is not None:
+        text = f"its checksum is wrong but its records are whole ({reason}); they were kept"
+        losses.append(_loss(span, "wrong_crc", text, bytes_lost=0))
+        return chunk
+    if unwritten:
+        return None
+    raise _SpanError("chunk_crc", "its checksum does not match its records")
 
 
 def explain_checksum(stored_crc: int, computed: int, stored: Buffer, compression: str) -> str | None:
@@ -149,21 +209,13 @@ def explain_checksum(stored_crc: int, computed: int, stored: Buffer, compression
         return "the compression's checksum holds"
     if sum(1 for shift in (0, 8, 16, 24) if difference >> shift & 0xFF) == 1:
         return "one byte of the stored checksum differs"
-    if difference == 0xFFFFFFFF:
+    if difference == _INVERTED:
         return "it is stored inverted"
     if stored_crc == int.from_bytes(computed.to_bytes(4, "little"), "big"):
         return "it is stored in the other byte order"
     if compression and stored_crc == checksum(stored):
         return "it was taken over the compressed bytes"
     return None
-
-
-def _give_up(span: Span, head: rec.ChunkHead, stored: Buffer, kind: str, reason: str) -> Loaded:
-    """Drop a damaged chunk, but for one whose end was never written: zeros stand there."""
-    written = len(bytes(stored).rstrip(b"\0"))
-    if len(stored) - written >= _ZERO_TAIL:
-        return _load_start(span, head, stored[:written], f"its last {len(stored) - written} bytes are zero")
-    return _lost(span, kind, reason)
 
 
 def _load_start(span: Span, head: rec.ChunkHead, stored: Buffer, reason: str) -> Loaded:

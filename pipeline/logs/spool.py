@@ -73,7 +73,8 @@ class Spool:
 
     def _spill(self) -> None:
         if self._file is None:
-            self._file = tempfile.NamedTemporaryFile(dir=self._beside.parent, prefix=f".{self._beside.name}.")  # noqa: SIM115
+            folder, prefix = self._beside.parent, f".{self._beside.name}."
+            self._file = tempfile.NamedTemporaryFile(dir=folder, prefix=prefix)  # noqa: SIM115 - closed later
         self._file.write(self._memory)
         self._memory = bytearray()
 

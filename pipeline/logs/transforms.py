@@ -7,6 +7,7 @@ child; slower links above it, such as map to odom, are interpolated there.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -165,17 +166,14 @@ class TransformBuffer:
                 step_position = -rotate(step_quaternion, step_position)
             position = position + rotate(quaternion, step_position)
             quaternion = multiply_quaternions(quaternion, step_quaternion)
-        if leading is not None and at is None:
-            log_time = leading.log_time[known]
-        else:
-            log_time = time
+        log_time = leading.log_time[known] if leading is not None and at is None else time
         return TransformSeries(
             _clean(parent), _clean(child), time, log_time, position, quaternion, tuple(notes)
         )
 
     def _steps(self, chain: tuple[str, ...]) -> list[tuple[Link, bool]]:
         steps: list[tuple[Link, bool]] = []
-        for upper, lower in zip(chain[:-1], chain[1:], strict=True):
+        for upper, lower in pairwise(chain):
             link = self._links.get(lower)
             if link is not None and link.parent == upper:
                 steps.append((link, True))
@@ -304,7 +302,8 @@ def _covers(link: Link, time: Ints) -> NDArray[np.bool_]:
     interval = float(np.median(np.diff(link.time)))
     lead = max(0.0, float(np.median(link.time - link.log_time)))
     held = int(_HELD_INTERVALS * interval + lead)
-    return (time >= link.time[0] - held) & (time <= link.time[-1] + held)
+    covered: NDArray[np.bool_] = (time >= link.time[0] - held) & (time <= link.time[-1] + held)
+    return covered
 
 
 def _pose_at(link: Link, time: Ints) -> tuple[Floats, Floats]:

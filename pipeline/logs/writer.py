@@ -162,8 +162,8 @@ class LogWriter:
         metadata: list[tuple[int, int, str]] = []
         self._put(rec.MAGIC)
         self._put(pack_record(rec.HEADER, pack_text("ros2") + pack_text(LIBRARY)))
-        for name, record in self._metadata:
-            packed = pack_metadata(name, record)
+        for name, entries in self._metadata:
+            packed = pack_metadata(name, entries)
             metadata.append((self._file.tell(), len(packed), name))
             self._put(packed)
         by_number = {channel.number: channel for channel in self._channels.values()}

@@ -1,0 +1,199 @@
+"""Channels whose messages are decoded one by one by others: JSON and protobuf.
+
+Messages become nested values first, then columns of their leaf fields.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+from pipeline.logs.channel import Rejected
+from pipeline.logs.columns import Ragged, RaggedStrings
+from pipeline.logs.errors import LogError
+from pipeline.logs.fields import select_leaves
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.logs.columns import Column
+    from pipeline.logs.payloads import Block
+
+    Ints = NDArray[np.int64]
+
+Value: TypeAlias = "float | str | bool | list[Value] | dict[str, Value] | None"
+Leaf: TypeAlias = "float | str | bool"
+_TIMES = {"nanos": "nanosec", "seconds": "sec", "nsec": "nanosec", "secs": "sec", "nsecs": "nanosec"}
+
+
+class ObjectDecoder:
+    """Decodes payloads one by one into nested values.
+
+    Args:
+        decode: from a payload to the message; raises ``ValueError`` when it cannot.
+        fields: wanted paths, None for all.
+        where: the topic, for messages.
+    """
+
+    def __init__(self, decode: Callable[[bytes], Value], fields: Sequence[str] | None, *, where: str) -> None:
+        self._decode = decode
+        self._fields = fields
+        self._where = where
+        self._rows: dict[int, dict[str, list[Leaf]]] = {}
+        self._several: set[str] = set()
+        self.rejected: list[Rejected] = []
+
+    def decode(self, ids: Ints, block: Block) -> None:
+        """Decode a block; ``ids`` are the numbers of its rows in the channel."""
+        wrong: list[int] = []
+        spans = zip(ids.tolist(), block.start.tolist(), block.size.tolist(), strict=True)
+        for position, (row, start, size) in enumerate(spans):
+            try:
+                leaves: dict[str, list[Leaf]] = {}
+                for path, value, several in _walk(
+                    self._decode(block.data[start : start + size].tobytes()), "", inside=False
+                ):
+                    leaves.setdefault(path, [])
+                    if several:
+                        self._several.add(path)
+                    if value is not None:
+                        leaves[path].append(value)
+                self._rows[row] = leaves
+            except (ValueError, RecursionError):
+                wrong.append(position)
+        if wrong:
+            lost = int(block.size[wrong].sum())
+            self.rejected.append(Rejected("undecodable", "the payload cannot be parsed", ids[wrong], lost))
+
+    def columns(self, rows: Ints) -> dict[str, Column]:
+        """Columns of the given rows, in their order.
+
+        Raises:
+            LogError: ``field_not_found`` when no message has a wanted field.
+        """
+        messages = [self._rows[row] for row in rows.tolist()]
+        leaves = tuple(dict.fromkeys(path for message in messages for path in message))
+        if not messages:
+            return {}
+        chosen = select_leaves(leaves, self._fields, where=self._where)
+        chosen |= {path for path in leaves if path.startswith("header.stamp.")}
+        return {path: self._column(path, messages) for path in leaves if path in chosen}
+
+    def _column(self, path: str, messages: list[dict[str, list[Leaf]]]) -> Column:
+        lists = [message.get(path, []) for message in messages]
+        flat = [value for values in lists for value in values]
+        offsets = np.r_[0, np.cumsum([len(values) for values in lists], dtype=np.int64)]
+        if any(isinstance(value, str) for value in flat):
+            numbers: dict[str, int] = {}
+            codes = np.array([numbers.setdefault(str(v), len(numbers)) for v in flat], dtype=np.int32)
+            column = RaggedStrings(codes, tuple(numbers), offsets)
+            return column if path in self._several else column.at(0)
+        values = np.array(flat) if flat else np.empty(0)
+        if values.dtype == object:
+            values = np.array([float(value) for value in flat])
+        if path in self._several:
+            return Ragged(values, offsets)
+        return values if values.size == len(messages) else Ragged(values, offsets).at(0)
+
+
+def decode_json(payload: bytes) -> Value:
+    """The value of a JSON text.
+
+    Raises:
+        ValueError: it is none.
+    """
+    value: Value = json.loads(payload)
+    return value
+
+
+def protobuf_decoder(schema: bytes, type_name: str, *, where: str) -> Callable[[bytes], Value]:
+    """A decoder of protobuf messages through ``mcap-protobuf-support``.
+
+    Args:
+        schema: serialized ``FileDescriptorSet``.
+        type_name: full name of the message.
+        where: the topic, for messages.
+
+    Raises:
+        LogError: ``unsupported_encoding`` when the package is absent or the schema is damaged.
+    """
+    try:
+        from google.protobuf.message import (  # type: ignore[import-untyped]  # noqa: PLC0415 - an extra
+            DecodeError,
+        )
+        from mcap.records import Schema  # noqa: PLC0415 - an extra
+        from mcap_protobuf.decoder import DecoderFactory  # noqa: PLC0415 - an extra
+    except ImportError:
+        raise LogError(
+            "unsupported_encoding",
+            "protobuf messages need another package",
+            where=where,
+            hint="Install mcap-protobuf-support",
+        ) from None
+    try:
+        parse = DecoderFactory().decoder_for(
+            "protobuf", Schema(id=1, name=type_name, encoding="protobuf", data=schema)
+        )
+    except (DecodeError, TypeError, KeyError, ValueError) as error:
+        raise _damaged(str(error), where) from None
+    if parse is None:
+        raise _damaged("its type is not in it", where)
+
+    def decode(payload: bytes) -> Value:
+        try:
+            return _plain(parse(payload))
+        except DecodeError as error:
+            raise ValueError(str(error)) from None
+
+    return decode
+
+
+def _damaged(reason: str, where: str) -> LogError:
+    return LogError(
+        "unsupported_encoding",
+        f"the protobuf schema is damaged ({reason})",
+        where=where,
+        hint="Leave the topic out",
+    )
+
+
+def _plain(message: object) -> Value:
+    """A protobuf message, known only by its descriptor, as nested values."""
+    descriptor = getattr(message, "DESCRIPTOR", None)
+    if descriptor is None:
+        if isinstance(message, bytes):
+            return list(message)
+        return message if isinstance(message, str | bool | int | float) else None
+    found: dict[str, Value] = {}
+    for field in descriptor.fields:
+        value = getattr(message, field.name)
+        if hasattr(value, "items"):
+            continue
+        if hasattr(value, "DESCRIPTOR") or isinstance(value, str | bytes | bool | int | float):
+            found[field.name] = _plain(value)
+        else:
+            found[field.name] = [_plain(each) for each in value]
+    return found
+
+
+def _walk(value: Value, path: str, *, inside: bool) -> Iterator[tuple[str, Leaf | None, bool]]:
+    if isinstance(value, dict):
+        for key, below in value.items():
+            name = _TIMES.get(key, key) if path.endswith(("stamp", "timestamp")) else key
+            yield from _walk(below, f"{path}.{name}" if path else name, inside=inside)
+    elif isinstance(value, list):
+        yield from _walk_list(value, path)
+    elif value is not None or path:
+        yield path, value, inside
+
+
+def _walk_list(values: list[Value], path: str) -> Iterator[tuple[str, Leaf | None, bool]]:
+    if not values:
+        yield path, None, True
+    for value in values:
+        name = f"{path}[]" if isinstance(value, dict) else path
+        yield from _walk(value, name, inside=True)
