@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 FORMATS = ("svg", "pdf", "png")
 
 _PNG_SCALE = 2.0
+_ID = re.compile(r"(?<=url\(#)\w+(?=\))|(?<= id=\")\w+(?=\")")
 
 
 def write_figures(
@@ -53,7 +55,7 @@ def write_figures(
         spec = fill_spec(drawing)
         content: str | bytes
         if format == "svg":
-            content = vl_convert.vegalite_to_svg(spec)
+            content = _number_ids(vl_convert.vegalite_to_svg(spec), figure.id)
         elif format == "pdf":
             content = vl_convert.vegalite_to_pdf(spec)
         else:
@@ -71,3 +73,9 @@ def write_figures(
             ) from error
         written.append(path)
     return written
+
+
+def _number_ids(svg: str, prefix: str) -> str:
+    """Count the ids of an SVG from zero; the engine counts on from one figure to the next."""
+    order = {name: f"{prefix}-{i}" for i, name in enumerate(dict.fromkeys(_ID.findall(svg)))}
+    return _ID.sub(lambda found: order[found.group()], svg)

@@ -1,0 +1,163 @@
+"""The page in a real browser, from a file, at the widths of a phone and of a laptop."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import queue
+import shutil
+import subprocess
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from typing import TYPE_CHECKING
+
+import pytest
+from report_synthesis import make_report
+
+from pipeline.report import render_report
+from pipeline.report.figures import list_figures
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--window-size=1400,1000",
+]
+PHONE, LAPTOP = 390, 1280
+PATIENCE_S = 40.0
+
+# Runs before anything else of the page, tries it as a reader would, and tells its parent what it saw.
+PROBE = """
+(() => {
+  const seen = {errors: [], blocked: []};
+  addEventListener("error", (event) => seen.errors.push(String(event.message)));
+  addEventListener("unhandledrejection", (event) => seen.errors.push(String(event.reason)));
+  addEventListener("securitypolicyviolation", (event) => seen.blocked.push(event.blockedURI));
+  for (const kind of ["error", "warn"]) console[kind] = (...said) => seen.errors.push(said.join(" "));
+  const wait = (ready) => new Promise((done) => {
+    const look = () => (ready() ? done() : setTimeout(look, 20));
+    look();
+  });
+  const plot = (id) => document.querySelector(`[data-figure=${id}]`);
+  const words = (selector) => [...document.querySelectorAll(selector)].map((text) => text.textContent);
+  const labels = (id) => words(`[data-figure=${id}] .role-axis-label text`);
+  const outside = () => [...document.querySelectorAll(".plot svg")].flatMap((svg) => {
+    const room = svg.parentElement.closest(".plot").getBoundingClientRect();
+    const box = svg.getBoundingClientRect();
+    const cut = [...svg.querySelectorAll("text")].filter((text) => {
+      const word = text.getBoundingClientRect();
+      return word.width && (word.left < box.left - 1 || word.right > box.right + 1);
+    });
+    return [...(box.right > room.right + 1 ? ["svg"] : []), ...cut.map((text) => text.textContent)];
+  });
+  addEventListener("load", async () => {
+    await wait(() => document.documentElement.dataset.drawn === "yes");
+    seen.drawn = Object.fromEntries([...document.querySelectorAll("[data-figure]")].map(
+      (place) => [place.dataset.figure, place.querySelectorAll("svg path").length]));
+    seen.wide = document.documentElement.scrollWidth - innerWidth;
+    seen.outside = outside();
+    seen.before = labels("velocities");
+    const empty = plot("trajectory").querySelectorAll("path").length;
+    document.getElementById("mark-from").value = "10";
+    document.getElementById("mark-to").value = "20";
+    document.getElementById("mark-set").click();
+    await wait(() => plot("trajectory").querySelectorAll("path").length > empty);
+    seen.marked = document.querySelector("#marked span").textContent;
+    seen.onMap = plot("trajectory").querySelectorAll("path").length - empty;
+    document.getElementById("zoom-in").click();
+    await wait(() => labels("velocities").join() !== seen.before.join());
+    seen.zoomed = labels("velocities");
+    dispatchEvent(new KeyboardEvent("keydown", {key: "Escape"}));
+    document.dispatchEvent(new KeyboardEvent("keydown", {key: "Escape"}));
+    await wait(() => plot("trajectory").querySelectorAll("path").length === empty);
+    seen.requests = performance.getEntriesByType("resource").map((entry) => entry.name);
+    parent.postMessage(JSON.stringify(seen), "*");
+  });
+})();
+"""
+
+FRAME = """<!DOCTYPE html><html><body><iframe src="page.html" width="{width}" height="900"></iframe>
+<script>addEventListener("message", (event) => fetch("{listener}", {{
+  method: "POST", mode: "no-cors", body: event.data,
+}}));</script></body></html>"""
+
+
+class Listener(BaseHTTPRequestHandler):
+    told: queue.Queue[bytes]
+
+    def do_POST(self) -> None:
+        self.told.put(self.rfile.read(int(self.headers["Content-Length"])))
+        self.send_response(204)
+        self.end_headers()
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def look_at(page: str, folder: Path, width: int) -> dict[str, object]:
+    digest = base64.b64encode(hashlib.sha256(PROBE.encode()).digest()).decode()
+    probed = page.replace("script-src ", f"script-src 'sha256-{digest}' ", 1)
+    probed = probed.replace("<title>", f"<script>{PROBE}</script><title>", 1)
+    (folder / "page.html").write_text(probed, encoding="utf-8")
+    told: queue.Queue[bytes] = queue.Queue()
+    with HTTPServer(("127.0.0.1", 0), type("Told", (Listener,), {"told": told})) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        frame = FRAME.format(width=width, listener=f"http://127.0.0.1:{server.server_port}/")
+        (folder / "frame.html").write_text(frame, encoding="utf-8")
+        browser = subprocess.Popen(
+            [str(BROWSER), *FLAGS, f"--user-data-dir={folder / 'profile'}", (folder / "frame.html").as_uri()],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            seen: dict[str, object] = json.loads(told.get(timeout=PATIENCE_S))
+        finally:
+            browser.terminate()
+            browser.wait(timeout=PATIENCE_S)
+            server.shutdown()
+    return seen
+
+
+@pytest.fixture(scope="module", params=[PHONE, LAPTOP], ids=["phone", "laptop"])
+def seen(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
+    if BROWSER is None:
+        pytest.skip("no Chromium here to open the page with")
+    page = render_report(make_report(duration_s=120.0))
+    return look_at(page, tmp_path_factory.mktemp("browser"), request.param)
+
+
+def test_the_page_opens_without_errors_or_requests(seen: dict[str, object]) -> None:
+    assert seen["errors"] == []
+    assert seen["blocked"] == []
+    assert seen["requests"] == []
+
+
+def test_every_figure_is_drawn(seen: dict[str, object]) -> None:
+    drawn = seen["drawn"]
+    assert isinstance(drawn, dict)
+    assert set(drawn) == {figure.id for figure in list_figures()}
+    assert min(drawn.values()) > 3
+
+
+def test_nothing_is_cut_or_wider_than_the_screen(seen: dict[str, object]) -> None:
+    assert isinstance(seen["wide"], int)
+    assert seen["wide"] <= 0
+    assert seen["outside"] == []
+
+
+def test_a_marked_stretch_shows_on_the_map_and_can_be_zoomed_into(seen: dict[str, object]) -> None:
+    assert str(seen["marked"]).startswith("Marked 10.0\u201320.0 s: 10.0 s, highest slip")
+    assert seen["onMap"] == 201
+    assert "100" in seen["before"]  # type: ignore[operator]
+    assert "100" not in seen["zoomed"]  # type: ignore[operator]
+    assert {"12", "18"} <= set(seen["zoomed"])  # type: ignore[call-overload]

@@ -1,0 +1,129 @@
+"""What the room writes: figures for papers, the bundle's cache."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from typing import TYPE_CHECKING, Literal
+
+import pytest
+from report_synthesis import make_report
+
+from pipeline.report import FORMATS, ReportError, RunReport, theme, warm_bundle, write_figures
+from pipeline.report.bundle import cache_path, load_bundle
+from pipeline.report.figures import list_figures
+from pipeline.report.scene import Scene, round_up
+from pipeline.report.specs import build_spec
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+START = {"svg": b"<svg", "pdf": b"%PDF", "png": b"\x89PNG"}
+
+
+@pytest.fixture(scope="module")
+def report() -> RunReport:
+    return make_report(duration_s=20.0)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_the_figures_of_the_page_are_written_for_papers(
+    report: RunReport, tmp_path: Path, kind: Literal["svg", "pdf", "png"]
+) -> None:
+    written = write_figures(report, tmp_path / "new" / "figures", kind)
+    assert [path.name for path in written] == [f"{figure.id}.{kind}" for figure in list_figures()]
+    assert all(path.read_bytes().startswith(START[kind]) for path in written)
+
+
+def test_a_figure_file_does_not_depend_on_when_it_was_written(report: RunReport, tmp_path: Path) -> None:
+    first, second = (write_figures(report, tmp_path / name, "svg") for name in "ab")
+    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
+
+
+def test_an_unknown_format_and_a_blocked_folder_say_what_to_do(report: RunReport, tmp_path: Path) -> None:
+    with pytest.raises(ReportError, match="Use one of svg, pdf, png"):
+        write_figures(report, tmp_path, "gif")  # type: ignore[arg-type]
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(ReportError, match="Choose a folder"):
+        write_figures(report, tmp_path / "file", "svg")
+
+
+def test_the_map_has_equal_scales(report: RunReport) -> None:
+    figure = next(figure for figure in list_figures() if figure.id == "trajectory")
+    drawing = figure.draw(Scene(report))
+    assert drawing is not None
+    spec = build_spec(drawing)
+    layers = spec["layer"]
+    assert isinstance(layers, list)
+    spans = {axis: layers[0]["encoding"][axis]["scale"]["domain"] for axis in "xy"}
+    scales = [
+        (spans[axis][1] - spans[axis][0]) / float(str(spec[size]))
+        for axis, size in (("x", "width"), ("y", "height"))
+    ]
+    assert scales[0] == pytest.approx(scales[1], rel=0.01), "height is a whole number of pixels"
+
+
+def test_every_colour_of_a_figure_has_a_twin_for_dark_screens(report: RunReport) -> None:
+    for figure in list_figures():
+        drawing = figure.draw(Scene(report))
+        assert drawing is not None
+        used = set(re.findall(r"#[0-9a-fA-F]{6}", str(build_spec(drawing))))
+        assert used
+        assert used <= set(theme.DARK_TWINS), figure.id
+
+
+def test_the_ramp_of_slip_is_monotonous_in_lightness() -> None:
+    def luminance(colour: str) -> float:
+        parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        return sum(weight * part**2.2 for weight, part in zip((0.2126, 0.7152, 0.0722), parts, strict=True))
+
+    light = [luminance(colour) for colour in theme.SLIP_RAMP]
+    dark = [luminance(theme.DARK_TWINS[colour]) for colour in theme.SLIP_RAMP]
+    assert light == sorted(light, reverse=True)
+    assert dark == sorted(dark)
+
+
+@pytest.mark.parametrize(
+    ("value", "up"), [(1.53, 1.6), (1.6, 1.6), (0.0234, 0.024), (12.01, 13.0), (99.5, 100.0)]
+)
+def test_scales_end_on_two_digits(value: float, up: float) -> None:
+    assert round_up(value) == pytest.approx(up)
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return cache_path()
+
+
+def test_the_bundle_is_the_same_with_and_without_its_cache(cache: Path) -> None:
+    fresh = load_bundle()
+    assert "vegaEmbed" in fresh
+    assert "</script" not in fresh.lower()
+    assert "<!--" not in fresh
+    assert cache.is_file()
+    assert load_bundle() == fresh
+    cache.write_bytes(cache.read_bytes()[:-10] + b"alert('x')")
+    assert load_bundle() == fresh, "a damaged cache is made anew"
+    assert [path.name for path in cache.parent.iterdir()] == [cache.name], "nothing half written stays"
+
+
+def test_a_cache_that_cannot_be_written_costs_nothing_but_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "cache").write_text("a file where a folder should be")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    warm_bundle()
+    assert "vegaEmbed" in load_bundle()
+
+
+def test_warming_fills_the_cache_without_waiting(cache: Path) -> None:
+    start = time.perf_counter()
+    warm_bundle()
+    assert time.perf_counter() - start < 0.5
+    deadline = time.perf_counter() + 30.0
+    while not cache.is_file() and time.perf_counter() < deadline:
+        time.sleep(0.05)
+    assert cache.is_file()
+    assert os.access(cache, os.R_OK)
