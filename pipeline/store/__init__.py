@@ -9,7 +9,7 @@ from pipeline.store.errors import StoreError
 from pipeline.store.generation import STEPS, Generation
 from pipeline.store.identities import LogIdentities, LogSighting, see_log
 from pipeline.store.manifest import JSON, FileEntry, Manifest, TableEntry, TableReport
-from pipeline.store.results import Store
+from pipeline.store.results import Store, Survey
 from pipeline.store.verification import Problem
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "Problem",
     "Store",
     "StoreError",
+    "Survey",
     "TableEntry",
     "TableReport",
     "see_log",

@@ -26,6 +26,7 @@ from pipeline.store.manifest import (
     file_missing,
     hash_bytes,
     hash_file,
+    read_parquet,
 )
 from pipeline.store.manifest_file import encode_manifest, load_manifest
 from pipeline.store.names import check_file_name
@@ -107,7 +108,7 @@ class Generation:
 
     @property
     def table_names(self) -> tuple[str, ...]:
-        """Tables written or taken over so far."""
+        """Tables written or taken over so far, in that order."""
         return tuple(self._tables)
 
     def read_table(self, name: str) -> pl.DataFrame:
@@ -116,8 +117,6 @@ class Generation:
         Raises:
             StoreError: ``no_such_table``, it was neither written nor taken over so far.
         """
-        import polars as pl  # noqa: PLC0415 - heavy, and `slip --help` imports this room
-
         if name not in self._tables:
             raise StoreError(
                 "no_such_table",
@@ -125,7 +124,7 @@ class Generation:
                 where=self.run,
                 hint="Run the stage before, or analyze the whole log",
             )
-        return pl.read_parquet(self._folder / self._tables[name].file, glob=False)
+        return read_parquet(self._folder / self._tables[name].file)
 
     def write_text(self, name: str, text: str) -> None:
         """Write a text file, UTF-8.

@@ -115,20 +115,7 @@ class Manifest:
         Raises:
             StoreError: ``no_such_table``; ``file_missing`` when it was pruned or deleted meanwhile.
         """
-        import polars as pl  # noqa: PLC0415 - heavy, and `slip --help` imports this room
-
-        path = self.path(table)
-        try:
-            return pl.read_parquet(path, glob=False)
-        except FileNotFoundError as error:
-            raise file_missing(path) from error
-        except (pl.exceptions.ComputeError, OSError) as error:
-            raise StoreError(
-                "table_damaged",
-                f"the table cannot be read: {error}",
-                where=str(path),
-                hint="Analyze the log again with --force",
-            ) from error
+        return read_parquet(self.path(table))
 
     def with_earlier(self, earlier: Sequence[str]) -> Manifest:
         """The same manifest with another list of older generations."""
@@ -148,6 +135,27 @@ def hash_file(path: Path) -> str:
     """
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_parquet(path: Path) -> pl.DataFrame:
+    """The frame in a table's file.
+
+    Raises:
+        StoreError: ``file_missing`` or ``table_damaged``.
+    """
+    import polars as pl  # noqa: PLC0415 - heavy, and `slip --help` imports this room
+
+    try:
+        return pl.read_parquet(path, glob=False)
+    except FileNotFoundError as error:
+        raise file_missing(path) from error
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise StoreError(
+            "table_damaged",
+            f"the table cannot be read: {str(error).splitlines()[0]}",
+            where=str(path),
+            hint="Analyze the log again with --force",
+        ) from error
 
 
 def file_missing(path: Path) -> StoreError:

@@ -69,7 +69,7 @@ def load_manifest(home: Path) -> Manifest | None:
             "manifest_damaged",
             f"the manifest is damaged ({error})",
             where=str(path),
-            hint="Delete this one file and analyze the log again; other runs are not concerned",
+            hint="Delete this one file and analyze its log again",
         ) from error
     if stored is None:
         raise StoreError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +30,14 @@ RUNS = "runs"
 
 def _ignore_step(step: str) -> None:
     del step
+
+
+@dataclass(frozen=True, kw_only=True)
+class Survey:
+    """The current generations that can be read, sorted by run, and why the others cannot."""
+
+    manifests: tuple[Manifest, ...]
+    errors: tuple[StoreError, ...]
 
 
 class Store:
@@ -67,13 +76,24 @@ class Store:
         Raises:
             StoreError: one of them is damaged: leaving a run out silently would falsify what is computed.
         """
-        found = []
+        survey = self.survey()
+        for error in survey.errors:
+            raise error
+        return survey.manifests
+
+    def survey(self) -> Survey:
+        """As `manifests`, for those who can go on without the damaged ones and say so."""
+        found, errors = [], []
         for home in self.homes():
-            with name_disk_errors(home):
-                manifest = load_manifest(home)
+            try:
+                with name_disk_errors(home):
+                    manifest = load_manifest(home)
+            except StoreError as error:
+                errors.append(error)
+                continue
             if manifest is not None:
                 found.append(manifest)
-        return tuple(sorted(found, key=lambda manifest: manifest.run))
+        return Survey(manifests=tuple(sorted(found, key=lambda manifest: manifest.run)), errors=tuple(errors))
 
     def runs(self) -> tuple[str, ...]:
         """Names of all runs that have a current generation, sorted.

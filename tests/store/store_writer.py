@@ -1,7 +1,7 @@
 """A writer in a process of its own, for tests that kill it.
 
 store_writer.py die ROOT RUN KEY SEED STEP COUNT    write a generation, die at the COUNT-th STEP
-store_writer.py loop ROOT RUN SEED ROUNDS           write generation after generation, prune in between
+store_writer.py loop ROOT RUN SEED ROUNDS           write generation after generation and tell each, prune in between
 store_writer.py hold ROOT RUN                       open a generation and sleep
 """
 
@@ -33,9 +33,9 @@ def die(*arguments: str) -> None:
 
 def loop(root: str, run: str, seed: str, rounds: str) -> None:
     store = Store(Path(root))
-    _say("ready")
     for number in range(int(seed), int(seed) + int(rounds)):
         write_generation(store, run, f"key{number % 3}", number)
+        _say(str(number))
         if number % 4 == 0:
             store.prune(1)
 

@@ -135,6 +135,22 @@ def test_closed_generation_refuses(store: Store) -> None:
     assert store.manifest(RUN) is not None
 
 
+def test_stages_read_what_the_ones_before_wrote(store: Store) -> None:
+    write_generation(store, RUN, "one", 1)
+    with store.open_generation(RUN, "two") as generation:
+        assert generation.table_names == ()
+        generation.reuse_table("slip")
+        generation.write_table("windows", break_windows(make_windows(RUN, 2)))
+        assert generation.table_names == ("slip", "windows")
+        assert generation.read_table("slip").equals(make_slip(RUN, 1))
+        assert generation.read_table("windows").height == 498
+        with pytest.raises(StoreError, match="'poses'") as caught:
+            generation.read_table("poses")
+        generation.commit({})
+    assert caught.value.code == "no_such_table"
+    assert store.read(RUN, "windows").height == 498
+
+
 def test_nested_files_are_kept(store: Store) -> None:
     with store.open_generation(RUN, "k") as generation:
         generation.write_bytes("figures/slip.svg", b"<svg/>")
@@ -204,6 +220,9 @@ def test_damaged_manifest_says_what_to_do(store: Store, content: bytes, code: st
         assert caught.value.code == code
         assert caught.value.where == str(path)
     assert [(problem.run, problem.code) for problem in store.verify()] == [(RUN, code)]
+    survey = store.survey()
+    assert [manifest.run for manifest in survey.manifests] == ["other"]
+    assert [(error.code, error.where) for error in survey.errors] == [(code, str(path))]
     assert read_seed(store, "other") == 2
 
     path.unlink()
