@@ -1,7 +1,7 @@
 """A writer in a process of its own, for tests that kill it.
 
 store_writer.py die ROOT RUN KEY SEED STEP COUNT    write a generation, die at the COUNT-th STEP
-store_writer.py loop ROOT RUN SEED ROUNDS           write generation after generation and tell each, prune in between
+store_writer.py loop ROOT RUN SEED ROUNDS           write one after another, tell each, prune in between
 store_writer.py hold ROOT RUN                       open a generation and sleep
 """
 
