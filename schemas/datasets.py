@@ -21,5 +21,7 @@ class Datasets(Table):
     runs = dy.Int64(min=1, metadata={"description": "number of runs"})
     samples = dy.Int64(min=0, metadata={"description": "time steps of all runs"})
     median_modulus = fields.number("m/s", "median over runs of the runs' median modulus", nullable=True)
-    median_window_norm = fields.number("m/s", "median over runs of the runs' median window norm", nullable=True)
+    median_window_norm = fields.number(
+        "m/s", "median over runs of the runs' median window norm", nullable=True
+    )
     keys = fields.text("run/generation of every run counted, separated by spaces")

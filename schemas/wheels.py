@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import dataframely as dy
-import polars as pl
 
 from schemas import fields
 from schemas.contract import Table
+
+if TYPE_CHECKING:
+    import polars as pl
 
 
 class Wheels(Table):

@@ -6,13 +6,16 @@ import importlib
 import os
 import pkgutil
 import sys
-from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from cyclopts import App, CycloptsError
 
 import pipeline.cli
 from pipeline.cli.output import FAILED, USAGE, print_error
 from pipeline.core.errors import SlipError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 HELP = """How far was the motion from the ideal model, and why?
 

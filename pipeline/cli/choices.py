@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline.job.options import INPUTS, Options
+from pipeline.job.options import INPUTS, FigureFormat, Options
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,14 +18,20 @@ class Choices:
     """What may be said on the command line in place of a configuration file."""
 
     vehicle: Annotated[str | None, Parameter(help="vehicle preset, for example husky_a200")] = None
-    wheel_radius: Annotated[PositiveFloat | None, Parameter(help="wheel radius [m], in place of a vehicle")] = None
-    track_width: Annotated[PositiveFloat | None, Parameter(help="track width [m], in place of a vehicle")] = None
+    wheel_radius: Annotated[
+        PositiveFloat | None, Parameter(help="wheel radius [m], in place of a vehicle")
+    ] = None
+    track_width: Annotated[PositiveFloat | None, Parameter(help="track width [m], in place of a vehicle")] = (
+        None
+    )
     dataset: Annotated[str | None, Parameter(help="dataset the run belongs to")] = None
     terrain: Annotated[str | None, Parameter(help="terrain driven on")] = None
     input: Annotated[
         Literal["command", "measured", "both"], Parameter(help="what the ideal model is fed with")
     ] = "both"
-    config: Annotated[Path | None, Parameter(help="configuration file in place of run.toml beside the log")] = None
+    config: Annotated[
+        Path | None, Parameter(help="configuration file in place of run.toml beside the log")
+    ] = None
     yaw: Annotated[
         Literal["pose", "imu"] | None, Parameter(help="whose yaw rate the slip tables use (default: pose)")
     ] = None
@@ -39,7 +45,7 @@ def build_options(
     choices: Choices,
     *,
     report: bool = False,
-    figures: str | None = None,
+    figures: FigureFormat | None = None,
     force: bool = False,
     through: str = "aggregate",
 ) -> Options:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-from pipeline.core.errors import SlipError
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from pipeline.core.errors import SlipError
 
 CLEAN = 0
 FAILED = 1
@@ -47,6 +50,11 @@ def exit_code(errors: Sequence[object], *, lossy: bool) -> int:
     return LOSSY if lossy else CLEAN
 
 
+def _write_line(text: str) -> None:
+    sys.stderr.write(f"{text}\n")
+    sys.stderr.flush()
+
+
 @contextmanager
 def show_progress(title: str, *, quiet: bool) -> Iterator[Callable[[str], None]]:
     """Tell on stderr what is being done: a spinner on a terminal, plain lines otherwise."""
@@ -54,7 +62,7 @@ def show_progress(title: str, *, quiet: bool) -> Iterator[Callable[[str], None]]
         yield lambda _stage: None
         return
     if not sys.stderr.isatty():
-        yield lambda stage: print(f"{title}: {_DOING.get(stage, stage)}", file=sys.stderr, flush=True)
+        yield lambda stage: _write_line(f"{title}: {_DOING.get(stage, stage)}")
         return
     from rich.console import Console  # noqa: PLC0415 - only for people at a terminal
     from rich.markup import escape  # noqa: PLC0415

@@ -69,7 +69,9 @@ def _describe_slip(summary: Summary) -> list[str]:
     split = _part(summary, "split")
     detail = []
     if split:
-        detail.append("   ".join(f"{name} {float(cast('float', value)):.0%}" for name, value in split.items()))
+        detail.append(
+            "   ".join(f"{name} {float(cast('float', value)):.0%}" for name, value in split.items())
+        )
     lead = _part(by_input, str(summary.get("leading_input")))
     detail.append(
         f"transitory {_number(lead, 'transitory_median_modulus')} | "
@@ -81,7 +83,7 @@ def _describe_slip(summary: Summary) -> list[str]:
 
 def _describe_topics(summary: Summary) -> list[str]:
     topics = _part(summary, "topics")
-    lines = []
+    lines: list[str] = []
     for role in ("command", "wheels", "pose", "imu", "interval"):
         source = _part(topics, role)
         if source:
@@ -96,20 +98,24 @@ def _findings(summary: Summary) -> list[Mapping[str, object]]:
 def _describe_findings(summary: Summary) -> list[str]:
     findings = _findings(summary)
     serious = [found for found in findings if found["severity"] != "info"]
-    lines = []
+    lines: list[str] = []
     for found in serious[:_SHOWN]:
         mark = "!!" if found["severity"] == "error" else "! "
         lines.append(_row("" if lines else "findings", f"{mark} {found['text']}"))
     rest = len(findings) - len(serious[:_SHOWN])
     if rest:
-        lines.append(_row("" if lines else "findings", f"   {rest} more in the report and in findings.parquet"))
+        lines.append(
+            _row("" if lines else "findings", f"   {rest} more in the report and in findings.parquet")
+        )
     return lines
 
 
 def _describe_end(summary: Summary, *, unchanged: bool) -> list[str]:
     lines = []
     if unchanged:
-        lines.append(_row("unchanged", "log and configuration are as before: nothing was computed (--force does)"))
+        lines.append(
+            _row("unchanged", "log and configuration are as before: nothing was computed (--force does)")
+        )
     report = summary.get("report")
     if isinstance(report, str):
         lines.append(_row("report", _relative(report)))

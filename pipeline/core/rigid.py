@@ -22,7 +22,8 @@ def wrap_angle(angle: Floats) -> Floats:
 
 def unwrap_yaw(yaw: Floats) -> Floats:
     """Remove the 2 pi jumps of a yaw series [rad], shape (n,)."""
-    return np.unwrap(yaw) if yaw.size else yaw
+    unwrapped: Floats = np.unwrap(yaw)
+    return unwrapped
 
 
 def multiply_quaternions(first: Floats, second: Floats) -> Floats:
@@ -42,7 +43,8 @@ def multiply_quaternions(first: Floats, second: Floats) -> Floats:
 
 def invert_quaternions(quaternion: Floats) -> Floats:
     """Inverse of unit quaternions of shape (n, 4)."""
-    return quaternion * np.array([-1.0, -1.0, -1.0, 1.0])
+    conjugated: Floats = quaternion * np.array([-1.0, -1.0, -1.0, 1.0])
+    return conjugated
 
 
 def rotate(quaternion: Floats, vector: Floats) -> Floats:

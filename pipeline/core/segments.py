@@ -40,7 +40,9 @@ def find_gaps(times: Floats, smallest: float) -> Flags:
 
 def find_held(position: Floats, quaternion: Floats) -> Flags:
     """Whether each pose repeats the one before it exactly; shapes (n, 3), (n, 4) -> (n,)."""
-    same = np.all(np.diff(position, axis=0) == 0.0, axis=1) & np.all(np.diff(quaternion, axis=0) == 0.0, axis=1)
+    same = np.all(np.diff(position, axis=0) == 0.0, axis=1) & np.all(
+        np.diff(quaternion, axis=0) == 0.0, axis=1
+    )
     return np.concatenate((np.zeros(min(1, position.shape[0]), dtype=bool), same))
 
 
@@ -68,12 +70,15 @@ def select_fresh_poses(times: Floats, held: Flags) -> Integers:
     return np.flatnonzero(~held | (stands & ~old_again)).astype(np.int64)
 
 
-def find_jumps(times: Floats, position: Floats, quaternion: Floats, *, metres: float, radians: float) -> Flags:
+def find_jumps(
+    times: Floats, position: Floats, quaternion: Floats, *, metres: float, radians: float
+) -> Flags:
     """Whether the pose jumps before each sample: a correction of the map, not a motion.
 
     A jump stays; vibration, and poses that are stamped late, come back. So the body's own odometer over four
     poses before and four after is fitted by a straight line with a step in the middle, and the step counts
-    where it exceeds both eight robust standard deviations of all such steps and the given floor.
+    where it exceeds eight robust standard deviations of all such steps, and the given floor plus the way
+    travelled in one and a half pose periods: a pose that a slow localization left out looks like that.
 
     Args:
         times: sample times [s], shape (n,), strictly increasing.
@@ -90,8 +95,10 @@ def find_jumps(times: Floats, position: Floats, quaternion: Floats, *, metres: f
         return flags
     move, turn = measure_increments(position, quaternion)
     for increment, floor in ((move, metres), (turn, radians)):
-        size = np.linalg.norm(_fit_steps(times, increment), axis=1)
-        limit = max(8.0 * _GAUSSIAN * float(np.median(size)), floor)
+        step, rate = _fit_steps(times, increment)
+        size = np.linalg.norm(step, axis=1)
+        skipped = 1.5 * float(np.median(np.diff(times))) * np.linalg.norm(rate, axis=1)
+        limit = np.maximum(8.0 * _GAUSSIAN * float(np.median(size)), floor + skipped)
         # The fits around a jump see it too; the jump is where the step is largest.
         padded = np.pad(size, _SIDE - 1)
         tallest = np.lib.stride_tricks.sliding_window_view(padded, 2 * _SIDE - 1).max(axis=1)
@@ -99,8 +106,8 @@ def find_jumps(times: Floats, position: Floats, quaternion: Floats, *, metres: f
     return flags
 
 
-def _fit_steps(times: Floats, increment: Floats) -> Floats:
-    """Step in the middle of every 2 x 4 poses, beside a straight line; shape (n - 7, 3)."""
+def _fit_steps(times: Floats, increment: Floats) -> tuple[Floats, Floats]:
+    """Step in the middle of every 2 x 4 poses and the slope beside it, each of shape (n - 7, 3)."""
     odometer = np.concatenate((np.zeros((1, 3)), np.cumsum(increment, axis=0)))
     windows = np.lib.stride_tricks.sliding_window_view(odometer, 2 * _SIDE, axis=0)
     stamps = np.lib.stride_tricks.sliding_window_view(times, 2 * _SIDE)
@@ -108,9 +115,11 @@ def _fit_steps(times: Floats, increment: Floats) -> Floats:
     after = np.broadcast_to(side - side.mean(), stamps.shape)
     along = stamps - stamps.mean(axis=1, keepdims=True)
     # Frisch and Waugh: the step's coefficient is that of the step cleared of the line.
-    cleared = after - along * (np.sum(along * after, axis=1) / np.sum(along**2, axis=1))[:, None]
-    steps: Floats = np.einsum("nw,ncw->nc", cleared, windows) / np.sum(cleared**2, axis=1)[:, None]
-    return steps
+    overlap = np.sum(along * after, axis=1) / np.sum(along**2, axis=1)
+    cleared = after - along * overlap[:, None]
+    steps = np.einsum("nw,ncw->nc", cleared, windows) / np.sum(cleared**2, axis=1)[:, None]
+    slope = np.einsum("nw,ncw->nc", along, windows) / np.sum(along**2, axis=1)[:, None]
+    return steps, slope - steps * overlap[:, None]
 
 
 def measure_increments(position: Floats, quaternion: Floats) -> tuple[Floats, Floats]:

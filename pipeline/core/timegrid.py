@@ -16,7 +16,7 @@ _BLOCK = 4096
 
 
 def make_grid(start: float, end: float, rate: float) -> Floats:
-    """Uniform times from ``start`` in steps of 1/``rate`` up to ``end`` inclusive (a rounding error is forgiven)."""
+    """Uniform times from ``start`` in steps of 1/``rate`` to ``end`` inclusive, rounding forgiven."""
     count = int(np.floor((end - start) * rate + 1e-6)) + 1
     grid: Floats = start + np.arange(max(count, 0)) / rate
     return grid

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -16,11 +15,14 @@ from pipeline.job.keys import STAGES, hash_json, key_stages
 from pipeline.job.subject import Subject, describe_subject, name_run
 from pipeline.job.summary import summarize_run
 from pipeline.job.work import Progress, Work, read_subject, stored_contexts, stored_keys
-from pipeline.logs import LogData
 from pipeline.store import JSON, LogIdentities, Manifest, Store, see_log
 
 if TYPE_CHECKING:
-    from pipeline.job.options import Options
+    from collections.abc import Mapping
+
+    from pipeline.job.options import FigureFormat, Options
+    from pipeline.logs import LogData
+    from pipeline.report import RunReport
     from pipeline.store import Generation
 
 SUMMARY = "summary.json"
@@ -125,7 +127,11 @@ def _write_outputs(work: Work, log: Mapping[str, JSON], options: Options, progre
     """Summary, report and figures of a finished run."""
     summary = summarize_run(work, log)
     summary["report"] = REPORT if options.report else None
-    summary["provenance"] = {"versions": versions(), "keys": dict(work.keys), "configuration": _configuration(work)}
+    summary["provenance"] = {
+        "versions": versions(),
+        "keys": dict(work.keys),
+        "configuration": _configuration(work),
+    }
     generation = work.generation
     if options.report or options.figures:
         # Drawing is most of the start-up time; who wants neither does not pay for it.
@@ -141,13 +147,13 @@ def _write_outputs(work: Work, log: Mapping[str, JSON], options: Options, progre
     generation.write_text(SUMMARY, json.dumps(summary, indent=1, sort_keys=False) + "\n")
 
 
-def _write_figures(report: object, kind: str, generation: Generation) -> None:
+def _write_figures(report: RunReport, kind: FigureFormat, generation: Generation) -> None:
     import tempfile  # noqa: PLC0415 - only where figures are asked for
 
-    from pipeline.report import RunReport, write_figures  # noqa: PLC0415 - heavy
+    from pipeline.report import write_figures  # noqa: PLC0415 - heavy
 
     with tempfile.TemporaryDirectory() as folder:
-        for path in write_figures(cast("RunReport", report), Path(folder), kind):
+        for path in write_figures(report, Path(folder), kind):
             generation.write_bytes(f"figures/{path.name}", path.read_bytes())
 
 

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from schemas import contract_of
-
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -32,6 +30,9 @@ _DIGITS = 16
 
 def key_stages(run: str, sha256: str, subject: Subject, inputs: tuple[str, ...]) -> dict[str, str]:
     """Key of every stage of a run, in order."""
+    # The contracts bring a table library along, which help and usage errors do without.
+    from schemas import contract_of  # noqa: PLC0415
+
     plain = msgspec.to_builtins(subject.configuration)
     pose_limits = {name: plain["velocity"][name] for name in ("jump_m", "jump_rad", "gap_s")}
     own = {

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 INPUTS = ("command", "measured")
+FigureFormat = Literal["svg", "pdf", "png"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +33,6 @@ class Options:
     overrides: Mapping[str, object] = field(default_factory=dict)
     inputs: tuple[str, ...] = INPUTS
     report: bool = True
-    figures: str | None = None
+    figures: FigureFormat | None = None
     force: bool = False
     through: str = "aggregate"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.job.errors import JobError
@@ -18,6 +17,8 @@ from pipeline.vehicles import (
 )
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pipeline.job.options import Options
     from pipeline.store import Store
 
@@ -83,7 +84,8 @@ def _require_sources(sources: Sources, index: LogIndex, options: Options) -> Non
             "no_command",
             f"no topic can serve as {roles}",
             where=str(index.path),
-            hint=f"Name it in run.toml ([command] topic = ... or left_topic, right_topic). The log has: {there}.",
+            hint="Name it in run.toml ([command] topic = ..., or left_topic and right_topic). "
+            f"The log has: {there}.",
         )
 
 

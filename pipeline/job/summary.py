@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import polars as pl
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from pipeline.job.work import Work
     from pipeline.store import JSON
 
@@ -24,7 +25,9 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
     subject, generation = work.subject, work.generation
     aggregates = generation.read_table("aggregates")
     velocities = generation.read_table("velocities")
-    by_input = {name: _describe_input(aggregates, name) for name in aggregates["input"].unique(maintain_order=True)}
+    by_input = {
+        name: _describe_input(aggregates, name) for name in aggregates["input"].unique(maintain_order=True)
+    }
     leading = "command" if "command" in by_input else "measured"
     whole = _row(aggregates, leading, "all")
     asked = "both" if len(work.options.inputs) > 1 else work.options.inputs[0]
@@ -102,15 +105,15 @@ def _describe_topics(work: Work) -> dict[str, JSON]:
         "imu": sources.imu,
         "interval": sources.interval,
     }
-    return {
+    described: dict[str, JSON] = {
         role: None if source is None else {"topic": str(source), "reason": source.reason}
         for role, source in roles.items()
-    } | {"notes": list(sources.notes)}
+    }
+    return {**described, "notes": list(sources.notes)}
 
 
 def list_findings(findings: pl.DataFrame) -> list[JSON]:
     """Findings as JSON objects, errors first."""
     columns = ["id", "severity", "text", "where", "t_start", "t_end", "value", "count", "stage"]
-    order = {"error": 0, "warning": 1, "info": 2}
-    rows = findings.select(columns).to_dicts()
-    return sorted(rows, key=lambda row: order[row["severity"]])
+    # Severities are an Enum from info to error: its order is that of importance.
+    return list(findings.select(columns).sort("severity", descending=True, maintain_order=True).to_dicts())

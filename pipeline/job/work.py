@@ -12,18 +12,17 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from pipeline.job.keys import STAGES, TABLES
-from pipeline.logs import LogData, read_topics
+from pipeline.logs import LogData, Loss, read_topics
 from pipeline.stages import aggregate, checks, slip, velocity
 from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.finding import Finding, tabulate_findings
-from pipeline.store import JSON
 from pipeline.vehicles import DriveForm
 from schemas import contract_of
 
 if TYPE_CHECKING:
     from pipeline.job.options import Options
     from pipeline.job.subject import Subject
-    from pipeline.store import Generation, Manifest, TableReport
+    from pipeline.store import JSON, Generation, Manifest, TableReport
 
 Progress = Callable[[str], None]
 
@@ -120,22 +119,20 @@ class Work:
         made = extract_tables(
             data, subject.sources, subject.configuration, subject.vehicle, where=str(subject.path)
         )
-        quarantined = {}
-        for name, frame in made.tables.items():
-            if not frame.is_empty():
-                report = self.write(name, frame)
-                if report.quarantined:
-                    quarantined[name] = {"rows": report.quarantined, "rules": dict(report.rules)}
+        reports = {
+            name: self.write(name, frame) for name, frame in made.tables.items() if not frame.is_empty()
+        }
+        broken = {name: report for name, report in reports.items() if report.quarantined}
         found = [
             Finding(
                 "quarantined_rows",
                 "warning",
-                f"{entry['rows']} rows of {name} break the contract ({', '.join(sorted(entry['rules']))}): "
-                f"they stand in quarantine_{name}",
+                f"{report.quarantined} rows of {name} break the contract "
+                f"({', '.join(sorted(report.rules))}): they stand in quarantine_{name}",
                 where=name,
-                count=int(entry["rows"]),
+                count=report.quarantined,
             )
-            for name, entry in quarantined.items()
+            for name, report in broken.items()
         ]
         notes = [Finding("log_note", "info", note, where="log") for note in data.notes]
         held = made.tables["poses"]["held"] if not made.tables["poses"].is_empty() else pl.Series([0])
@@ -143,7 +140,10 @@ class Work:
             "start_ns": made.start_ns,
             "clocks": {topic: dict(clock) for topic, clock in made.clocks.items()},
             "held_poses": round(float(held.mean() or 0.0), 6),  # type: ignore[arg-type]
-            "quarantined": quarantined,
+            "quarantined": {
+                name: {"rows": report.quarantined, "rules": dict(report.rules)}
+                for name, report in broken.items()
+            },
             "losses": [describe_loss(loss, data.index.start_ns) for loss in data.losses],
         }
         return StageOutcome((*made.findings, *found, *notes), context)
@@ -201,22 +201,19 @@ def read_subject(subject: Subject) -> LogData:
     return read_topics(subject.path, list_wanted(subject.sources, types))
 
 
-def describe_loss(loss: object, start_ns: int) -> dict[str, JSON]:
+def describe_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:
     """A loss as JSON, its times in seconds since the log's start."""
-    content = vars(loss) if hasattr(loss, "__dict__") else {
-        name: getattr(loss, name) for name in ("kind", "bytes", "chunks", "start_ns", "end_ns", "text")
-    }  # fmt: skip
 
-    def since(value: object) -> float | None:
-        return None if not isinstance(value, int) else round((value - start_ns) / 1e9, 6)
+    def since(stamp: int | None) -> float | None:
+        return None if stamp is None else round((stamp - start_ns) / 1e9, 6)
 
     return {
-        "kind": content["kind"],
-        "bytes": content["bytes"],
-        "chunks": content["chunks"],
-        "start_s": since(content["start_ns"]),
-        "end_s": since(content["end_ns"]),
-        "text": content["text"],
+        "kind": loss.kind,
+        "bytes": loss.bytes,
+        "chunks": loss.chunks,
+        "start_s": since(loss.start_ns),
+        "end_s": since(loss.end_ns),
+        "text": loss.text,
     }
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.vehicles import Vehicle
+if TYPE_CHECKING:
+    from pipeline.vehicles import Vehicle
 
 Floats = NDArray[np.float64]
 

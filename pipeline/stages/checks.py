@@ -6,8 +6,8 @@ where neither smoothing nor vibration matters.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -15,7 +15,11 @@ from numpy.typing import NDArray
 
 from pipeline.stages.delays import estimate_delay
 from pipeline.stages.finding import Finding
-from pipeline.vehicles import Vehicle
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pipeline.vehicles import Vehicle
 
 Floats = NDArray[np.float64]
 
@@ -142,7 +146,10 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         text = f"the vehicle was hardly asked to move: {path:.2g} m of path in the whole run"
         return [Finding("not_moving", "error", text, value=path)]
     gains = [
-        float(np.sum(samples.velocity[known, i] * ideal[known, i]) / max(float(np.sum(ideal[known, i] ** 2)), 1e-12))
+        float(
+            np.sum(samples.velocity[known, i] * ideal[known, i])
+            / max(float(np.sum(ideal[known, i] ** 2)), 1e-12)
+        )
         for i in (0, 2)
     ]
     reach = samples.position[known]
@@ -172,8 +179,8 @@ def check_independence(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     if share > _ROUNDING or sideways > _ROUNDING * moved:
         return []
     text = (
-        "the poses follow the measured wheels to within rounding: they are wheel odometry, not a localization, "
-        "and the slip is zero by construction: draw no conclusion from it"
+        "the poses follow the measured wheels to within rounding: they are wheel odometry, "
+        "not a localization, and the slip is zero by construction: draw no conclusion from it"
     )
     return [Finding("pose_from_wheels", "error", text, where="pose", value=share)]
 
@@ -185,7 +192,9 @@ def check_command_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     """
     if samples.measured is None or samples.command is None:
         return []
-    both = np.isfinite(samples.measured).all(axis=1) & np.isfinite(samples.command).all(axis=1) & samples.steady
+    both = (
+        np.isfinite(samples.measured).all(axis=1) & np.isfinite(samples.command).all(axis=1) & samples.steady
+    )
     if not both.any():
         return []
     asked, got = _average_steps(samples.step[both], samples.command[both], samples.measured[both])
@@ -195,16 +204,16 @@ def check_command_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         return []
     if abs(np.log(forward)) > _SCALED:
         text = (
-            f"in slow steady steps the wheels turn {forward:.2f} times as fast as commanded: the recorded command is "
-            "scaled wrongly (another vehicle's wheel radius, or a unit)"
+            f"in slow steady steps the wheels turn {forward:.2f} times as fast as commanded: "
+            "the recorded command is scaled wrongly (another vehicle's wheel radius, or a unit)"
         )
         return [Finding("command_scale", "warning", text, where="command", value=forward)]
     if turning is None or not samples.body_commanded or np.log(turning / forward) < _SCALED:
         return []
     multiplier = turning / forward * vehicle.controller_track_multiplier
     text = (
-        f"in slow steady turns the wheels differ {turning / forward:.2f} times as much as the command asks with the "
-        f"nominal track width: set vehicle.controller_track_multiplier = {multiplier:.3g}"
+        f"in slow steady turns the wheels differ {turning / forward:.2f} times as much as the command asks "
+        f"with the nominal track width: set vehicle.controller_track_multiplier = {multiplier:.3g}"
     )
     return [Finding("controller_multiplier", "warning", text, where="command", value=multiplier)]
 
@@ -247,7 +256,9 @@ def check_limits(samples: Samples, vehicle: Vehicle) -> list[Finding]:
                 f"{share:.0%} of the commands ask for more than the vehicle's largest {name} "
                 f"({limit:g} {unit}): its controller may clip them"
             )
-            findings.append(Finding("command_beyond_limit", "info", text, where=f"command {name}", value=share))
+            findings.append(
+                Finding("command_beyond_limit", "info", text, where=f"command {name}", value=share)
+            )
     return findings
 
 
@@ -258,8 +269,9 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         return []
     findings = []
     known = np.isfinite(ideal).all(axis=1)
-    along = _delay_of(samples.velocity[:, 0], ideal[:, 0], known, samples)
-    turning = _delay_of(samples.velocity[:, 2], ideal[:, 2], known, samples)
+    places = np.flatnonzero(known)
+    along = _delay_of(samples.velocity[:, 0], ideal[:, 0], places, samples)
+    turning = _delay_of(samples.velocity[:, 2], ideal[:, 2], places, samples)
     if along is not None and turning is not None and samples.measured is not None:
         skew = turning[0] - along[0]
         if abs(skew) > max(_SKEW, 3.0 * np.hypot(along[1], turning[1])):
@@ -270,7 +282,7 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
             )
             findings.append(Finding("heading_skew", "warning", text, where="pose", value=skew))
     if samples.measured is not None and np.isfinite(samples.gyro).any():
-        usable = known & np.isfinite(samples.gyro)
+        usable = np.flatnonzero(known & np.isfinite(samples.gyro))
         late = _delay_of(samples.measured[:, 2], samples.gyro, usable, samples)
         # The other way round, a body that follows its wheels late is physics, not an encoder.
         if late is not None and late[0] > _SKEW:
@@ -279,10 +291,12 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     return findings
 
 
-def _delay_of(signal: Floats, reference: Floats, known: NDArray[np.bool_], samples: Samples) -> tuple[float, float] | None:
+def _delay_of(
+    signal: Floats, reference: Floats, places: NDArray[np.int64], samples: Samples
+) -> tuple[float, float] | None:
     """Delay and its uncertainty [s] of a signal against a reference, None where they do not correlate."""
-    times = samples.times[known]
-    found = estimate_delay(times, signal[known], times, reference[known])
+    times = samples.times[places]
+    found = estimate_delay(times, signal[places], times, reference[places])
     if found is None or abs(found.correlation) < 0.7:  # noqa: PLR2004 - below it the lag means nothing
         return None
     return found.seconds, found.half_width

@@ -50,7 +50,9 @@ def estimate_delay(
     if spread < 1e-9 or float(np.std(reference)) < 1e-9:  # noqa: PLR2004 - constant up to rounding
         return None
     lags = np.arange(-largest, largest + _STEP / 2.0, _STEP)
-    scores = np.array([_correlate(centred, spread, np.interp(times - lag, reference_times, reference)) for lag in lags])
+    scores = np.array(
+        [_correlate(centred, spread, np.interp(times - lag, reference_times, reference)) for lag in lags]
+    )
     best = int(np.argmax(np.abs(scores)))
     sign = np.sign(scores[best]) or 1.0
     tall = sign * scores

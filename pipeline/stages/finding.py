@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import polars as pl
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
 Severity = Literal["info", "warning", "error"]
 
-_TYPES = {
+_TYPES: dict[str, pl.DataType | type[pl.DataType]] = {
     "stage": pl.String,
     "id": pl.String,
     "severity": pl.Enum(["info", "warning", "error"]),

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import timegrid
 from pipeline.stages.delays import estimate_delay
 from pipeline.stages.finding import Finding
+
+if TYPE_CHECKING:
+    import polars as pl
 
 Floats = NDArray[np.float64]
 
@@ -44,7 +47,9 @@ class GyroFit:
     correlation: float
 
 
-def fit_gyro(velocities: pl.DataFrame, imu: pl.DataFrame, window: float) -> tuple[GyroFit | None, list[Finding]]:
+def fit_gyro(
+    velocities: pl.DataFrame, imu: pl.DataFrame, window: float
+) -> tuple[GyroFit | None, list[Finding]]:
     """Compare the gyro with the yaw rate of the poses.
 
     Args:
@@ -66,9 +71,7 @@ def fit_gyro(velocities: pl.DataFrame, imu: pl.DataFrame, window: float) -> tupl
     shifted = np.interp(times - delay.seconds, grid, rate)
     slope, offset = _fit_line(shifted, turning)
     usable = abs(delay.correlation) > _AGREES and abs(slope) > 0.5  # noqa: PLR2004 - a gyro is no worse than that
-    fit = GyroFit(
-        usable, -1 if slope < 0.0 else 1, abs(slope), offset, delay.seconds, delay.correlation
-    )
+    fit = GyroFit(usable, -1 if slope < 0.0 else 1, abs(slope), offset, delay.seconds, delay.correlation)
     return fit, _describe(fit)
 
 
@@ -85,7 +88,10 @@ def _smooth_gyro(times: Floats, imu: pl.DataFrame, window: float) -> tuple[Float
     distinct = np.concatenate(([True], np.diff(stamps) > 0.0))
     stamps, rate = stamps[distinct], rate[distinct]
     angle = timegrid.integrate_rate(stamps, rate)[:, None]
-    first, last = max(float(times.min()) - 1.0, float(stamps[0])), min(float(times.max()) + 1.0, float(stamps[-1]))
+    first, last = (
+        max(float(times.min()) - 1.0, float(stamps[0])),
+        min(float(times.max()) + 1.0, float(stamps[-1])),
+    )
     grid = timegrid.make_grid(first, last, _GYRO_RATE)
     if grid.size < 2 or stamps.size < 2:  # noqa: PLR2004 - no overlap with the poses
         return np.array([first, first + 1.0]), np.zeros(2)
@@ -110,7 +116,9 @@ def _describe(fit: GyroFit) -> list[Finding]:
         text = f"the gyro does not agree with the poses (correlation {fit.correlation:.2f}): it was not used"
         return [Finding("imu_disagrees", "warning", text, where="imu", value=fit.correlation)]
     if fit.sign < 0:
-        text = f"the gyro's yaw rate has the wrong sign (correlation {fit.correlation:.2f}): it was turned round"
+        text = (
+            f"the gyro's yaw rate has the wrong sign (correlation {fit.correlation:.2f}): it was turned round"
+        )
         findings.append(Finding("imu_sign", "warning", text, where="imu", value=fit.correlation))
     if abs(fit.scale - 1.0) > _SCALE_FORGIVEN:
         text = f"the poses turn {fit.scale:.3f} times as much as the gyro says: it was scaled"

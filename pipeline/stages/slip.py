@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -15,7 +15,11 @@ from pipeline.stages import steps
 from pipeline.stages.errors import StageError
 from pipeline.stages.finding import Finding
 from pipeline.stages.stretches import find_bad_stretches
-from pipeline.vehicles import Configuration, Vehicle
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.vehicles import Configuration, Vehicle
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -87,7 +91,7 @@ def compute_slip(
             "no_command",
             "no command and no measured wheel speed falls together with a pose",
             where=where,
-            hint="Name the command topic in run.toml ([command] topic = ...); `slip inspect` lists what there is.",
+            hint="Name the command in run.toml ([command] topic = ...); `slip inspect` lists the topics.",
         )
     leading = found.get("command") or found["measured"]
     length = configuration.slip.length_scale_m
@@ -97,7 +101,9 @@ def compute_slip(
     base = velocities.select("t", "stamp", "segment", "v_x", "v_y", "v_w").with_columns(
         step=pl.Series(step), transitory=pl.Series(transitory)
     )
-    suspect, findings = find_bad_stretches(velocities, {name: ideal.velocity for name, ideal in found.items()}, step)
+    suspect, findings = find_bad_stretches(
+        velocities, {name: ideal.velocity for name, ideal in found.items()}, step
+    )
     findings += _describe_stale(times, found)
     parts = [_tabulate(base, name, ideal, suspect, length) for name, ideal in found.items()]
     slip = pl.concat(parts)
@@ -175,9 +181,14 @@ def cut_windows(slip: pl.DataFrame, rate: float) -> pl.DataFrame:
     size = max(round(WINDOW_S * rate), 1)
     indexed = slip.with_columns(
         # A sample left out inside a step (stale, outside an interval) ends the stretch as a step would.
-        (pl.col("t").diff().fill_null(0.0) > 1.5 / rate).cum_sum().alias("stretch"),  # 1.5: half a period of doubt
+        (pl.col("t").diff().fill_null(0.0) > 1.5 / rate)
+        .cum_sum()
+        .alias("stretch"),  # 1.5: half a period of doubt
     ).with_columns(
-        ((pl.col("t") - pl.col("t").min().over("step")) * rate / size + 1e-6).floor().cast(pl.Int32).alias("window")
+        ((pl.col("t") - pl.col("t").min().over("step")) * rate / size + 1e-6)
+        .floor()
+        .cast(pl.Int32)
+        .alias("window")
     )
     grouped = indexed.group_by("step", "stretch", "window", maintain_order=True).agg(
         pl.col("input").first(),
@@ -203,8 +214,6 @@ def _describe_stale(times: Floats, found: dict[str, Ideal]) -> list[Finding]:
     if ideal is None or not ideal.stale.any():
         return []
     count = int(ideal.stale.sum())
-    text = (
-        f"for {count} time steps the last command was too old to count (set command.hold_s to hold it longer): left out"
-    )
+    text = f"in {count} time steps the last command is too old (command.hold_s holds it longer): left out"
     first = float(times[np.flatnonzero(ideal.stale)[0]])
     return [Finding("stale_command", "warning", text, where="command", t_start=first, count=count)]

@@ -12,7 +12,9 @@ _SMALLEST_CHANGE = 0.02
 _SHORTEST_STEP = 1.0
 
 
-def number_steps(times: Floats, segment: NDArray[np.int32], ideal: Floats, length: float) -> NDArray[np.int32]:
+def number_steps(
+    times: Floats, segment: NDArray[np.int32], ideal: Floats, length: float
+) -> NDArray[np.int32]:
     """Number the command steps of a run.
 
     A step starts where a segment starts, and where the ideal velocity of the command has moved by more than

@@ -7,13 +7,18 @@ model of the whole run; what fails is marked, shown, and left out of medians.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.stages.finding import Finding
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import polars as pl
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -45,8 +50,8 @@ def find_bad_stretches(
         return np.zeros(times.size, dtype=bool), []
     label = _label_stretches(times, step)
     summed = _sum_stretches(label, velocities, ideal, times)
-    driven, moved = summed["driven"], summed["moved"]
-    tested = summed["whole"] & (np.abs(driven) > _LEAST_PATH)
+    driven, moved = summed.driven, summed.moved
+    tested = summed.whole & (np.abs(driven) > _LEAST_PATH)
     if tested.sum() < 8:  # noqa: PLR2004 - too few stretches to know what is usual
         return np.zeros(times.size, dtype=bool), []
     length = np.linalg.norm(moved, axis=1)
@@ -54,7 +59,7 @@ def find_bad_stretches(
     if gain < 0.2:  # noqa: PLR2004 - a vehicle that hardly moves on its wheels has no direction to test
         return np.zeros(times.size, dtype=bool), []
     # Lateral motion in turns is what slip is about: the direction is judged against what turning explains.
-    turning = summed["turned"]
+    turning = summed.turned
     angle = np.arctan2(moved[:, 1] * np.sign(driven), moved[:, 0] * np.sign(driven))
     usual = _fit_angle(turning[tested], angle[tested])
     spread = 1.4826 * float(np.median(np.abs(angle[tested] - usual(turning[tested]))))
@@ -66,14 +71,16 @@ def find_bad_stretches(
     suspect: Flags = bad[label]
     if not bad.any():
         return suspect, []
+    share = float(bad.sum() / max(int(tested.sum()), 1))
     first = float(times[np.flatnonzero(suspect)[0]])
     text = (
-        f"{int(bad.sum())} stretches of 2 s ({bad.sum() / max(int(tested.sum()), 1):.1%}) have a rotated heading "
-        f"({int(rotated.sum())}) or a frozen position ({int((bad & ~rotated).sum())}): marked and left out of medians"
+        f"{int(bad.sum())} stretches of 2 s ({share:.1%}) have a rotated heading ({int(rotated.sum())}) or a "
+        f"frozen position ({int((bad & ~rotated).sum())}): marked and left out of medians"
     )
-    share = float(bad.sum() / max(int(tested.sum()), 1))
     return suspect, [
-        Finding("bad_stretch", "warning", text, where="pose", t_start=first, value=share, count=int(bad.sum()))
+        Finding(
+            "bad_stretch", "warning", text, where="pose", t_start=first, value=share, count=int(bad.sum())
+        )
     ]
 
 
@@ -85,31 +92,44 @@ def _label_stretches(times: Floats, step: NDArray[np.int32]) -> NDArray[np.int64
     return np.cumsum(starts) - 1
 
 
-def _sum_stretches(
-    label: NDArray[np.int64], velocities: pl.DataFrame, ideal: Floats, times: Floats
-) -> dict[str, NDArray[np.generic]]:
+def _sum_stretches(label: NDArray[np.int64], velocities: pl.DataFrame, ideal: Floats, times: Floats) -> _Sums:
     """Displacement, turning and driven path of every stretch, in its own mean heading frame."""
     count = int(label[-1]) + 1
     period = float(np.median(np.diff(times))) if times.size > 1 else 0.0
     samples = np.bincount(label, minlength=count)
     yaw = velocities["yaw"].to_numpy()
-    turned = np.bincount(label, velocities["v_w"].to_numpy() * period, count)
+    turned = _sum_by(label, velocities["v_w"].to_numpy() * period, count)
     start = yaw[np.searchsorted(label, np.arange(count))]
     relative = yaw - start[label] - turned[label] / 2.0
     v_x, v_y = velocities["v_x"].to_numpy(), velocities["v_y"].to_numpy()
     cosine, sine = np.cos(relative), np.sin(relative)
     moved = np.stack(
         (
-            np.bincount(label, (cosine * v_x - sine * v_y) * period, count),
-            np.bincount(label, (sine * v_x + cosine * v_y) * period, count),
+            _sum_by(label, (cosine * v_x - sine * v_y) * period, count),
+            _sum_by(label, (sine * v_x + cosine * v_y) * period, count),
         ),
         axis=-1,
     )
     known = np.isfinite(ideal).all(axis=1)
     # Driven along the chord that the measured turning makes of the path.
-    driven = np.bincount(label, np.where(known, ideal[:, 0] * cosine, 0.0) * period, count)
-    whole = (np.bincount(label, known.astype(float), count) == samples) & (samples * period > 0.9 * STRETCH_S)
-    return {"moved": moved, "driven": driven, "turned": turned, "whole": whole}
+    driven = _sum_by(label, np.where(known, ideal[:, 0] * cosine, 0.0) * period, count)
+    whole = (_sum_by(label, known.astype(float), count) == samples) & (samples * period > 0.9 * STRETCH_S)
+    return _Sums(moved, driven, turned, whole)
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Displacement [m], driven path [m], turning [rad] of every stretch, and whether it is whole."""
+
+    moved: Floats
+    driven: Floats
+    turned: Floats
+    whole: Flags
+
+
+def _sum_by(label: NDArray[np.int64], values: Floats, count: int) -> Floats:
+    """Sums of values with equal labels."""
+    return np.bincount(label, values, count).astype(np.float64)
 
 
 class _AngleLine:

@@ -8,6 +8,7 @@ quadratic fit of that odometer gives the velocity.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -17,7 +18,9 @@ from pipeline.core import rigid, segments, timegrid
 from pipeline.stages.errors import StageError
 from pipeline.stages.finding import Finding
 from pipeline.stages.gyro import GyroFit, fit_gyro, rate_of_gyro
-from pipeline.vehicles.configuration import VelocitySection
+
+if TYPE_CHECKING:
+    from pipeline.vehicles.configuration import VelocitySection
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +36,9 @@ class VelocityResult:
     gyro: GyroFit | None = None
 
 
-def compute_velocities(poses: pl.DataFrame, imu: pl.DataFrame, settings: VelocitySection, *, where: str) -> VelocityResult:
+def compute_velocities(
+    poses: pl.DataFrame, imu: pl.DataFrame, settings: VelocitySection, *, where: str
+) -> VelocityResult:
     """Differentiate poses into body velocities.
 
     Args:
@@ -57,7 +62,7 @@ def compute_velocities(poses: pl.DataFrame, imu: pl.DataFrame, settings: Velocit
             "no_segment",
             "the poses hold no stretch of half a second without a gap or a jump",
             where=where,
-            hint="Check the pose topic with `slip inspect`; velocity.gap_s and velocity.jump_m may be widened.",
+            hint="Check the pose topic with `slip inspect`; or widen velocity.gap_s, velocity.jump_m.",
         )
     findings = []
     if skipped:
@@ -69,7 +74,11 @@ def compute_velocities(poses: pl.DataFrame, imu: pl.DataFrame, settings: Velocit
         fit, more = fit_gyro(table, imu, settings.window_s)
         findings += more
     rate = rate_of_gyro(table["t"].to_numpy(), imu, fit, settings.window_s) if fit and fit.usable else None
-    column = pl.Series("v_w_imu", rate, dtype=pl.Float64) if rate is not None else pl.lit(None, pl.Float64).alias("v_w_imu")
+    column = (
+        pl.Series("v_w_imu", rate, dtype=pl.Float64)
+        if rate is not None
+        else pl.lit(None, pl.Float64).alias("v_w_imu")
+    )
     table = table.with_columns(column)
     if settings.yaw == "imu":
         if rate is None:
@@ -97,7 +106,9 @@ def _differentiate_segment(piece: pl.DataFrame, settings: VelocitySection) -> pl
     position = piece.select("x", "y", "z").to_numpy()[fresh]
     quaternion = piece.select("q_x", "q_y", "q_z", "q_w").to_numpy()[fresh]
     move, turn = segments.measure_increments(position, quaternion)
-    odometer = np.concatenate((np.zeros((1, 3)), np.cumsum(np.column_stack((move[:, :2], turn[:, 2])), axis=0)))
+    odometer = np.concatenate(
+        (np.zeros((1, 3)), np.cumsum(np.column_stack((move[:, :2], turn[:, 2])), axis=0))
+    )
     grid = timegrid.make_grid(times[0], times[-1], settings.rate_hz)
     inside = np.clip(grid, kept[0], kept[-1])
     velocity = timegrid.differentiate_locally(inside, kept, odometer, settings.window_s)

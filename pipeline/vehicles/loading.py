@@ -5,12 +5,15 @@ from __future__ import annotations
 import fnmatch
 import tomllib
 from collections.abc import Iterable, Mapping
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from pipeline.vehicles.configuration import Configuration
 from pipeline.vehicles.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 Tree = Mapping[str, object]
 
@@ -18,7 +21,9 @@ FLEET_FILE = "fleet.toml"
 RUN_FILE = "run.toml"
 
 
-def load_configuration(log: Path, *, given: Path | None = None, overrides: Tree | None = None) -> Configuration:
+def load_configuration(
+    log: Path, *, given: Path | None = None, overrides: Tree | None = None
+) -> Configuration:
     """The configuration of one log.
 
     Every `fleet.toml` from the file system's root down to the log's folder is read, nearer ones winning;
@@ -80,8 +85,10 @@ def convert(tree: Tree, where: str) -> Configuration:
 
 
 def _readable(message: str) -> str:
-    return message.replace("Object contains unknown field", "unknown key").replace(" - at `$.", " in `").replace(
-        "`$`", "the top level"
+    return (
+        message.replace("Object contains unknown field", "unknown key")
+        .replace(" - at `$.", " in `")
+        .replace("`$`", "the top level")
     )
 
 

@@ -79,7 +79,7 @@ def resolve_vehicle(section: VehicleSection, *, recorded: str | None, where: str
         where: the log, for the error message.
 
     Raises:
-        ConfigurationError: no vehicle is named, the name is unknown, or a value that its kind needs is missing.
+        ConfigurationError: no vehicle is named, the name is unknown, or a value is missing.
     """
     values = {key: value for key, value in msgspec.structs.asdict(section).items() if value is not None}
     named = values.pop("preset", None)
@@ -91,7 +91,9 @@ def resolve_vehicle(section: VehicleSection, *, recorded: str | None, where: str
         )
     if base is None:
         if "wheel_radius_m" not in values:
-            said = f"the log names {recorded!r}, which is no preset" if recorded else "the log does not name one"
+            said = (
+                f"the log names {recorded!r}, which is no preset" if recorded else "the log does not name one"
+            )
             raise ConfigurationError(
                 "vehicle_unknown",
                 f"the vehicle cannot be determined: {said}",

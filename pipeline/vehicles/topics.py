@@ -7,14 +7,17 @@ that vehicles usually have, and words such as `cmd` or `status`, rank them. The 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from pipeline.logs import ChannelInfo
-from pipeline.vehicles.configuration import Configuration, DriveSection, IntervalSection
 from pipeline.vehicles.errors import ConfigurationError
-from pipeline.vehicles.presets import Vehicle
 from pipeline.vehicles.sources import DriveForm, DriveSource, PoseSource, Signal, Sources, TopicSource
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from pipeline.logs import ChannelInfo
+    from pipeline.vehicles.configuration import Configuration, DriveSection, IntervalSection
+    from pipeline.vehicles.presets import Vehicle
 
 JOINTS = "sensor_msgs/JointState"
 BODY_TYPES = ("geometry_msgs/Twist", "geometry_msgs/TwistStamped")
@@ -34,7 +37,9 @@ _COMMANDED = re.compile(r"cmd|command|setpoint|target|desired|reference")
 _MEASURED = re.compile(r"status|state|feedback|measured|encoder|actual")
 _RECEIVED = re.compile(r"controller|mux/cmd|cmd_vel_out|platform/cmd|drive/cmd|base/cmd|vehicle/")
 _UPSTREAM = re.compile(r"joy|teleop|nav|web|key|interactive|plan|raw|key_vel")
-_LOCALIZED = re.compile(r"icp|slam|lidar|laser|map|locali|loam|gnss|gps|rtk|ground_truth|truth|mocap|vicon|optitrack|amcl|vio|lio")
+_LOCALIZED = re.compile(
+    r"icp|slam|lidar|laser|map|locali|loam|gnss|gps|rtk|ground_truth|truth|mocap|vicon|optitrack|amcl|vio|lio"
+)
 _DEAD_RECKONED = re.compile(r"controller|wheel|encoder|diff_drive|drive_odom|platform/odom|dead")
 _NOT_A_POSE = re.compile(r"goal|initialpose|initial_pose|target|waypoint|desired|reference|setpoint|cmd")
 
@@ -135,15 +140,15 @@ class _Chooser:
             return DriveSource(form, tuple(self.require_number(text, role) for text in pair), reason)
         if section.topic:
             signal = self.require(section.topic, role)
-            form = self._form_of(signal.topic)
-            if form is None:
+            found = self._form_of(signal.topic)
+            if found is None:
                 raise ConfigurationError(
                     "type_not_usable",
-                    f"the topic {signal.topic!r} of type {self.types[signal.topic]} cannot serve as {role} alone",
+                    f"the topic {signal.topic!r} ({self.types[signal.topic]}) cannot serve as {role} alone",
                     where=self.where,
                     hint=f"Give {role}.left_topic and {role}.right_topic with field paths.",
                 )
-            return DriveSource(form, (signal,), reason)
+            return DriveSource(found, (signal,), reason)
         return None
 
     def _form_of(self, topic: str) -> DriveForm | None:
@@ -165,9 +170,7 @@ class _Chooser:
             says_command = bool(_COMMANDED.search(topic.lower()))
             if says_command == commanded:
                 word = "says command" if says_command else "does not say command"
-                yield 3.0, DriveSource(
-                    DriveForm.JOINTS, (Signal(topic),), f"JointState whose name {word}"
-                )
+                yield 3.0, DriveSource(DriveForm.JOINTS, (Signal(topic),), f"JointState whose name {word}")
         for left, right in [] if ackermann else self._pairs():
             name = left.lower()
             fits, misfits = bool(wanted.search(name)), bool(unwanted.search(name))
@@ -269,9 +272,7 @@ class _Chooser:
             return None
         return TopicSource(topic, f"commands are live only while it says {value!r}; --interval all takes all")
 
-    def _best(
-        self, candidates: list[tuple[float, Source]], usual: list[str], role: str
-    ) -> Source | None:
+    def _best(self, candidates: list[tuple[float, Source]], usual: list[str], role: str) -> Source | None:
         """The candidate of highest rank; a vehicle's usual name breaks ties, then the number of messages."""
         if not candidates:
             return None

@@ -7,13 +7,17 @@ right again through the log time; the place is remembered, so that no segment cr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.stages.finding import Finding
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 Stamps = NDArray[np.int64]
 
@@ -78,13 +82,15 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
     clocks = {key: _read_clock(times) for key, times in recorded.items()}
     findings = [found for clock in clocks.values() for found in clock.findings]
     findings += _check_early_stamps(clocks)
-    shifted, more = _join_time_bases(clocks, recorded)
+    shifted, more = _join_time_bases(clocks)
     return shifted, findings + more
 
 
 def _read_clock(times: Recorded) -> TopicClock:
     """The chosen time of one topic, its jumps mended."""
-    log_known = times.log_time > DAY_NS if np.median(times.log_time) > DAY_NS else np.ones(times.log_time.size, bool)
+    log_known = (
+        times.log_time > DAY_NS if np.median(times.log_time) > DAY_NS else np.ones(times.log_time.size, bool)
+    )
     if times.clock == "publish":
         return TopicClock(times.topic, "publish", times.publish_time, times.publish_time > 0)
     header = times.header_time
@@ -136,7 +142,7 @@ def _mend_jumps(
         if abs(moved) > _JUMP_NS or moved < -_BACKWARD_NS:
             edges.append(int(place) + 1)
     edges.append(known.size)
-    spans = [known[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    spans = [known[a:b] for a, b in itertools.pairwise(edges)]
     home = float(np.median(offset[max(spans, key=len)]))
     stamp = header.copy()
     found: list[Finding] = []
@@ -171,7 +177,7 @@ def _check_early_stamps(clocks: Mapping[str, TopicClock]) -> list[Finding]:
         Finding(
             "stamp_after_log_time",
             "warning",
-            f"the stamps of {clock.topic} lie {-clock.latency_s * 1e3:.0f} ms after the time they were recorded: "
+            f"the stamps of {clock.topic} lie {-clock.latency_s * 1e3:.0f} ms after they were recorded: "
             "its clock runs ahead",
             where=clock.topic,
             value=clock.latency_s,
@@ -182,7 +188,7 @@ def _check_early_stamps(clocks: Mapping[str, TopicClock]) -> list[Finding]:
 
 
 def _join_time_bases(
-    clocks: dict[str, TopicClock], recorded: Mapping[str, Recorded]
+    clocks: dict[str, TopicClock],
 ) -> tuple[dict[str, TopicClock], list[Finding]]:
     """Bring clocks that lie more than a second apart together, through the log time that all share."""
     stamped = {key: clock for key, clock in clocks.items() if clock.clock == "header"}
@@ -197,11 +203,12 @@ def _join_time_bases(
             continue
         if clock.clock == "header":
             shift = round(away * 1e9)
-            text = f"the stamps of {clock.topic} lie {-away:.3g} s from those of the other topics: they were shifted"
+            text = f"the stamps of {clock.topic} lie {-away:.3g} s from the other topics' and were shifted"
         else:
             shift = round(-home * 1e9)
             text = (
-                f"the recorder's clock lies {home:.3g} s from the stamps: {clock.topic}, which has no stamp, was shifted"
+                f"the recorder's clock lies {home:.3g} s from the stamps: "
+                f"{clock.topic}, which has none, was shifted"
             )
         findings.append(Finding("clock_offset", "warning", text, where=clock.topic, value=away))
         joined[key] = TopicClock(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from pipeline.motion.ideal import invert_ackermann, invert_differential
 from pipeline.stages.errors import StageError
 from pipeline.stages.finding import Finding
 from pipeline.vehicles import DriveForm, DriveSection, Vehicle
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
 
 Floats = NDArray[np.float64]
 
@@ -74,7 +77,7 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
             Finding(
                 "velocity_from_position",
                 "info",
-                f"{columns.topic} has no velocity of {', '.join(missing)}: their positions were differentiated",
+                f"{columns.topic} has no velocity of {', '.join(missing)}: positions were differentiated",
                 where=columns.topic,
             )
         )
@@ -103,7 +106,7 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
 
 
 def _joint_matrix(values: object, names: RaggedStrings) -> dict[str, Floats]:
-    """Values by joint name, NaN where a message lacks the joint; the order of joints may change on the way."""
+    """Values by joint name, NaN where a message lacks the joint; the order of joints may change."""
     if not isinstance(values, Ragged):
         return {}
     found: dict[str, Floats] = {}
@@ -173,7 +176,7 @@ def read_sides(left: Floats, right: Floats, section: DriveSection, vehicle: Vehi
 
 def read_body(forward: Floats, yaw_rate: Floats, section: DriveSection, vehicle: Vehicle) -> Drive:
     """A body command, turned into the drive's by the vehicle's ideal inverse."""
-    forward, yaw_rate = forward * section.sign, yaw_rate
+    forward = forward * section.sign
     if vehicle.kind == "ackermann":
         speed, steering = invert_ackermann(forward, yaw_rate, vehicle)
         return Drive(speed=speed, steering=steering, body_x=forward, body_w=yaw_rate)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.stages.errors import StageError
-from pipeline.vehicles.configuration import IntervalSection
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.vehicles.configuration import IntervalSection
 
 Floats = NDArray[np.float64]
 Span = tuple[float, float]

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import rigid, segments
 from pipeline.stages.finding import Finding
-from pipeline.vehicles.configuration import VelocitySection
+
+if TYPE_CHECKING:
+    from pipeline.vehicles.configuration import VelocitySection
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -56,7 +60,12 @@ def normalize_quaternions(quaternion: Floats, topic: str) -> tuple[Floats, Flags
 
 
 def cut_track(
-    times: Floats, position: Floats, quaternion: Floats, clock_breaks: Flags, settings: VelocitySection, topic: str
+    times: Floats,
+    position: Floats,
+    quaternion: Floats,
+    clock_breaks: Flags,
+    settings: VelocitySection,
+    topic: str,
 ) -> Track:
     """Cut poses into segments at holes, clock jumps and pose jumps, and flag held poses.
 
@@ -115,28 +124,28 @@ def _find_pose_jumps(
 
 def _stretches(breaks: Flags) -> list[tuple[int, int]]:
     edges = [0, *np.flatnonzero(breaks).tolist(), breaks.size]
-    return [(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+    return [(a, b) for a, b in itertools.pairwise(edges) if b > a]
 
 
 def _describe(t: Floats, gaps: Flags, jumps: Flags, held: Flags, topic: str) -> list[Finding]:
     findings = []
     if gaps.any():
         holes = np.diff(t)[gaps[1:]]
-        text = f"{holes.size} holes in the poses of {topic}, the longest {holes.max():.3g} s: segments end there"
+        text = (
+            f"{holes.size} holes in the poses of {topic}, the longest {holes.max():.3g} s: segments end there"
+        )
         findings.append(
             Finding("pose_gap", "info", text, where=topic, value=float(holes.max()), count=int(holes.size))
         )
     if jumps.any():
         count = int(jumps.sum())
-        text = f"the pose of {topic} jumped {count} times (corrections of the map, not motion): segments end there"
+        text = f"the pose of {topic} jumped {count} times (the map was corrected): segments end there"
         where = float(t[np.flatnonzero(jumps)[0]])
         findings.append(Finding("pose_jump", "warning", text, where=topic, t_start=where, count=count))
     share = float(held.mean())
     if share > 0.05:  # noqa: PLR2004 - fewer repeats are chance
-        text = f"{share:.0%} of the poses of {topic} repeat the one before (the localization is slower than its topic)"
-        findings.append(
-            Finding("held_poses", "info", text, where=topic, value=share, count=int(held.sum()))
-        )
+        text = f"{share:.0%} of the poses of {topic} repeat the one before: the localization is slower"
+        findings.append(Finding("held_poses", "info", text, where=topic, value=share, count=int(held.sum())))
     return findings
 
 

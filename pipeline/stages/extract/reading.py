@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.logs import LogData, Strings, TopicColumns, Wanted
+from pipeline.logs import LogData, Strings, TopicColumns, Wanted, wanted_transforms
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract.drive import ACKERMANN_FIELDS, BODY_FIELDS
 from pipeline.vehicles import DriveForm, DriveSource, Signal, Sources
-from pipeline.vehicles.topics import plain_type
+from pipeline.vehicles.topics import TRANSFORM_TYPES, plain_type
 
 Floats = NDArray[np.float64]
 
@@ -24,13 +24,6 @@ _POSITION = ("position.x", "position.y", "position.z")
 _ORIENTATION = ("orientation.x", "orientation.y", "orientation.z", "orientation.w")
 _RATES = tuple(f"angular_velocity.{axis}" for axis in "xyz")
 _FORCES = tuple(f"linear_acceleration.{axis}" for axis in "xyz")
-TRANSFORM_FIELDS = (
-    "transforms[].header.stamp",
-    "transforms[].header.frame_id",
-    "transforms[].child_frame_id",
-    *(f"transforms[].transform.translation.{axis}" for axis in "xyz"),
-    *(f"transforms[].transform.rotation.{axis}" for axis in "xyzw"),
-)
 
 
 def drive_fields(source: DriveSource, types: dict[str, str]) -> list[Signal]:
@@ -66,11 +59,6 @@ def list_wanted(sources: Sources, types: dict[str, str]) -> list[Wanted]:
         if kind == "nav_msgs/Odometry":
             names.append("child_frame_id")
         signals += [Signal(topic, name) for name in names]
-    transforms = [topic for topic, kind in types.items() if plain_type(kind) == "tf2_msgs/TFMessage"]
-    for topic in transforms:
-        needed = sources.pose is not None and (sources.pose.from_transforms or "static" in topic)
-        if needed:
-            signals += [Signal(topic, name) for name in TRANSFORM_FIELDS]
     if sources.imu is not None:
         signals += [Signal(sources.imu.topic, name) for name in (*_RATES, *_FORCES)]
     if sources.interval is not None:
@@ -80,7 +68,19 @@ def list_wanted(sources: Sources, types: dict[str, str]) -> list[Wanted]:
         fields = by_topic.setdefault(signal.topic, [])
         if signal.field not in fields:
             fields.append(signal.field)
-    return [Wanted(topic, tuple(fields)) for topic, fields in by_topic.items()]
+    wanted = [Wanted(topic, tuple(fields)) for topic, fields in by_topic.items()]
+    return wanted + _list_wanted_transforms(sources, types)
+
+
+def _list_wanted_transforms(sources: Sources, types: dict[str, str]) -> list[Wanted]:
+    """All transforms where poses come from them; else the static ones, which may place the pose's frame."""
+    if sources.pose is None:
+        return []
+    transforms = [topic for topic, kind in types.items() if plain_type(kind) in TRANSFORM_TYPES]
+    wanted = wanted_transforms(transforms)
+    if sources.pose.from_transforms:
+        return wanted
+    return [one for one in wanted if "static" in one.topic]
 
 
 @dataclass(frozen=True)
@@ -148,5 +148,3 @@ def busiest_channel(data: LogData, topic: str) -> TopicColumns | None:
     """The channel of a topic with most messages; a topic may be recorded on several."""
     channels = [columns for columns in data.of(topic) if columns.log_time.size]
     return max(channels, key=lambda columns: columns.log_time.size, default=None)
-
-

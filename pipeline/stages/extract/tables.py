@@ -6,14 +6,13 @@ written all the same: the store moves them to quarantine, where they can be look
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.logs import LogData, TopicColumns
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract import localization, reading
 from pipeline.stages.extract.clocks import Recorded, TopicClock, align_clocks
@@ -26,7 +25,7 @@ from pipeline.stages.extract.drive import (
     read_steering,
 )
 from pipeline.stages.extract.intervals import Span, find_spans_given, find_spans_of_state, is_inside
-from pipeline.stages.extract.transforms import pose_from_transforms, to_base_link
+from pipeline.stages.extract.transforms import chain_poses, describe_chain, is_transforms, to_base_link
 from pipeline.stages.finding import Finding
 from pipeline.vehicles import (
     DEFAULT_INTERVAL,
@@ -34,12 +33,19 @@ from pipeline.vehicles import (
     DriveForm,
     DriveSection,
     DriveSource,
+    PoseSource,
     Sources,
     Vehicle,
 )
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.logs import LogData, TopicColumns
+
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -94,6 +100,8 @@ class _Extraction:
             for topic in dict.fromkeys(columns.topic for columns in data.topics)
             if (found := self._join_channels(topic)) is not None
         }
+        pose = sources.pose
+        self.chain = chain_poses(data.topics, pose, where) if pose and pose.from_transforms else None
         self.clocks = self._align()
         self.start_ns = self._find_start()
 
@@ -106,7 +114,7 @@ class _Extraction:
             "wheels": self._drive_table(self.sources.wheels, self.configuration.wheels, spans, held=False),
             "imu": self._imu(spans),
         }
-        clocks = {
+        clocks: dict[str, dict[str, str | float]] = {
             clock.topic: {"clock": clock.clock, "latency_s": round(clock.latency_s, 6)}
             for clock in self.clocks.values()
         }
@@ -128,8 +136,11 @@ class _Extraction:
                 topic, columns.log_time, columns.publish_time, columns.header_time, asked.get(topic)
             )
             for topic, columns in self.columns.items()
-            if "transforms[].child_frame_id" not in columns.fields
+            if not is_transforms(columns)
         }
+        if self.chain is not None and self.sources.pose is not None:
+            topic, times = self.sources.pose.topic, self.chain
+            recorded[topic] = Recorded(topic, times.log_time, times.log_time, times.time, asked.get(topic))
         clocks, findings = align_clocks(recorded)
         self.findings += findings
         return clocks
@@ -149,9 +160,9 @@ class _Extraction:
         return asked
 
     def _find_start(self) -> int:
-        firsts = [int(clock.stamp[clock.usable].min()) for clock in self.clocks.values() if clock.usable.any()]
-        if self.sources.pose and self.sources.pose.from_transforms and self.sources.pose.topic in self.columns:
-            firsts.append(int(self.columns[self.sources.pose.topic].log_time.min()))
+        firsts = [
+            int(clock.stamp[clock.usable].min()) for clock in self.clocks.values() if clock.usable.any()
+        ]
         return min(firsts, default=0)
 
     def _seconds(self, stamp: Stamps) -> Floats:
@@ -162,12 +173,12 @@ class _Extraction:
         columns, clock = self.columns.get(topic), self.clocks.get(topic)
         if columns is None or clock is None:
             return None
-        usable = np.flatnonzero(clock.usable)
-        order = usable[np.argsort(clock.stamp[usable], kind="stable")]
-        self._note_disorder(topic, clock.stamp[usable])
-        return columns, clock, order
+        return columns, clock, self._order(clock)
 
-    def _note_disorder(self, topic: str, stamp: Stamps) -> None:
+    def _order(self, clock: TopicClock) -> NDArray[np.int64]:
+        """Usable messages in the order of their stamps; disorder is noted."""
+        usable = np.flatnonzero(clock.usable)
+        stamp, topic = clock.stamp[usable], clock.topic
         late = int((np.diff(stamp) < 0).sum())
         twice = int((np.diff(np.sort(stamp)) == 0).sum())
         if late:
@@ -176,6 +187,7 @@ class _Extraction:
         if twice:
             text = f"{twice} messages of {topic} share their stamp with another"
             self.findings.append(Finding("duplicate_stamps", "warning", text, where=topic, count=twice))
+        return usable[np.argsort(stamp, kind="stable")]
 
     def _find_spans(self) -> list[Span] | None:
         """Spans in which commands are live; None when nothing restricts them."""
@@ -203,27 +215,7 @@ class _Extraction:
         source = self.sources.pose
         if source is None:
             return pl.DataFrame()
-        if source.from_transforms:
-            chained = pose_from_transforms(list(self.data.topics), source, self.where)
-            self.findings += chained.findings
-            stamp, log_time, arrays = chained.stamp, chained.stamp, chained.arrays
-            breaks = np.zeros(stamp.size, dtype=bool)
-        else:
-            found = self._ordered(source.topic)
-            if found is None:
-                raise self._nothing("pose", source.topic)
-            columns, clock, order = found
-            recorded = reading.read_pose_topic(columns)
-            stamp, log_time = clock.stamp[order], columns.log_time[order]
-            arrays = reading.PoseArrays(
-                recorded.position[order], recorded.quaternion[order], recorded.parent, recorded.child
-            )
-            breaks = np.zeros(order.size, dtype=bool)
-            for jump in clock.breaks:
-                place = np.flatnonzero(log_time >= jump)
-                breaks[place[:1]] = True
-            arrays, more = to_base_link(arrays, list(self.data.topics), source.topic)
-            self.findings += more
+        stamp, log_time, arrays, breaks = self._recorded_poses(source)
         times = self._seconds(stamp)
         track = localization.cut_track(
             times, arrays.position, arrays.quaternion, breaks, self.configuration.velocity, source.topic
@@ -239,6 +231,36 @@ class _Extraction:
                 "active": is_inside(times, spans),
             }
         )
+
+    def _recorded_poses(self, source: PoseSource) -> tuple[Stamps, Stamps, reading.PoseArrays, Flags]:
+        """Stamps, log times and poses of base_link in time order, and where their clock jumped."""
+        topic = source.topic
+        clock = self.clocks.get(topic)
+        if self.chain is not None:
+            recorded = reading.PoseArrays(
+                self.chain.position, self.chain.quaternion, self.chain.parent, self.chain.child
+            )
+            log_times = self.chain.log_time
+            self.findings += describe_chain(self.chain, topic)
+        else:
+            columns = self.columns.get(topic)
+            if columns is None:
+                raise self._nothing("pose", topic)
+            recorded, log_times = reading.read_pose_topic(columns), columns.log_time
+        if clock is None or not clock.usable.any():
+            raise self._nothing("pose", topic)
+        order = self._order(clock)
+        stamp, log_time = clock.stamp[order], log_times[order]
+        breaks = np.zeros(order.size, dtype=bool)
+        for jump in clock.breaks:
+            breaks[np.flatnonzero(log_time >= jump)[:1]] = True
+        arrays = reading.PoseArrays(
+            recorded.position[order], recorded.quaternion[order], recorded.parent, recorded.child
+        )
+        if self.chain is None:
+            arrays, more = to_base_link(arrays, self.data.topics, topic)
+            self.findings += more
+        return stamp, log_time, arrays, breaks
 
     def _time_columns(self, times: Floats, stamp: Stamps, log_time: Stamps) -> dict[str, NDArray[np.generic]]:
         return {"t": times, "stamp": stamp, "log_time": log_time}

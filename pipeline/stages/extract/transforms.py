@@ -2,29 +2,125 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.logs import TopicColumns
+from pipeline.logs import LogError, TopicColumns, TransformBuffer, TransformSeries
+from pipeline.stages.errors import StageError
+from pipeline.stages.extract.localization import move_to_base
 from pipeline.stages.extract.reading import PoseArrays
 from pipeline.stages.finding import Finding
-from pipeline.vehicles import PoseSource
+from pipeline.vehicles.topics import TRANSFORM_TYPES, plain_type
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.vehicles import PoseSource
+
+_BASES = ("base_link", "base_footprint", "base")
+_FIXED = ("map", "world", "odom")
 
 
-@dataclass(frozen=True)
-class ChainedPoses:
-    """Poses of a chain at the child's stamps [ns]."""
-
-    stamp: NDArray[np.int64]
-    arrays: PoseArrays
-    findings: tuple[Finding, ...]
+def is_transforms(columns: TopicColumns) -> bool:
+    """Whether a topic holds transforms."""
+    return plain_type(columns.type_name) in TRANSFORM_TYPES
 
 
-def pose_from_transforms(topics: list[TopicColumns], source: PoseSource, where: str) -> ChainedPoses:
-    raise KeyError(where)
+def chain_poses(topics: Sequence[TopicColumns], source: PoseSource, where: str) -> TransformSeries:
+    """Poses of base_link along the chain of transforms.
+
+    Without configured frames the child is base_link (or base_footprint, base), the parent map, world or odom,
+    whichever comes first among the child's ancestors, else its topmost ancestor.
+
+    Args:
+        topics: all topics that were read; the transforms among them are used.
+        source: the choice, with frames where they are configured.
+        where: the log, for error messages.
+
+    Raises:
+        StageError: the frames do not exist or are not connected.
+    """
+    buffer = TransformBuffer([columns for columns in topics if is_transforms(columns)])
+    parent, child = source.frames or _choose_frames(buffer, where)
+    try:
+        return buffer.lookup_series(parent, child)
+    except LogError as error:
+        raise StageError(error.code, error.what, where=where, hint=error.hint) from error
 
 
-def to_base_link(arrays: PoseArrays, topics: list[TopicColumns], topic: str) -> tuple[PoseArrays, list[Finding]]:
-    return arrays, []
+def _choose_frames(buffer: TransformBuffer, where: str) -> tuple[str, str]:
+    parents = {link.child: link.parent for link in buffer.links()}
+    frames = buffer.frames()
+    bases = [frame for base in _BASES for frame in frames if frame.rsplit("/", 1)[-1] == base]
+    if not bases:
+        raise StageError(
+            "no_base_frame",
+            "the transforms have no frame called base_link, base_footprint or base",
+            where=where,
+            hint=f"Name both: [pose] frames = [parent, child]. Known frames: {', '.join(frames) or 'none'}.",
+        )
+    child = bases[0]
+    above = [child]
+    while parents.get(above[-1]) is not None and parents[above[-1]] not in above:
+        above.append(parents[above[-1]])
+    named = [frame for fixed in _FIXED for frame in above[1:] if frame.rsplit("/", 1)[-1] == fixed]
+    if not named and len(above) == 1:
+        raise StageError(
+            "no_base_frame",
+            f"the transforms give {child} no parent",
+            where=where,
+            hint=f"Name both: [pose] frames = [parent, child]. Known frames: {', '.join(frames)}.",
+        )
+    return (named[0] if named else above[-1]), child
+
+
+def describe_chain(series: TransformSeries, topic: str) -> list[Finding]:
+    """What is worth knowing about a chain."""
+    findings = [
+        Finding(
+            "transforms",
+            "info",
+            f"poses are the transform from {series.parent} to {series.child}",
+            where=topic,
+        )
+    ]
+    if series.parent.rsplit("/", 1)[-1] == "odom":
+        text = (
+            "the transforms end at odom: the poses are an odometry, which drifts and may come from the wheels"
+        )
+        findings.append(Finding("pose_is_odometry", "warning", text, where=topic))
+    return findings + [Finding("transform_note", "info", note, where=topic) for note in series.notes]
+
+
+def to_base_link(
+    arrays: PoseArrays, topics: Sequence[TopicColumns], topic: str
+) -> tuple[PoseArrays, list[Finding]]:
+    """Move poses of another frame of the vehicle to base_link, through the static transforms.
+
+    Without a static transform the poses are taken as they are, and that is said.
+    """
+    child = arrays.child.lstrip("/")
+    if not child or child.rsplit("/", 1)[-1] in _BASES:
+        return arrays, []
+    buffer = TransformBuffer([columns for columns in topics if is_transforms(columns)])
+    base = next((frame for frame in buffer.frames() if frame.rsplit("/", 1)[-1] == _BASES[0]), "")
+    try:
+        offset = buffer.lookup_series(child, base, at=np.zeros(1, dtype=np.int64)) if base else None
+    except LogError:
+        offset = None
+    if offset is None or offset.position.shape[0] == 0:
+        text = (
+            f"{topic} gives poses of {child!r}, and no static transform leads from there to base_link: "
+            "they were taken as poses of base_link (a lever arm would look like lateral slip in turns)"
+        )
+        return arrays, [Finding("child_frame", "warning", text, where=topic)]
+    good = np.isfinite(arrays.quaternion).all(axis=1) & (np.linalg.norm(arrays.quaternion, axis=1) > 1e-6)  # noqa: PLR2004 - not a zero quaternion
+    unit = arrays.quaternion[good] / np.linalg.norm(arrays.quaternion[good], axis=1, keepdims=True)
+    position, quaternion = arrays.position.copy(), arrays.quaternion.copy()
+    position[good], quaternion[good] = move_to_base(
+        arrays.position[good], unit, offset.position[0], offset.quaternion[0]
+    )
+    text = f"{topic} gives poses of {child!r}: moved to base_link through the static transforms"
+    moved = PoseArrays(position, quaternion, arrays.parent, base)
+    return moved, [Finding("child_frame", "info", text, where=topic)]

@@ -1,0 +1,107 @@
+"""`slip explain`: where a number came from."""
+
+from __future__ import annotations
+
+import json as encoder
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+
+from pipeline.cli.output import CLEAN, print_json
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.store import Manifest
+
+
+def register(app: App) -> None:
+    """Add the verb."""
+    app.command(explain)
+
+
+def explain(  # noqa: D417 - arguments document themselves
+    run: Annotated[str, Parameter(help="name of a run, or its log")],
+    column: Annotated[str | None, Parameter(help="a column, as table.column, to be told what it is")] = None,
+    /,
+    *,
+    out: Path = Path("results"),
+    json: bool = False,
+) -> int:
+    """Say from which log, configuration and versions a run's numbers came.
+
+    Args:
+        out: results folder.
+        json: print one JSON object.
+    """
+    from pipeline.job.lookup import find_run  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    manifest = find_run(run, Store(out))
+    about = _describe_column(column) if column else {}
+    if json:
+        print_json({"run": manifest.run, "key": manifest.key, **manifest.details, "column": about or None})
+        return CLEAN
+    for line in _describe(manifest):
+        print(line)
+    if about:
+        print(f"\n{column}: " + ", ".join(f"{key} {value}" for key, value in about.items()))
+    return CLEAN
+
+
+def _describe_column(column: str) -> dict[str, str]:
+    """Unit, frame and description of a column, from its contract."""
+    from pipeline.core.errors import SlipError  # noqa: PLC0415 - only on the way to an error
+    from schemas import list_contracts  # noqa: PLC0415 - heavy
+
+    table, _, name = column.partition(".")
+    for contract in list_contracts():
+        if contract.name == table and name in contract.schema.columns():
+            return contract.metadata_of(name)
+    known = ", ".join(contract.name for contract in list_contracts())
+    raise SlipError(
+        "no_such_column",
+        f"no contract has the column {column!r}",
+        hint=f"Write table.column; the tables are {known}.",
+    )
+
+
+def _describe(manifest: Manifest) -> list[str]:
+    details = manifest.details
+    log = _part(details, "log")
+    lines = [
+        f"run            {manifest.run}",
+        f"generation     {manifest.key}    {manifest.folder}",
+        f"log            {log.get('path')}",
+        f"sha256         {log.get('sha256')}",
+        f"vehicle        {_part(details, 'vehicle').get('name')}, dataset {details.get('dataset')}",
+        "versions       " + ", ".join(f"{name} {text}" for name, text in _part(details, "versions").items()),
+        "stages",
+    ]
+    for stage, entry in _part(details, "stages").items():
+        key = entry.get("key") if isinstance(entry, dict) else ""
+        lines.append(f"  {stage:<13}{key}")
+    lines.append("tables")
+    for table, stored in sorted(manifest.tables.items()):
+        quarantined = f", {stored.quarantined} in quarantine" if stored.quarantined else ""
+        contract = f"contract {stored.contract_version}"
+        lines.append(f"  {table:<13}{stored.rows} rows{quarantined}    {contract}    {stored.sha256[:16]}")
+    lines.append("configuration")
+    lines.append("  " + encoder.dumps(_without_defaults(_part(details, "configuration"))))
+    return lines
+
+
+def _part(content: Mapping[str, object], key: str) -> dict[str, object]:
+    found = content.get(key)
+    return dict(found) if isinstance(found, dict) else {}
+
+
+def _without_defaults(configuration: Mapping[str, object]) -> dict[str, object]:
+    """What the configuration says beyond empty values."""
+    kept: dict[str, object] = {}
+    for key, value in configuration.items():
+        inner = _without_defaults(value) if isinstance(value, dict) else value
+        if inner not in (None, {}, []):
+            kept[key] = inner
+    return kept

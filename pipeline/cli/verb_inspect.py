@@ -1,0 +1,128 @@
+"""`slip inspect`: what a log holds, how healthy it is, and which topics would serve."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+
+from pipeline.cli.choices import Choices, build_options
+from pipeline.cli.output import CLEAN, LOSSY, print_json
+from pipeline.cli.screen import format_duration
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.job.inspection import Inspection, TopicHealth
+
+_ROLES = ("command", "wheels", "pose", "imu", "interval")
+
+
+def register(app: App) -> None:
+    """Add the verb."""
+    app.command(inspect)
+
+
+def inspect(
+    log: Annotated[Path, Parameter(help="a log, MCAP file or folder of a split recording")],
+    /,
+    *,
+    choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
+    json: bool = False,
+) -> int:
+    """Show topics, rates, gaps, clocks and damage of a log, and which topics would serve, and why."""
+    from pipeline.job.inspection import inspect_log  # noqa: PLC0415 - heavy
+
+    options = build_options(choices)
+    seen = inspect_log(log, config=options.config, overrides=options.overrides)
+    if json:
+        print_json(_as_json(seen))
+    else:
+        print("\n".join(_describe(seen)))
+    return LOSSY if seen.losses else CLEAN
+
+
+def _as_json(seen: Inspection) -> dict[str, object]:
+    index, sources = seen.index, seen.sources
+    return {
+        "path": str(index.path),
+        "bytes": index.size_bytes,
+        "profile": index.profile,
+        "library": index.library,
+        "duration_s": index.duration_s,
+        "messages": index.message_count,
+        "chunks": index.chunk_count,
+        "compressions": list(index.compressions),
+        "complete": not seen.losses,
+        "losses": [
+            {
+                "kind": loss.kind,
+                "bytes": loss.bytes,
+                "chunks": loss.chunks,
+                "start_ns": loss.start_ns,
+                "end_ns": loss.end_ns,
+                "text": loss.text,
+            }
+            for loss in seen.losses
+        ],
+        "notes": list(seen.notes),
+        "metadata": {name: dict(record) for name, record in index.metadata.items()},
+        "topics": [vars(topic) for topic in seen.topics],
+        "vehicle": seen.vehicle.id if seen.vehicle else None,
+        "roles": {
+            role: None
+            if sources is None or (source := getattr(sources, role)) is None
+            else {"topic": str(source), "reason": source.reason}
+            for role in _ROLES
+        },
+        "problem": seen.problem or None,
+    }
+
+
+def _describe(seen: Inspection) -> list[str]:
+    index = seen.index
+    packing = ", ".join(name or "none" for name in index.compressions) or "none"
+    lines = [
+        (
+            f"log       {index.path}    {index.size_bytes / 1e6:.1f} MB, {format_duration(index.duration_s)}, "
+            f"{index.message_count} messages"
+        ),
+        (
+            f"          {index.chunk_count} chunks, compression {packing}, "
+            f"profile {index.profile or '-'}, written by {index.library or '-'}"
+        ),
+        f"health    {'complete' if not seen.losses else 'with losses'}",
+    ]
+    lines += [f"  lost    {loss.text}" for loss in seen.losses]
+    lines += [f"  note    {note}" for note in seen.notes]
+    for name, record in index.metadata.items():
+        lines.append(f"metadata  {name}: " + ", ".join(f"{key} = {value}" for key, value in record.items()))
+    lines += ["", *_describe_topics(seen.topics), ""]
+    lines.append(f"vehicle   {seen.vehicle.name if seen.vehicle else 'unknown'}")
+    if seen.sources is not None:
+        for role in _ROLES:
+            source = getattr(seen.sources, role)
+            lines.append(f"{role:<10}{f'{source}    {source.reason}' if source else '-'}")
+        lines += [f"          {note}" for note in seen.sources.notes]
+    if seen.problem:
+        lines.append(f"problem   {seen.problem}")
+    return lines
+
+
+def _describe_topics(topics: Sequence[TopicHealth]) -> list[str]:
+    width = max([len(topic.topic) for topic in topics] + [5])
+    kind = max([len(topic.type_name) for topic in topics] + [4])
+    numbers = f"{'messages':>8}  {'Hz':>7}  {'gaps':>5}  {'longest':>8}  {'late':>8}"
+    head = f"{'topic':<{width}}  {'type':<{kind}}  {numbers}"
+    return [head, *(_describe_topic(topic, width, kind) for topic in topics)]
+
+
+def _describe_topic(topic: TopicHealth, width: int, kind: int) -> str:
+    rate = "-" if topic.rate_hz is None else f"{topic.rate_hz:.4g}"
+    gap = "-" if topic.largest_gap_s is None else f"{topic.largest_gap_s:.3g} s"
+    late = "-" if topic.latency_s is None else f"{topic.latency_s * 1e3:.0f} ms"
+    return (
+        f"{topic.topic:<{width}}  {topic.type_name:<{kind}}  {topic.messages:>8}  {rate:>7}  "
+        f"{topic.gaps:>5}  {gap:>8}  {late:>8}"
+    )

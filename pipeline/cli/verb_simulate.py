@@ -1,0 +1,101 @@
+"""`slip simulate`: logs with known effects, for teaching and tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter
+from cyclopts.types import PositiveFloat
+
+from pipeline.cli.output import CLEAN, print_json
+from pipeline.core.errors import SlipError
+
+
+def register(app: App) -> None:
+    """Add the verb."""
+    app.command(simulate)
+
+
+def simulate(  # noqa: D417 - arguments document themselves
+    case: Annotated[str | None, Parameter(help="a named case; without one, a plain vehicle")] = None,
+    /,
+    *,
+    effect: Annotated[
+        list[str] | None,
+        Parameter(help="ID, ID=VALUE or ID=NAME:VALUE,NAME:VALUE; may be repeated", negative=()),
+    ] = None,
+    out: Path = Path("run.mcap"),
+    seed: int | None = None,
+    duration: PositiveFloat | None = None,
+    vehicle: str | None = None,
+    layout: str | None = None,
+    program: str | None = None,
+    cases: Annotated[bool, Parameter(negative=())] = False,
+    json: bool = False,
+) -> int:
+    """Write a log with known physics; the truth stays out of it.
+
+    Args:
+        out: the log to write.
+        seed: seed of driving and noise.
+        duration: length of the run [s].
+        vehicle: simulated vehicle.
+        layout: layout of topics.
+        program: how the vehicle is driven.
+        cases: list the cases and effects instead.
+        json: print one JSON object.
+    """
+    from pipeline.simulate import list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy
+
+    if cases:
+        _print_catalogue(
+            [(found.name, found.shows) for found in list_cases()],
+            [(found.id, found.formula) for found in list_effects()],
+            json=json,
+        )
+        return CLEAN
+    effects = dict(_parse_effect(text) for text in effect or [])
+    path = simulate_case(
+        case,
+        effects,
+        out=out,
+        seed=seed,
+        duration_s=duration,
+        vehicle=vehicle,
+        layout=layout,
+        program=program,
+    )
+    if json:
+        print_json({"path": str(path), "effects": effects})
+    else:
+        print(path)
+    return CLEAN
+
+
+def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:
+    """`drive_lag`, `drive_lag=0.6` or `turn_lag=tau_mean:0.4,tau_diff:1.2`."""
+    name, given, values = text.partition("=")
+    if not given:
+        return name, {}
+    try:
+        if ":" not in values:
+            return name, float(values)
+        pairs = (pair.partition(":") for pair in values.split(","))
+        return name, {key.strip(): float(value) for key, _, value in pairs}
+    except ValueError:
+        raise SlipError(
+            "bad_effect",
+            f"the effect {text!r} has no number where one belongs",
+            hint="Write ID, ID=VALUE or ID=NAME:VALUE,NAME:VALUE; `slip simulate --cases` lists them.",
+        ) from None
+
+
+def _print_catalogue(cases: list[tuple[str, str]], effects: list[tuple[str, str]], *, json: bool) -> None:
+    if json:
+        print_json({"cases": dict(cases), "effects": dict(effects)})
+        return
+    for title, rows in (("cases", cases), ("effects", effects)):
+        print(title)
+        for name, text in rows:
+            print(f"  {name:<24}{text}")

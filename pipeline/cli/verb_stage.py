@@ -1,0 +1,53 @@
+"""`slip stage`: one stage alone, from the stored tables of the one before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from pipeline.cli.choices import Choices, build_options
+from pipeline.cli.output import CLEAN, LOSSY, print_json, show_progress
+
+
+def register(app: App) -> None:
+    """Add the verb."""
+    app.command(stage)
+
+
+def stage(  # noqa: D417 - the shared choices document themselves
+    name: Literal["extract", "velocity", "slip", "aggregate"],
+    log: Annotated[str, Parameter(help="a log, or the name of a run that has results")],
+    /,
+    *,
+    choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
+    force: bool = False,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Run one stage of a log; stages before it are reused where nothing changed.
+
+    Args:
+        name: the stage.
+        force: compute again what is already there.
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.job.analyze import analyze_log  # noqa: PLC0415 - heavy
+    from pipeline.job.lookup import find_log  # noqa: PLC0415 - heavy
+
+    options = build_options(choices, force=force, through=name)
+    path = find_log(log, options.out)
+    with show_progress(path.name, quiet=quiet or json) as progress:
+        outcome = analyze_log(Path(path), options, progress)
+    tables = {table: entry.rows for table, entry in sorted(outcome.manifest.tables.items())}
+    if json:
+        print_json({"run": outcome.manifest.run, "computed": list(outcome.computed), "rows": tables})
+    elif not quiet:
+        done = ", ".join(outcome.computed) or "nothing: all is as before"
+        print(f"run       {outcome.manifest.run}\ncomputed  {done}")
+        for table, rows in tables.items():
+            print(f"  {table:<12}{rows:>9} rows")
+        print(f"in        {outcome.manifest.folder}")
+    return LOSSY if outcome.lossy else CLEAN

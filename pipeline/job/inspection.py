@@ -1,0 +1,129 @@
+"""What a log holds and how healthy it is, without analyzing it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.core.errors import SlipError
+from pipeline.logs import ChannelInfo, LogIndex, Loss, Wanted, open_log, read_topics
+from pipeline.vehicles import (
+    Configuration,
+    Sources,
+    Vehicle,
+    choose_sources,
+    find_preset,
+    load_configuration,
+    resolve_vehicle,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+_GAP_PERIODS = 3.0
+_SMALLEST_GAP_S = 0.12
+
+
+@dataclass(frozen=True)
+class TopicHealth:
+    """One channel's times.
+
+    Attributes:
+        topic: name.
+        type_name: message type.
+        messages: how many there are.
+        rate_hz: one over the median period of log times; None with fewer than two messages.
+        largest_gap_s: longest time between two messages.
+        gaps: times between messages of more than three periods (and 0.12 s).
+        latency_s: median of log time minus header stamp; None without stamps.
+    """
+
+    topic: str
+    type_name: str
+    messages: int
+    rate_hz: float | None = None
+    largest_gap_s: float | None = None
+    gaps: int = 0
+    latency_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """A log's health: index, topics, losses, and which topics would serve."""
+
+    index: LogIndex
+    topics: tuple[TopicHealth, ...]
+    losses: tuple[Loss, ...]
+    notes: tuple[str, ...]
+    vehicle: Vehicle | None
+    sources: Sources | None
+    problem: str
+
+
+def inspect_log(path: Path, *, config: Path | None, overrides: Mapping[str, object]) -> Inspection:
+    """Look at a log.
+
+    Raises:
+        LogError: the log cannot be read.
+        ConfigurationError: the configuration is wrong.
+    """
+    index = open_log(path)
+    configuration = load_configuration(path, given=config, overrides=overrides)
+    channels = [channel for channel in index.channels if channel.message_count]
+    data = read_topics(path, [Wanted(topic, ()) for topic in dict.fromkeys(c.topic for c in channels)])
+    times = {columns.channel_id: (columns.log_time, columns.header_time) for columns in data.topics}
+    topics = tuple(
+        _measure_topic(channel, *times.get(channel.id, (np.zeros(0, dtype=np.int64), None)))
+        for channel in index.channels
+    )
+    vehicle, sources, problem = _choose(index, configuration)
+    return Inspection(index, topics, data.losses, data.notes, vehicle, sources, problem)
+
+
+def _measure_topic(
+    channel: ChannelInfo, log_time: NDArray[np.int64], header_time: NDArray[np.int64] | None
+) -> TopicHealth:
+    plain = TopicHealth(channel.topic, channel.type_name, channel.message_count)
+    if log_time.size < 2:  # noqa: PLR2004 - one message has no rate
+        return plain
+    periods = np.diff(np.sort(log_time)).astype(np.float64) / 1e9
+    median = float(np.median(periods))
+    latency = None
+    if header_time is not None and header_time.any():
+        latency = float(np.median(log_time - header_time)) / 1e9
+    return TopicHealth(
+        channel.topic,
+        channel.type_name,
+        channel.message_count,
+        rate_hz=1.0 / median if median > 0.0 else None,
+        largest_gap_s=float(periods.max()),
+        gaps=int((periods > max(_GAP_PERIODS * median, _SMALLEST_GAP_S)).sum()),
+        latency_s=latency,
+    )
+
+
+def _choose(index: LogIndex, configuration: Configuration) -> tuple[Vehicle | None, Sources | None, str]:
+    """Vehicle and sources as an analysis would choose them; a problem is told, not raised."""
+    recorded = index.metadata.get("deployment", {}).get("vehicle")
+    problem, vehicle = "", None
+    try:
+        vehicle = resolve_vehicle(configuration.vehicle, recorded=recorded, where=str(index.path))
+    except SlipError as error:
+        problem = str(error)
+    # Which topics would serve hardly depends on the vehicle: any differential one stands in for an unknown.
+    stand_in = vehicle or find_preset("husky_a200")
+    if stand_in is None:
+        return vehicle, None, problem
+    try:
+        return (
+            vehicle,
+            choose_sources(index.channels, configuration, stand_in, where=str(index.path)),
+            problem,
+        )
+    except SlipError as error:
+        return vehicle, None, problem or str(error)
