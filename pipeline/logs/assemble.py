@@ -28,31 +28,26 @@ class ColumnParts:
 
     def __init__(self, leaf: Leaf) -> None:
         self._leaf = leaf
-        self._ids: list[Ints] = []
         self._pieces: list[Piece] = []
 
-    def add(self, ids: Ints, piece: Piece) -> None:
-        """Take the values of some rows."""
-        self._ids.append(ids)
+    def add(self, piece: Piece) -> None:
+        """Take the values of the next rows."""
         self._pieces.append(piece)
 
-    def column(self, rows: Ints, vocabulary: Vocabulary | None) -> Column:
-        """The column of the given rows, in their order.
+    def take_column(self, order: Ints, vocabulary: Vocabulary | None) -> Column:
+        """The column of some rows; gives the pieces up, so that memory holds every value about once.
 
         Args:
-            rows: numbers of rows that were added.
+            order: places of the rows among those that were added.
             vocabulary: of a string field.
         """
-        ids = np.concatenate([np.empty(0, dtype=np.int64), *self._ids])
-        position = np.empty(int(ids.max(initial=-1)) + 1, dtype=np.int64)
-        position[ids] = np.arange(ids.size)
-        order = position[rows]
         values = np.concatenate([self._leaf.nothing, *(piece.values for piece in self._pieces)])
+        counts = [piece.counts for piece in self._pieces if piece.counts is not None]
+        self._pieces = []
         texts = () if vocabulary is None else vocabulary.texts()
         if not self._leaf.ragged:
             values = _take(values, order)
             return Strings(values.astype(np.int32, copy=False), texts) if self._leaf.text else values
-        counts = [piece.counts for piece in self._pieces if piece.counts is not None]
         count = np.concatenate([np.empty(0, dtype=np.int64), *counts])
         if not _is_plain(order, count.size):
             values = take_ragged(values, count, order)

@@ -50,7 +50,7 @@ class PayloadDecoder(Protocol):
         """Decode a block; ``ids`` are the numbers of its rows in the channel."""
 
     def columns(self, rows: Ints) -> dict[str, Column]:
-        """Columns of the given rows, in their order."""
+        """Columns of the given rows, in their order; to be asked once."""
 
     @property
     def rejected(self) -> list[Rejected]:
@@ -71,6 +71,7 @@ class StructuredDecoder:
         self._ros1 = encoding == "ros1"
         self._decoder = Decoder(self._plan, {})
         self._parts = {path: ColumnParts(leaf) for path, leaf in wanted_leaves(self._plan)}
+        self._ids: list[Ints] = []
         self.rejected: list[Rejected] = []
 
     def decode(self, ids: Ints, block: Block) -> None:
@@ -102,8 +103,9 @@ class StructuredDecoder:
         if chosen.size < ids.size:
             base, limit, stride = base[chosen], limit[chosen], None
         pieces, kept = self._decoder.decode(Cursor(block.data, base, limit, chosen, stride, dialect))
+        self._ids.append(ids[kept])
         for path, piece in pieces.items():
-            self._parts[path].add(ids[kept], piece)
+            self._parts[path].add(piece)
         if kept.size < chosen.size:
             missing = np.ones(ids.size, dtype=np.bool_)
             missing[kept] = False
@@ -114,11 +116,13 @@ class StructuredDecoder:
         self.rejected.append(Rejected(kind, reason, ids[wrong], int(block.size[wrong].sum())))
 
     def columns(self, rows: Ints) -> dict[str, Column]:
-        """Columns of the given rows, in their order."""
-        return {
-            path: parts.column(rows, self._decoder.vocabularies.get(path))
-            for path, parts in self._parts.items()
-        }
+        """Columns of the given rows, in their order; to be asked once."""
+        ids = np.concatenate([np.empty(0, dtype=np.int64), *self._ids])
+        place = np.empty(int(ids.max(initial=-1)) + 1, dtype=np.int64)
+        place[ids] = np.arange(ids.size)
+        order = place[rows]
+        vocabularies = self._decoder.vocabularies
+        return {path: part.take_column(order, vocabularies.get(path)) for path, part in self._parts.items()}
 
 
 @dataclass(slots=True)

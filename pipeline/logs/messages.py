@@ -78,7 +78,7 @@ class _Found:
     damage: list[tuple[int, int]] = field(default_factory=list)
 
 
-def locate_messages(chunk: Buffer, entries: Sequence[tuple[int, NDArray[np.void]]] | None) -> Messages:
+def locate_messages(chunk: Buffer, entries: Sequence[tuple[int, NDArray[np.uint64]]] | None) -> Messages:
     """Find all messages of a chunk.
 
     Args:
@@ -87,19 +87,21 @@ def locate_messages(chunk: Buffer, entries: Sequence[tuple[int, NDArray[np.void]
     """
     data = np.frombuffer(chunk, dtype=np.uint8)
     found = _Found()
-    offsets = None if entries is None else _agreeing_offsets(data, entries)
-    if offsets is None:
+    agreed = None if entries is None else _agreeing_messages(data, entries)
+    if agreed is None:
         _walk(chunk, 0, data.size, found)
         offsets = np.array(found.offsets, dtype=np.int64)
+        heads = _heads(data, offsets)
     else:
-        ends = offsets + rec.HEAD_SIZE + _heads(data, offsets)["length"].astype(np.int64)
-        starts = np.r_[offsets, data.size]
-        ends = np.r_[0, ends]
-        for gap in np.flatnonzero(starts > ends).tolist():
-            _walk(chunk, int(ends[gap]), int(starts[gap]), found)
+        offsets, heads = agreed
+        ends = offsets + rec.HEAD_SIZE + heads["length"].astype(np.int64)
+        gaps = np.flatnonzero(np.append(offsets, data.size) > np.append(0, ends))
+        for gap in gaps.tolist():
+            start = int(ends[gap - 1]) if gap else 0
+            _walk(chunk, start, int(offsets[gap]) if gap < offsets.size else data.size, found)
         if found.offsets:
-            offsets = np.sort(np.r_[offsets, np.array(found.offsets, dtype=np.int64)])
-    heads = _heads(data, offsets)
+            offsets = np.sort(np.append(offsets, np.array(found.offsets, dtype=np.int64)))
+            heads = _heads(data, offsets)
     return Messages(
         start=offsets + MESSAGE_OVERHEAD,
         size=heads["length"].astype(np.int64) - (MESSAGE_OVERHEAD - rec.HEAD_SIZE),
@@ -121,33 +123,28 @@ def _heads(data: NDArray[np.uint8], offsets: Ints) -> NDArray[np.void]:
     return window[offsets]
 
 
-def _agreeing_offsets(
-    data: NDArray[np.uint8], entries: Sequence[tuple[int, NDArray[np.void]]]
-) -> Ints | None:
-    """Offsets of the index in ascending order, None unless every entry points to the message it names."""
-    counted = [(channel, entry) for channel, entry in entries if entry.size]
-    if not counted or data.size < MESSAGE_HEAD.itemsize:
+def _agreeing_messages(
+    data: NDArray[np.uint8], entries: Sequence[tuple[int, NDArray[np.uint64]]]
+) -> tuple[Ints, NDArray[np.void]] | None:
+    """Offsets and heads by offset, None unless every entry of the index points to the message it names."""
+    joined = np.concatenate([np.empty((0, 2), dtype=np.uint64), *(entry for _, entry in entries)])
+    if joined.size == 0 or data.size < MESSAGE_HEAD.itemsize:
         return None
-    joined = np.concatenate([entry for _, entry in counted])
-    channel = np.repeat([channel for channel, _ in counted], [entry.size for _, entry in counted])
-    if (joined["offset"] > data.size - MESSAGE_HEAD.itemsize).any():
+    if joined[:, 1].max() > data.size - MESSAGE_HEAD.itemsize:
         return None
-    offsets = joined["offset"].astype(np.int64)
+    channel = np.repeat([channel for channel, _ in entries], [entry.shape[0] for _, entry in entries])
+    order = np.argsort(joined[:, 1], kind="stable")
+    offsets = joined[order, 1].astype(np.int64)
     heads = _heads(data, offsets)
-    room = (data.size - offsets - rec.HEAD_SIZE).astype(np.uint64)
-    agrees = (
-        (heads["opcode"] == rec.MESSAGE)
-        & (heads["channel"] == channel)
-        & (heads["log_time"] == joined["log_time"])
-        & (heads["length"] >= MESSAGE_HEAD.itemsize - rec.HEAD_SIZE)
-        & (heads["length"] <= room)
-    )
+    length = heads["length"]
+    agrees = (heads["opcode"] == rec.MESSAGE) & (heads["channel"] == channel[order])
+    agrees &= heads["log_time"] == joined[order, 0]
+    agrees &= (length >= MESSAGE_HEAD.itemsize - rec.HEAD_SIZE) & (length <= data.size)
     if not agrees.all():
         return None
-    order = np.argsort(offsets, kind="stable")
-    offsets = offsets[order]
-    ends = offsets + rec.HEAD_SIZE + heads["length"][order].astype(np.int64)
-    return offsets if (offsets[1:] >= ends[:-1]).all() else None
+    ends = offsets + rec.HEAD_SIZE + length.astype(np.int64)
+    apart = ends[-1] <= data.size and (offsets[1:] >= ends[:-1]).all()
+    return (offsets, heads) if apart else None
 
 
 def _walk(chunk: Buffer, start: int, end: int, found: _Found) -> None:

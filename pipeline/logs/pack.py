@@ -101,10 +101,8 @@ def pack_chunk(batch: Batch, side: bytes, compression: str) -> tuple[bytes, byte
     place = len(chunk)
     for channel in np.unique(batch.channel).tolist():
         chosen = batch.channel == channel
-        entries = np.empty(int(chosen.sum()), dtype=rec.ENTRY)
-        entries["log_time"] = batch.log_time[chosen]
-        entries["offset"] = batch.offset[chosen] + len(side)
-        offsets[channel], counts[channel] = place, entries.size
+        entries = np.stack((batch.log_time[chosen], batch.offset[chosen] + len(side)), axis=1).astype("<u8")
+        offsets[channel], counts[channel] = place, entries.shape[0]
         body = number(channel, 2) + number(entries.nbytes, 4) + entries.tobytes()
         indexes.append(pack_record(rec.MESSAGE_INDEX, body))
         place += len(indexes[-1])

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 MAGIC: Final = b"\x89MCAP0\r\n"
 HEAD: Final = struct.Struct("<BQ")
 HEAD_SIZE: Final = HEAD.size
-MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 FOOTER_SIZE: Final = HEAD_SIZE + 20
 
 HEADER: Final = 0x01
@@ -59,7 +58,8 @@ LEAST_BODY: Final[Mapping[int, int]] = {
 }
 """Fewest bytes of the body of every kind of record."""
 
-ENTRY: Final = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+_INDEX_HEAD: Final = struct.Struct("<HI")
+_ENTRY_SIZE: Final = 16
 
 
 class RecordError(ValueError):
@@ -214,11 +214,15 @@ def parse_chunk_head(body: Buffer, body_size: int) -> ChunkHead:
     return ChunkHead(start, end, size, crc, compression, stored, HEAD_SIZE + parser.place)
 
 
-def parse_message_index(body: Buffer) -> tuple[int, NDArray[np.void]]:
-    """Channel and entries (log_time, offset in the chunk) of a message index."""
-    parser = Parser(body)
-    channel, size = parser.number(2), parser.number(4)
-    return channel, np.frombuffer(parser.take(size - size % ENTRY.itemsize), dtype=ENTRY)
+def parse_message_index(body: Buffer) -> tuple[int, NDArray[np.uint64]]:
+    """Channel and entries of a message index: log time [ns] and offset in the chunk, shape (n, 2)."""
+    if len(body) < _INDEX_HEAD.size:
+        raise RecordError("a message index is cut")
+    channel, size = _INDEX_HEAD.unpack_from(body)
+    if size > len(body) - _INDEX_HEAD.size:
+        raise RecordError("a message index says it is longer than its record")
+    count = size // _ENTRY_SIZE * 2
+    return channel, np.frombuffer(body, dtype="<u8", count=count, offset=_INDEX_HEAD.size).reshape(-1, 2)
 
 
 def parse_chunk_index(body: Buffer) -> ChunkIndexRecord:

@@ -237,8 +237,8 @@ def _load_start(span: Span, head: rec.ChunkHead, stored: Buffer, reason: str) ->
     return Loaded(chunk, replace(messages, damage=[]), [loss], unchecked=True)
 
 
-def _read_entries(blob: Buffer) -> list[tuple[int, NDArray[np.void]]] | None:
-    entries: list[tuple[int, NDArray[np.void]]] = []
+def _read_entries(blob: Buffer) -> list[tuple[int, NDArray[np.uint64]]] | None:
+    entries: list[tuple[int, NDArray[np.uint64]]] = []
     place = 0
     while place + rec.HEAD_SIZE <= len(blob):
         opcode, length = rec.HEAD.unpack_from(blob, place)
