@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from pipeline.store.errors import StoreError, name_disk_errors
@@ -153,7 +152,8 @@ class Generation:
         from pipeline.store.tables import QUARANTINE  # noqa: PLC0415 - heavy
 
         previous = self._require_previous(name)
-        previous.path(name)
+        if name not in previous.tables:
+            raise _nothing_to_reuse(self.run, name)
         entry = previous.tables[name]
         self._link(entry.file, entry.sha256)
         broken = f"{QUARANTINE}{name}.parquet"
@@ -170,7 +170,8 @@ class Generation:
             StoreError: as `reuse_table`.
         """
         previous = self._require_previous(name)
-        previous.path(name)
+        if name not in previous.files:
+            raise _nothing_to_reuse(self.run, name)
         self._link(name, previous.files[name].sha256)
         self._files[name] = previous.files[name]
 
@@ -206,9 +207,11 @@ class Generation:
     def discard(self) -> None:
         """Remove what was not published; without effect after a commit."""
         self._is_open = False
-        current = None
-        with suppress(StoreError, OSError):
+        try:
             current = load_manifest(self._home)
+        except (StoreError, OSError):
+            # Without a look at the manifest this may be the current generation: the next writer decides.
+            return
         # The manifest on disk decides: a commit interrupted right behind its last step is a commit.
         if current is None or current.folder != self._folder:
             shutil.rmtree(self._folder, ignore_errors=True)
@@ -277,9 +280,14 @@ class Generation:
 
     def _require_previous(self, name: str) -> Manifest:
         if self.previous is None:
-            raise StoreError(
-                "no_such_table",
-                f"there are no results of {self.run!r} to take {name!r} over from",
-                hint="Write it instead",
-            )
+            raise _nothing_to_reuse(self.run, name)
         return self.previous
+
+
+def _nothing_to_reuse(run: str, name: str) -> StoreError:
+    return StoreError(
+        "no_such_table",
+        f"the results before hold no {name!r} to take over",
+        where=run,
+        hint="Compute it instead: analyze the log with --force",
+    )

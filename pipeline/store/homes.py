@@ -34,7 +34,10 @@ def point_latest(home: Path, folder: str) -> None:
     temporary = temporary_beside(home / LATEST)
     with suppress(OSError):
         temporary.symlink_to(folder, target_is_directory=True)
-        temporary.replace(home / LATEST)
+        try:
+            temporary.replace(home / LATEST)
+        except OSError:
+            temporary.unlink()
 
 
 def remove_orphans(home: Path, current: Manifest | None) -> None:

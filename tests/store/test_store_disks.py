@@ -176,3 +176,18 @@ def test_everything_is_on_the_disk_before_it_is_pointed_to(
     assert ("sync", home) in calls[pointed:]
     assert calls[pointed - 1][0] == "sync"
     assert calls[pointed - 1][1].startswith(".tmp-")
+
+
+def test_published_generation_stays_when_its_manifest_cannot_be_looked_at(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: Path) -> bytes:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    with store.open_generation(RUN, "key") as generation:
+        generation.write_text("summary.json", "whole")
+        manifest = generation.commit({})
+        monkeypatch.setattr(Path, "read_bytes", refuse)
+    monkeypatch.undo()
+    assert store.manifest(RUN) == manifest
+    assert manifest.path("summary.json").read_text() == "whole"

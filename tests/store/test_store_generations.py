@@ -82,12 +82,21 @@ def generation_report(manifest: Manifest) -> TableReport:
 
 
 def test_reuse_refuses_what_is_not_there_or_not_what_was_written(store: Store) -> None:
-    with pytest.raises(StoreError, match="no results"), store.open_generation(RUN, "k") as generation:
+    with (
+        pytest.raises(StoreError, match="no 'slip' to take over"),
+        store.open_generation(RUN, "k") as generation,
+    ):
         generation.reuse_table("slip")
     manifest = write_generation(store, RUN, "one", 1)
-    with pytest.raises(StoreError) as caught, store.open_generation(RUN, "two") as generation:
-        generation.reuse_table("poses")
-    assert caught.value.code == "no_such_table"
+    with store.open_generation(RUN, "two") as generation:
+        for reuse, name in (
+            (generation.reuse_table, "poses"),
+            (generation.reuse_table, "summary.json"),
+            (generation.reuse_file, "slip"),
+        ):
+            with pytest.raises(StoreError) as caught:
+                reuse(name)
+            assert caught.value.code == "no_such_table"
     path = manifest.path("slip")
     data = bytearray(path.read_bytes())
     data[100] ^= 1
@@ -268,9 +277,15 @@ def test_latest_that_cannot_be_made_is_no_error(store: Store, monkeypatch: pytes
     def refuse(*_: object, **__: object) -> None:
         raise OSError("no links here")
 
-    monkeypatch.setattr(os, "symlink", refuse)
-    write_generation(store, RUN, "k", 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "symlink", refuse)
+        manifest = write_generation(store, RUN, "k", 1)
     assert read_seed(store, RUN) == 1
+
+    (manifest.folder.parent / "latest").mkdir()
+    write_generation(store, RUN, "l", 2)
+    assert read_seed(store, RUN) == 2
+    assert not list(store.root.rglob(".tmp-*"))
 
 
 def test_counts_of_the_quarantine_survive_a_round_trip(store: Store, tmp_path: Path) -> None:
