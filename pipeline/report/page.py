@@ -51,7 +51,7 @@ def _render_header(page: Page) -> str:
     report = page.report
     duration = report.part("log").get("duration_s")
     line = [
-        report.text("vehicle"),
+        report.text("vehicle_name") or report.text("vehicle"),
         report.text("terrain"),
         say_date(_first_stamp(page)),
         say_duration(float(duration)) if isinstance(duration, int | float) else "",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
+from pipeline.report.scales import round_up, usual_ends
 from pipeline.report.thinning import drop_flat_rows, find_spans, thin_series, thin_to_peaks
 
 if TYPE_CHECKING:
@@ -32,10 +32,12 @@ class Thinned:
     Attributes:
         frame: the rows that are drawn.
         total: the rows that they stand for.
+        usual: where all but lone peaks of a line lie, before anything was left out.
     """
 
     frame: pl.DataFrame
     total: int
+    usual: tuple[float, float] = (0.0, 0.0)
 
     @property
     def is_shorter(self) -> bool:
@@ -166,16 +168,11 @@ class Scene:
     def _join_lines(self, lines: list[tuple[pl.DataFrame, str, str]]) -> Thinned | None:
         if not lines:
             return None
-        parts, total = [], 0
+        parts, total, ends = [], 0, []
         for frame, column, series in lines:
             # Flat stretches go first, so that a held command keeps its edges where they were.
             line = drop_flat_rows(frame.select("t", "piece", value=pl.col(column)), "value")
             parts.append(thin_series(line, "value", bins=LINE_BINS).with_columns(series=pl.lit(series)))
             total += line.height
-        return Thinned(pl.concat(parts), total)
-
-
-def round_up(value: float) -> float:
-    """The next number of two significant digits, for example 1.53 to 1.6."""
-    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
-    return float(f"{math.ceil(value / unit - 1e-9) * unit:.12g}")
+            ends += usual_ends(frame[column], exact=column.startswith("f_"))
+        return Thinned(pl.concat(parts), total, (min(ends), max(ends)))

@@ -93,7 +93,7 @@ def chart_config() -> dict[str, object]:
         "axis": axis,
         "legend": legend,
         "view": {"stroke": None},
-        "line": {"strokeWidth": 1.4, "strokeJoin": "round", "strokeCap": "round"},
+        "line": {"strokeWidth": 1.2, "strokeJoin": "round", "strokeCap": "round"},
         "title": {
             "anchor": "start",
             "color": INK,

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 _MISSING = "\u2013"
 _MINUTE, _HOUR = 60.0, 3600.0
 _KILOMETRE = 1000.0
+_MOST_PLACES = 3
 _EARLIEST_YEAR = 2000
 
 
@@ -31,6 +32,11 @@ def _is_control(mark: str) -> bool:
     return unicodedata.category(mark).startswith("C") and mark not in "\n\t"
 
 
+def begin_large(text: str) -> str:
+    """The text with a capital at its start."""
+    return text[:1].upper() + text[1:]
+
+
 def encode_json(value: object) -> str:
     """JSON that may stand inside a script element: nothing in it can end the element or start a comment."""
     packed = json.dumps(value, separators=(",", ":"), sort_keys=True, ensure_ascii=True, allow_nan=False)
@@ -38,13 +44,13 @@ def encode_json(value: object) -> str:
 
 
 def say_number(value: float | None, *, digits: int = 3) -> str:
-    """A number with so many significant digits, a dash when there is none."""
+    """A number with so many significant digits, at most three decimals; a dash when there is none."""
     if value is None or not math.isfinite(value):
         return _MISSING
     if value == 0.0:
         return "0"
     places = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-    return f"{value:,.{min(places, 6)}f}".replace("-", "\u2212")
+    return f"{value:,.{min(places, _MOST_PLACES)}f}".replace("-", "\u2212")
 
 
 def say_share(value: float | None) -> str:

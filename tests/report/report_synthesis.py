@@ -110,6 +110,7 @@ def make_summary(tables: dict[str, pl.DataFrame], names: dict[str, str]) -> dict
         "by_input": by_input,
         "split": split,
         "held_poses": 0.52,
+        "quarantined": {"poses": {"rows": 3, "rules": {"quaternion_has_unit_length": 3}}},
         "distance_m": 1421.0,
         "findings": [
             {key: row[key] for key in ("id", "severity", "text", "where", "t_start", "t_end")}

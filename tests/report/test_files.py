@@ -7,13 +7,16 @@ import re
 import time
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+import polars as pl
 import pytest
 from report_synthesis import make_report
 
 from pipeline.report import FORMATS, ReportError, RunReport, theme, warm_bundle, write_figures
 from pipeline.report.bundle import cache_path, load_bundle
 from pipeline.report.figures import list_figures
-from pipeline.report.scene import Scene, round_up
+from pipeline.report.scales import find_range, round_up, usual_ends
+from pipeline.report.scene import Scene
 from pipeline.report.specs import build_spec
 
 if TYPE_CHECKING:
@@ -89,6 +92,25 @@ def test_the_ramp_of_slip_is_monotonous_in_lightness() -> None:
 )
 def test_scales_end_on_two_digits(value: float, up: float) -> None:
     assert round_up(value) == pytest.approx(up)
+
+
+def test_lone_peaks_are_cut_from_an_axis_and_told() -> None:
+    wave = np.sin(np.arange(2000) / 50)
+    calm = pl.DataFrame({"t": np.arange(2000) / 20, "value": wave})
+    low, high = usual_ends(calm["value"], exact=False)
+    assert find_range(calm, (low, high)).beyond is None
+    peaked = calm.with_columns(value=pl.when(pl.col("t") == 40.0).then(-31.0).otherwise(pl.col("value")))
+    low, high = usual_ends(peaked["value"], exact=False)
+    shown = find_range(peaked, (low, high))
+    assert shown.beyond == (-31.0, 40.0)
+    assert -2.0 < shown.low < -0.99
+    assert 0.99 < shown.high < 2.0
+
+
+def test_what_was_asked_is_never_cut() -> None:
+    asked = pl.Series([0.0] * 999 + [5.0])
+    assert usual_ends(asked, exact=True) == [0.0, 5.0]
+    assert usual_ends(asked, exact=False) == [0.0, 0.0]
 
 
 @pytest.fixture

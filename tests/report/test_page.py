@@ -247,15 +247,24 @@ def test_without_measured_wheels_nothing_is_said_about_the_ground() -> None:
     assert 'id="why"' not in page
 
 
+def test_a_grave_finding_stands_before_the_numbers() -> None:
+    report = make_report(duration_s=20.0)
+    grave = {"id": "not_moving", "severity": "error", "text": "the vehicle does not move", "where": ""}
+    page = render_report(RunReport({**report.summary, "findings": [grave]}, report.tables))
+    warned = page.index("Do not draw conclusions")
+    assert warned < page.index("The vehicle does not move") < page.index("median slip")
+
+
 def test_losses_and_findings_are_told_gravest_first(page: str) -> None:
     assert "log has losses (1)" in page
     assert "48.2 kB" in page
+    assert "quaternion_has_unit_length" in page
     assert page.index("take care") < page.index(">note<")
 
 
 @pytest.mark.parametrize(
     ("value", "words"),
-    [(1234.5, "1,234"), (0.0534, "0.0534"), (-2.0, "\u22122.00"), (None, "\u2013"), (0.0, "0")],
+    [(1234.5, "1,234"), (0.0534, "0.053"), (-2.0, "\u22122.00"), (None, "\u2013"), (0.0, "0")],
 )
 def test_numbers_keep_three_digits(value: float | None, words: str) -> None:
     assert say_number(value) == words

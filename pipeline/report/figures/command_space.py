@@ -11,7 +11,7 @@ from pipeline.report import theme
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
 from pipeline.report.run import INPUT_WORDS
-from pipeline.report.scene import round_up
+from pipeline.report.scales import round_up
 
 if TYPE_CHECKING:
     from pipeline.report.scene import Scene

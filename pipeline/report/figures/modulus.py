@@ -9,6 +9,7 @@ import altair as alt
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
 from pipeline.report.run import INPUT_WORDS
+from pipeline.report.scales import find_range
 from pipeline.report.words import say_number
 
 if TYPE_CHECKING:
@@ -20,18 +21,22 @@ def draw_modulus(scene: Scene) -> Drawing | None:
     lines = scene.modulus_lines
     if lines is None:
         return None
+    shown = find_range(lines.frame, lines.usual)
     line = (
         alt.Chart(alt.NamedData("modulus"))
         .mark_line(clip=True)
         .encode(
             x=parts.time_axis(scene),
-            y=parts.value_axis(),
+            y=parts.value_axis(shown),
             color=parts.series_colour(list(scene.slip), INPUT_WORDS),
             detail="piece:N",
         )
     )
     chart = alt.layer(*parts.shade_spans(), line).properties(
-        width=parts.WIDTH, height=150, title="slip modulus [m/s]", usermeta=parts.brush_over_time()
+        width=parts.WIDTH,
+        height=150,
+        title=parts.title_panel("slip modulus", "m/s", shown),
+        usermeta=parts.brush_over_time(),
     )
     note = parts.tell_thinning(lines, kept="first, last, lowest and highest of every bin")
     return Drawing(

@@ -9,8 +9,10 @@ import polars as pl
 
 from pipeline.report import theme
 from pipeline.report.run import INPUT_WORDS
+from pipeline.report.words import say_number
 
 if TYPE_CHECKING:
+    from pipeline.report.scales import Range
     from pipeline.report.scene import Scene, Thinned
 
 WIDTH = 720
@@ -38,10 +40,19 @@ def time_axis(scene: Scene, *, title: str | None = "time since the start of the 
     )
 
 
-def value_axis() -> alt.Y:
+def value_axis(shown: Range) -> alt.Y:
     """A vertical axis without a title of its own (the panel's title names quantity and unit)."""
     axis = alt.Axis(title=None, tickCount=4, format=",~r", minExtent=GUTTER - 10)
-    return alt.Y("value:Q", axis=axis, scale=alt.Scale(zero=True))
+    cut = shown.beyond is not None
+    return alt.Y("value:Q", axis=axis, scale=alt.Scale(domain=[shown.low, shown.high], nice=not cut))
+
+
+def title_panel(quantity: str, unit: str, shown: Range) -> str:
+    """A panel's title: quantity, unit, and how far peaks go that the axis does not show."""
+    if shown.beyond is None:
+        return f"{quantity} [{unit}]"
+    value, time = shown.beyond
+    return f"{quantity} [{unit}], peaks cut: {say_number(value)} at {say_number(time)} s"
 
 
 def shade_spans() -> list[alt.Chart]:

@@ -53,11 +53,19 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
             "place:N", scale=alt.Scale(domain=["start", "end"], range=["circle", "square"]), legend=None
         )
     )
-    words = ends.mark_text(align="left", dx=10, dy=-9, fontWeight=600, color=theme.INK).encode(text="place:N")
+    # Above and below, so that they can be read where a run ends where it began.
+    words = [
+        ends.transform_filter(alt.datum.place == place)
+        .mark_text(align="left", dx=10, dy=dy, fontWeight=600, color=theme.INK)
+        .encode(text="place:N")
+        for place, dy in (("start", -9), ("end", 12))
+    ]
     meta = parts.brush_over_plane("x", "y") | {
         "equal": {"x": extent[0], "y": extent[1], "lowest": _LOWEST, "highest": _HIGHEST}
     }
-    chart = alt.layer(path, marked, dots, spots, words).properties(width=_WIDTH, height=height, usermeta=meta)
+    chart = alt.layer(path, marked, dots, spots, *words).properties(
+        width=_WIDTH, height=height, usermeta=meta
+    )
     first, last = (
         frame.head(1).with_columns(place=pl.lit("start")),
         frame.tail(1).with_columns(place=pl.lit("end")),

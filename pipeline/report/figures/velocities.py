@@ -8,16 +8,17 @@ import altair as alt
 
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.scales import find_range
 from pipeline.report.scene import COMPONENTS
 
 if TYPE_CHECKING:
     from pipeline.report.figures.figure import Picture
-    from pipeline.report.scene import Scene
+    from pipeline.report.scene import Scene, Thinned
 
-_TITLES = {
-    "x": "forward velocity v_x [m/s]",
-    "y": "sideways velocity v_y, left positive [m/s]",
-    "w": "yaw rate v_w, left positive [rad/s]",
+_QUANTITIES = {
+    "x": ("forward velocity v_x", "m/s"),
+    "y": ("sideways velocity v_y, left positive", "m/s"),
+    "w": ("yaw rate v_w, left positive", "rad/s"),
 }
 
 
@@ -25,31 +26,33 @@ def draw_velocities(scene: Scene) -> Drawing | None:
     """Three panels over one time axis: measured, ideal on command, ideal on measured wheels."""
     lines = {component: scene.component_lines(component) for component in COMPONENTS}
     there = {component: line for component, line in lines.items() if line is not None}
-    if not there or scene.time_domain is None:
+    if not there:
         return None
-    names = [*scene.slip, "velocity"]
-    panels = [_draw_panel(scene, component, names) for component in there]
-    panels[-1] = _draw_panel(scene, COMPONENTS[-1], names, title="time since the start of the run [s]")
-    chart = alt.vconcat(*panels).properties(usermeta=parts.brush_over_time())
+    chart = alt.vconcat(*(_draw_panel(scene, component, line) for component, line in there.items()))
     rows = {f"velocity_{component}": line.frame for component, line in there.items()}
     note = parts.tell_thinning(*there.values(), kept="first, last, lowest and highest of every bin")
-    return Drawing(chart, rows | parts.span_rows(scene), f"{parts.tell_bands(scene)} {note}".strip())
+    return Drawing(
+        chart.properties(usermeta=parts.brush_over_time()),
+        rows | parts.span_rows(scene),
+        f"{parts.tell_bands(scene)} {note}".strip(),
+    )
 
 
-def _draw_panel(scene: Scene, component: str, names: list[str], *, title: str | None = None) -> Picture:
+def _draw_panel(scene: Scene, component: str, lines: Thinned) -> Picture:
+    shown = find_range(lines.frame, lines.usual)
+    title = parts.title_panel(*_QUANTITIES[component], shown)
+    last = component == COMPONENTS[-1]
     line = (
         alt.Chart(alt.NamedData(f"velocity_{component}"))
         .mark_line(clip=True)
         .encode(
-            x=parts.time_axis(scene, title=title),
-            y=parts.value_axis(),
-            color=parts.series_colour(names, parts.SERIES_WORDS),
+            x=parts.time_axis(scene) if last else parts.time_axis(scene, title=None),
+            y=parts.value_axis(shown),
+            color=parts.series_colour([*scene.slip, "velocity"], parts.SERIES_WORDS),
             detail="piece:N",
         )
     )
-    return alt.layer(*parts.shade_spans(), line).properties(
-        width=parts.WIDTH, height=118, title=_TITLES[component]
-    )
+    return alt.layer(*parts.shade_spans(), line).properties(width=parts.WIDTH, height=118, title=title)
 
 
 def describe_velocities(scene: Scene) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.report.run import RunReport, mapping_in, number_in, objects_in
-from pipeline.report.words import build_table, escape, say_bytes, say_number, say_share
+from pipeline.report.words import begin_large, build_table, escape, say_bytes, say_number, say_share
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -14,13 +14,20 @@ if TYPE_CHECKING:
 
 _RANK = {"error": 0, "warning": 1, "info": 2}
 _SEVERITY_WORDS = {"error": "do not trust", "warning": "take care", "info": "note"}
-_TOPICS = {"command": "command", "wheels": "measured wheels", "pose": "pose", "imu": "IMU"}
+_TOPICS = {
+    "command": "command",
+    "wheels": "measured wheels",
+    "pose": "pose",
+    "imu": "IMU",
+    "interval": "interval",
+}
 
 
 def render_health(page: Page) -> str:
     """Findings, losses and topics."""
     report = page.report
-    return _render_findings(report) + _render_losses(report) + _render_topics(report)
+    parts = (_render_findings, _render_losses, _render_quarantine, _render_topics)
+    return "".join(render(report) for render in parts)
 
 
 def list_findings(report: RunReport) -> list[Mapping[str, object]]:
@@ -56,13 +63,13 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
 
 
 def _held_share(report: RunReport) -> float | None:
-    held = report.number("held_poses")
-    poses = report.table("poses")
-    if held is None:
-        return None
-    if held > 1 and poses is not None:
-        return held / poses.height
-    return held if held <= 1 else None
+    """Share of held poses; the summary may tell the share or, as a whole number, the count."""
+    held, poses = report.summary.get("held_poses"), report.table("poses")
+    if isinstance(held, float):
+        return held
+    if isinstance(held, int) and (poses is not None or held == 0):
+        return held / poses.height if poses is not None else 0.0
+    return None
 
 
 def _render_findings(report: RunReport) -> str:
@@ -81,12 +88,11 @@ def _render_finding(finding: Mapping[str, object]) -> str:
         place.append(f"{say_number(start)}\u2013{say_number(end)} s")
     elif start is not None:
         place.append(f"at {say_number(start)} s")
-    joined = " \u00b7 ".join(place)
-    where = f' <span class="where">{joined}</span>' if place else ""
+    place.append(f"<code>{escape(finding.get('id', ''))}</code>")
+    where = " \u00b7 ".join(place)
     return (
         f'<li class="{grade}"><span class="grade">{_SEVERITY_WORDS[grade]}</span>'
-        f"<div>{escape(finding.get('text', ''))}{where} "
-        f"<code>{escape(finding.get('id', ''))}</code></div></li>"
+        f'<div>{begin_large(escape(finding.get("text", "")))}<p class="where">{where}</p></div></li>'
     )
 
 
@@ -110,6 +116,16 @@ def _render_losses(report: RunReport) -> str:
     return build_table(head, rows, caption="What the log has lost", numeric=(1, 2))
 
 
+def _render_quarantine(report: RunReport) -> str:
+    """Rows that broke a contract, counted by table and rule."""
+    rows = []
+    for table in report.part("quarantined"):
+        rules = mapping_in(mapping_in(report.part("quarantined"), table), "rules")
+        rows += [[escape(table), escape(rule), escape(count)] for rule, count in rules.items()]
+    head = ["table", "rule", "rows"]
+    return build_table(head, rows, caption="Rows set aside", numeric=(2,)) if rows else ""
+
+
 def _render_topics(report: RunReport) -> str:
     topics = report.part("topics")
     rows = []
@@ -121,5 +137,9 @@ def _render_topics(report: RunReport) -> str:
         shown = f"<code>{escape(topic)}</code>" if topic else "none"
         because = f' <span class="because">{escape(reason)}</span>' if reason else ""
         rows.append(f"<div><dt>{words}</dt><dd>{shown}{because}</dd></div>")
+    if not rows:
+        return ""
+    notes = topics.get("notes")
+    told = "".join(f'<p class="note">{escape(note)}</p>' for note in notes) if isinstance(notes, list) else ""
     joined = "".join(rows)
-    return f'<p class="caption">Topics used, and why these</p><dl class="facts">{joined}</dl>' if rows else ""
+    return f'<p class="caption">Topics used, and why these</p><dl class="facts">{joined}</dl>{told}'

@@ -19,14 +19,17 @@ def render_provenance(page: Page) -> str:
     log, origin = report.part("log"), report.part("provenance")
     facts = [("log", log.get("path")), ("SHA-256", log.get("sha256"))]
     facts += [("dataset", report.text("dataset")), ("rate", _say_rate(report.number("rate_hz")))]
-    facts += [(f"version of {name}", value) for name, value in mapping_in(origin, "versions").items()]
-    facts += [(f"key of {name}", value) for name, value in mapping_in(origin, "keys").items()]
+    facts += [(name, _list_entries(mapping_in(origin, name))) for name in ("versions", "keys")]
     items = "".join(
         f"<div><dt>{escape(name)}</dt><dd><code>{escape(value)}</code></dd></div>"
         for name, value in facts
         if value
     )
     return f'<dl class="facts">{items}</dl>' + _render_configuration(origin.get("configuration"))
+
+
+def _list_entries(entries: Mapping[str, object]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in entries.items())
 
 
 def _say_rate(rate: float | None) -> str:

@@ -8,7 +8,7 @@ import polars as pl
 
 from pipeline.report.figures.figure import Section
 from pipeline.report.run import INPUT_WORDS
-from pipeline.report.scene import round_up
+from pipeline.report.scales import round_up
 from pipeline.report.words import say_share
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ _WORTH_TELLING = 1.15
 _SMALLEST_SHARE = 0.15
 _UPPER_QUANTILE = 0.7
 _SLOW = 0.05
+_VERBS = {"command": ("Asked to turn", "Asked to drive"), "measured": ("Turning", "Driving")}
 
 
 def render_where(page: Page) -> str:
@@ -26,7 +27,7 @@ def render_where(page: Page) -> str:
     figures = page.render_figures(Section.WHERE)
     if not figures:
         return ""
-    regions = find_regions(page.scene.sound_slip.get(page.report.main_input))
+    regions = find_regions(page.scene.sound_slip.get(page.report.main_input), _VERBS[page.report.main_input])
     told = ""
     if regions:
         words = INPUT_WORDS[page.report.main_input]
@@ -39,11 +40,12 @@ def render_where(page: Page) -> str:
     return told + _MARKING + figures
 
 
-def find_regions(slip: pl.DataFrame | None) -> list[tuple[str, float, float]]:
+def find_regions(slip: pl.DataFrame | None, verbs: tuple[str, str]) -> list[tuple[str, float, float]]:
     """Regions of driving that carry more slip than their share of the time.
 
     Args:
         slip: slip of one input.
+        verbs: how to say that the input turns, and that it drives.
 
     Returns:
         Words, share of the sum of squared moduli and share of the samples, the densest first, at most three.
@@ -58,8 +60,8 @@ def find_regions(slip: pl.DataFrame | None) -> list[tuple[str, float, float]]:
     fast = _threshold(slip, "f_x")
     spinning = (pl.col("f_x").abs() < _SLOW) & (pl.col("f_w").abs() > _SLOW)
     candidates = {
-        f"Asked to turn faster than {turning:g} rad/s": pl.col("f_w").abs() > turning,
-        f"Asked to drive faster than {fast:g} m/s": pl.col("f_x").abs() > fast,
+        f"{verbs[0]} faster than {turning:g} rad/s": pl.col("f_w").abs() > turning,
+        f"{verbs[1]} faster than {fast:g} m/s": pl.col("f_x").abs() > fast,
         "The transitory time after a change of command": pl.col("transitory"),
         "Turning on the spot": spinning,
         "Reversing": pl.col("f_x") < -_SLOW,
