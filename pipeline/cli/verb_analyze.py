@@ -83,6 +83,7 @@ def _warm_report() -> None:
 
 
 def _print_outcomes(outcomes: list[Outcome]) -> None:
+    from pipeline.cli.screen import describe_run  # noqa: PLC0415 - only for people
 
-    for _outcome in outcomes:
-        pass
+    for outcome in outcomes:
+        print(describe_run(outcome.summary, unchanged=not outcome.computed))

@@ -202,7 +202,7 @@ def update_datasets(store: Store) -> None:
 
     keys: dict[str, str] = {}
     seen: set[str] = set()
-    for manifest in store.manifests():
+    for manifest in store.survey().manifests:
         log = manifest.details.get("log")
         sha256 = str(log.get("sha256")) if isinstance(log, dict) else manifest.run
         if "aggregates" in manifest.tables and sha256 not in seen:

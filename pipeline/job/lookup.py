@@ -18,7 +18,7 @@ def find_run(text: str, store: Store) -> Manifest:
     Raises:
         JobError: nothing fits, or several runs do.
     """
-    manifests = store.manifests()
+    manifests = store.survey().manifests
     path = str(Path(text).resolve())
     fitting = [
         manifest

@@ -98,7 +98,7 @@ def name_run(path: Path, sha256: str, store: Store) -> str:
     plain = f"{absolute.parent.name}/{absolute.stem}" if absolute.parent.name else absolute.stem
     manifest = store.manifest(plain)
     if manifest is None:
-        for known in store.manifests():
+        for known in store.survey().manifests:
             if _log_of(known.details).get("sha256") == sha256:
                 return known.run
         return plain

@@ -24,11 +24,14 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 STRETCH_S = 2.0
+_FEWEST = 8
 _LEAST_PATH = 0.5
+_LEAST_GAIN = 0.2
+_LEAST_TURN = 0.05
 _FROZEN = 0.1
-_LONG_ENOUGH = 0.5
+_SHORTEST, _LONGEST = 0.6, 1.5
 _OFF_ANGLE = np.radians(35.0)
-_SPREADS = 6.0
+_STEADY = 0.93
 
 
 def find_bad_stretches(
@@ -49,25 +52,23 @@ def find_bad_stretches(
     if ideal is None:
         return np.zeros(times.size, dtype=bool), []
     label = _label_stretches(times, step)
-    summed = _sum_stretches(label, velocities, ideal, times)
-    driven, moved = summed.driven, summed.moved
-    tested = summed.whole & (np.abs(driven) > _LEAST_PATH)
-    if tested.sum() < 8:  # noqa: PLR2004 - too few stretches to know what is usual
+    sums = _sum_stretches(label, velocities, ideal, times)
+    length, driven = sums.length, sums.driven
+    tested = sums.whole & (driven > _LEAST_PATH)
+    if tested.sum() < _FEWEST:
         return np.zeros(times.size, dtype=bool), []
-    length = np.linalg.norm(moved, axis=1)
-    gain = float(np.median(length[tested] / np.abs(driven[tested])))
-    if gain < 0.2:  # noqa: PLR2004 - a vehicle that hardly moves on its wheels has no direction to test
+    gain = float(np.median(length[tested] / driven[tested]))
+    if gain < _LEAST_GAIN:
         return np.zeros(times.size, dtype=bool), []
     # Lateral motion in turns is what slip is about: the direction is judged against what turning explains.
-    turning = summed.turned
-    angle = np.arctan2(moved[:, 1] * np.sign(driven), moved[:, 0] * np.sign(driven))
-    usual = _fit_angle(turning[tested], angle[tested])
-    spread = 1.4826 * float(np.median(np.abs(angle[tested] - usual(turning[tested]))))
-    off = np.abs(_wrap(angle - usual(turning))) > max(_OFF_ANGLE, _SPREADS * spread)
-    rotated = tested & off & (length > _LONG_ENOUGH * gain * np.abs(driven))
-    frozen = tested & (length < _FROZEN * gain * np.abs(driven))
-    lively = np.abs(turning) > 0.05  # noqa: PLR2004 - rad over the stretch: the heading is being updated
-    bad = rotated | (frozen & lively)
+    usual = _fit_angle(sums.turned[tested], sums.direction[tested])
+    off = np.abs(_wrap(sums.direction - usual(sums.turned)))
+    right_length = (length > _SHORTEST * gain * driven) & (length < _LONGEST * gain * driven)
+    # A sliding vehicle turns its direction of travel on the way; a wrong heading is wrong by one angle.
+    rotated = tested & (off > _OFF_ANGLE) & (sums.steadiness > _STEADY) & right_length
+    lively = np.abs(sums.turned) > _LEAST_TURN
+    frozen = tested & lively & (length < _FROZEN * gain * driven)
+    bad = rotated | frozen
     suspect: Flags = bad[label]
     if not bad.any():
         return suspect, []
@@ -92,39 +93,48 @@ def _label_stretches(times: Floats, step: NDArray[np.int32]) -> NDArray[np.int64
     return np.cumsum(starts) - 1
 
 
+@dataclass(frozen=True)
+class _Sums:
+    """Sums over every stretch.
+
+    Attributes:
+        length: path of the poses [m].
+        driven: path that the ideal model drives [m].
+        direction: mean direction of travel against the driven direction [rad].
+        steadiness: 1 where that direction is the same throughout, 0 where it is any.
+        turned: turning of the poses [rad].
+        whole: the input is known throughout and the stretch is full.
+    """
+
+    length: Floats
+    driven: Floats
+    direction: Floats
+    steadiness: Floats
+    turned: Floats
+    whole: Flags
+
+
 def _sum_stretches(label: NDArray[np.int64], velocities: pl.DataFrame, ideal: Floats, times: Floats) -> _Sums:
-    """Displacement, turning and driven path of every stretch, in its own mean heading frame."""
+    """Path, direction and turning of every stretch."""
     count = int(label[-1]) + 1
     period = float(np.median(np.diff(times))) if times.size > 1 else 0.0
     samples = np.bincount(label, minlength=count)
-    yaw = velocities["yaw"].to_numpy()
-    turned = _sum_by(label, velocities["v_w"].to_numpy() * period, count)
-    start = yaw[np.searchsorted(label, np.arange(count))]
-    relative = yaw - start[label] - turned[label] / 2.0
-    v_x, v_y = velocities["v_x"].to_numpy(), velocities["v_y"].to_numpy()
-    cosine, sine = np.cos(relative), np.sin(relative)
-    moved = np.stack(
-        (
-            _sum_by(label, (cosine * v_x - sine * v_y) * period, count),
-            _sum_by(label, (sine * v_x + cosine * v_y) * period, count),
-        ),
-        axis=-1,
-    )
     known = np.isfinite(ideal).all(axis=1)
-    # Driven along the chord that the measured turning makes of the path.
-    driven = _sum_by(label, np.where(known, ideal[:, 0] * cosine, 0.0) * period, count)
+    forward = np.where(known, ideal[:, 0], 0.0)
+    speed = velocities["v_x"].to_numpy() + 1j * velocities["v_y"].to_numpy()
+    travelled = speed * np.sign(forward)
+    size = np.abs(travelled)
+    heading = np.where(size > 0.0, travelled / np.where(size > 0.0, size, 1.0), 0.0)
+    mean = _sum_by(label, heading.real, count) + 1j * _sum_by(label, heading.imag, count)
     whole = (_sum_by(label, known.astype(float), count) == samples) & (samples * period > 0.9 * STRETCH_S)
-    return _Sums(moved, driven, turned, whole)
-
-
-@dataclass(frozen=True)
-class _Sums:
-    """Displacement [m], driven path [m], turning [rad] of every stretch, and whether it is whole."""
-
-    moved: Floats
-    driven: Floats
-    turned: Floats
-    whole: Flags
+    return _Sums(
+        length=_sum_by(label, size * period, count),
+        driven=_sum_by(label, np.abs(forward) * period, count),
+        direction=np.angle(mean),
+        steadiness=np.abs(mean) / np.maximum(samples, 1),
+        turned=_sum_by(label, velocities["v_w"].to_numpy() * period, count),
+        whole=whole,
+    )
 
 
 def _sum_by(label: NDArray[np.int64], values: Floats, count: int) -> Floats:

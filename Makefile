@@ -1,0 +1,82 @@
+# The few verbs of this project; `make` alone prints them. Each sets up its environment the first time.
+#
+#   make analyze LOG=run.mcap [VEHICLE=husky_a200] [ARGS="--yaw imu"]
+
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+OUT    ?= results
+
+# Values reach the shell through its environment, so that a path may hold spaces and quotes.
+export LOG OUT VEHICLE ARGS
+
+# Exit code 3 means done, but the log had losses: they are on the screen, and make has not failed.
+FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see above)" >&2 || exit $$code; }
+
+.DEFAULT_GOAL := help
+.PHONY: help setup analyze inspect test test-long check format samples bench bench-reader browser lock clean
+
+help: ## print this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+analyze: $(VENV)/.ready ## LOG=run.mcap: slip tables, a summary, a report [VEHICLE=, OUT=results, ARGS=]
+	@[ -n "$$LOG" ] || { echo "Say which log: make analyze LOG=run.mcap" >&2; exit 2; }
+	@if [ -n "$$VEHICLE" ]; then $(BIN)/slip analyze "$$LOG" --out "$$OUT" --vehicle "$$VEHICLE" $$ARGS; \
+	else $(BIN)/slip analyze "$$LOG" --out "$$OUT" $$ARGS; fi $(FORGIVE_LOSSES)
+
+inspect: $(VENV)/.ready ## LOG=run.mcap: topics, rates, gaps, clocks, damage
+	@[ -n "$$LOG" ] || { echo "Say which log: make inspect LOG=run.mcap" >&2; exit 2; }
+	@$(BIN)/slip inspect "$$LOG" $(FORGIVE_LOSSES)
+
+test: $(VENV)/.ready-dev ## the fast tests
+	$(BIN)/python -m pytest -n 2 -m "not long"
+
+test-long: $(VENV)/.ready-dev ## the tests that take minutes
+	$(BIN)/python -m pytest -n 2 -m long
+
+check: $(VENV)/.ready-dev ## style, types, and who imports whom
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(VENV)/.ready-dev ## put the code into the house's layout
+	$(BIN)/ruff format
+	$(BIN)/ruff check --fix
+
+samples: $(VENV)/.ready ## make the logs in data_samples again
+	@for case in husky_tile warthog_ice ackermann_gravel; do \
+		$(BIN)/slip simulate $$case --out data_samples/$$case.mcap || exit 1; done
+
+bench: bench-reader ## all benchmarks
+
+bench-reader: $(VENV)/.ready-dev ## reading a 1 GB log: ours, its peers, and the bound
+	$(BIN)/python tests/bench/reader.py
+
+browser: ## install Debian's Chromium, for the tests that look at pages
+	apt-get update && apt-get install --yes --no-install-recommends chromium
+
+lock: $(VENV)/.ready-dev ## pin the dependencies of pyproject.toml again
+	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
+		--no-emit-index-url --no-header --no-annotate --extra build --output-file requirements.txt
+	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
+		--no-emit-index-url --no-header --no-annotate --extra build --extra dev --extra sim \
+		--constraint requirements.txt --output-file requirements-dev.txt
+
+clean: ## remove the environment and caches; results stay
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis dist build
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "Python 3.11 or newer is needed; say which: make PYTHON=python3.12 ..." >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.ready: requirements.txt pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement requirements.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+$(VENV)/.ready-dev: requirements-dev.txt $(VENV)/.ready
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement requirements-dev.txt
+	@touch $@
