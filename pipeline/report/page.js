@@ -101,7 +101,7 @@
     let width = room - (page.figures[place.dataset.figure].usermeta?.gutter ?? 50) - RIGHT;
     await embed(place, width);
     const excess = place.querySelector("svg").width.baseVal.value - room;
-    if (excess > 1 || excess < -12) {
+    if (excess > 1 || excess < -30) {
       width -= excess;
       await embed(place, width);
     }

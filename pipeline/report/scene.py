@@ -22,6 +22,7 @@ COMPONENTS = ("x", "y", "w")
 _DEFAULT_RATE_HZ = 20.0
 _HOLE_PERIODS = 2.5
 _WIDEST_PIXELS = 1200
+_FAR_M = 10_000.0
 _CAP_QUANTILE = 0.98
 
 
@@ -113,11 +114,24 @@ class Scene:
         return round_up(top) if top > 0.0 else 1.0
 
     @cached_property
+    def origin(self) -> tuple[float, float]:
+        """What is taken off the map's coordinates [m]: nothing, or the start where that is far away."""
+        if self.velocities is None:
+            return 0.0, 0.0
+        start = [float(self.velocities[axis][0]) for axis in "xy"]
+        if max(abs(value) for value in start) < _FAR_M:
+            return 0.0, 0.0
+        return float(round(start[0])), float(round(start[1]))
+
+    @cached_property
     def track(self) -> Thinned | None:
         """Where the vehicle was, what was asked and how much it slipped: ``t x y f_x f_w modulus piece``."""
         if self.velocities is None:
             return None
-        places = self.velocities.select("t", "stamp", "segment", "piece", "x", "y")
+        east, north = self.origin
+        places = self.velocities.select(
+            "t", "stamp", "segment", "piece", x=pl.col("x") - east, y=pl.col("y") - north
+        )
         if self.main_slip is None:
             columns = [pl.lit(None, pl.Float64).alias(name) for name in ("f_x", "f_w", "modulus")]
             joined = places.with_columns(columns)

@@ -96,12 +96,12 @@ def slip_colour(scene: Scene, field: str = "modulus") -> alt.Color:
 
 def brush_over_time() -> dict[str, object]:
     """Tells the page that dragging sideways marks a stretch of time."""
-    return {"brush": "time", "gutter": GUTTER}
+    return {"brush": "time", "gutter": GUTTER - 11}
 
 
 def brush_over_plane(x: str, y: str) -> dict[str, object]:
     """Tells the page that dragging a box marks the points with ``x`` and ``y`` inside."""
-    return {"brush": "plane", "x": x, "y": y, "gutter": GUTTER + 16}
+    return {"brush": "plane", "x": x, "y": y, "gutter": GUTTER + 4}
 
 
 def span_rows(scene: Scene) -> dict[str, pl.DataFrame]:

@@ -62,7 +62,7 @@ def draw_shares(name: str, medians: pl.DataFrame, *, title: str) -> Picture:
     base = alt.Chart(alt.NamedData(f"{name}_medians")).encode(x="value:Q", y="share:Q", color=colour)
     drops = base.mark_rule(strokeDash=[2, 3], strokeWidth=1.2).encode(y2=alt.value("height"))
     dots = base.mark_point(size=60, filled=False, fill=theme.PAPER, strokeWidth=2, opacity=1)
-    meta = {"gutter": parts.GUTTER + 16}
+    meta = {"gutter": parts.GUTTER + 19}
     return alt.layer(drops, curve, dots).properties(width=480, height=220, usermeta=meta)
 
 

@@ -46,7 +46,7 @@ def draw_split(scene: Scene) -> Drawing | None:
     left = base.transform_filter("datum.mean_square < 0").mark_text(align="right", dx=-5)
     words = [side.encode(text=alt.Text("share:Q", format=".0%")) for side in (right, left)]
     chart = alt.layer(bars, *words).properties(
-        width=640, height=34 * 3 * rows["subset"].n_unique() // 2 + 40, usermeta={"gutter": 74}
+        width=640, height=34 * 3 * rows["subset"].n_unique() // 2 + 40, usermeta={"gutter": 60}
     )
     note = "Vectors add, moduli do not: shares of the mean square; the cross term is twice the mean product."
     return Drawing(chart, {"split": rows}, note)

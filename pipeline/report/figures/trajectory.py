@@ -27,8 +27,12 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
     frame = track.frame
     extent = [_extent(frame["x"]), _extent(frame["y"])]
     height, x_domain, y_domain = fit_equal_aspect(extent[0], extent[1])
-    x = alt.X("x:Q", scale=alt.Scale(domain=x_domain, nice=False, zero=False), axis=_axis("x in the map [m]"))
-    y = alt.Y("y:Q", scale=alt.Scale(domain=y_domain, nice=False, zero=False), axis=_axis("y in the map [m]"))
+    x = alt.X(
+        "x:Q", scale=alt.Scale(domain=x_domain, nice=False, zero=False), axis=_axis("x", scene.origin[0])
+    )
+    y = alt.Y(
+        "y:Q", scale=alt.Scale(domain=y_domain, nice=False, zero=False), axis=_axis("y", scene.origin[1])
+    )
     base = alt.Chart(alt.NamedData("track"))
     path = base.mark_line(color=theme.QUIET, strokeWidth=0.8, opacity=0.5).encode(
         x=x, y=y, order="t:Q", detail="piece:N"
@@ -98,7 +102,9 @@ def _extent(values: pl.Series) -> list[float]:
     return [round(value, 4) for value in _widen([low, high], span)]
 
 
-def _axis(title: str) -> alt.Axis:
+def _axis(name: str, offset: float) -> alt.Axis:
+    less = f", less {offset:,.0f} m" if offset else ""
+    title = f"{name} in the map{less} [m]"
     return alt.Axis(title=title, tickCount=5, format=",~r", minExtent=parts.GUTTER - 20)
 
 
