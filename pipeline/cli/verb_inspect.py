@@ -84,14 +84,10 @@ def _describe(seen: Inspection) -> list[str]:
     index = seen.index
     packing = ", ".join(name or "none" for name in index.compressions) or "none"
     lines = [
-        (
-            f"log       {index.path}    {index.size_bytes / 1e6:.1f} MB, {format_duration(index.duration_s)}, "
-            f"{index.message_count} messages"
-        ),
-        (
-            f"          {index.chunk_count} chunks, compression {packing}, "
-            f"profile {index.profile or '-'}, written by {index.library or '-'}"
-        ),
+        f"log       {index.path}",
+        f"          {index.size_bytes / 1e6:.1f} MB, {format_duration(index.duration_s)}, "
+        f"{index.message_count} messages, {index.chunk_count} chunks, compression {packing}",
+        f"          profile {index.profile or '-'}, written by {index.library or '-'}",
         f"health    {'complete' if not seen.losses else 'with losses'}",
     ]
     lines += [f"  lost    {loss.text}" for loss in seen.losses]

@@ -27,7 +27,7 @@ class SlipError(Exception):
     def __str__(self) -> str:
         """One line: where, what, what to do."""
         place = f"{self.where}: " if self.where else ""
-        return f"{place}{self.what}. {self.hint}"
+        return f"{place}{self.what}. {self.hint.rstrip('.')}."
 
     def __reduce__(self) -> tuple[object, ...]:
         """Keep every part when the error crosses a process boundary."""

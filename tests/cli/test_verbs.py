@@ -1,0 +1,246 @@
+"""The command line as scripts and people use it: output, exit codes, one clear line for every error."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.logs import LogWriter
+from pipeline.simulate import simulate_case
+
+START = 1_700_000_000_000_000_000
+
+
+def slip(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "pipeline", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+    )
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of good and bad logs."""
+    folder = tmp_path_factory.mktemp("field")
+    simulate_case("husky_tile", out=folder / "good.mcap", duration_s=30.0)
+    whole = (folder / "good.mcap").read_bytes()
+    (folder / "truncated.mcap").write_bytes(whole[: len(whole) * 2 // 3])
+    (folder / "empty.mcap").write_bytes(b"")
+    (folder / "text.mcap").write_text("this is no recording\n" * 100)
+    stamps = START + np.arange(200, dtype=np.int64) * 50_000_000
+    pose = {"pose.pose.position.x": np.arange(200) * 0.02, "pose.pose.orientation.w": np.ones(200)}
+    with LogWriter(folder / "no_pose.mcap") as log:
+        log.metadata("deployment", {"vehicle": "husky_a200", "terrain": "tile"})
+        log.write_columns("/cmd_vel", "geometry_msgs/msg/Twist", stamps, {"linear.x": np.ones(200)})
+    with LogWriter(folder / "no_command.mcap") as log:
+        log.metadata("deployment", {"vehicle": "husky_a200", "terrain": "tile"})
+        log.write_columns("/odom", "nav_msgs/msg/Odometry", stamps, pose, header_time=stamps)
+    with LogWriter(folder / "no_vehicle.mcap") as log:
+        log.write_columns("/cmd_vel", "geometry_msgs/msg/Twist", stamps, {"linear.x": np.ones(200)})
+        log.write_columns("/odom", "nav_msgs/msg/Odometry", stamps, pose, header_time=stamps)
+    with LogWriter(folder / "no_messages.mcap") as log:
+        log.metadata("deployment", {"vehicle": "husky_a200", "terrain": "tile"})
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("missing.mcap", ["no such file", "Check the path"]),
+        ("empty.mcap", ["no bytes"]),
+        ("text.mcap", ["MCAP"]),
+        ("no_pose.mcap", ["pose", "[pose] topic", "/cmd_vel"]),
+        ("no_command.mcap", ["command", "[command] topic", "/odom"]),
+        ("no_vehicle.mcap", ["vehicle", "--vehicle", "husky_a200", "--wheel-radius"]),
+        ("no_messages.mcap", ["no message"]),
+    ],
+)
+def test_a_log_that_cannot_be_analyzed_gets_one_line(
+    field: Path, tmp_path: Path, name: str, words: list[str]
+) -> None:
+    done = slip("analyze", field / name, "--out", tmp_path / "out", "--quiet")
+
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith(f"slip: {field / name}: ")
+    assert "Traceback" not in done.stderr
+    for word in words:
+        assert word in done.stderr
+    assert list(tmp_path.rglob("*.parquet")) == []
+    assert list(tmp_path.rglob("manifest.json")) == []
+
+
+def test_a_truncated_log_is_analyzed_up_to_the_cut(field: Path, tmp_path: Path) -> None:
+    done = slip("analyze", field / "truncated.mcap", "--out", tmp_path, "--json", "--no-report")
+
+    assert done.returncode == 3
+    log = json.loads(done.stdout)["runs"][0]["log"]
+    assert not log["complete"]
+    assert {"kind", "bytes", "chunks", "start_s", "end_s"} <= log["losses"][0].keys()
+    assert log["losses"][0]["bytes"] > 0
+
+
+def test_json_is_all_that_stdout_holds_and_has_the_promised_keys(field: Path, tmp_path: Path) -> None:
+    done = slip("analyze", field / "good.mcap", field / "missing.mcap", "--out", tmp_path, "--json")
+
+    assert done.returncode == 1, "one of two failed"
+    content = json.loads(done.stdout)
+    (run,) = content["runs"]
+    assert {
+        "run", "log", "vehicle", "input", "rate_hz", "samples", "segments", "median_modulus",
+        "median_window_norm", "length_scale_m", "by_input", "held_poses", "findings", "report",
+    } <= run.keys()  # fmt: skip
+    assert {"path", "sha256", "duration_s", "complete", "losses"} <= run["log"].keys()
+    assert run["input"] == "both"
+    assert run["by_input"].keys() == {"command", "measured"}
+    assert {"samples", "median_modulus", "median_window_norm", "rms"} <= run["by_input"]["measured"].keys()
+    assert run["median_modulus"] == run["by_input"]["command"]["median_modulus"]
+    assert Path(run["report"]).is_file()
+    (error,) = content["errors"]
+    assert error.keys() == {"path", "code", "message", "hint"}
+    assert error["code"] == "log_not_found"
+
+
+def test_the_summary_fits_a_screen_and_says_what_was_used(field: Path, tmp_path: Path) -> None:
+    done = slip("analyze", field / "good.mcap", "--out", tmp_path)
+
+    assert done.returncode == 0
+    assert len(done.stdout.splitlines()) < 24
+    for word in (
+        "husky_a200",
+        "tile",
+        "on command",
+        "on measured wheels",
+        "/mapping/icp_odom",
+        "report.html",
+    ):
+        assert word in done.stdout
+    assert "differentiating poses" in done.stderr
+    again = slip("analyze", field / "good.mcap", "--out", tmp_path)
+    assert "nothing was computed" in again.stdout
+    assert "differentiating" not in again.stderr
+
+
+def test_geometry_may_stand_in_for_a_vehicle(field: Path, tmp_path: Path) -> None:
+    done = slip(
+        "analyze", field / "no_vehicle.mcap", "--wheel-radius", 0.1, "--track-width", 0.4,
+        "--out", tmp_path, "--json", "--no-report",
+    )  # fmt: skip
+
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["runs"][0]["vehicle"] == "vehicle"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("analyze",),
+        ("analyze", "log.mcap", "--wheel-radius", "-1"),
+        ("analyze", "log.mcap", "--input", "guess"),
+        ("fly",),
+        ("stage", "dream", "log.mcap"),
+    ],
+)
+def test_usage_errors_exit_2(arguments: tuple[str, ...], tmp_path: Path) -> None:
+    done = slip(*arguments, cwd=tmp_path)
+
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_wrong_configuration_names_file_and_key(field: Path, tmp_path: Path) -> None:
+    config = tmp_path / "mine.toml"
+    config.write_text("[velocity]\nrate_hzz = 10\n")
+    done = slip("analyze", field / "good.mcap", "--config", config, "--out", tmp_path / "out", "--quiet")
+
+    assert done.returncode == 1
+    assert str(config) in done.stderr
+    assert "rate_hzz" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_explain_says_where_numbers_come_from(field: Path, tmp_path: Path) -> None:
+    run = json.loads(slip("analyze", field / "good.mcap", "--out", tmp_path, "--json", "--no-report").stdout)[
+        "runs"
+    ][0]
+    done = slip("explain", "good", "slip.g_w", "--out", tmp_path)
+
+    assert done.returncode == 0
+    for word in (run["log"]["sha256"], run["key"], "numpy", "rad/s", "slip in yaw rate"):
+        assert word in done.stdout
+    details = json.loads(slip("explain", "good", "--out", tmp_path, "--json").stdout)
+    assert details["vehicle"]["track_width_m"] == 0.55
+    assert details["stages"].keys() == {"extract", "velocity", "slip", "aggregate"}
+    wrong = slip("explain", "nobody", "--out", tmp_path)
+    assert wrong.returncode == 1
+    assert run["run"] in wrong.stderr
+
+
+def test_inspect_shows_topics_roles_and_damage(field: Path) -> None:
+    done = slip("inspect", field / "good.mcap")
+    assert done.returncode == 0
+    for word in (
+        "complete",
+        "/mapping/icp_odom",
+        "nav_msgs/msg/Odometry",
+        "Clearpath Husky A200",
+        "JointState whose name",
+    ):
+        assert word in done.stdout
+
+    cut = json.loads(slip("inspect", field / "truncated.mcap", "--json").stdout)
+    assert not cut["complete"]
+    assert cut["losses"]
+    assert cut["roles"]["pose"]["topic"] == "/mapping/icp_odom"
+
+    unknown = slip("inspect", field / "no_vehicle.mcap")
+    assert unknown.returncode == 0
+    assert "cannot be determined" in unknown.stdout
+
+
+def test_a_stage_alone(field: Path, tmp_path: Path) -> None:
+    done = slip("stage", "extract", field / "good.mcap", "--out", tmp_path, "--json")
+    assert done.returncode == 0
+    assert set(json.loads(done.stdout)["rows"]) == {"commands", "wheels", "poses", "imu", "findings"}
+
+    by_run = slip("stage", "slip", "good", "--out", tmp_path, "--json")
+    assert json.loads(by_run.stdout)["computed"] == ["velocity", "slip"]
+
+
+def test_simulate_writes_a_log_with_the_effect_asked_for(tmp_path: Path) -> None:
+    out = tmp_path / "sim.mcap"
+    done = slip("simulate", "ideal_husky", "--effect", "effective_track=1.8", "--duration", 20, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert out.is_file()
+
+    for effect in ("effective_track=wide", "antigravity=1"):
+        wrong = slip("simulate", "ideal_husky", "--effect", effect, "--out", tmp_path / "x.mcap")
+        assert wrong.returncode == 1
+        assert len(wrong.stderr.splitlines()) == 1
+        assert not (tmp_path / "x.mcap").exists()
+
+
+def test_help_loads_no_heavy_library() -> None:
+    code = (
+        "import sys\nfrom pipeline.cli import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "heavy = {'numpy', 'polars', 'pyarrow', 'scipy', 'altair', 'dataframely'} & set(sys.modules)\n"
+        "print('heavy:', sorted(heavy))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert "heavy: []" in done.stdout
+    for verb in ("analyze", "inspect", "stage", "explain", "simulate"):
+        assert verb in done.stdout
