@@ -41,12 +41,13 @@ def find_range(lines: pl.DataFrame, usual: tuple[float, float]) -> Range:
     """The axis of lines over time: all of them, or without lone peaks that would flatten the rest.
 
     Args:
-        lines: rows with ``t`` [s] and ``value``.
+        lines: rows with ``t`` [s] and ``value``, null where a line breaks.
         usual: where all but lone peaks lie.
 
     Returns:
         The range with zero inside; peaks are cut where they would make it more than three times as wide.
     """
+    lines = lines.drop_nulls("value")
     values = lines["value"].to_numpy()
     whole = Range(min(float(values.min()), 0.0), max(float(values.max()), 0.0))
     low, high = min(usual[0], 0.0), max(usual[1], 0.0)

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.report.scales import round_up, usual_ends
-from pipeline.report.thinning import drop_flat_rows, find_spans, thin_series, thin_to_peaks
+from pipeline.report.thinning import break_lines, drop_flat_rows, find_spans, thin_series, thin_to_peaks
 
 if TYPE_CHECKING:
     from pipeline.report.run import RunReport
@@ -31,19 +31,16 @@ class Thinned:
     """Rows to draw, and how many there were.
 
     Attributes:
-        frame: the rows that are drawn.
+        frame: the rows that are drawn, with those that break lines.
+        drawn: how many points that are.
         total: the rows that they stand for.
         usual: where all but lone peaks of a line lie, before anything was left out.
     """
 
     frame: pl.DataFrame
+    drawn: int
     total: int
     usual: tuple[float, float] = (0.0, 0.0)
-
-    @property
-    def is_shorter(self) -> bool:
-        """Whether rows were left out."""
-        return self.frame.height < self.total
 
 
 @dataclass(frozen=True)
@@ -100,8 +97,8 @@ class Scene:
         frames = [*self.slip.values()] + ([] if self.velocities is None else [self.velocities])
         if not frames:
             return None
-        start = min(float(frame["t"][0]) for frame in frames)
-        end = max(float(frame["t"][-1]) for frame in frames)
+        ends = [frame.select(low=pl.col("t").min(), high=pl.col("t").max()).row(0) for frame in frames]
+        start, end = min(float(low) for low, _ in ends), max(float(high) for _, high in ends)
         return start, max(end, start + self.period)
 
     @cached_property
@@ -142,15 +139,15 @@ class Scene:
         joined = joined.drop("stamp", "segment")
         peaks = joined.with_columns(peak=pl.col("modulus").fill_null(-1.0))
         thinned = thin_to_peaks(peaks, "peak", bins=TRACK_BINS).drop("peak")
-        return Thinned(thinned, joined.height)
+        return Thinned(thinned, thinned.height, joined.height)
 
     @cached_property
     def modulus_lines(self) -> Thinned | None:
-        """Slip modulus over time, long: ``t value series piece``."""
+        """Slip modulus over time, long: ``t value series``, null where a line breaks."""
         return self._join_lines([(frame, "modulus", name) for name, frame in self.slip.items()])
 
     def component_lines(self, component: str) -> Thinned | None:
-        """Measured and ideal velocity over time of `x`, `y` or `w`, long: ``t value series piece``."""
+        """Velocities of `x`, `y` or `w` over time, long: ``t value series``, null where a line breaks."""
         measured = self.velocities if self.velocities is not None else self.main_slip
         lines = [] if measured is None else [(measured, f"v_{component}", "velocity")]
         return self._join_lines(
@@ -174,7 +171,8 @@ class Scene:
         return find_spans(self.main_slip, flag, period=self.period, shortest_gap=pixel)
 
     def _number_pieces(self, frame: pl.DataFrame) -> pl.DataFrame:
-        ordered = frame.sort("t", maintain_order=True)
+        # By segment first: a clock that was set back makes segments overlap in time.
+        ordered = frame.sort("segment", "t", maintain_order=True)
         hole = pl.col("t").diff() > _HOLE_PERIODS * self.period
         new = (hole | (pl.col("segment") != pl.col("segment").shift(1))).fill_null(value=False)
         return ordered.with_columns(piece=new.cum_sum().cast(pl.Int32))
@@ -182,11 +180,12 @@ class Scene:
     def _join_lines(self, lines: list[tuple[pl.DataFrame, str, str]]) -> Thinned | None:
         if not lines:
             return None
-        parts, total, ends = [], 0, []
+        parts, drawn, total, ends = [], 0, 0, []
         for frame, column, series in lines:
             # Flat stretches go first, so that a held command keeps its edges where they were.
             line = drop_flat_rows(frame.select("t", "piece", value=pl.col(column)), "value")
-            parts.append(thin_series(line, "value", bins=LINE_BINS).with_columns(series=pl.lit(series)))
-            total += line.height
+            thinned = thin_series(line, "value", bins=LINE_BINS)
+            parts.append(break_lines(thinned, "value").with_columns(series=pl.lit(series)))
+            drawn, total = drawn + thinned.height, total + line.height
             ends += usual_ends(frame[column], exact=column.startswith("f_"))
-        return Thinned(pl.concat(parts), total, (min(ends), max(ends)))
+        return Thinned(pl.concat(parts), drawn, total, (min(ends), max(ends)))

@@ -5,7 +5,7 @@ import polars as pl
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.report.thinning import drop_flat_rows, find_spans, thin_series, thin_to_peaks
+from pipeline.report.thinning import break_lines, drop_flat_rows, find_spans, thin_series, thin_to_peaks
 
 
 @st.composite
@@ -48,6 +48,15 @@ def test_a_line_of_many_points_is_shortened_to_four_a_bin() -> None:
     line = pl.DataFrame({"t": np.arange(count) / 20, "value": noise, "piece": np.zeros(count, np.int32)})
     assert thin_series(line, "value", bins=1000).height <= 4000
     assert thin_to_peaks(line, "value", bins=1000).height <= 1001
+
+
+@given(lines())
+def test_no_line_is_drawn_from_one_piece_to_the_next(line: pl.DataFrame) -> None:
+    broken = break_lines(line, "value")
+    assert broken.drop_nulls().equals(line.drop("piece"))
+    assert broken["value"].null_count() == line["piece"].n_unique() - 1
+    edges = line.filter(pl.col("piece") != pl.col("piece").shift(-1))["t"]
+    assert broken.filter(pl.col("value").is_null())["t"].equals(edges)
 
 
 def test_spans_end_one_period_after_their_last_row_and_never_cross_a_segment() -> None:

@@ -24,12 +24,11 @@ def draw_modulus(scene: Scene) -> Drawing | None:
     shown = find_range(lines.frame, lines.usual)
     line = (
         alt.Chart(alt.NamedData("modulus"))
-        .mark_line(clip=True)
+        .mark_line(clip=True, order=False)
         .encode(
             x=parts.time_axis(scene),
             y=parts.value_axis(shown),
             color=parts.series_colour(list(scene.slip), INPUT_WORDS),
-            detail="piece:N",
         )
     )
     chart = alt.layer(*parts.shade_spans(), line).properties(

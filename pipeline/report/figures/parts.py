@@ -126,7 +126,7 @@ def tell_bands(scene: Scene) -> str:
 
 def tell_thinning(*lines: Thinned, kept: str) -> str:
     """A sentence about rows that were left out; empty when none were."""
-    drawn, total = sum(line.frame.height for line in lines), sum(line.total for line in lines)
+    drawn, total = sum(line.drawn for line in lines), sum(line.total for line in lines)
     if drawn >= total:
         return ""
     return f"Drawn from {drawn:,} of {total:,} points: {kept}, so no peak is lost."

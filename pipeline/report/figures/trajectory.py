@@ -10,6 +10,7 @@ import polars as pl
 from pipeline.report import theme
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.thinning import break_lines
 
 if TYPE_CHECKING:
     from pipeline.report.scene import Scene
@@ -34,9 +35,10 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
         "y:Q", scale=alt.Scale(domain=y_domain, nice=False, zero=False), axis=_axis("y", scene.origin[1])
     )
     base = alt.Chart(alt.NamedData("track"))
-    path = base.mark_line(color=theme.QUIET, strokeWidth=0.8, opacity=0.5).encode(
-        x=x, y=y, order="t:Q", detail="piece:N"
+    line = alt.Chart(alt.NamedData("path")).mark_line(
+        color=theme.QUIET, strokeWidth=0.8, opacity=0.5, order=False
     )
+    path = line.encode(x=x, y=y)
     tooltip = [
         alt.Tooltip("t:Q", title="time [s]", format=".2f"),
         alt.Tooltip("modulus:Q", title="slip modulus [m/s]", format=".2f"),
@@ -74,7 +76,8 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
         frame.head(1).with_columns(place=pl.lit("start")),
         frame.tail(1).with_columns(place=pl.lit("end")),
     )
-    rows = {"track": frame, "track_ends": pl.concat([first, last])} | parts.marked_rows()
+    steps = break_lines(frame.select("x", "y", "piece"), "x", "y")
+    rows = {"track": frame, "path": steps, "track_ends": pl.concat([first, last])} | parts.marked_rows()
     note = parts.tell_thinning(track, kept="the highest slip of every bin")
     return Drawing(
         chart, rows, f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile. {note}".strip()

@@ -44,12 +44,11 @@ def _draw_panel(scene: Scene, component: str, lines: Thinned) -> Picture:
     last = component == COMPONENTS[-1]
     line = (
         alt.Chart(alt.NamedData(f"velocity_{component}"))
-        .mark_line(clip=True)
+        .mark_line(clip=True, order=False)
         .encode(
             x=parts.time_axis(scene) if last else parts.time_axis(scene, title=None),
             y=parts.value_axis(shown),
             color=parts.series_colour([*scene.slip, "velocity"], parts.SERIES_WORDS),
-            detail="piece:N",
         )
     )
     return alt.layer(*parts.shade_spans(), line).properties(width=parts.WIDTH, height=118, title=title)
