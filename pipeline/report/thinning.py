@@ -74,8 +74,8 @@ def break_lines(frame: pl.DataFrame, *columns: str) -> pl.DataFrame:
         columns: the columns that are drawn.
 
     Returns:
-        The rows without ``piece``, which is no longer needed. One broken line is drawn many times faster than as
-        many lines as there are pieces.
+        The rows without ``piece``, which is no longer needed: one broken line is drawn many times faster than
+        as many lines as there are pieces.
     """
     ends = frame.filter(pl.col("piece") != pl.col("piece").shift(-1))
     gaps = ends.with_columns(pl.lit(None, frame.schema[name]).alias(name) for name in columns)
