@@ -22,7 +22,7 @@ class Windows(Table):
     t_end = fields.seconds("end of the window")
     segment = fields.segment()
     step = fields.step()
-    transitory = fields.flag("the window is the first of its command step")
+    transitory = fields.flag("most of the window lies in the transitory span of a change of command")
     suspect = fields.flag("in a stretch with a rotated heading or a frozen position; left out of medians")
     samples = dy.Int32(min=1, metadata={"description": "grid steps in the window"})
     rms_modulus = dy.Float64(

@@ -80,12 +80,13 @@ def compute_slip(
         StageError: none of the asked inputs gives a single sample.
     """
     times = velocities["t"].to_numpy()
-    found: dict[str, Ideal] = {}
-    if "command" in inputs and not commands.is_empty():
-        found["command"] = hold_commands(times, commands, vehicle, configuration.command.hold_s)
-    if "measured" in inputs and not wheels.is_empty():
-        found["measured"] = interpolate_wheels(times, wheels, vehicle)
-    found = {name: ideal for name, ideal in found.items() if np.isfinite(ideal.velocity[ideal.active]).any()}
+    known: dict[str, Ideal] = {}
+    if not commands.is_empty():
+        known["command"] = hold_commands(times, commands, vehicle, configuration.command.hold_s)
+    if not wheels.is_empty():
+        known["measured"] = interpolate_wheels(times, wheels, vehicle)
+    known = {name: ideal for name, ideal in known.items() if np.isfinite(ideal.velocity[ideal.active]).any()}
+    found = {name: ideal for name, ideal in known.items() if name in inputs}
     if not found:
         raise StageError(
             "no_command",
@@ -93,16 +94,17 @@ def compute_slip(
             where=where,
             hint="Name the command in run.toml ([command] topic = ...); `slip inspect` lists the topics.",
         )
-    leading = found.get("command") or found["measured"]
+    # The steps are the command's whatever was asked for, so that both inputs have the same windows.
+    leading = known.get("command") or known["measured"]
     length = configuration.slip.length_scale_m
-    segment = velocities["segment"].to_numpy()
-    step = steps.number_steps(times, segment, leading.velocity, length)
-    transitory = steps.mark_transitory(times, step, configuration.slip.transitory_s)
+    changes = steps.find_changes(times, leading.velocity, length)
+    step = steps.number_steps(times, velocities["segment"].to_numpy(), changes)
+    transitory = steps.mark_transitory(times, changes, configuration.slip.transitory_s)
     base = velocities.select("t", "stamp", "segment", "v_x", "v_y", "v_w").with_columns(
         step=pl.Series(step), transitory=pl.Series(transitory)
     )
     suspect, findings = find_bad_stretches(
-        velocities, {name: ideal.velocity for name, ideal in found.items()}, step
+        velocities, {name: ideal.velocity for name, ideal in known.items()}, step
     )
     findings += _describe_stale(times, found)
     parts = [_tabulate(base, name, ideal, suspect, length) for name, ideal in found.items()]
@@ -122,7 +124,7 @@ def hold_commands(times: Floats, commands: pl.DataFrame, vehicle: Vehicle, hold:
     """
     stamps = commands["t"].to_numpy()
     if hold is None:
-        hold = max(_SHORTEST_HOLD, _PERIODS * _median_period(stamps))
+        hold = max(_SHORTEST_HOLD, _PERIODS * _usual_period(stamps))
     index = timegrid.hold_indices(times, stamps)
     known = index >= 0
     last = np.maximum(index, 0)
@@ -139,7 +141,7 @@ def interpolate_wheels(times: Floats, wheels: pl.DataFrame, vehicle: Vehicle) ->
     values = timegrid.interpolate_linearly(times, stamps, _predict(wheels, vehicle))
     left = timegrid.hold_indices(times, stamps)
     right = np.minimum(left + 1, stamps.size - 1)
-    longest = max(_LONGEST_WHEEL_GAP, _PERIODS * _median_period(stamps))
+    longest = max(_LONGEST_WHEEL_GAP, _PERIODS * _usual_period(stamps))
     on_sample = np.abs(times - stamps[np.maximum(left, 0)]) < 1e-6  # noqa: PLR2004 - a microsecond is the same time
     known = (left >= 0) & (on_sample | ((right > left) & (stamps[right] - stamps[left] <= longest)))
     values[~known] = np.nan
@@ -153,8 +155,9 @@ def _predict(drive: pl.DataFrame, vehicle: Vehicle) -> Floats:
     return predict_differential(drive["left"].to_numpy(), drive["right"].to_numpy(), vehicle)
 
 
-def _median_period(stamps: Floats) -> float:
-    return float(np.median(np.diff(stamps))) if stamps.size > 1 else 0.0
+def _usual_period(stamps: Floats) -> float:
+    # Two topics, one a side, come in pairs of nearly equal stamps: the median period would be next to none.
+    return float(np.quantile(np.diff(stamps), 0.75)) if stamps.size > 1 else 0.0
 
 
 def _tabulate(base: pl.DataFrame, name: str, ideal: Ideal, suspect: Flags, length: float) -> pl.DataFrame:
@@ -196,15 +199,13 @@ def cut_windows(slip: pl.DataFrame, rate: float) -> pl.DataFrame:
         (pl.col("t").max() + 1.0 / rate).alias("t_end"),
         pl.col("segment").first(),
         pl.col("suspect").any(),
+        (pl.col("transitory").mean() > 0.5).alias("transitory"),  # noqa: PLR2004 - most of the window
         pl.len().cast(pl.Int32).alias("samples"),
         (pl.col("modulus") ** 2).mean().sqrt().alias("rms_modulus"),
     )
     return (
         grouped.filter(pl.col("samples") == size)
-        .with_columns(
-            (pl.col("rms_modulus") * PUBLISHED_SAMPLES**0.5).alias("window_norm"),
-            (pl.col("window") == 0).alias("transitory"),
-        )
+        .with_columns((pl.col("rms_modulus") * PUBLISHED_SAMPLES**0.5).alias("window_norm"))
         .drop("stretch", "window")
     )
 
