@@ -122,16 +122,16 @@ def _sum_stretches(label: NDArray[np.int64], velocities: pl.DataFrame, ideal: Fl
     known = np.isfinite(ideal).all(axis=1)
     forward = np.where(known, ideal[:, 0], 0.0)
     speed = velocities["v_x"].to_numpy() + 1j * velocities["v_y"].to_numpy()
-    travelled = speed * np.sign(forward)
-    size = np.abs(travelled)
-    heading = np.where(size > 0.0, travelled / np.where(size > 0.0, size, 1.0), 0.0)
-    mean = _sum_by(label, heading.real, count) + 1j * _sum_by(label, heading.imag, count)
+    # Weighed by the way travelled: at a stop or a reversal the direction is that of noise.
+    travelled = speed * np.sign(forward) * period
+    length = _sum_by(label, np.abs(speed) * period, count)
+    mean = _sum_by(label, travelled.real, count) + 1j * _sum_by(label, travelled.imag, count)
     whole = (_sum_by(label, known.astype(float), count) == samples) & (samples * period > 0.9 * STRETCH_S)
     return _Sums(
-        length=_sum_by(label, size * period, count),
+        length=length,
         driven=_sum_by(label, np.abs(forward) * period, count),
         direction=np.angle(mean),
-        steadiness=np.abs(mean) / np.maximum(samples, 1),
+        steadiness=np.abs(mean) / np.maximum(length, 1e-9),
         turned=_sum_by(label, velocities["v_w"].to_numpy() * period, count),
         whole=whole,
     )
