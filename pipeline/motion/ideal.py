@@ -6,10 +6,13 @@ reference point at the rear axle (Becker et al. 2023); base_link elsewhere is a 
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.vehicles import Vehicle
+if TYPE_CHECKING:
+    from pipeline.vehicles import Vehicle
 
 Floats = NDArray[np.float64]
 

@@ -1,0 +1,97 @@
+"""Finding effects: those of the folder `effects`, and those of files that a user names."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.util
+import inspect
+import pkgutil
+from typing import TYPE_CHECKING
+
+from pipeline.motion.effect import Effect
+from pipeline.motion.errors import MotionError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+    from types import ModuleType
+
+EffectClass = type[Effect]
+
+
+@functools.cache
+def list_effects() -> tuple[EffectClass, ...]:
+    """Every effect of the folder, in the order of a command's way."""
+    folder = importlib.import_module("pipeline.motion.effects")
+    found: list[EffectClass] = []
+    for module in pkgutil.iter_modules(folder.__path__):
+        found += _effects_of(importlib.import_module(f"pipeline.motion.effects.{module.name}"))
+    return tuple(sorted(found, key=lambda effect: (effect.place, effect.rank, effect.id)))
+
+
+def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> EffectClass:
+    """The effect of that id.
+
+    Args:
+        name: id of the effect.
+        own: effects of the user's own, by id; they win.
+
+    Raises:
+        MotionError: ``unknown_effect``, with the nearest ids.
+    """
+    known = {effect.id: effect for effect in list_effects()} | dict(own or {})
+    if name in known:
+        return known[name]
+    import difflib  # noqa: PLC0415 - only for the error
+
+    near = difflib.get_close_matches(name, known, n=3) or sorted(known)
+    raise MotionError(
+        "unknown_effect",
+        f"no effect is called {name!r}",
+        where=name,
+        hint=f"Did you mean {' or '.join(near[:3])}? `slip effects` lists them all.",
+    )
+
+
+def load_effects(path: Path) -> dict[str, EffectClass]:
+    """Effects of a user's own file, by id.
+
+    Raises:
+        MotionError: ``effects_file``, the file is missing, does not run, or defines no effect.
+    """
+    spec = importlib.util.spec_from_file_location(f"slip_effects_{path.stem}", path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise MotionError(
+            "effects_file", "there is no such file of effects", where=str(path), hint="Check the path."
+        )
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise MotionError(
+            "effects_file",
+            f"the file of effects does not run: {type(error).__name__}: {error}",
+            where=str(path),
+            hint="Mend it; it must be importable Python.",
+        ) from error
+    found = {effect.id: effect for effect in _effects_of(module)}
+    if not found:
+        raise MotionError(
+            "effects_file",
+            "the file defines no effect",
+            where=str(path),
+            hint="Derive a class from one of pipeline.motion's effect classes and give it an id.",
+        )
+    return found
+
+
+def _effects_of(module: ModuleType) -> list[EffectClass]:
+    return [
+        value
+        for value in vars(module).values()
+        if inspect.isclass(value)
+        and issubclass(value, Effect)
+        and not inspect.isabstract(value)
+        and value.__module__ == module.__name__
+    ]

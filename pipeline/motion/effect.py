@@ -1,0 +1,276 @@
+"""What an effect is: declared parameters, a place on the command's way, and one method that acts there.
+
+An effect's docstring is its manual page: what happens, the formula, the parameters, the source. Effects are
+values: changing a parameter makes another effect.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal, Self
+
+from pipeline.motion.errors import MotionError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from pipeline.motion.signals import Commands, Floats, Rolling, Surroundings, Velocity, Wheels
+
+INF = math.inf
+NAN = math.nan
+
+
+class Place(enum.IntEnum):
+    """Where on a command's way an effect acts, in this order."""
+
+    COMMAND = 1
+    DRIVE = 2
+    KINEMATICS = 3
+    BODY = 4
+    GROUND = 5
+    CENTRE = 6
+    LOCALIZATION = 7
+
+
+class Excitation(enum.Enum):
+    """What a run must contain for an effect to leave a trace of its own."""
+
+    DRIVING = "driving"
+    TURNING = "turning both ways"
+    SPEED_SPREAD = "several speeds"
+    BOTH_SIGNS = "driving forward and backward"
+    CHANGES = "changes of command"
+    SLOPE = "slopes in several directions"
+    LARGE = "commands near the limits"
+    SMALL = "commands near zero"
+    LONG = "a run of several minutes"
+    STEERING = "steering to both sides"
+
+
+class Search(enum.Enum):
+    """How a parameter is found: from one start, from several, or on a shrinking grid where it is not smooth."""
+
+    DIRECT = "direct"
+    STARTS = "starts"
+    GRID = "grid"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an effect.
+
+    Attributes:
+        name: as in the formula.
+        unit: SI, `1` for a plain number.
+        bounds: smallest and largest value.
+        neutral: value at which the effect changes nothing; NaN for a number that only says where it acts.
+        about: what it is.
+        typical: a usual size.
+        search: how it is found.
+        starts: values to start or to begin the grid from.
+        relative_to: what the starts are shares of: the largest commanded `speed`, `turn` or `wheel` speed, or
+            the run's `duration`; empty where they are values.
+        step: change used for numerical derivatives.
+    """
+
+    name: str
+    unit: str
+    bounds: tuple[float, float]
+    neutral: float
+    about: str
+    typical: float
+    search: Search = Search.DIRECT
+    starts: tuple[float, ...] = ()
+    relative_to: Literal["", "speed", "turn", "wheel", "duration"] = ""
+    step: float = 1e-4
+
+
+DIFFERENTIAL = ("differential",)
+ACKERMANN = ("ackermann",)
+ANY = ("differential", "ackermann")
+
+
+class Effect(ABC):
+    """One physical reason why the velocity differs from the ideal one.
+
+    Attributes:
+        id: stable name.
+        place: where it acts; `rank` orders the effects of one place.
+        parameters: its numbers.
+        kinds: kinds of vehicles it exists on.
+        needs: what a run must contain to show it.
+        confused_with: effects that look alike at first order or under poor driving.
+        equivalent_to: effects that cannot be told from it at all, under `equivalent_when`.
+        values: the numbers themselves.
+        fixed: names of parameters that a fit leaves alone.
+    """
+
+    id: str
+    place: Place
+    rank: ClassVar[int] = 0
+    parameters: tuple[Parameter, ...]
+    kinds: tuple[str, ...] = ANY
+    needs: tuple[Excitation, ...] = (Excitation.DRIVING,)
+    confused_with: tuple[str, ...] = ()
+    equivalent_to: tuple[str, ...] = ()
+    equivalent_when: str = ""
+
+    def __init__(self, *, fixed: Iterable[str] = (), **values: float) -> None:
+        self.values: Mapping[str, float] = self._complete(values)
+        self.fixed = frozenset(fixed)
+
+    def __repr__(self) -> str:
+        numbers = ", ".join(f"{name}={value:g}" for name, value in self.values.items())
+        return f"{self.id}({numbers})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Effect) and self.key == other.key and self.fixed == other.fixed
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What the effect does, as a hashable value."""
+        return (self.id, *(None if math.isnan(value) else value for value in self.values.values()))
+
+    @property
+    def is_neutral(self) -> bool:
+        """Whether every parameter that can be neutral is."""
+        return all(math.isnan(p.neutral) or self.values[p.name] == p.neutral for p in self.parameters)
+
+    def parameter(self, name: str) -> Parameter:
+        """The declared parameter.
+
+        Raises:
+            MotionError: ``unknown_parameter``.
+        """
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return parameter
+        known = ", ".join(f"{p.name} [{p.unit}]" for p in self.parameters)
+        raise MotionError(
+            "unknown_parameter",
+            f"the effect {self.id} has no parameter {name!r}",
+            where=f"{self.id}.{name}",
+            hint=f"It has: {known}.",
+        )
+
+    def change(self, **values: float) -> Self:
+        """The same effect with other values.
+
+        Raises:
+            MotionError: ``unknown_parameter`` or ``out_of_bounds``.
+        """
+        return self._copy({**self.values, **values}, self.fixed)
+
+    def fix(self, *names: str) -> Self:
+        """The same effect with parameters that a fit must leave alone.
+
+        Raises:
+            MotionError: ``unknown_parameter``.
+        """
+        return self._copy(self.values, self.fixed | {self.parameter(name).name for name in names})
+
+    def _copy(self, values: Mapping[str, float], fixed: Iterable[str]) -> Self:
+        return type(self)(fixed=fixed, **values)
+
+    def _complete(self, given: Mapping[str, float]) -> dict[str, float]:
+        for name, value in given.items():
+            parameter = self.parameter(name)
+            low, high = parameter.bounds
+            neutral = value == parameter.neutral or (math.isnan(value) and math.isnan(parameter.neutral))
+            if not neutral and not low <= value <= high:
+                raise MotionError(
+                    "out_of_bounds",
+                    f"{name} = {value:g} {parameter.unit} is outside of {low:g} to {high:g}",
+                    where=f"{self.id}.{name}",
+                    hint="Give a value inside the bounds.",
+                )
+        return {p.name: float(given.get(p.name, p.neutral)) for p in self.parameters}
+
+
+class CommandEffect(Effect):
+    """Acts on commands at their own stamps."""
+
+    place = Place.COMMAND
+
+    @abstractmethod
+    def change_commands(self, commands: Commands, around: Surroundings) -> Commands:
+        """What the drive is told in place of these commands."""
+
+
+class DriveEffect(Effect):
+    """Acts between what the drive is told and what the wheels do."""
+
+    place = Place.DRIVE
+
+    @abstractmethod
+    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+        """What the wheels do in place of this."""
+
+
+class KinematicEffect(Effect):
+    """Acts between the wheels and the body velocity before the ground acts."""
+
+    place = Place.KINEMATICS
+
+    @abstractmethod
+    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+        """The body velocity before the ground, in place of this."""
+
+
+class BodyEffect(Effect):
+    """Makes the body's velocity out of the rolling velocity."""
+
+    place = Place.BODY
+
+    @abstractmethod
+    def move_body(self, rolling: Rolling, around: Surroundings) -> Velocity:
+        """Velocity of the body before ground effects are added."""
+
+
+Column = tuple["Floats | float", "Floats | float", "Floats | float"]
+
+
+class LinearEffect(Effect):
+    """Adds parameter times column to the velocity; columns are made of the model, never of measurements."""
+
+    place = Place.GROUND
+
+    @abstractmethod
+    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+        """What one unit of each parameter adds to v_x, v_y, v_w.
+
+        Args:
+            rolling: v0, w0 of the model.
+            velocity: what this place acts on; ground effects, which act in parallel, must not use it.
+            around: the run.
+        """
+
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Velocity:
+        """Add all columns to ``total``."""
+        for name, (x, y, w) in self.columns(rolling, velocity, around).items():
+            value = self.values[name]
+            total = total.add(
+                *(None if isinstance(part, float) and part == 0.0 else value * part for part in (x, y, w))
+            )
+        return total
+
+
+class ReportEffect(Effect):
+    """Acts on what the localization reports."""
+
+    place = Place.LOCALIZATION
+
+    @abstractmethod
+    def report(self, velocity: Velocity, around: Surroundings) -> Velocity:
+        """Velocity as the reported poses show it."""
+
+    def delay_s(self) -> float:
+        """How late the reported poses are stamped [s]."""
+        return 0.0

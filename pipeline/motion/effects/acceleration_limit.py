@@ -1,0 +1,50 @@
+"""Acceleration limit: wheels change their speed no faster than the drive can.
+
+    abs(dOmega/dt) <= limit, each wheel
+
+limit [rad/s^2]. Ask for large steps of speed: small ones are reached at once and do not show it.
+
+Source: acceleration limits of a ros2_control diff_drive_controller; torque limit of the motor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipeline.motion.effect import INF, DriveEffect, Excitation, Parameter, Search
+from pipeline.motion.filters import limit_rate
+
+if TYPE_CHECKING:
+    from pipeline.motion.signals import Surroundings, Wheels
+
+
+class AccelerationLimit(DriveEffect):
+    """Acceleration limit: wheels change their speed no faster than the drive can."""
+
+    id = "acceleration_limit"
+    rank = 10
+    parameters = (
+        Parameter(
+            "limit",
+            "rad/s^2",
+            (0.05, 500.0),
+            INF,
+            "largest wheel acceleration",
+            3.0,
+            search=Search.STARTS,
+            starts=(1.0, 2.5, 6.0, 12.0, 25.0),
+            step=1e-2,
+        ),
+    )
+    needs = (Excitation.CHANGES, Excitation.LARGE)
+    confused_with = ("drive_lag", "body_inertia")
+
+    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+        """See the formula above."""
+        limit, start = self.values["limit"], around.start_wheels
+        return replace(
+            wheels,
+            left=limit_rate(wheels.left, limit, around, start[:, 0]),
+            right=limit_rate(wheels.right, limit, around, start[:, 1]),
+        )

@@ -1,0 +1,59 @@
+"""Body inertia: with little grip the body follows its wheels late and slides on in turns.
+
+    dv_x/dt = (v0 - v_x)/tau + v_y*w,  dv_y/dt = -v_y/tau - v_x*w,  dw/dt = (w0 - w)/tau
+
+tau [s], 0.2 to 1 on ice. Change speed while turning.
+
+Source: Newton's law of a body in viscous contact, written in its own turning frame; the ice runs of Samson et
+al. 2024.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.motion.effect import BodyEffect, Excitation, Parameter, Search
+from pipeline.motion.filters import lag_complex
+from pipeline.motion.signals import Velocity
+
+if TYPE_CHECKING:
+    from pipeline.motion.signals import Rolling, Surroundings
+
+
+class BodyInertia(BodyEffect):
+    """Body inertia: with little grip the body follows its wheels late and slides on in turns."""
+
+    id = "body_inertia"
+    parameters = (
+        Parameter(
+            "tau",
+            "s",
+            (0.0, 10.0),
+            0.0,
+            "time constant of the body on the ground",
+            0.5,
+            search=Search.STARTS,
+            starts=(0.15, 0.4, 0.9, 1.6),
+            step=5e-3,
+        ),
+    )
+    needs = (Excitation.CHANGES, Excitation.TURNING)
+    confused_with = ("lateral_skid", "drive_lag", "acceleration_limit", "heading_skew")
+    equivalent_to = ("drive_lag",)
+    equivalent_when = "never turning, or only turning on the spot"
+
+    def move_body(self, rolling: Rolling, around: Surroundings) -> Velocity:
+        """See the formula above."""
+        tau, start = self.values["tau"], around.start_velocity
+        if tau <= 0.0:
+            return Velocity(rolling.v0, np.zeros_like(rolling.v0), rolling.w0)
+        turn = np.where(np.isfinite(start[:, 2]), start[:, 2], np.nan).astype(np.complex128)
+        w = lag_complex(rolling.w0.astype(np.complex128), tau, around, turn, around.settle).real
+        # In a frame that does not turn the two equations of v_x and v_y are one lag of a complex number.
+        heading = np.cumsum(w) * around.step_s - 0.5 * w * around.step_s
+        frame = np.exp(1j * heading)
+        start_slide = (start[:, 0] + 1j * start[:, 1]) * frame[around.settle]
+        slide = lag_complex(rolling.v0 * frame, tau, around, start_slide, around.settle) * np.conj(frame)
+        return Velocity(slide.real, slide.imag, w)

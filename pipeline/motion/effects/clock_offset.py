@@ -1,0 +1,51 @@
+"""Clock offset: reported poses are stamped late, or early.
+
+    reported pose(t) = pose(t - d)
+
+d [s]; d < 0 is a clock that runs ahead, which no physics can do. Encoders or a gyro with their own stamps
+tell it from a delay of the drive.
+
+Source: header stamps against log times; measured on the DRIVE recordings.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.motion.effect import Excitation, Parameter, ReportEffect, Search
+
+if TYPE_CHECKING:
+    from pipeline.motion.signals import Surroundings, Velocity
+
+
+class ClockOffset(ReportEffect):
+    """Clock offset: reported poses are stamped late, or early."""
+
+    id = "clock_offset"
+    rank = 40
+    parameters = (
+        Parameter(
+            "d",
+            "s",
+            (-1.0, 1.0),
+            0.0,
+            "how late poses are stamped",
+            -0.15,
+            search=Search.STARTS,
+            starts=(-0.3, -0.1, 0.1, 0.3),
+            step=5e-3,
+        ),
+    )
+    needs = (Excitation.CHANGES,)
+    confused_with = ("drive_lag", "body_inertia")
+    equivalent_to = ("transport_delay",)
+    equivalent_when = "the input is the command and there are neither encoders, gyro nor another clock"
+
+    def report(self, velocity: Velocity, around: Surroundings) -> Velocity:
+        """See the formula above."""
+        del around
+        return velocity
+
+    def delay_s(self) -> float:
+        """How late the reported poses are stamped [s]."""
+        return self.values["d"]

@@ -1,0 +1,52 @@
+"""Drive lag: wheels approach the commanded speed like a first-order system.
+
+    tau * dOmega/dt = u - Omega, each wheel
+
+tau [s]: 0.55 to 0.64 on a Husky on tile, 1.0 in snow, 1.05 to 1.2 on a Warthog. Change commands often.
+
+Source: the powertrain model of Samson et al. 2024 and of DRIVE, Baril et al. 2024.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipeline.motion.effect import DriveEffect, Excitation, Parameter, Search
+from pipeline.motion.filters import lag_real
+
+if TYPE_CHECKING:
+    from pipeline.motion.signals import Surroundings, Wheels
+
+
+class DriveLag(DriveEffect):
+    """Drive lag: wheels approach the commanded speed like a first-order system."""
+
+    id = "drive_lag"
+    rank = 20
+    parameters = (
+        Parameter(
+            "tau",
+            "s",
+            (0.0, 10.0),
+            0.0,
+            "time constant",
+            0.5,
+            search=Search.STARTS,
+            starts=(0.1, 0.3, 0.7, 1.4),
+            step=5e-3,
+        ),
+    )
+    needs = (Excitation.CHANGES,)
+    confused_with = ("transport_delay", "turn_lag", "acceleration_limit")
+    equivalent_to = ("body_inertia",)
+    equivalent_when = "never turning, or only turning on the spot"
+
+    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+        """See the formula above."""
+        tau, start = self.values["tau"], around.start_wheels
+        return replace(
+            wheels,
+            left=lag_real(wheels.left, tau, around, start[:, 0]),
+            right=lag_real(wheels.right, tau, around, start[:, 1]),
+        )

@@ -1,0 +1,33 @@
+"""Effective track: a skid-steered vehicle turns as if its wheels stood further apart.
+
+    w0 = w0 / k    (b_eff = k b)
+
+k is a plain number: 1 without skidding, about 1.9 on a Husky, 1.8 on a Warthog. Turn both ways.
+
+Source: Mandow et al., IROS 2007; Baril et al., CRV 2020.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.motion.effect import DIFFERENTIAL, Excitation, KinematicEffect, Parameter
+
+if TYPE_CHECKING:
+    from pipeline.motion.signals import Rolling, Surroundings
+
+
+class EffectiveTrack(KinematicEffect):
+    """Effective track: a skid-steered vehicle turns as if its wheels stood further apart."""
+
+    id = "effective_track"
+    rank = 20
+    kinds = DIFFERENTIAL
+    parameters = (Parameter("k", "1", (0.2, 10.0), 1.0, "effective over nominal track", 1.8),)
+    needs = (Excitation.TURNING,)
+    confused_with = ("wheel_radius", "terrain_change")
+
+    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+        """See the formula above."""
+        del around
+        return rolling.scale(1.0, 1.0 / self.values["k"])

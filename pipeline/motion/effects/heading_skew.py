@@ -1,0 +1,54 @@
+"""Heading skew: the reported heading is older than the reported position.
+
+    reported yaw(t) = yaw(t - d):  v_y += d * v0 * w0 at first order
+
+d [s], up to 0.1. It looks like lateral skid of c = -d. It shows only against the reported heading: with a
+gyro as heading it is the difference of two delays instead (see the run's timing).
+
+Source: two clocks in one localization; measured on the DRIVE recordings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.motion.effect import Excitation, Parameter, ReportEffect
+from pipeline.motion.signals import earlier_in_span
+
+if TYPE_CHECKING:
+    from pipeline.motion.signals import Surroundings, Velocity
+
+
+class HeadingSkew(ReportEffect):
+    """Heading skew: the reported heading is older than the reported position."""
+
+    id = "heading_skew"
+    rank = 30
+    parameters = (
+        Parameter("d", "s", (-0.6, 0.6), 0.0, "age of the heading against the position", 0.1, step=1e-3),
+    )
+    needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
+    confused_with = ("lateral_skid", "body_inertia", "icr_offset")
+
+    def report(self, velocity: Velocity, around: Surroundings) -> Velocity:
+        """See the formula above."""
+        late = self.values["d"]
+        if late == 0.0:
+            return velocity
+        ends = np.cumsum(velocity.w) * around.step_s
+        middle = ends - 0.5 * velocity.w * around.step_s
+        # Between spans the cells jump in time; a delayed value must not come from the span before.
+        earlier = np.interp(around.times - late, around.times, middle)
+        reaches = earlier_in_span(around, late)
+        turned = np.where(reaches, middle - earlier, late * velocity.w)
+        rate = np.where(reaches, np.interp(around.times - late, around.times, velocity.w), velocity.w)
+        sine, cosine = np.sin(turned), np.cos(turned)
+        return replace(
+            velocity,
+            x=cosine * velocity.x - sine * velocity.y,
+            y=sine * velocity.x + cosine * velocity.y,
+            w=rate,
+        )

@@ -1,0 +1,49 @@
+"""Steering lag: the steering angle approaches what is asked like a first-order system.
+
+    tau * ddelta/dt = u_delta - delta
+
+tau [s], about 0.4. Change the steering often.
+
+Source: actuator model of a kinematic bicycle; Becker et al. 2023.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.motion.effect import ACKERMANN, DriveEffect, Excitation, Parameter, Search
+from pipeline.motion.filters import lag_real
+
+if TYPE_CHECKING:
+    from pipeline.motion.signals import Surroundings, Wheels
+
+
+class SteeringLag(DriveEffect):
+    """Steering lag: the steering angle approaches what is asked like a first-order system."""
+
+    id = "steering_lag"
+    rank = 60
+    kinds = ACKERMANN
+    parameters = (
+        Parameter(
+            "tau",
+            "s",
+            (0.0, 10.0),
+            0.0,
+            "time constant",
+            0.4,
+            search=Search.STARTS,
+            starts=(0.1, 0.3, 0.7, 1.4),
+            step=5e-3,
+        ),
+    )
+    needs = (Excitation.CHANGES, Excitation.STEERING)
+    confused_with = ("transport_delay",)
+
+    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+        """See the formula above."""
+        unknown = np.full(around.first.size, np.nan)
+        return replace(wheels, steering=lag_real(wheels.steering, self.values["tau"], around, unknown))

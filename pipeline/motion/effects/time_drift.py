@@ -1,0 +1,32 @@
+"""Time drift: speed and turning fade over a run, as with a falling battery or heating motors.
+
+    v0 = v0 * (1 - k * t/T),  w0 = w0 * (1 - k * t/T)
+
+T is the length of the run, t the time since its start. k is a plain number, about 10 % a run.
+
+Source: first-order drift of a gain; measured on long deployments.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.motion.effect import Excitation, KinematicEffect, Parameter
+
+if TYPE_CHECKING:
+    from pipeline.motion.signals import Rolling, Surroundings
+
+
+class TimeDrift(KinematicEffect):
+    """Time drift: speed and turning fade over a run, as with a falling battery or heating motors."""
+
+    id = "time_drift"
+    rank = 50
+    parameters = (Parameter("k", "1", (-0.9, 0.9), 0.0, "share lost at the end of the run", 0.1),)
+    needs = (Excitation.LONG,)
+    confused_with = ("terrain_change", "wheel_radius")
+
+    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+        """See the formula above."""
+        fade = 1.0 - self.values["k"] * around.times / around.duration_s
+        return rolling.scale(fade, fade)

@@ -1,0 +1,66 @@
+"""Turn lag: the difference of the wheels follows its command more slowly than their mean.
+
+    D = Omega_r - Omega_l,  M = (Omega_r + Omega_l)/2:
+    tau_mean * dM/dt = u_M - M,  tau_diff * dD/dt = u_D - D
+
+Friction on the ground brakes turning: tau_mean 0.4 and tau_diff 1.1 to 1.6 s on a Warthog (0.55 on ice),
+0.1 and 0.35 s on a Husky. Change speed and turning separately.
+
+Source: measured on the DRIVE recordings; the powertrain model of DRIVE, Baril et al. 2024, split in two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipeline.motion.effect import DIFFERENTIAL, DriveEffect, Excitation, Parameter, Search
+from pipeline.motion.filters import lag_real
+
+if TYPE_CHECKING:
+    from pipeline.motion.signals import Surroundings, Wheels
+
+
+class TurnLag(DriveEffect):
+    """Turn lag: the difference of the wheels follows its command more slowly than their mean."""
+
+    id = "turn_lag"
+    rank = 30
+    kinds = DIFFERENTIAL
+    parameters = (
+        Parameter(
+            "tau_mean",
+            "s",
+            (0.0, 10.0),
+            0.0,
+            "time constant of the mean",
+            0.3,
+            search=Search.STARTS,
+            starts=(0.1, 0.4),
+            step=5e-3,
+        ),
+        Parameter(
+            "tau_diff",
+            "s",
+            (0.0, 10.0),
+            0.0,
+            "time constant of the difference",
+            1.0,
+            search=Search.STARTS,
+            starts=(0.3, 1.2),
+            step=5e-3,
+        ),
+    )
+    needs = (Excitation.CHANGES, Excitation.TURNING)
+    confused_with = ("drive_lag", "transport_delay", "turn_droop")
+
+    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+        """See the formula above."""
+        start = around.start_wheels
+        slow, fast = self.values["tau_diff"], self.values["tau_mean"]
+        if slow <= 0.0 and fast <= 0.0:
+            # Splitting into mean and difference and back would leave rounding behind.
+            return wheels
+        mean = lag_real(0.5 * (wheels.left + wheels.right), fast, around, start.mean(axis=1))
+        difference = lag_real(wheels.right - wheels.left, slow, around, start[:, 1] - start[:, 0])
+        return replace(wheels, left=mean - 0.5 * difference, right=mean + 0.5 * difference)

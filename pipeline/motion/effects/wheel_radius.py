@@ -1,0 +1,32 @@
+"""Wheel radius: all wheels are larger or smaller than nominal, or slip in proportion to their speed.
+
+    v0 = k * v0,  w0 = k * w0
+
+k is a plain number, off one by 2 to 25 %. Drive at several speeds, straight and turning.
+
+Source: Borenstein and Feng, IEEE T-RA 1996 (UMBmark), the common scale error.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.motion.effect import Excitation, KinematicEffect, Parameter
+
+if TYPE_CHECKING:
+    from pipeline.motion.signals import Rolling, Surroundings
+
+
+class WheelRadius(KinematicEffect):
+    """Wheel radius: all wheels are larger or smaller than nominal, or slip in proportion to their speed."""
+
+    id = "wheel_radius"
+    rank = 30
+    parameters = (Parameter("k", "1", (0.0, 5.0), 1.0, "true over nominal radius", 0.92),)
+    needs = (Excitation.SPEED_SPREAD,)
+    confused_with = ("speed_slip", "effective_track")
+
+    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+        """See the formula above."""
+        del around
+        return rolling.scale(self.values["k"], self.values["k"])

@@ -1,0 +1,239 @@
+"""One run as arrays, ready for models: commands, wheels, poses, gyro, and which stretches count."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core import rigid, segments
+from pipeline.motion.errors import MotionError
+from pipeline.motion.ideal import invert_differential
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import polars as pl
+
+    from pipeline.vehicles import Vehicle
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+
+_SHORTEST_HOLD = 0.5
+_PERIODS = 5.0
+_DEAD = 1e-9
+
+
+@dataclass(frozen=True)
+class DriveSeries:
+    """Wheel speeds (rear axle on a car) [rad/s] and steering [rad] at stamps [s], each of shape (n,)."""
+
+    times: Floats
+    left: Floats
+    right: Floats
+    steering: Floats
+
+
+@dataclass(frozen=True)
+class Track:
+    """Poses that carry information, in the plane the body moves in.
+
+    Attributes:
+        times: stamps [s], shape (n,).
+        segment: number of the segment, shape (n,).
+        path: position x + iy [m] in the plane, unrolled from body increments, shape (n,).
+        heading: accumulated rotation about the body's own z axis [rad], shape (n,).
+        attitude: roll, pitch, yaw [rad], yaw unwrapped, shape (n, 3).
+        place: x, y in the map [m], shape (n, 2).
+        active: inside an interval with live commands, shape (n,).
+    """
+
+    times: Floats
+    segment: Integers
+    path: NDArray[np.complex128]
+    heading: Floats
+    attitude: Floats
+    place: Floats
+    active: Flags
+
+
+@dataclass(frozen=True)
+class MotionRun:
+    """One run.
+
+    Attributes:
+        name: of the run.
+        sha256: of its recording, empty when unknown.
+        terrain: its terrain.
+        commands: held commands, with stops where the controller fell silent; None without.
+        wheels: measured wheels; None without, or when they are dead.
+        gyro: times [s] and yaw rate [rad/s], as recorded; None without.
+        track: the poses.
+        streams: stamps of everything recorded [s], increasing: where they pause, the recording has a hole.
+        step_starts: where command steps begin [s].
+        barred: times [s] of samples in bad stretches or without a live command.
+        duration_s: length of the run.
+    """
+
+    name: str
+    sha256: str
+    terrain: str
+    commands: DriveSeries | None
+    wheels: DriveSeries | None
+    gyro: tuple[Floats, Floats] | None
+    track: Track
+    streams: Floats
+    step_starts: Floats
+    barred: Floats
+    duration_s: float
+
+
+def load_run(
+    tables: Mapping[str, pl.DataFrame],
+    vehicle: Vehicle,
+    *,
+    name: str,
+    sha256: str = "",
+    hold_s: float | None = None,
+) -> MotionRun:
+    """Make a run of its tables.
+
+    Args:
+        tables: `poses`, `commands`, `wheels`, `imu`, and `slip` (for steps and bad stretches); those that the
+            log lacks may be missing or empty.
+        vehicle: geometry.
+        name: of the run.
+        sha256: of the recording.
+        hold_s: the controller stops this long after its last command; five periods by default, at least 0.5 s.
+
+    Raises:
+        MotionError: ``no_poses``, fewer than ten poses carry information.
+    """
+    track = _read_track(tables["poses"], name)
+    commands = _read_drive(tables.get("commands"), vehicle)
+    wheels = _read_drive(tables.get("wheels"), vehicle)
+    if wheels is not None and max(np.abs(wheels.left).max(), np.abs(wheels.right).max()) < _DEAD:
+        wheels = None
+    imu = tables.get("imu")
+    gyro = None
+    if imu is not None and not imu.is_empty():
+        gyro = _distinct(imu["t"].to_numpy(), imu["rate_z"].to_numpy())
+    stamps = [tables["poses"]["t"].to_numpy(), *(d.times for d in (commands, wheels) if d is not None)]
+    streams = np.unique(np.concatenate(stamps))
+    if commands is not None:
+        commands = _stop_when_silent(commands, hold_s)
+    steps, barred = _read_steps(tables.get("slip"))
+    terrains = tables["poses"]["terrain"] if "terrain" in tables["poses"].columns else None
+    return MotionRun(
+        name=name,
+        sha256=sha256,
+        terrain=str(terrains[0]) if terrains is not None else "unknown",
+        commands=commands,
+        wheels=wheels,
+        gyro=gyro,
+        track=track,
+        streams=streams,
+        step_starts=steps,
+        barred=barred,
+        duration_s=float(streams[-1]),
+    )
+
+
+def _read_track(poses: pl.DataFrame, name: str) -> Track:
+    parts = []
+    for piece in poses.sort("segment", "t").partition_by("segment", maintain_order=True):
+        times = piece["t"].to_numpy()
+        fresh = segments.select_fresh_poses(times, piece["held"].to_numpy())
+        fresh = fresh[np.diff(times[fresh], prepend=-np.inf) > 0.0]
+        if fresh.size > 1:
+            parts.append(_unroll(piece[fresh]))
+    if sum(part.times.size for part in parts) < 10:  # noqa: PLR2004 - fewer say nothing
+        raise MotionError(
+            "no_poses",
+            "fewer than ten poses carry information",
+            where=name,
+            hint="Check the pose topic with `slip inspect`.",
+        )
+    return Track(
+        *(np.concatenate([getattr(part, field) for part in parts]) for field in Track.__dataclass_fields__)
+    )
+
+
+def _unroll(piece: pl.DataFrame) -> Track:
+    """One segment's poses, rolled out into the plane of motion."""
+    position = piece.select("x", "y", "z").to_numpy()
+    quaternion = piece.select("q_x", "q_y", "q_z", "q_w").to_numpy()
+    roll, pitch, yaw = rigid.euler_from_quaternions(quaternion)
+    _, turn = segments.measure_increments(position, quaternion)
+    middle = rigid.slerp(quaternion[:-1], quaternion[1:], np.full(turn.shape[0], 0.5))
+    moved = rigid.rotate(rigid.invert_quaternions(middle), np.diff(position, axis=0))
+    heading = yaw[0] + np.concatenate(([0.0], np.cumsum(turn[:, 2])))
+    along = (moved[:, 0] + 1j * moved[:, 1]) * np.exp(0.5j * (heading[:-1] + heading[1:]))
+    path = position[0, 0] + 1j * position[0, 1] + np.concatenate(([0.0], np.cumsum(along)))
+    return Track(
+        times=piece["t"].to_numpy(),
+        segment=piece["segment"].to_numpy().astype(np.int64),
+        path=path,
+        heading=heading,
+        attitude=np.column_stack((roll, pitch, rigid.unwrap_yaw(yaw))),
+        place=position[:, :2],
+        active=piece["active"].to_numpy(),
+    )
+
+
+def _read_drive(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | None:
+    if table is None or table.is_empty():
+        return None
+    times = table["t"].to_numpy()
+    if vehicle.kind == "ackermann":
+        axle = table["speed"].to_numpy() / vehicle.wheel_radius_m
+        left, right, steering = axle, axle, table["steering"].to_numpy()
+    else:
+        left, right, steering = table["left"].to_numpy(), table["right"].to_numpy(), np.zeros(times.size)
+        if table["left"].null_count():
+            left, right = invert_differential(table["body_x"].to_numpy(), table["body_w"].to_numpy(), vehicle)
+    kept = np.isfinite(left) & np.isfinite(right) & np.isfinite(steering)
+    kept &= np.concatenate((np.diff(times) > 0.0, [True]))
+    if kept.sum() < 2:  # noqa: PLR2004 - one value is no series
+        return None
+    return DriveSeries(times[kept], left[kept], right[kept], steering[kept])
+
+
+def _distinct(times: Floats, values: Floats) -> tuple[Floats, Floats]:
+    kept = np.concatenate(([True], np.diff(times) > 0.0)) & np.isfinite(values)
+    return times[kept], values[kept]
+
+
+def _stop_when_silent(commands: DriveSeries, hold_s: float | None) -> DriveSeries:
+    times = commands.times
+    if hold_s is None:
+        hold_s = max(_SHORTEST_HOLD, _PERIODS * float(np.median(np.diff(times))))
+    silent = np.flatnonzero(np.diff(times, append=np.inf) > hold_s)
+    at = silent + 1
+    return DriveSeries(
+        np.insert(times, at, times[silent] + hold_s),
+        np.insert(commands.left, at, 0.0),
+        np.insert(commands.right, at, 0.0),
+        np.insert(commands.steering, at, 0.0),
+    )
+
+
+def _read_steps(slip: pl.DataFrame | None) -> tuple[Floats, Floats]:
+    """Where steps start, and times of samples that must not be scored."""
+    if slip is None or slip.is_empty():
+        return np.zeros(0), np.zeros(0)
+    leading = "command" if (slip["input"] == "command").any() else "measured"
+    rows = slip.filter(slip["input"] == leading).sort("t")
+    step, times = rows["step"].to_numpy(), rows["t"].to_numpy()
+    starts = times[np.concatenate(([True], np.diff(step) != 0))]
+    barred = [slip.filter(slip["suspect"])["t"].to_numpy()]
+    # Rows are missing where no live command stands beside the motion: such stretches are not scored either.
+    holes = np.flatnonzero(np.diff(times) > 0.2)  # noqa: PLR2004 - four samples at the usual rate
+    for hole in holes.tolist():
+        barred.append(np.arange(times[hole] + 0.05, times[hole + 1], 0.05))  # noqa: PERF401
+    barred.append(np.array([times[0] - 1e-3, times[-1] + 1e-3]))
+    return starts, np.unique(np.concatenate(barred))

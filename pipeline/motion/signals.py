@@ -1,0 +1,162 @@
+"""The signals on a command's way: commands, wheels, rolling, velocity; and what surrounds them.
+
+Commands stand at their own stamps. Everything after them stands on cells: short stretches of equal length
+whose values are means over the cell, so that a held command enters exactly wherever its stamp falls. Cells
+are grouped in spans; between spans the recording had a hole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from pipeline.vehicles import Vehicle
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Held commands: each value counts from its stamp to the next.
+
+    Attributes:
+        times: stamps [s], increasing, shape (n,).
+        left, right: wheel speeds [rad/s]; on a car both are the rear axle's, shape (n,).
+        steering: steering angle [rad], left positive; zero on a differential vehicle, shape (n,).
+    """
+
+    times: Floats
+    left: Floats
+    right: Floats
+    steering: Floats
+
+    def change_wheels(self, left: Floats, right: Floats) -> Commands:
+        """The same commands with other wheel speeds."""
+        return replace(self, left=left, right=right)
+
+
+@dataclass(frozen=True)
+class Wheels:
+    """What the drivetrain's output does, on cells.
+
+    Attributes:
+        left, right: wheel speeds [rad/s], shape (n,).
+        steering: steering angle [rad], shape (n,).
+    """
+
+    left: Floats
+    right: Floats
+    steering: Floats
+
+
+@dataclass(frozen=True)
+class Rolling:
+    """Body velocity before the ground acts, on cells.
+
+    Attributes:
+        v0: forward [m/s], shape (n,).
+        w0: yaw rate [rad/s], shape (n,).
+        wheels: the drivetrain's output it came from.
+    """
+
+    v0: Floats
+    w0: Floats
+    wheels: Wheels
+
+    def scale(self, along: Floats | float, around: Floats | float) -> Rolling:
+        """Rolling with both parts multiplied."""
+        return Rolling(self.v0 * along, self.w0 * around, self.wheels)
+
+
+@dataclass(frozen=True)
+class Velocity:
+    """Body velocity on cells: x [m/s], y [m/s], w [rad/s], each of shape (n,)."""
+
+    x: Floats
+    y: Floats
+    w: Floats
+
+    def add(
+        self,
+        x: Floats | float | None = None,
+        y: Floats | float | None = None,
+        w: Floats | float | None = None,
+    ) -> Velocity:
+        """Velocity with something added; None leaves a channel alone."""
+        return Velocity(
+            self.x if x is None else self.x + x,
+            self.y if y is None else self.y + y,
+            self.w if w is None else self.w + w,
+        )
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What an effect may know of a run beside the signal it acts on.
+
+    Attributes:
+        vehicle: geometry.
+        times: middles of the cells [s] since the run's start, shape (n,).
+        step_s: width of a cell [s].
+        span: number of the span of each cell, shape (n,).
+        first: first cell of each span, shape (k,).
+        duration_s: length of the run [s].
+        start_wheels: measured wheel speeds at each span's start (left, right) [rad/s], NaN where there are
+            none, shape (k, 2).
+        settle: cell of each span from which `start_velocity` counts, shape (k,).
+        start_velocity: body velocity measured over the span's first moments, before its `settle` cell's end;
+            NaN where there is none, shape (k, 3).
+        attitude: roll, pitch, yaw as reported [rad], shape (n, 3).
+        place: x, y as reported [m], shape (n, 2).
+    """
+
+    vehicle: Vehicle
+    times: Floats
+    step_s: float
+    span: Integers
+    first: Integers
+    duration_s: float
+    start_wheels: Floats
+    settle: Integers
+    start_velocity: Floats
+    attitude: Floats
+    place: Floats
+
+    @property
+    def track_m(self) -> float:
+        """Nominal track width [m]; one on a vehicle without."""
+        return self.vehicle.track_width_m or 1.0
+
+
+_LEAST_RIM_SPEED = 0.01
+
+
+def find_turning(wheels: Wheels, around: Surroundings) -> Floats:
+    """One where the wheels turn, zero where they stand, shape (n,)."""
+    rim = around.vehicle.wheel_radius_m * np.maximum(np.abs(wheels.left), np.abs(wheels.right))
+    return (rim > _LEAST_RIM_SPEED).astype(np.float64)
+
+
+def roll_ideally(wheels: Wheels, around: Surroundings) -> Rolling:
+    """Ideal velocity of the drivetrain's output (see `ideal`), without sideways motion."""
+    vehicle = around.vehicle
+    forward = 0.5 * vehicle.wheel_radius_m * (wheels.left + wheels.right)
+    if vehicle.kind == "ackermann":
+        turning = forward * np.tan(wheels.steering) / (vehicle.wheelbase_m or 1.0)
+    else:
+        turning = vehicle.wheel_radius_m * (wheels.right - wheels.left) / around.track_m
+    return Rolling(forward, turning, wheels)
+
+
+def earlier_in_span(around: Surroundings, late: float) -> Flags:
+    """Whether the time ``late`` seconds before each cell lies in the same span (after it, when negative)."""
+    last = np.append(around.first[1:], around.times.size) - 1
+    at = around.times - late
+    inside: Flags = (at >= around.times[around.first][around.span]) & (at <= around.times[last][around.span])
+    return inside
