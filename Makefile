@@ -14,7 +14,7 @@ export LOG OUT VEHICLE ARGS
 FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: help setup analyze inspect test test-long check format samples bench bench-reader browser lock clean
+.PHONY: help setup analyze inspect test test-long check format samples bench bench-analyze bench-reader browser lock clean
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -48,7 +48,10 @@ samples: $(VENV)/.ready ## make the logs in data_samples again
 	@for case in husky_tile warthog_ice ackermann_gravel; do \
 		$(BIN)/slip simulate $$case --out data_samples/$$case.mcap || exit 1; done
 
-bench: bench-reader ## all benchmarks
+bench: bench-reader bench-analyze ## all benchmarks
+
+bench-analyze: $(VENV)/.ready-dev ## a whole analysis of a 10-minute log
+	$(BIN)/python tests/bench/analyze.py
 
 bench-reader: $(VENV)/.ready-dev ## reading a 1 GB log: ours, its peers, and the bound
 	$(BIN)/python tests/bench/reader.py
