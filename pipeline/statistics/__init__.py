@@ -1,0 +1,51 @@
+"""Medians, intervals, permutation tests and effect sizes: functions of arrays, usable alone.
+
+Slip is correlated from sample to sample, so samples are not what is counted: runs are, or blocks of one run
+where there is only one. Nothing here knows of logs, tables or vehicles.
+"""
+
+from pipeline.statistics.changes import Change, find_changes
+from pipeline.statistics.correlation import TIMES_PER_BLOCK, count_effective, integrated_time, number_blocks
+from pipeline.statistics.effect_sizes import cliffs_delta, name_delta, shift_between
+from pipeline.statistics.errors import StatisticsError
+from pipeline.statistics.families import (
+    MOST_GROUPS,
+    adjust_holm,
+    adjust_max_t,
+    runs_needed,
+    runs_needed_against,
+)
+from pipeline.statistics.intervals import Interval, bootstrap_median, bound_mean, bound_shift, bound_typical
+from pipeline.statistics.orders import kendall_tau, list_swaps
+from pipeline.statistics.permutation import PermutationTest, permute_means, permute_studentized, smallest_p
+from pipeline.statistics.ranks import mann_whitney
+
+__all__ = [
+    "MOST_GROUPS",
+    "TIMES_PER_BLOCK",
+    "Change",
+    "Interval",
+    "PermutationTest",
+    "StatisticsError",
+    "adjust_holm",
+    "adjust_max_t",
+    "bootstrap_median",
+    "bound_mean",
+    "bound_shift",
+    "bound_typical",
+    "cliffs_delta",
+    "count_effective",
+    "find_changes",
+    "integrated_time",
+    "kendall_tau",
+    "list_swaps",
+    "mann_whitney",
+    "name_delta",
+    "number_blocks",
+    "permute_means",
+    "permute_studentized",
+    "runs_needed",
+    "runs_needed_against",
+    "shift_between",
+    "smallest_p",
+]
