@@ -25,7 +25,14 @@ Reads MCAP logs of field robots, computes slip per time step, and writes tables,
 
 def build_app() -> App:
     """The program with every verb found in this folder; a verb is a module with a `register` function."""
-    app = App(name="slip", help=HELP, version_flags=["--version"], result_action="return_value")
+    app = App(
+        name="slip",
+        help=HELP,
+        # Plain text: a Markdown renderer takes longer to load than all the rest.
+        help_format="plaintext",
+        version_flags=["--version"],
+        result_action="return_value",
+    )
     for module in sorted(pkgutil.iter_modules(pipeline.cli.__path__), key=lambda found: found.name):
         if module.name.startswith("verb_"):
             importlib.import_module(f"pipeline.cli.{module.name}").register(app)

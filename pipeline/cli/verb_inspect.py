@@ -82,11 +82,11 @@ def _as_json(seen: Inspection) -> dict[str, object]:
 
 def _describe(seen: Inspection) -> list[str]:
     index = seen.index
-    packing = ", ".join(name or "none" for name in index.compressions) or "none"
+    packing = "compression " + (", ".join(name or "none" for name in index.compressions) or "none")
     lines = [
         f"log       {index.path}",
-        f"          {index.size_bytes / 1e6:.1f} MB, {format_duration(index.duration_s)}, "
-        f"{index.message_count} messages, {index.chunk_count} chunks, compression {packing}",
+        f"          {index.size_bytes / 1e6:.1f} MB, {format_duration(index.duration_s)}, {packing}",
+        f"          {index.message_count} messages in {index.chunk_count} chunks",
         f"          profile {index.profile or '-'}, written by {index.library or '-'}",
         f"health    {'complete' if not seen.losses else 'with losses'}",
     ]

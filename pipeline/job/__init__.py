@@ -5,7 +5,6 @@ tables, summary and report in one moment.
 """
 
 from pipeline.job.errors import JobError
-from pipeline.job.keys import STAGES
-from pipeline.job.options import INPUTS, Options
+from pipeline.job.options import INPUTS, STAGES, Options
 
 __all__ = ["INPUTS", "STAGES", "JobError", "Options"]

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, cast
 
 import msgspec
 
-from pipeline.job.keys import STAGES, hash_json, key_stages
+from pipeline.job.keys import hash_json, key_stages
+from pipeline.job.options import STAGES
 from pipeline.job.subject import Subject, describe_subject, name_run
 from pipeline.job.summary import summarize_run
 from pipeline.job.work import Progress, Work, read_subject, stored_contexts, stored_keys

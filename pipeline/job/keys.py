@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from pipeline.job.options import STAGES
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.job.subject import Subject
 
-STAGES = ("extract", "velocity", "slip", "aggregate")
 VERSIONS: Mapping[str, int] = {"extract": 1, "velocity": 1, "slip": 1, "aggregate": 1}
 TABLES: Mapping[str, tuple[str, ...]] = {
     "extract": ("commands", "wheels", "poses", "imu"),

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.job.keys import STAGES, TABLES
+from pipeline.job.keys import TABLES
+from pipeline.job.options import STAGES
 from pipeline.logs import LogData, Loss, read_topics
 from pipeline.stages import aggregate, checks, slip, velocity
 from pipeline.stages.extract import extract_tables, list_wanted
