@@ -17,6 +17,7 @@ Integers = NDArray[np.int64]
 
 _GAUSSIAN = 1.4826
 _SIDE = 4
+_PLAINLY = 3.0
 
 
 def find_gaps(times: Floats, smallest: float) -> Flags:
@@ -76,9 +77,10 @@ def find_jumps(
     """Whether the pose jumps before each sample: a correction of the map, not a motion.
 
     A jump stays; vibration, and poses that are stamped late, come back. So the body's own odometer over four
-    poses before and four after is fitted by a straight line with a step in the middle, and the step counts
-    where it exceeds eight robust standard deviations of all such steps, and the given floor plus the way
-    travelled in one and a half pose periods: a pose that a slow localization left out looks like that.
+    poses before and four after is fitted by a straight line with a step in the middle. The step counts where
+    it exceeds eight robust standard deviations of all such steps, and the given floor plus the way travelled
+    in one and a half pose periods (a pose that a slow localization left out looks like that), and where a
+    bend, as of a vehicle that turns round at once, does not explain the poses far better.
 
     Args:
         times: sample times [s], shape (n,), strictly increasing.
@@ -95,31 +97,49 @@ def find_jumps(
         return flags
     move, turn = measure_increments(position, quaternion)
     for increment, floor in ((move, metres), (turn, radians)):
-        step, rate = _fit_steps(times, increment)
+        step, rate, stepped = _fit_steps(times, increment)
         size = np.linalg.norm(step, axis=1)
         skipped = 1.5 * float(np.median(np.diff(times))) * np.linalg.norm(rate, axis=1)
         limit = np.maximum(8.0 * _GAUSSIAN * float(np.median(size)), floor + skipped)
         # The fits around a jump see it too; the jump is where the step is largest.
         padded = np.pad(size, _SIDE - 1)
         tallest = np.lib.stride_tricks.sliding_window_view(padded, 2 * _SIDE - 1).max(axis=1)
-        flags[_SIDE : _SIDE + size.size] |= (size > limit) & (size >= tallest)
+        flags[_SIDE : _SIDE + size.size] |= stepped & (size > limit) & (size >= tallest)
     return flags
 
 
-def _fit_steps(times: Floats, increment: Floats) -> tuple[Floats, Floats]:
-    """Step in the middle of every 2 x 4 poses and the slope beside it, each of shape (n - 7, 3)."""
+def _fit_steps(times: Floats, increment: Floats) -> tuple[Floats, Floats, Flags]:
+    """What happens in the middle of every 2 x 4 poses, each of shape (n - 7, ...).
+
+    Returns:
+        The step of the odometer (n - 7, 3), the slope beside it (n - 7, 3), and whether no bend explains the
+        poses far better: a vehicle that starts, stops or turns round bends its odometer.
+    """
     odometer = np.concatenate((np.zeros((1, 3)), np.cumsum(increment, axis=0)))
     windows = np.lib.stride_tricks.sliding_window_view(odometer, 2 * _SIDE, axis=0)
+    windows = windows - windows.mean(axis=2, keepdims=True)
     stamps = np.lib.stride_tricks.sliding_window_view(times, 2 * _SIDE)
     side = np.repeat([0.0, 1.0], _SIDE)
     after = np.broadcast_to(side - side.mean(), stamps.shape)
     along = stamps - stamps.mean(axis=1, keepdims=True)
-    # Frisch and Waugh: the step's coefficient is that of the step cleared of the line.
-    overlap = np.sum(along * after, axis=1) / np.sum(along**2, axis=1)
-    cleared = after - along * overlap[:, None]
-    steps = np.einsum("nw,ncw->nc", cleared, windows) / np.sum(cleared**2, axis=1)[:, None]
+    middle = 0.5 * (along[:, _SIDE - 1] + along[:, _SIDE])
+    bent = np.abs(along - middle[:, None])
+    bent = bent - bent.mean(axis=1, keepdims=True)
+    steps, slopes, rest_of_step = _fit_beside_line(along, after, windows)
+    _, _, rest_of_bend = _fit_beside_line(along, bent, windows)
+    return steps, slopes, rest_of_step < _PLAINLY * rest_of_bend
+
+
+def _fit_beside_line(along: Floats, shape: Floats, windows: Floats) -> tuple[Floats, Floats, Floats]:
+    """Coefficients of a shape (n, w) and of the line beside it in windows (n, 3, w), and the squares left."""
+    # Frisch and Waugh: the shape's coefficient is that of the shape cleared of the line.
+    overlap = np.sum(along * shape, axis=1) / np.sum(along**2, axis=1)
+    cleared = shape - along * overlap[:, None]
+    size = np.einsum("nw,ncw->nc", cleared, windows) / np.sum(cleared**2, axis=1)[:, None]
     slope = np.einsum("nw,ncw->nc", along, windows) / np.sum(along**2, axis=1)[:, None]
-    return steps, slope - steps * overlap[:, None]
+    slope = slope - size * overlap[:, None]
+    left = windows - size[:, :, None] * shape[:, None, :] - slope[:, :, None] * along[:, None, :]
+    return size, slope, np.sum(left**2, axis=(1, 2))
 
 
 def measure_increments(position: Floats, quaternion: Floats) -> tuple[Floats, Floats]:
