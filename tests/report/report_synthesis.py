@@ -39,6 +39,7 @@ def make_tables(
     wheels = _lag(command, 0.8)
     body = _lag(wheels, 0.2) * np.array([0.96, 0.0, 0.56]) + rng.normal(0.0, 0.03, (t.size, 3))
     body[:, 1] -= 0.05 * body[:, 0] * body[:, 2]
+    body[100, 1] += 9.0  # a lone peak, as a jumping localization makes it
     yaw = np.cumsum(body[:, 2]) / RATE_HZ
     x = np.cumsum(body[:, 0] * np.cos(yaw) - body[:, 1] * np.sin(yaw)) / RATE_HZ
     y = np.cumsum(body[:, 0] * np.sin(yaw) + body[:, 1] * np.cos(yaw)) / RATE_HZ

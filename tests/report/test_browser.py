@@ -58,7 +58,8 @@ PROBE = """
       const word = text.getBoundingClientRect();
       return word.width && (word.left < box.left - 1 || word.right > box.right + 1);
     });
-    return [...(box.right > room.right + 1 ? ["svg"] : []), ...cut.map((text) => text.textContent)];
+    const shrunk = svg.width.baseVal.value > room.width + 1;
+    return [...(shrunk || box.right > room.right + 1 ? ["svg"] : []), ...cut.map((text) => text.textContent)];
   });
   addEventListener("load", async () => {
     await wait(() => document.documentElement.dataset.drawn === "yes");
@@ -66,6 +67,8 @@ PROBE = """
       (place) => [place.dataset.figure, place.querySelectorAll("svg path").length]));
     seen.wide = document.documentElement.scrollWidth - innerWidth;
     seen.outside = outside();
+    seen.scrolled = [...document.querySelectorAll(".table")].map(
+      (table) => table.scrollWidth - table.clientWidth);
     seen.before = labels("velocities");
     const empty = plot("trajectory").querySelectorAll("path").length;
     document.getElementById("mark-from").value = "10";
@@ -153,6 +156,7 @@ def test_nothing_is_cut_or_wider_than_the_screen(seen: dict[str, object]) -> Non
     assert isinstance(seen["wide"], int)
     assert seen["wide"] <= 0
     assert seen["outside"] == []
+    assert set(seen["scrolled"]) == {0}  # type: ignore[call-overload]
 
 
 def test_a_marked_stretch_shows_on_the_map_and_can_be_zoomed_into(seen: dict[str, object]) -> None:

@@ -255,6 +255,10 @@ def test_a_grave_finding_stands_before_the_numbers() -> None:
     assert warned < page.index("The vehicle does not move") < page.index("median slip")
 
 
+def test_a_lone_peak_does_not_flatten_a_figure_and_is_told(page: str) -> None:
+    assert re.search(r"peaks cut, the highest (9\.0|8\.9)\d at 5\.00 s", page)
+
+
 def test_losses_and_findings_are_told_gravest_first(page: str) -> None:
     assert "log has losses (1)" in page
     assert "48.2 kB" in page

@@ -47,12 +47,14 @@ def value_axis(shown: Range) -> alt.Y:
     return alt.Y("value:Q", axis=axis, scale=alt.Scale(domain=[shown.low, shown.high], nice=not cut))
 
 
-def title_panel(quantity: str, unit: str, shown: Range) -> str:
-    """A panel's title: quantity, unit, and how far peaks go that the axis does not show."""
+def title_panel(quantity: str, unit: str, shown: Range) -> alt.Title:
+    """A panel's title: quantity and unit; below, how far peaks go that the axis does not show."""
     if shown.beyond is None:
-        return f"{quantity} [{unit}]"
+        return alt.Title(f"{quantity} [{unit}]")
     value, time = shown.beyond
-    return f"{quantity} [{unit}], peaks cut: {say_number(value)} at {say_number(time)} s"
+    return alt.Title(
+        f"{quantity} [{unit}]", subtitle=f"peaks cut, the highest {say_number(value)} at {say_number(time)} s"
+    )
 
 
 def shade_spans() -> list[alt.Chart]:
