@@ -76,7 +76,7 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
         return Outcome(_read_summary(current, options), current, ())
     done = keys[options.through]
     with store.open_generation(run, hash_json([done, options.through])) as generation:
-        work = Work(run, subject, options, generation, keys, data, progress)
+        work = Work(run, subject, options, generation, keys, sha256, data, progress)
         work.run_stages()
         log = _describe_log(subject, sha256, work)
         if options.through == STAGES[-1]:
@@ -88,6 +88,11 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
 def _identify(path: Path, subject: Subject, store: Store, progress: Progress) -> tuple[str, LogData | None]:
     """Hash of the log: remembered, or computed beside reading it."""
     identities = LogIdentities(store)
+    # The folder of a split recording looks unchanged when a file in it has changed: it is read every time.
+    if not path.is_file():
+        progress("read")
+        data = read_subject(subject)
+        return data.sha256, data
     known = identities.lookup(path)
     if known is not None:
         return known, None

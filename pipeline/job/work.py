@@ -46,6 +46,7 @@ class Work:
         options: what the user asked for.
         generation: where tables go.
         keys: key of every stage.
+        sha256: hash of the log.
         data: columns of the log, where they have been read already.
         progress: told what is being done.
     """
@@ -55,6 +56,7 @@ class Work:
     options: Options
     generation: Generation
     keys: Mapping[str, str]
+    sha256: str
     data: LogData | None
     progress: Progress
     contexts: dict[str, Mapping[str, JSON]] = field(default_factory=dict)
@@ -115,7 +117,7 @@ class Work:
         return pl.DataFrame()
 
     def _extract(self) -> StageOutcome:
-        data = self.data if self.data is not None else read_subject(self.subject)
+        data = self.data if self.data is not None else read_subject(self.subject, self.sha256)
         subject = self.subject
         made = extract_tables(
             data, subject.sources, subject.configuration, subject.vehicle, where=str(subject.path)
@@ -196,10 +198,10 @@ class Work:
         return StageOutcome(())
 
 
-def read_subject(subject: Subject) -> LogData:
-    """Read the columns that a run needs."""
+def read_subject(subject: Subject, sha256: str | None = None) -> LogData:
+    """Read the columns that a run needs; the hash is computed beside it unless it is known."""
     types = {channel.topic: channel.type_name for channel in subject.index.channels}
-    return read_topics(subject.path, list_wanted(subject.sources, types))
+    return read_topics(subject.index, list_wanted(subject.sources, types), sha256=sha256)
 
 
 def describe_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:
