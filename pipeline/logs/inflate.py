@@ -75,6 +75,27 @@ def inflate_start(stored: Buffer, compression: str, size: int) -> Buffer:
     return b""
 
 
+def inflate_prefix(stored: Buffer, compression: str, size: int, needed: int) -> Buffer:
+    """Inflate the first ``needed`` bytes of a chunk of ``size`` bytes and leave the rest.
+
+    Raises:
+        InflateError: as ``inflate``; damage behind the needed bytes is not seen.
+    """
+    check_size(len(stored), compression, size)
+    if compression == "":
+        return stored[:needed]
+    if compression != "zstd":
+        return inflate(stored, compression, size)[:needed]
+    with zstandard.ZstdDecompressor().stream_reader(stored) as reader:
+        try:
+            found = reader.read(needed)
+        except zstandard.ZstdError as error:
+            raise InflateError(str(error)) from None
+    if len(found) != needed:
+        raise InflateError(f"{len(found)} bytes came out in place of {needed}")
+    return found
+
+
 def checksum(records: Buffer) -> int:
     """CRC-32 as MCAP stores it."""
     return zlib.crc32(records)

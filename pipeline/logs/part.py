@@ -206,16 +206,21 @@ def _rebuild(source: ByteSource, catalog: Catalog, start: int, stop: int, thread
 
 
 def _examine(source: ByteSource, catalog: Catalog, threads: int) -> None:
-    """Inflate every span for what no index tells: channels, counts, times."""
+    """Inflate every span for what no index tells: channels, counts, times.
+
+    What stands in a chunk whose checksum holds replaces what stands elsewhere.
+    """
     catalog.counts = {}
     examined: list[Span] = []
+    schemas: dict[int, rec.SchemaRecord] = {}
+    channels: dict[int, rec.ChannelRecord] = {}
     for span, loaded in _load_all(source, catalog.spans, threads):
         messages = loaded.messages
         catalog.losses += [loss for loss in loaded.losses if loss not in catalog.losses]
         for schema in messages.schemas:
-            catalog.schemas.setdefault(schema.id, schema)
+            (catalog.schemas if loaded.unchecked else schemas).setdefault(schema.id, schema)
         for channel in messages.channels:
-            catalog.channels.setdefault(channel.id, channel)
+            (catalog.channels if loaded.unchecked else channels).setdefault(channel.id, channel)
         numbers, counts = np.unique(messages.channel, return_counts=True)
         for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
             catalog.counts[number] = catalog.counts.get(number, 0) + count
@@ -223,9 +228,12 @@ def _examine(source: ByteSource, catalog: Catalog, threads: int) -> None:
             first, last = int(messages.log_time.min()), int(messages.log_time.max())
             catalog.start_ns = first if catalog.start_ns is None else min(first, catalog.start_ns)
             catalog.end_ns = last if catalog.end_ns is None else max(last, catalog.end_ns)
-            span = replace(span, start_ns=first, end_ns=last)  # noqa: PLW2901
+            if span.start_ns is None:
+                span = replace(span, start_ns=first, end_ns=last)  # noqa: PLW2901
         examined.append(replace(span, channels=frozenset(numbers.tolist())))
     catalog.spans = examined
+    catalog.schemas |= schemas
+    catalog.channels |= channels
 
 
 def _load_all(source: ByteSource, spans: list[Span], threads: int) -> Iterator[tuple[Span, Loaded]]:

@@ -226,7 +226,7 @@ def _read_part(
         return _data_is_whole(source, part)
 
     def read(span: Span) -> tuple[dict[int, Payloads], list[Loss], bool]:
-        loaded = load_span(source, span, trusts_data)
+        loaded = load_span(source, span, trusts_data, own)
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)
         merged = {part.numbers[number]: each for number, each in payloads.items()}
         return merged, loaded.losses, loaded.unchecked and span.kind is SpanKind.CHUNK

@@ -185,6 +185,8 @@ class Scanner:
 
     def _recover(self, previous: int, place: int, stop: int) -> tuple[int, int]:
         """Note damage at ``place``: (where records go on, where the damage starts)."""
+        if self._take_cut_chunk(place, stop):
+            return stop, place
         last = self._catalog.spans[-1] if self._catalog.spans else None
         again = self._find(place + 1, stop)
         if last is not None and last.kind is SpanKind.LOOSE and previous < place:
@@ -192,8 +194,6 @@ class Scanner:
             if inside < place:
                 self._drop_message(previous)
                 place, again = previous, inside
-        if again == stop and self._take_cut_chunk(place, stop):
-            return stop, place
         self._note_damage(place, again, stop)
         return again, place
 

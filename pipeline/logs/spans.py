@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from pipeline.logs import records as rec
 from pipeline.logs.errors import Loss
@@ -18,12 +18,14 @@ from pipeline.logs.inflate import (
     checksum,
     holds_own_checksum,
     inflate,
+    inflate_prefix,
     inflate_start,
 )
 from pipeline.logs.messages import Messages, locate_messages
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from collections.abc import Set as AbstractSet
 
     import numpy as np
     from numpy.typing import NDArray
@@ -31,11 +33,17 @@ if TYPE_CHECKING:
     from pipeline.logs.records import Buffer
     from pipeline.logs.source import ByteSource
 
+    Entries: TypeAlias = tuple[int, NDArray[np.uint64]]
+
 
 _CRC_IN_HEAD: Final = 24
 _INVERTED: Final = 0xFFFFFFFF
 _ZERO_TAIL: Final = 64
 """So many zeros at the end of a chunk are bytes that were never written."""
+
+
+_WORTHWHILE: Final = 0.8
+"""Stopping early pays when this share of a chunk or less is needed."""
 
 
 class SpanKind(Enum):
@@ -106,12 +114,21 @@ class _SpanError(Exception):
         self.reason = reason
 
 
-def load_span(source: ByteSource, span: Span, trusts_data: Callable[[], bool] = bool) -> Loaded:
+def load_span(
+    source: ByteSource,
+    span: Span,
+    trusts_data: Callable[[], bool] = bool,
+    wanted: AbstractSet[int] | None = None,
+) -> Loaded:
     """Read, inflate and check one span.
+
+    A chunk without checksum is inflated no further than its last wanted message when its message index tells
+    where that ends.
 
     Args:
         source: the file.
         span: which stretch.
+        wanted: numbers of the channels whose messages are needed, None for all.
         trusts_data: asked when a chunk's checksum differs: whether a checksum over the whole data section
             holds, so that the chunk was written so.
     """
@@ -126,15 +143,38 @@ def load_span(source: ByteSource, span: Span, trusts_data: Callable[[], bool] = 
         stored = blob[head.body : head.body + head.compressed_size]
         if span.kind is SpanKind.CUT_CHUNK:
             return _load_start(span, head, stored, "the file ends inside it")
+        entries = _read_entries(blob[span.length :])
+        if head.crc == 0 and entries and wanted and set(span.channels or ()) == {number for number, _ in entries}:
+            needed = _needed_size(entries, wanted)
+            if needed is not None and needed < head.uncompressed_size * _WORTHWHILE:
+                return _load_prefix(span, head, stored, entries, needed)
         chunk = _inflate_checked(span, head, stored, trusts_data, losses)
     except _SpanError as error:
         return _lost(span, error.kind, error.reason)
     if chunk is None:
         written = memoryview(bytes(stored).rstrip(b"\0"))
         return _load_start(span, head, written, f"its last {len(stored) - len(written)} bytes are zero")
-    messages = locate_messages(chunk, _read_entries(blob[span.length :]))
+    messages = locate_messages(chunk, entries)
     losses += _damage_losses(span, messages, len(chunk))
     return Loaded(chunk, messages, losses, unchecked=head.crc == 0)
+
+
+def _needed_size(entries: list[Entries], wanted: AbstractSet[int]) -> int | None:
+    """Bytes up to the end of the last wanted message, None when no message behind it tells where that is."""
+    last = max((int(e[:, 1].max()) for c, e in entries if c in wanted and e.size), default=-1)
+    behind = [int(later.min()) for _, e in entries if (later := e[e[:, 1] > last, 1]).size]
+    return min(behind, default=None)
+
+
+def _load_prefix(
+    span: Span, head: rec.ChunkHead, stored: Buffer, entries: list[Entries], needed: int
+) -> Loaded:
+    try:
+        chunk = inflate_prefix(stored, head.compression, head.uncompressed_size, needed)
+    except InflateError as error:
+        raise _SpanError("damaged_chunk", f"it cannot be inflated: {error}") from None
+    messages = locate_messages(chunk, [(c, e[e[:, 1] < needed]) for c, e in entries])
+    return Loaded(chunk, messages, _damage_losses(span, messages, len(chunk)), unchecked=True)
 
 
 def _open_chunk(span: Span, blob: memoryview) -> tuple[rec.ChunkHead, list[Loss]]:
@@ -237,8 +277,8 @@ def _load_start(span: Span, head: rec.ChunkHead, stored: Buffer, reason: str) ->
     return Loaded(chunk, replace(messages, damage=[]), [loss], unchecked=True)
 
 
-def _read_entries(blob: Buffer) -> list[tuple[int, NDArray[np.uint64]]] | None:
-    entries: list[tuple[int, NDArray[np.uint64]]] = []
+def _read_entries(blob: Buffer) -> list[Entries] | None:
+    entries: list[Entries] = []
     place = 0
     while place + rec.HEAD_SIZE <= len(blob):
         opcode, length = rec.HEAD.unpack_from(blob, place)

@@ -79,7 +79,7 @@ class Spool:
         self._memory = bytearray()
 
     def batches(self, size: int) -> Iterator[Batch]:
-        """All messages by log time, in batches of about ``size`` bytes; equal times in the order of adding."""
+        """All messages in batches of about ``size`` bytes, by log time, then in the order of adding."""
         empty = np.empty(0, dtype=np.int64)
         log = np.concatenate([empty, *self._log])
         order = np.argsort(log, kind="stable")
