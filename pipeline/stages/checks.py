@@ -6,20 +6,22 @@ where neither smoothing nor vibration matters.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.stages.delays import estimate_delay
 from pipeline.stages.finding import Finding
+from pipeline.stages.samples import Samples, gather_samples
+from pipeline.stages.trust import check_independence, check_live_commands
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from pipeline.vehicles import Vehicle
+
+__all__ = ["gather_samples", "run_checks"]
 
 Floats = NDArray[np.float64]
 
@@ -27,72 +29,11 @@ _GAIN_OF_NO_MOTION = 0.05
 _NET_OF_NO_MOTION = 0.5
 _PATH_OF_MOTION = 5.0
 _LIVE = 0.02
-_ROUNDING = 2e-3
 _FEWEST = 100
 _FEWEST_STEPS = 6
 _SCALED = 0.18
 _DISAGREES = 0.2
 _SKEW = 0.05
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Samples of one run on its grid; ideals are NaN where unknown.
-
-    Attributes:
-        times: [s], shape (n,).
-        segment: number of the segment, shape (n,).
-        steady: outside transitory spans, shape (n,).
-        step: number of the command step, shape (n,).
-        position: x, y of base_link [m], shape (n, 2).
-        velocity: (v_x, v_y, v_w), shape (n, 3).
-        gyro: yaw rate of the gyro, NaN without one, shape (n,).
-        command: ideal velocity of the command, shape (n, 3); None without commands.
-        measured: ideal velocity of the measured wheels, shape (n, 3); None without encoders.
-        body_commanded: whether the command was a body command.
-    """
-
-    times: Floats
-    segment: NDArray[np.int32]
-    steady: NDArray[np.bool_]
-    step: NDArray[np.int32]
-    position: Floats
-    velocity: Floats
-    gyro: Floats
-    command: Floats | None
-    measured: Floats | None
-    body_commanded: bool
-
-
-def gather_samples(velocities: pl.DataFrame, slip: pl.DataFrame, *, body_commanded: bool) -> Samples:
-    """Arrange the tables of a run for the checks."""
-    ideals: dict[str, Floats | None] = {"command": None, "measured": None}
-    steady = np.zeros(velocities.height, dtype=bool)
-    step = np.full(velocities.height, -1, dtype=np.int32)
-    stamps = velocities["stamp"].to_numpy()
-    for name in ideals:
-        part = slip.filter(pl.col("input") == name)
-        if part.is_empty():
-            continue
-        values = np.full((velocities.height, 3), np.nan)
-        place = np.searchsorted(stamps, part["stamp"].to_numpy())
-        values[place] = part.select("f_x", "f_y", "f_w").to_numpy()
-        steady[place] |= ~part["transitory"].to_numpy()
-        step[place] = part["step"].to_numpy()
-        ideals[name] = values
-    gyro = velocities["v_w_imu"].cast(pl.Float64).fill_null(np.nan).to_numpy()
-    return Samples(
-        velocities["t"].to_numpy(),
-        velocities["segment"].to_numpy(),
-        steady,
-        step,
-        velocities.select("x", "y").to_numpy(),
-        velocities.select("v_x", "v_y", "v_w").to_numpy(),
-        gyro,
-        ideals["command"],
-        ideals["measured"],
-        body_commanded,
-    )
 
 
 def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
@@ -102,6 +43,7 @@ def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         return stuck
     checks: tuple[Callable[[Samples, Vehicle], list[Finding]], ...] = (
         check_independence,
+        check_live_commands,
         check_command_scale,
         check_limits,
         check_delays,
@@ -163,26 +105,6 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         f"within {net:.2g} m (wheels in the air, blocked, or stopped)"
     )
     return [Finding("not_moving", "error", text, value=gains[0])]
-
-
-def check_independence(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
-    """A pose that is integrated from the wheels gives zero slip by construction."""
-    if samples.measured is None:
-        return []
-    known = np.isfinite(samples.measured).all(axis=1) & samples.steady
-    if known.sum() < _FEWEST:
-        return []
-    residual = samples.measured[known] - samples.velocity[known]
-    moved = float(np.sqrt(np.mean(samples.velocity[known] ** 2)))
-    share = float(np.median(np.abs(residual[:, (0, 2)]).max(axis=1))) / max(moved, 1e-9)
-    sideways = float(np.median(np.abs(samples.velocity[known, 1])))
-    if share > _ROUNDING or sideways > _ROUNDING * moved:
-        return []
-    text = (
-        "the poses follow the measured wheels to within rounding: they are wheel odometry, "
-        "not a localization, and the slip is zero by construction: draw no conclusion from it"
-    )
-    return [Finding("pose_from_wheels", "error", text, where="pose", value=share)]
 
 
 def check_command_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:

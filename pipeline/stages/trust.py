@@ -1,0 +1,134 @@
+"""Whether poses and commands are what they call themselves: a localization, and what the drive was told."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core import segments, timegrid
+from pipeline.stages.finding import Finding
+
+if TYPE_CHECKING:
+    from pipeline.stages.samples import Samples
+    from pipeline.vehicles import Vehicle
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+_LIVE = 0.02
+_FEWEST = 100
+_SPAN = 0.5
+_FEWEST_SPANS = 20
+_SIDEWAYS = 1e-4
+_ROUNDING = 5e-3
+_SHORTEST_SILENCE = 3.0
+_SETTLED = 2.0
+_MOVES = 0.1
+_ZERO = 1e-6
+
+
+def check_independence(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
+    """A pose that is integrated from the wheels gives zero slip by construction.
+
+    Wheel odometry never moves sideways, while any localization has noise there; and its speed is that of the
+    wheels, perhaps by another radius and a little later. Its heading may come from a gyro.
+    """
+    if samples.measured is None:
+        return []
+    known: Flags = np.all(np.isfinite(samples.measured), axis=1)
+    moving = known & (np.abs(np.nan_to_num(samples.measured)) > _LIVE).any(axis=1)
+    sideways = samples.velocity[moving, 1] - samples.measured[moving, 1]
+    if sideways.size < _FEWEST or float(np.median(np.abs(sideways))) > _SIDEWAYS:
+        return []
+    ahead, turning = _share_beside_wheels(samples, samples.measured, known)
+    share = turning if ahead is None else ahead
+    if share is None or share > _ROUNDING:
+        return []
+    elsewhere = turning is not None and turning > _ROUNDING
+    but = " but for their heading, which may be a gyro's" if elsewhere else ""
+    text = (
+        f"the poses follow the measured wheels to within rounding{but}: they are wheel odometry, "
+        "not a localization, and the slip is zero by construction: draw no conclusion from it"
+    )
+    return [Finding("pose_from_wheels", "error", text, where="pose", value=share)]
+
+
+def _share_beside_wheels(
+    samples: Samples, measured: Floats, known: Flags
+) -> tuple[float | None, float | None]:
+    """Shares of the way and of the turning over half seconds that the wheels do not account for.
+
+    Any gain is allowed (another radius, another track width), and a small delay, to first order. A share is
+    None where there is nothing to share.
+    """
+    times = samples.times
+    span = max(round(_SPAN / max(float(np.median(np.diff(times))), 1e-3)), 1)
+    first = np.arange(0, times.size - span, span)
+    last = first + span
+    counted = np.concatenate(([0], np.cumsum(known)))
+    whole = (counted[last + 1] - counted[first] == span + 1) & (
+        samples.segment[first] == samples.segment[last]
+    )
+    first, last = first[whole], last[whole]
+    if first.size < _FEWEST_SPANS:
+        return None, None
+    turned = samples.yaw[last] - samples.yaw[first]
+    heading = samples.yaw[first] + 0.5 * turned
+    chord = np.sum(
+        (samples.position[last] - samples.position[first])
+        * np.stack((np.cos(heading), np.sin(heading)), axis=-1),
+        axis=1,
+    )
+    # The way along an arc is longer than its chord.
+    way = chord / np.sinc(turned / (2.0 * np.pi))
+    shares = []
+    for moved, axis in ((way, 0), (turned, 2)):
+        rate = np.nan_to_num(measured[:, axis])
+        driven = timegrid.integrate_rate(times, rate)
+        shares.append(_share_left(moved, driven[last] - driven[first], rate[last] - rate[first]))
+    return shares[0], shares[1]
+
+
+def _share_left(moved: Floats, driven: Floats, changed: Floats) -> float | None:
+    """Median rest of a robust fit of ``moved`` on ``driven`` and ``changed``, over the size of ``moved``."""
+    size = float(np.sqrt(np.mean(moved**2)))
+    if size < _LIVE * _SPAN:
+        return None
+    design = np.column_stack((driven, changed))
+    rest, weight = moved, np.ones(moved.size)
+    for _ in range(10):
+        found, *_ = np.linalg.lstsq(design * weight[:, None], moved * weight, rcond=None)
+        rest = np.abs(moved - design @ found)
+        weight = 1.0 / np.sqrt(1.0 + (rest / (2.0 * max(float(np.median(rest)), 1e-9))) ** 2)
+    return float(np.median(rest)) / size
+
+
+def check_live_commands(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
+    """A command that says zero, again and again, while the wheels turn: someone drives past it.
+
+    The drive gets two seconds to come to rest. Without encoders the poses are taken, which see a vehicle that
+    slides or is pushed, too.
+    """
+    if samples.command is None:
+        return []
+    body = samples.velocity if samples.measured is None else samples.measured
+    size = np.abs(np.nan_to_num(body)).max(axis=1)
+    moves = size > max(_MOVES * float(np.quantile(size, 0.99)), _MOVES)
+    # An unknown command is not below anything, so that it counts as none.
+    silent: Flags = np.all(np.abs(samples.command) < _ZERO, axis=1)
+    past: Flags = np.zeros(silent.size, dtype=bool)
+    for first, end in segments.find_runs(silent):
+        since = samples.times[first:end] - samples.times[first]
+        if since[-1] >= _SHORTEST_SILENCE:
+            past[first:end] = moves[first:end] & (since > _SETTLED)
+    count = int(past.sum())
+    if count < _FEWEST:
+        return []
+    begin = float(samples.times[np.flatnonzero(past)[0]])
+    text = (
+        f"in {count} time steps the command says zero while the vehicle drives: the topic is stale, "
+        "or someone drives past it (restrict the run with [[interval]], or take the measured wheels)"
+    )
+    return [Finding("stale_command", "warning", text, where="command", t_start=begin, count=count)]
