@@ -8,7 +8,7 @@ right again through the log time; the place is remembered, so that no segment cr
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +27,9 @@ _BACKWARD_NS = 20_000_000
 _EARLY_NS = 5_000_000
 _APART_NS = 1_000_000_000
 _AROUND = 20
+_BIN_NS = 500_000_000
+_FREQUENT = 4
+_DENSE = 1.6
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,8 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
     findings = [found for clock in clocks.values() for found in clock.findings]
     findings += _check_early_stamps(clocks)
     shifted, more = _join_time_bases(clocks)
-    return shifted, findings + more
+    single, still_more = leave_out_twice_told(shifted)
+    return single, findings + more + still_more
 
 
 def _read_clock(times: Recorded) -> TopicClock:
@@ -131,8 +135,12 @@ def _mend_jumps(
     known = np.flatnonzero(log_known)
     if known.size < 2:  # noqa: PLR2004 - one message shows no jump
         return header, usable, (), _flag_unset(topic, ~usable)
+    passed, recorded = np.diff(header[known]), np.diff(log_time[known])
+    usual = float(np.median(passed))
+    # Messages that a busy recorder writes late come at their usual stamps: there the log times jump.
+    jumped = np.abs(passed - usual) >= np.abs(recorded - usual)
     candidates = np.flatnonzero(
-        (np.abs(np.diff(offset[known])) > _JUMP_NS) | (np.diff(header[known]) < -_BACKWARD_NS)
+        ((np.abs(np.diff(offset[known])) > _JUMP_NS) & jumped) | (passed < -_BACKWARD_NS)
     )
     edges = [0]
     for place in candidates:
@@ -215,3 +223,42 @@ def _join_time_bases(
             clock.topic, clock.clock, clock.stamp + shift, clock.usable, clock.breaks, clock.latency_s
         )
     return joined, findings
+
+
+def leave_out_twice_told(
+    clocks: Mapping[str, TopicClock],
+) -> tuple[dict[str, TopicClock], list[Finding]]:
+    """Leave out what was recorded while the recorder's own clock went over the same time twice.
+
+    When that clock is put back, log times and stamps go back with it, and a log in the order of its log
+    times mixes both passes. Every topic is then twice as dense for as long. Which message is of which pass
+    cannot be told, so both are left out, and the hole ends the segment.
+    """
+    counts = {
+        key: _count_messages(clock.stamp[clock.usable]) for key, clock in clocks.items() if clock.usable.any()
+    }
+    dense: list[set[int]] = []
+    for places, sizes in counts.values():
+        usual = float(np.median(sizes))
+        if usual >= _FREQUENT:
+            dense.append(set(places[sizes > _DENSE * usual].tolist()))
+    twice = sorted(set.intersection(*dense)) if len(dense) > 1 else []
+    if not twice:
+        return dict(clocks), []
+    edges = {place + around for place in twice for around in (-1, 0, 1)}
+    single = {}
+    for key, clock in clocks.items():
+        inside = np.isin(clock.stamp // _BIN_NS, sorted(edges))
+        single[key] = replace(clock, usable=clock.usable & ~inside)
+    seconds = len(twice) * _BIN_NS / 1e9
+    text = (
+        f"for about {seconds:.2g} s all topics are twice as dense as usual: the recorder's clock was put "
+        "back, and both passes over that time were left out"
+    )
+    return single, [Finding("clock_jump", "warning", text, where="recorder", value=seconds, count=1)]
+
+
+def _count_messages(stamp: Stamps) -> tuple[Stamps, NDArray[np.int64]]:
+    """Numbers of the bins of half a second that hold messages, and how many each holds."""
+    places, sizes = np.unique(stamp // _BIN_NS, return_counts=True)
+    return places, sizes.astype(np.int64)
