@@ -98,8 +98,8 @@ class TransformBuffer:
     """All transforms of a recording.
 
     Args:
-        topics: columns of TFMessage topics; those named ``tf_static`` never move, wherever in the recording
-            they stand.
+        topics: columns of TFMessage topics, others are passed over; what is published on ``tf_static``
+            never moves, wherever in the recording it stands.
     """
 
     def __init__(self, topics: Iterable[TopicColumns]) -> None:
@@ -234,10 +234,10 @@ class _Rows:
 
 
 def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[_Rows]:
-    parents = columns.fields[f"{_TRANSFORM}header.frame_id"]
-    children = columns.fields[f"{_TRANSFORM}child_frame_id"]
+    parents = columns.fields.get(f"{_TRANSFORM}header.frame_id")
+    children = columns.fields.get(f"{_TRANSFORM}child_frame_id")
     if not isinstance(parents, RaggedStrings) or not isinstance(children, RaggedStrings):
-        raise TypeError(f"{columns.topic} is no topic of transforms")
+        return []
     seconds = _values(columns, "header.stamp.sec").astype(np.int64)
     time = seconds * 1_000_000_000 + _values(columns, "header.stamp.nanosec").astype(np.int64)
     position, quaternion = (

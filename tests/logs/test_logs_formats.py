@@ -1,0 +1,409 @@
+"""Everything that is legal, and much that is not but met in the field, is read as it was meant."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+from mcap_files import FLOAT, JOINTS, START, TEXT, payloads, read_small, small_truth, write_official, write_small
+
+from pipeline.logs import (
+    LogError,
+    LogWriter,
+    Ragged,
+    RaggedStrings,
+    Strings,
+    TransformBuffer,
+    Wanted,
+    definition_text,
+    hash_log,
+    open_log,
+    read_topics,
+    wanted_transforms,
+)
+
+Channel = tuple[str, str, str, bytes, str, list[bytes]]
+IDL = """================================================================================
+IDL: demo_msgs/msg/Status
+module demo_msgs {
+  module msg {
+    const long COUNT = 2;
+    typedef double double__2[COUNT];
+    @verbatim (language="comment", text="a } brace; in words")
+    struct Status {
+      std_msgs::msg::Header header;
+      @unit ("m/s") double speed;
+      double__2 pair;
+      sequence<float, 4> history;
+      string<16> name;
+      unsigned long long count;
+    };
+  };
+};
+================================================================================
+IDL: std_msgs/msg/Header
+module std_msgs { module msg { struct Header {
+  builtin_interfaces::msg::Time stamp; string frame_id; }; }; };
+================================================================================
+IDL: builtin_interfaces/msg/Time
+module builtin_interfaces { module msg { struct Time { long sec; unsigned long nanosec; }; }; };
+"""
+SAME_AS_IDL = """std_msgs/Header header
+float64 speed
+float64[2] pair
+float32[<=4] history
+string<=16 name
+uint64 count
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+"""
+
+
+def write_channels(path: Path, channels: list[Channel], *, times: list[int] | None = None, **options: Any) -> None:
+    """Channels as (topic, type, schema encoding, schema, message encoding, payloads)."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start(profile="ros2", library="test")
+        for topic, kind, schema_encoding, schema, encoding, encoded in channels:
+            schema_id = writer.register_schema(kind, schema_encoding, schema) if kind else 0
+            channel = writer.register_channel(topic, encoding, schema_id)
+            for number, payload in enumerate(encoded):
+                time = times[number] if times else START + number
+                writer.add_message(channel, time, payload, time, number)
+        writer.finish()
+
+
+def read_one(path: Path, topic: str, *fields: str) -> Any:
+    data = read_topics(path, [Wanted(topic, fields or None)])
+    assert not data.losses
+    (columns,) = data.of(topic)
+    return columns
+
+
+def text_of(kind: str) -> bytes:
+    return (definition_text(kind) or "").encode()
+
+
+def test_two_channels_on_one_topic_stay_apart(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema(FLOAT, "ros2msg", text_of(FLOAT))
+        for value in (1.0, 2.0):
+            channel = writer.register_channel("/speed", "cdr", schema, {"node": str(value)})
+            (payload,) = payloads(FLOAT, 1, {"data": value})
+            writer.add_message(channel, START, payload, START)
+        writer.finish()
+    data = read_topics(path, [Wanted("/speed")])
+    assert sorted(float(columns.fields["data"][0]) for columns in data.of("/speed")) == [1.0, 2.0]
+
+
+def test_one_name_with_two_definitions_is_decoded_by_each(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    first, second = "float64 x\nfloat64 y\n", "float64 y\nfloat64 x\n"
+    values = {"x": 1.0, "y": 2.0}
+    write_channels(
+        path,
+        [
+            ("/a", "demo/msg/Pair", "ros2msg", first.encode(), "cdr", payloads("demo/Pair", 1, values, first)),
+            ("/b", "demo/msg/Pair", "ros2msg", second.encode(), "cdr", payloads("demo/Pair", 1, values, second)),
+        ],
+    )
+    for topic in ("/a", "/b"):
+        fields = read_one(path, topic).fields
+        assert (fields["x"][0], fields["y"][0]) == (1.0, 2.0)
+
+
+def big_endian_joints() -> bytes:
+    body = struct.pack(">iI", 5, 6) + struct.pack(">I", 4) + b"abc\0"
+    body += struct.pack(">I", 1) + struct.pack(">I", 3) + b"xy\0"
+    body += b"\0" + struct.pack(">I", 1)
+    body += b"\0" * (-len(body) % 8) + struct.pack(">d", 1.5)
+    body += struct.pack(">I", 2) + b"\0" * 4 + struct.pack(">2d", 2.5, -3.5) + struct.pack(">I", 0)
+    return b"\x00\x00\x00\x00" + body
+
+
+def test_big_endian_messages_are_read_among_little_endian_ones(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    little = payloads(JOINTS, 1, {"name": ["xy"], "velocity": np.array([[7.0]])})
+    write_channels(path, [("/j", JOINTS, "ros2msg", text_of(JOINTS), "cdr", [big_endian_joints(), *little])])
+    columns = read_one(path, "/j")
+    assert columns.fields["velocity"].row(0).tolist() == [2.5, -3.5]
+    assert columns.fields["velocity"].row(1).tolist() == [7.0]
+    assert columns.fields["name"].row(0) == ["xy"]
+    assert columns.fields["header.frame_id"].to_list() == ["abc", ""]
+    assert columns.header_time.tolist() == [5_000_000_006, 0]
+
+
+def test_plain_xcdr2_is_aligned_to_four_and_counts_bytes_of_sequences(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    text = "uint8 flag\nfloat64 value\nstring[] names\nfloat64[] list\n"
+    names = struct.pack("<I", 2) + struct.pack("<I", 2) + b"a\0" + b"\0\0" + struct.pack("<I", 2) + b"b\0"
+    body = b"\x01\0\0\0" + struct.pack("<d", 2.25) + struct.pack("<I", len(names)) + names
+    body += b"\0" * (-len(body) % 4) + struct.pack("<I", 1) + struct.pack("<d", -4.0)
+    write_channels(path, [("/x", "demo/msg/X", "ros2msg", text.encode(), "cdr", [b"\x00\x07\x00\x00" + body])])
+    fields = read_one(path, "/x").fields
+    assert fields["value"].tolist() == [2.25]
+    assert fields["names"].row(0) == ["a", "b"]
+    assert fields["list"].row(0).tolist() == [-4.0]
+
+
+@pytest.mark.parametrize(("kind", "name"), [(0x03, "PL_CDR_LE"), (0x09, "D_CDR2_LE"), (0x0B, "PL_CDR2_LE")])
+def test_other_encapsulations_are_named_never_decoded_as_plain(tmp_path: Path, kind: int, name: str) -> None:
+    path = tmp_path / "log.mcap"
+    good = payloads(FLOAT, 3, {"data": np.array([1.0, 2.0, 3.0])})
+    odd = bytes([0, kind]) + good[1][2:]
+    write_channels(path, [("/x", FLOAT, "ros2msg", text_of(FLOAT), "cdr", [good[0], odd, good[2]])])
+    data = read_topics(path, [Wanted("/x")])
+    assert data.of("/x")[0].fields["data"].tolist() == [1.0, 3.0]
+    (loss,) = data.losses
+    assert loss.kind == "unsupported_encoding"
+    assert name in loss.text
+    assert (loss.start_ns, loss.end_ns) == (START + 1, START + 1)
+
+
+def test_payloads_that_do_not_fit_their_type_are_lost_and_counted(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    good = payloads(JOINTS, 2, {"name": ["a"], "velocity": np.array([[1.0], [2.0]])})
+    too_long = bytearray(good[0])
+    struct.pack_into("<I", too_long, 12, 1 << 31)
+    bad = [b"", b"\0", good[0][:30], bytes(too_long), b"\xff\xff\0\0" + good[0][4:]]
+    write_channels(path, [("/j", JOINTS, "ros2msg", text_of(JOINTS), "cdr", [good[0], *bad, good[1]])])
+    data = read_topics(path, [Wanted("/j", ("velocity[0]",))])
+    assert data.of("/j")[0].fields["velocity[0]"].tolist() == [1.0, 2.0]
+    assert {loss.kind for loss in data.losses} == {"undecodable"}
+    assert sum(int(loss.text.split()[0]) for loss in data.losses) == len(bad)
+
+
+def test_idl_schemas_mean_the_same_as_msg(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    fields = {
+        "speed": np.array([1.0, 2.0]),
+        "pair": np.array([[1.0, 2.0], [3.0, 4.0]]),
+        "history": Ragged(np.array([1.0, 2.0, 3.0], dtype=np.float32), np.array([0, 1, 3])),
+        "name": ["a", "bcd"],
+        "count": np.array([1, 2**40]),
+    }
+    encoded = payloads("demo_msgs/msg/Status", 2, fields, SAME_AS_IDL)
+    write_channels(
+        path,
+        [
+            ("/idl", "demo_msgs/msg/Status", "ros2idl", IDL.encode(), "cdr", encoded),
+            ("/msg", "demo_msgs/msg/Status", "ros2msg", SAME_AS_IDL.encode(), "cdr", encoded),
+        ],
+    )
+    idl, msg = read_one(path, "/idl"), read_one(path, "/msg")
+    assert list(idl.fields) == list(msg.fields)
+    assert idl.fields["history"].row(1).tolist() == [2.0, 3.0]
+    assert idl.fields["pair"].tolist() == [[1.0, 2.0], [3.0, 4.0]]
+    assert idl.fields["count"].tolist() == [1, 2**40]
+    assert idl.fields["name"].to_list() == msg.fields["name"].to_list() == ["a", "bcd"]
+
+
+def test_an_empty_schema_falls_back_to_the_bundled_definition_and_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    encoded = payloads(FLOAT, 2, {"data": np.array([1.0, 2.0])})
+    channels: list[Channel] = [
+        ("/known", FLOAT, "ros2msg", b"", "cdr", encoded),
+        ("/unknown", "vendor_msgs/msg/Thing", "ros2msg", b"", "cdr", encoded),
+        ("/odd", "vendor_msgs/msg/Thing", "ros2msg", b"this is ! no definition", "cdr", encoded),
+        ("/none", "", "", b"", "cdr", encoded),
+    ]
+    write_channels(path, channels)
+    data = read_topics(path, [Wanted(topic) for topic in ("/known", "/unknown", "/odd", "/none")])
+    (known,) = data.of("/known")
+    assert known.fields["data"].tolist() == [1.0, 2.0]
+    assert any("bundled" in note for note in known.notes)
+    (unknown,) = data.of("/unknown")
+    assert len(unknown) == 2
+    assert not unknown.fields
+    assert [loss.kind for loss in data.losses] == ["unsupported_encoding"]
+    assert "/odd" in data.losses[0].text
+
+
+def test_unchunked_logs_and_log_time_zero_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    truth = write_official(path, use_chunking=False)
+    data, found = read_small(path)
+    assert found == truth
+    assert not data.losses
+    encoded = payloads(FLOAT, 3, {"data": np.array([1.0, 2.0, 3.0])})
+    channel: Channel = ("/x", FLOAT, "ros2msg", text_of(FLOAT), "cdr", encoded)
+    write_channels(path, [channel], times=[0, START, START + 1])
+    assert open_log(path).start_ns == 0
+    assert read_one(path, "/x").log_time.tolist() == [0, START, START + 1]
+
+
+def test_messages_come_in_the_order_of_log_time(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    encoded = payloads(TEXT, 4, {"data": ["c", "a", "b", "b2"]})
+    times = [START + 9, START, START + 5, START + 5]
+    write_channels(path, [("/x", TEXT, "ros2msg", text_of(TEXT), "cdr", encoded)], times=times, chunk_size=10)
+    columns = read_one(path, "/x")
+    assert columns.log_time.tolist() == sorted(times)
+    assert columns.fields["data"].to_list() == ["a", "b", "b2", "c"]
+
+
+def transform(parent: str, child: str) -> dict[str, Any]:
+    return {
+        "transforms[].header.frame_id": parent,
+        "transforms[].child_frame_id": child,
+        "transforms[].transform.rotation.w": 1.0,
+    }
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_split_recording_is_one_run(tmp_path: Path, *, listed: bool) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    topics, truth = small_truth()
+    kind = "tf2_msgs/msg/TFMessage"
+    for part in range(3):
+        with LogWriter(folder / f"run_{part}.mcap") as writer:
+            first = START + part * 200_000_000
+            if part == 0:
+                writer.write_columns("/tf_static", kind, np.array([first]), transform("base_link", "imu"))
+            writer.write_columns("/tf", kind, np.array([first, first + 1]), transform("odom", "base_link"),
+                                 header_time=np.array([first, first + 1]))  # fmt: skip
+            for topic in (sorted(topics) if part % 2 else sorted(topics, reverse=True)):
+                name, time, fields = topics[topic]
+                rows = slice(part * 20, part * 20 + 20)
+                chosen = {
+                    key: value[rows] if key != "name" else value for key, value in fields.items()
+                }
+                writer.write_columns(topic, name, time[rows], chosen)
+    if listed:
+        lines = "\n".join(f"    - run_{part}.mcap" for part in range(3))
+        (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:\n{lines}\n")
+    index = open_log(folder)
+    assert index.message_count == len(truth) + 7
+    data = read_topics(index, [Wanted(topic) for topic in index.topics()])
+    assert not data.losses
+    for topic, (_, time, _) in topics.items():
+        (columns,) = data.of(topic)
+        assert columns.log_time.tolist() == time.tolist()
+    assert TransformBuffer(data.topics).chain("odom", "imu") == ("odom", "base_link", "imu")
+    assert data.sha256 == hash_log(folder)
+    (folder / "run_1.mcap").unlink()
+    if listed:
+        assert [loss.kind for loss in open_log(folder).losses] == ["missing_part"]
+
+
+def test_a_folder_of_several_recordings_is_refused(tmp_path: Path) -> None:
+    for name in ("a.mcap", "b.mcap"):
+        write_small(tmp_path / name, rows=2)
+    with pytest.raises(LogError) as caught:
+        open_log(tmp_path)
+    assert caught.value.code == "not_a_recording"
+
+
+def test_json_messages_are_columns(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    messages = [
+        {"speed": 1.5, "mode": "calib", "wheels": [1, 2], "pose": {"x": 3}, "points": [{"x": 1}, {"x": 2}]},
+        {"speed": 2.5, "mode": "idle", "wheels": [], "pose": {"x": 4}, "points": []},
+    ]
+    encoded = [json.dumps(message).encode() for message in messages]
+    write_channels(path, [("/j", "Status", "jsonschema", b"{}", "json", [*encoded, b"{broken"])])
+    data = read_topics(path, [Wanted("/j")])
+    fields: Any = data.of("/j")[0].fields
+    assert fields["speed"].tolist() == [1.5, 2.5]
+    assert isinstance(fields["mode"], Strings)
+    assert fields["wheels"].row(0).tolist() == [1, 2]
+    assert fields["points[].x"].row(0).tolist() == [1, 2]
+    assert fields["pose.x"].tolist() == [3, 4]
+    assert [loss.kind for loss in data.losses] == ["undecodable"]
+    only = read_topics(path, [Wanted("/j", ("wheels[1]",))]).of("/j")[0].fields
+    assert np.array_equal(only["wheels[1]"], [2.0, np.nan], equal_nan=True)
+
+
+def test_protobuf_messages_are_columns(tmp_path: Path) -> None:
+    timestamp = pytest.importorskip("google.protobuf.timestamp_pb2", reason="protobuf is not installed")
+    support = pytest.importorskip("mcap_protobuf.writer", reason="mcap-protobuf-support is not installed")
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as stream, support.Writer(stream) as writer:
+        for row in range(3):
+            message = timestamp.Timestamp(seconds=row, nanos=row * 2)
+            writer.write_message("/p", message, START + row, START + row)
+    fields = read_one(path, "/p").fields
+    assert fields["seconds"].tolist() == [0, 1, 2]
+    assert fields["nanos"].tolist() == [0, 2, 4]
+
+
+def test_ros1_messages_are_columns(tmp_path: Path) -> None:
+    pytest.importorskip("mcap_ros1", reason="mcap-ros1-support is not installed")
+    from mcap_ros1.decoder import DecoderFactory  # noqa: PLC0415 - optional
+    from mcap.reader import make_reader  # noqa: PLC0415 - optional
+
+    path = tmp_path / "log.mcap"
+    text = "Header header\nfloat64[] velocity\nstring[] name\nint8 level\n" + "=" * 80
+    text += "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+    body = struct.pack("<III", 7, 5, 6) + struct.pack("<I", 3) + b"map" + struct.pack("<I2d", 2, 1.5, 2.5)
+    body += struct.pack("<I", 1) + struct.pack("<I", 2) + b"ab" + b"\xff"
+    write_channels(path, [("/r", "demo/Joints", "ros1msg", text.encode(), "ros1", [body])])
+    columns = read_one(path, "/r")
+    with path.open("rb") as stream:
+        ((_, _, _, official),) = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+    assert columns.fields["velocity"].row(0).tolist() == list(official.velocity)
+    assert columns.fields["name"].row(0) == official.name
+    assert columns.fields["header.frame_id"].to_list() == [official.header.frame_id]
+    assert columns.fields["level"].tolist() == [official.level] == [-1]
+    assert columns.header_time.tolist() == [5_000_000_006]
+
+
+def test_fields_are_chosen_by_path(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    write_small(path, rows=5)
+    wanted = [Wanted("/joints", ("velocity[1]", "velocity[5]", "name[0]", "header.stamp"))]
+    fields: Any = read_topics(path, wanted).of("/joints")[0].fields
+    assert list(fields) == ["velocity[1]", "velocity[5]", "name[0]", "header.stamp.sec", "header.stamp.nanosec"]
+    assert np.isnan(fields["velocity[5]"]).all()
+    assert fields["name[0]"].to_list() == ["left"] * 5
+    with pytest.raises(LogError) as missing:
+        read_topics(path, [Wanted("/joints", ("velocities",))])
+    assert missing.value.code == "field_not_found"
+    assert "velocity" in missing.value.hint
+    with pytest.raises(LogError) as absent:
+        read_topics(path, [Wanted("/nowhere")])
+    assert absent.value.code == "topic_not_found"
+    assert "/joints" in absent.value.hint
+
+
+def test_a_chunk_without_checksum_is_read_up_to_the_last_wanted_message(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    encoded = payloads(FLOAT, 50, {"data": np.arange(50.0)})
+    large = payloads("demo/Big", 50, {"data": np.zeros((50, 4000), dtype=np.uint8)}, "uint8[] data\n")
+    channels: list[Channel] = [
+        ("/x", FLOAT, "ros2msg", text_of(FLOAT), "cdr", encoded),
+        ("/image", "demo/msg/Big", "ros2msg", b"uint8[] data\n", "cdr", large),
+    ]
+    write_channels(path, channels, enable_crcs=False)
+    data = read_topics(path, [Wanted("/x")])
+    assert data.of("/x")[0].fields["data"].tolist() == list(range(50))
+    assert not data.losses
+    assert any("no checksum" in note for note in data.notes)
+
+
+def test_the_index_tells_what_a_log_holds(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    truth = write_small(path)
+    index = open_log(path)
+    assert index.complete
+    assert index.metadata == {"deployment": {"vehicle": "husky_a200"}}
+    assert index.compressions == ("zstd",)
+    assert index.topics() == ("/joints", "/speed", "/state")
+    assert index.message_count == len(truth)
+    assert index.start_ns == min(time for _, time in truth)
+    assert index.duration_s == pytest.approx(0.59, abs=1e-6)
+    assert {channel.type_name for channel in index.channels} == {FLOAT, JOINTS, TEXT}
+    assert isinstance(read_topics(path, [Wanted("/joints")]).topics[0].fields["name"], RaggedStrings)
+    assert io.BytesIO(path.read_bytes()).read(5) == b"\x89MCAP"

@@ -1,0 +1,164 @@
+"""What is written is what was given, for our reader and for the official one."""
+
+from __future__ import annotations
+
+import pickle
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_files import FLOAT, JOINTS, START, TEXT, assert_equals_official, read_small, write_small
+
+from pipeline.logs import LogError, LogWriter, Ragged, RaggedStrings, Wanted, bundled_types, open_log, read_topics
+from pipeline.logs.spool import Spool
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
+def test_what_is_written_is_read_by_both_readers(tmp_path: Path, compression: str) -> None:
+    path = tmp_path / "log.mcap"
+    truth = write_small(path, compression=compression)
+    data, found = read_small(path)
+    assert found == truth
+    assert not data.losses
+    assert assert_equals_official(path) == len(truth)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert sum(1 for _ in reader.iter_messages()) == len(truth)
+        summary = reader.get_summary()
+        assert [record.name for record in reader.iter_metadata()] == ["deployment"]
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == len(truth)
+    assert summary.statistics.chunk_count == len(summary.chunk_indexes) > 3
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
+    write_small(tmp_path / "a.mcap")
+    write_small(tmp_path / "b.mcap")
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    write_small(path)
+    before = path.read_bytes()
+    with pytest.raises(RuntimeError, match="stop"), LogWriter(path) as writer:
+        writer.write_columns("/x", FLOAT, np.array([START]), {"data": 1.0})
+        raise RuntimeError("stop")
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_every_way_to_give_a_column(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    times = START + np.arange(3)
+    ragged = Ragged(np.array([1.0, 2.0, 3.0]), np.array([0, 0, 1, 3]))
+    names = RaggedStrings(np.array([1, 1, 0], dtype=np.int32), ("a", "bé"), np.array([0, 0, 1, 3]))
+    kind = "tf2_msgs/msg/TFMessage"
+    with LogWriter(path) as writer:
+        writer.write_columns("/lists", JOINTS, times, {"name": [["a"], [], ["b", "c"]], "velocity": [[1.0], [], [2, 3]]})
+        writer.write_columns("/ragged", JOINTS, times, {"name": names, "velocity": ragged}, header_time=times)
+        writer.write_columns("/same", JOINTS, times, {"name": ["l", "r"], "velocity": np.ones((3, 2))})
+        pose = {"pose.covariance": np.arange(36.0), "child_frame_id": "base", "pose.pose.position.x": times * 1.0}
+        writer.write_columns("/odom", ODOMETRY, times, pose, publish_time=times + 5)
+        both = {"transforms[].child_frame_id": ["x", "y", "z"], "transforms[].transform.rotation.w": 1.0}
+        writer.write_columns("/tf", kind, times, both, header_time=times)
+    data = read_topics(path, [Wanted(topic) for topic in open_log(path).topics()])
+    fields: dict[str, Any] = {columns.topic: columns.fields for columns in data.topics}
+    assert [fields["/lists"]["name"].row(row) for row in range(3)] == [["a"], [], ["b", "c"]]
+    assert [fields["/lists"]["velocity"].row(row).tolist() for row in range(3)] == [[1.0], [], [2.0, 3.0]]
+    assert fields["/ragged"]["name"].row(2) == ["bé", "a"]
+    assert fields["/same"]["name"].fixed().shape == (3, 2)
+    assert fields["/odom"]["pose.covariance"][2].tolist() == list(range(36))
+    assert fields["/odom"]["pose.pose.orientation.w"].tolist() == [0.0, 0.0, 0.0]
+    assert data.of("/odom")[0].publish_time.tolist() == (times + 5).tolist()
+    assert data.of("/ragged")[0].header_time.tolist() == times.tolist()
+    assert fields["/tf"]["transforms[].child_frame_id"].row(1) == ["y"]
+    assert fields["/tf"]["transforms[].header.stamp.nanosec"].row(2).tolist() == [2]
+    assert assert_equals_official(path) == 15
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields", "code"),
+    [
+        ("vendor_msgs/msg/Thing", {}, "unknown_type"),
+        (FLOAT, {"value": 1.0}, "field_not_found"),
+        (FLOAT, {"data": np.zeros(7)}, "bad_column"),
+        ("std_msgs/msg/Int32", {"data": 0.5}, "bad_column"),
+        (TEXT, {"data": ["a", "b"]}, "bad_column"),
+        (JOINTS, {"velocity": [1.0], "name": 3.0}, "bad_column"),
+    ],
+)
+def test_what_cannot_be_written_is_said(tmp_path: Path, kind: str, fields: dict[str, Any], code: str) -> None:
+    with LogWriter(tmp_path / "log.mcap") as writer:
+        with pytest.raises(LogError) as caught:
+            writer.write_columns("/x", kind, START + np.arange(3), fields)
+        assert caught.value.code == code
+    assert open_log(tmp_path / "log.mcap").message_count == 0
+
+
+def test_every_bundled_type_can_be_written_empty(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as writer:
+        for kind in bundled_types():
+            writer.write_columns(f"/{kind}", kind, np.array([START, START + 1]), {})
+    assert assert_equals_official(path) == 2 * len(bundled_types())
+
+
+def test_a_type_with_its_own_definition(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as writer:
+        writer.write_columns("/x", "demo/msg/Pair", np.array([START]), {"b": 2.5}, definition="int8 a\nfloat64 b\n")
+    assert read_topics(path, [Wanted("/x")]).of("/x")[0].fields["b"].tolist() == [2.5]
+
+
+def test_messages_are_ordered_however_they_were_given(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    rng = np.random.default_rng(3)
+    times = START + rng.permutation(500)
+    with LogWriter(path, chunk_size=1000) as writer:
+        for part in np.split(times, 5):
+            writer.write_columns("/x", FLOAT, part, {"data": (part - START).astype(float)})
+    with path.open("rb") as stream:
+        logged = [m.log_time for _, _, m in make_reader(stream).iter_messages(log_time_order=False)]
+    assert logged == sorted(times.tolist())
+    assert read_topics(path, [Wanted("/x")]).of("/x")[0].fields["data"].tolist() == list(range(500))
+
+
+def test_large_exports_wait_in_a_file(tmp_path: Path) -> None:
+    few, many = Spool(tmp_path / "a"), Spool(tmp_path / "b", limit=1000)
+    rng = np.random.default_rng(4)
+    for spool in (few, many):
+        rng = np.random.default_rng(4)
+        for channel in range(4):
+            rows = rng.integers(0, 256, size=(50, 40 + channel), dtype=np.uint8)
+            spool.add(rows, channel, rng.integers(0, 99, size=50))
+    assert many._file is not None
+    assert few._file is None
+    batches = [[batch.records for batch in spool.batches(512)] for spool in (few, many)]
+    assert batches[0] == batches[1]
+    few.close()
+    many.close()
+
+
+def test_what_was_read_crosses_a_process_boundary(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    write_small(path)
+    index = pickle.loads(pickle.dumps(open_log(path)))  # noqa: S301 - our own bytes
+    data = pickle.loads(pickle.dumps(read_topics(index, [Wanted("/speed")])))  # noqa: S301 - our own bytes
+    assert len(data.of("/speed")[0]) == 60
+
+
+def test_a_hundred_thousand_messages_are_written_in_seconds(tmp_path: Path) -> None:
+    times = START + np.arange(100_000) * 10_000_000
+    begin = time.process_time()
+    with LogWriter(tmp_path / "log.mcap") as writer:
+        writer.write_columns("/odom", ODOMETRY, times, {"pose.pose.position.x": times * 1e-9}, header_time=times)
+    assert time.process_time() - begin < 3.0
