@@ -17,13 +17,16 @@ from pipeline.statistics.families import (
 )
 from pipeline.statistics.intervals import Interval, bootstrap_median, bound_mean, bound_shift, bound_typical
 from pipeline.statistics.orders import kendall_tau, list_swaps
+from pipeline.statistics.pairs import Blocks, Comparison, compare_blocks, compare_runs, cut_blocks
 from pipeline.statistics.permutation import PermutationTest, permute_means, permute_studentized, smallest_p
 from pipeline.statistics.ranks import mann_whitney
 
 __all__ = [
     "MOST_GROUPS",
     "TIMES_PER_BLOCK",
+    "Blocks",
     "Change",
+    "Comparison",
     "Interval",
     "PermutationTest",
     "StatisticsError",
@@ -34,7 +37,10 @@ __all__ = [
     "bound_shift",
     "bound_typical",
     "cliffs_delta",
+    "compare_blocks",
+    "compare_runs",
     "count_effective",
+    "cut_blocks",
     "find_changes",
     "integrated_time",
     "kendall_tau",

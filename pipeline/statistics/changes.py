@@ -42,8 +42,9 @@ def find_changes(
 
     The best split is the one with the largest weighted difference of means; its p comes from the largest
     split of the same values in random order, so that looking everywhere is paid for. Then each side is
-    searched in turn with half the level (binary segmentation). Sources: Scott and Knott, Biometrics 30 (1974); Matteson
-    and James, Journal of the American Statistical Association 109 (2014) for the permutation.
+    searched in turn with half the level (binary segmentation). Sources: Scott and Knott, Biometrics 30
+    (1974); for the permutation Matteson and James, Journal of the American Statistical Association 109
+    (2014).
 
     Args:
         values: one a run, in the order of time, shape (n,).

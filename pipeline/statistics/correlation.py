@@ -13,15 +13,15 @@ if TYPE_CHECKING:
 
 _FEWEST_PAIRS = 20
 _LONGEST_SHARE = 0.25
-_WINDOW = 6.0
+_WINDOW = 3.0
 TIMES_PER_BLOCK = 5.0
 
 
 def integrated_time(values: ArrayLike, ticks: ArrayLike) -> float:
-    """Integrated autocorrelation time tau = 1/2 + sum of rho_k, in grid steps; at least 1/2.
+    """Integrated autocorrelation time tau = 1 + 2 sum of rho_k, in grid steps; at least one.
 
-    The mean of n samples scatters as that of n / (2 tau) independent ones. The sum ends at the first lag that
-    is 6 tau long (Sokal 1997), or where the correlation is no longer positive. Samples that are missing, in
+    The mean of n samples scatters as that of n / tau independent ones. The sum ends at the first lag that is
+    3 tau long (Sokal 1997), or where the correlation is no longer positive. Samples that are missing, in
     gaps between segments for example, are left out pair by pair.
 
     Args:
@@ -39,27 +39,27 @@ def integrated_time(values: ArrayLike, ticks: ArrayLike) -> float:
     filled[index], there[index] = samples - samples.mean(), 1.0
     products, pairs = _autocorrelate(filled, size)[:span], _autocorrelate(there, size)[:span]
     if products[0] <= 0.0:
-        return 0.5
+        return 1.0
     variance = products[0] / pairs[0]
-    tau = 0.5
+    tau = 1.0
     for lag in range(1, max(int(span * _LONGEST_SHARE), 2)):
         if lag >= span or pairs[lag] < _FEWEST_PAIRS:
             break
         rho = products[lag] / pairs[lag] / variance
         if rho <= 0.0 or lag > _WINDOW * tau:
             break
-        tau += float(rho)
+        tau += 2.0 * float(rho)
     return tau
 
 
 def count_effective(values: ArrayLike, ticks: ArrayLike) -> float:
-    """How many independent samples these are worth: n / (2 tau), at least one.
+    """How many independent samples these are worth: n / tau, at least one.
 
     Raises:
         StatisticsError: as `integrated_time`.
     """
     samples = check_values(values, what="samples", fewest=2)
-    return max(samples.size / (2.0 * integrated_time(samples, ticks)), 1.0)
+    return max(samples.size / integrated_time(samples, ticks), 1.0)
 
 
 def number_blocks(ticks: ArrayLike, pieces: ArrayLike, length: float) -> Integers:

@@ -68,22 +68,29 @@ def bound_shift(a: ArrayLike, b: ArrayLike, *, level: float = 0.95) -> Interval:
     For values near normal the shift scatters as the difference of means does (within 5 % in the limit of many
     values), so Welch's interval fits it. Source: Welch, Biometrika 34 (1947).
 
+    A side of one value is taken to scatter as the other does.
+
     Args:
-        a: one number a unit, shape (n,), n >= 2.
-        b: the same for the other side, shape (m,), m >= 2.
+        a: one number a unit, shape (n,).
+        b: the same for the other side, shape (m,), n + m >= 3.
         level: confidence level.
 
     Raises:
-        StatisticsError: fewer than two values on a side, or one that is not finite.
+        StatisticsError: a side is empty, both have a single value, or one is not finite.
     """
-    first = check_values(a, what="values", fewest=2)
-    second = check_values(b, what="values", fewest=2)
-    parts = [float(np.var(side, ddof=1)) / side.size for side in (first, second)]
+    first = check_values(a, what="values", fewest=1)
+    second = check_values(b, what="values", fewest=2 if first.size == 1 else 1)
+    scatter = [float(np.var(side, ddof=1)) for side in (first, second) if side.size > 1]
+    freedom = [side.size - 1 for side in (first, second) if side.size > 1]
+    parts = [scatter[0] / first.size, scatter[-1] / second.size]
     centre, error = shift_between(first, second), sum(parts) ** 0.5
     if error == 0.0:
         return Interval(centre, centre, level)
-    weights = parts[0] ** 2 / (first.size - 1) + parts[1] ** 2 / (second.size - 1)
-    half = _student(level, sum(parts) ** 2 / weights) * error
+    if len(freedom) == 1:
+        half = _student(level, freedom[0]) * error
+    else:
+        weights = sum(part**2 / count for part, count in zip(parts, freedom, strict=True))
+        half = _student(level, sum(parts) ** 2 / weights) * error
     return Interval(centre - half, centre + half, level)
 
 
