@@ -22,36 +22,46 @@ RUN_FILE = "run.toml"
 
 
 def load_configuration(
-    log: Path, *, given: Path | None = None, overrides: Tree | None = None
+    log: Path, *, given: Path | None = None, fleet: Path | None = None, overrides: Tree | None = None
 ) -> Configuration:
     """The configuration of one log.
 
-    Every `fleet.toml` from the file system's root down to the log's folder is read, nearer ones winning;
-    then `run.toml` or `<log's stem>.toml` beside the log, or the file given in their place; then overrides.
+    Every `fleet.toml` from the file system's root down to the log's folder is read, nearer ones winning, then
+    the given fleet file; then `run.toml` or `<log's stem>.toml` beside the log, or the file given in their
+    place; then overrides.
 
     Args:
         log: the recording.
         given: a configuration file that replaces the one beside the log.
+        fleet: a fleet file that need not stand above the log; its globs are held against every end of the
+            log's path that begins with a whole folder.
         overrides: values from the command line, nested like the file.
 
     Raises:
         ConfigurationError: a file is missing, not TOML, or has an unknown key or a wrong value.
     """
-    folder = log.resolve().parent
     layers: list[Tree] = []
-    for place in (*reversed(folder.parents), folder):
-        fleet = place / FLEET_FILE
-        if fleet.is_file():
-            layers += _match_fleet(fleet, log.resolve())
-    if given is not None:
-        layers.append(_checked(read_toml(given), given))
-    else:
-        for beside in (folder / RUN_FILE, folder / f"{log.stem}.toml"):
-            if beside.is_file():
-                layers.append(_checked(read_toml(beside), beside))
+    for place in list_configuration_files(log, given=given, fleet=fleet):
+        if place == fleet or (place.name == FLEET_FILE and place != given):
+            layers += _match_fleet(place, log.resolve())
+        else:
+            layers.append(_checked(read_toml(place), place))
     if overrides:
         layers.append(overrides)
     return convert(merge(layers), "the command line")
+
+
+def list_configuration_files(
+    log: Path, *, given: Path | None = None, fleet: Path | None = None
+) -> tuple[Path, ...]:
+    """The files that configure a log, later ones winning; arguments as of `load_configuration`."""
+    folder = log.resolve().parent
+    fleets = [place / FLEET_FILE for place in (*reversed(folder.parents), folder)]
+    beside = [folder / RUN_FILE, folder / f"{log.stem}.toml"]
+    found = [file for file in fleets if file.is_file() and (fleet is None or file != fleet.resolve())]
+    found += [] if fleet is None else [fleet]
+    found += [given] if given is not None else [file for file in beside if file.is_file()]
+    return tuple(found)
 
 
 def merge(layers: Iterable[Tree]) -> dict[str, object]:
@@ -128,7 +138,7 @@ def _match_fleet(path: Path, log: Path) -> list[Tree]:
     tree = read_toml(path)
     matches = tree.pop("match", [])
     layers: list[Tree] = [_checked(tree, path)]
-    relative = log.relative_to(path.parent).as_posix()
+    names = _names_under(path.resolve().parent, log)
     if not isinstance(matches, list):
         raise _bad_match(path, 1)
     for number, match in enumerate(matches, start=1):
@@ -136,9 +146,17 @@ def _match_fleet(path: Path, log: Path) -> list[Tree]:
             raise _bad_match(path, number)
         values = {key: value for key, value in match.items() if key != "glob"}
         _checked(values, path)
-        if fnmatch.fnmatchcase(relative, match["glob"]) or fnmatch.fnmatchcase(log.name, match["glob"]):
+        if any(fnmatch.fnmatchcase(name, match["glob"]) for name in names):
             layers.append(values)
     return layers
+
+
+def _names_under(folder: Path, log: Path) -> list[str]:
+    """What a glob may match: the log's path below the fleet file or its name; elsewhere any end of its path."""
+    if log.is_relative_to(folder):
+        return [log.relative_to(folder).as_posix(), log.name]
+    parts = log.parts[1:]
+    return ["/".join(parts[start:]) for start in range(len(parts))]
 
 
 def _bad_match(path: Path, number: int) -> ConfigurationError:

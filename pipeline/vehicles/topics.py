@@ -103,6 +103,18 @@ class _Chooser:
             )
         return signal
 
+    def _require_type(self, topic: str, role: str, kind: str) -> str:
+        """A configured topic that must be of one type."""
+        name = self.require(topic, role).topic
+        if self.types[name] != kind:
+            raise ConfigurationError(
+                "type_not_usable",
+                f"the topic {name!r} of type {self.types[name]} cannot serve as {role}",
+                where=self.where,
+                hint=f"Use a topic of type {kind}.",
+            )
+        return name
+
     def require_number(self, text: str, role: str) -> Signal:
         """A configured signal that must come to one number."""
         signal = self.require(text, role)
@@ -124,7 +136,7 @@ class _Chooser:
         if configured is not None:
             return configured
         usual = self.vehicle.topics.command if commanded else self.vehicle.topics.wheels
-        candidates = list(self._drive_candidates(section, commanded=commanded))
+        candidates = list(self._drive_candidates(commanded=commanded))
         return self._best(candidates, usual, role)
 
     def _configured_drive(self, section: DriveSection, role: str) -> DriveSource | None:
@@ -159,29 +171,19 @@ class _Chooser:
             return DriveForm.BODY
         return DriveForm.ACKERMANN if kind in ACKERMANN_TYPES else None
 
-    def _drive_candidates(
-        self, section: DriveSection, *, commanded: bool
-    ) -> Iterable[tuple[float, DriveSource]]:
+    def _drive_candidates(self, *, commanded: bool) -> Iterable[tuple[float, DriveSource]]:
         """Candidates with their rank: wheel commands before body commands, since the drive received them."""
-        wanted, unwanted = (_COMMANDED, _MEASURED) if commanded else (_MEASURED, _COMMANDED)
         ackermann = self.vehicle.kind == "ackermann"
-        steered = bool(section.steering_joint) or not ackermann
-        for topic in self.of_type(JOINTS) if steered else []:
+        for topic in self.of_type(JOINTS):
             says_command = bool(_COMMANDED.search(topic.lower()))
             if says_command == commanded:
                 word = "says command" if says_command else "does not say command"
-                yield 3.0, DriveSource(DriveForm.JOINTS, (Signal(topic),), f"JointState whose name {word}")
-        for left, right in [] if ackermann else self._pairs():
-            name = left.lower()
-            fits, misfits = bool(wanted.search(name)), bool(unwanted.search(name))
-            if fits and not misfits:
-                reason, rank = "a pair of sides whose name fits the role", 3.0
-            elif commanded and not misfits:
-                reason, rank = "a pair of sides that does not say it is measured", 2.5
-            else:
-                continue
-            signals = (Signal(left, "data"), Signal(right, "data"))
-            yield rank, DriveSource(DriveForm.SIDES, signals, reason)
+                rank = 2.0 if ackermann else 3.0
+                yield rank, DriveSource(DriveForm.JOINTS, (Signal(topic),), f"JointState whose name {word}")
+        form = DriveForm.STEERING_SIGNALS if ackermann else DriveForm.SIDES
+        pairs = self._pairs_of_speed_and_steering() if ackermann else self._pairs_of_sides()
+        for rank, pair, reason in _rank_pairs(pairs, commanded=commanded):
+            yield rank, DriveSource(form, (Signal(pair[0], "data"), Signal(pair[1], "data")), reason)
         for topic in self.of_type(*ACKERMANN_TYPES) if ackermann else []:
             if bool(_MEASURED.search(topic.lower())) != commanded:
                 yield 3.0, DriveSource(DriveForm.ACKERMANN, (Signal(topic),), "speed and steering angle")
@@ -200,13 +202,24 @@ class _Chooser:
             rank, reason = 1.5, "a body command"
         return rank, DriveSource(DriveForm.BODY, (Signal(topic),), reason)
 
-    def _pairs(self) -> list[tuple[str, str]]:
+    def _pairs_of_sides(self) -> list[tuple[str, str]]:
         """Topics of one number whose names differ in left and right."""
         floats = set(self.of_type(*FLOAT_TYPES))
         return [
             (topic, topic.replace("left", "right"))
             for topic in sorted(floats)
             if "left" in topic and topic.replace("left", "right") in floats
+        ]
+
+    def _pairs_of_speed_and_steering(self) -> list[tuple[str, str]]:
+        """Topics of one number whose names differ in speed (or velocity) and steering."""
+        floats = set(self.of_type(*FLOAT_TYPES))
+        return [
+            (speed, topic)
+            for topic in sorted(floats)
+            for word in ("speed", "velocity")
+            for turn in ("steering_angle", "steering", "steer")
+            if turn in topic and (speed := topic.replace(turn, word)) in floats
         ]
 
     def choose_pose(self, topic: str | None, frames: list[str] | None) -> PoseSource | None:
@@ -257,16 +270,23 @@ class _Chooser:
     def choose_imu(self, topic: str | None) -> TopicSource | None:
         """The gyro: configured, else the usual one, else the one with most messages."""
         if topic:
-            return TopicSource(self.require(topic, "imu").topic, "configured")
+            return TopicSource(self._require_type(topic, "imu", IMU_TYPE), "configured")
         candidates = [(1.0, TopicSource(name, "an IMU by its type")) for name in self.of_type(IMU_TYPE)]
         return self._best(candidates, self.vehicle.topics.imu, "imu")
 
     def choose_interval(self, configuration: Configuration) -> TopicSource | None:
         """The topic that says when commands are live."""
         sections: list[IntervalSection] = configuration.interval
-        configured = [section.topic for section in sections if section.topic]
+        configured = sorted({section.topic for section in sections if section.topic})
+        if len(configured) > 1:
+            raise ConfigurationError(
+                "intervals_disagree",
+                f"the intervals name several topics: {', '.join(configured)}",
+                where=self.where,
+                hint="Give one state topic; it may have several [[interval]] with different `equals`.",
+            )
         if configured:
-            return TopicSource(self.require(configured[0], "interval").topic, "configured")
+            return TopicSource(self._require_type(configured[0], "interval", STRING_TYPE), "configured")
         topic, value = DEFAULT_INTERVAL
         if sections or configuration.use_intervals == "all" or self.types.get(topic) != STRING_TYPE:
             return None
@@ -288,3 +308,26 @@ class _Chooser:
         if others:
             self.notes.append(f"{role}: {ranked[0][1]} was preferred to {others}")
         return ranked[0][1]
+
+
+def _rank_pairs(
+    pairs: Sequence[tuple[str, str]], *, commanded: bool
+) -> Iterable[tuple[float, tuple[str, str], str]]:
+    """Pairs of topics that may serve in a role, ranked by what their names say.
+
+    A pair that says nothing is a command, unless another pair says that it is the command.
+    """
+    wanted, unwanted = (_COMMANDED, _MEASURED) if commanded else (_MEASURED, _COMMANDED)
+    command_is_named = any(
+        _COMMANDED.search(pair[0].lower()) and not _MEASURED.search(pair[0].lower()) for pair in pairs
+    )
+    for pair in pairs:
+        name = pair[0].lower()
+        if unwanted.search(name):
+            continue
+        if wanted.search(name):
+            yield 3.0, pair, "a pair of topics whose names fit the role"
+        elif commanded and not command_is_named:
+            yield 2.5, pair, "a pair of topics that do not say they are measured"
+        elif not commanded and command_is_named:
+            yield 2.5, pair, "a pair of topics beside one that says command"

@@ -22,6 +22,7 @@ Floats = NDArray[np.float64]
 
 _LEFT = re.compile(r"left|(^|[_/])(l|lf|fl|rl|bl|ml|lb)([_/\d]|$)")
 _RIGHT = re.compile(r"right|(^|[_/])(r|rf|fr|rr|br|mr|rb)([_/\d]|$)")
+_STEERS = re.compile(r"steer")
 _RPM = 2.0 * np.pi / 60.0
 
 BODY_FIELDS = {"geometry_msgs/Twist": "", "geometry_msgs/TwistStamped": "twist."}
@@ -68,8 +69,11 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     velocity = _joint_matrix(columns.fields["velocity"], names)
     position = _joint_matrix(columns.fields["position"], names)
     joints = sorted(set(velocity) | set(position))
-    left = _choose_joints(joints, section.left, _LEFT, _RIGHT)
-    right = _choose_joints(joints, section.right, _RIGHT, _LEFT)
+    rolling = [
+        joint for joint in joints if joint != section.steering_joint and not _STEERS.search(joint.lower())
+    ]
+    left = _choose_joints(rolling, section.left, _LEFT, _RIGHT)
+    right = _choose_joints(rolling, section.right, _RIGHT, _LEFT)
     found: list[Finding] = []
     missing = [joint for joint in (*left, *right) if not _is_known(velocity, joint)]
     if missing:
@@ -86,16 +90,12 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
             raise _no_wheels(columns.topic, joints)
         velocity[joint] = differentiate_angle(times, position[joint])
     if vehicle.kind == "ackermann":
-        if section.steering_joint is None or section.steering_joint not in position:
-            raise StageError(
-                "no_steering",
-                f"{columns.topic} needs a steering joint",
-                where=columns.topic,
-                hint=f"Set steering_joint to one of: {', '.join(sorted(position))}.",
-            )
+        steering = _mean_steering(position, section.steering_joint, columns.topic)
         wheels = [velocity[joint] for joint in (*left, *right)]
+        if not wheels:
+            raise _no_wheels(columns.topic, joints)
         speed = _to_radps(np.mean(wheels, axis=0), section, vehicle) * vehicle.wheel_radius_m
-        return Drive(speed=speed, steering=position[section.steering_joint], findings=tuple(found))
+        return Drive(speed=speed, steering=steering, findings=tuple(found))
     if not left or not right:
         raise _no_wheels(columns.topic, joints)
     sides = [
@@ -103,6 +103,21 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
         for side in (left, right)
     ]
     return Drive(left=sides[0], right=sides[1], findings=tuple(found))
+
+
+def _mean_steering(position: Mapping[str, Floats], configured: str | None, topic: str) -> Floats:
+    """Steering angle [rad]: of the configured joint, else the mean of those whose names say they steer."""
+    names = [configured] if configured else [joint for joint in position if _STEERS.search(joint.lower())]
+    found = [position[joint] for joint in names if joint in position]
+    if not found:
+        raise StageError(
+            "no_steering",
+            f"{topic} needs a steering joint",
+            where=topic,
+            hint=f"Set steering_joint to one of: {', '.join(sorted(position)) or 'none it has'}.",
+        )
+    mean: Floats = np.mean(found, axis=0)
+    return mean
 
 
 def _joint_matrix(values: object, names: RaggedStrings) -> dict[str, Floats]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.stages.errors import StageError
+from pipeline.vehicles import DEFAULT_INTERVAL
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,8 +19,12 @@ Floats = NDArray[np.float64]
 Span = tuple[float, float]
 
 
-def find_spans_of_state(times: Floats, states: Sequence[str], value: str) -> list[Span]:
-    """Spans [s] in which a state topic says ``value``; the last one is open."""
+def find_spans_of_state(times: Floats, states: Sequence[str], section: IntervalSection) -> list[Span]:
+    """Spans [s] in which a state topic says what a section asks for, within the section's own times.
+
+    The last span is open: the topic need not be repeated while its state lasts.
+    """
+    value = section.equals or DEFAULT_INTERVAL[1]
     spans: list[Span] = []
     begin: float | None = None
     for time, state in zip(times.tolist(), states, strict=True):
@@ -30,7 +35,15 @@ def find_spans_of_state(times: Floats, states: Sequence[str], value: str) -> lis
             begin = None
     if begin is not None:
         spans.append((begin, np.inf))
-    return spans
+    earliest, latest = _limits_of(section)
+    cut = [(max(start, earliest), min(end, latest)) for start, end in spans]
+    return [(start, end) for start, end in cut if start < end]
+
+
+def _limits_of(section: IntervalSection) -> Span:
+    start = -np.inf if section.start_s is None else section.start_s
+    end = np.inf if section.end_s is None else section.end_s
+    return start, end
 
 
 def find_spans_given(sections: Sequence[IntervalSection], where: str) -> list[Span]:
@@ -41,10 +54,7 @@ def find_spans_given(sections: Sequence[IntervalSection], where: str) -> list[Sp
     """
     spans = []
     for section in sections:
-        if section.topic is not None:
-            continue
-        start = -np.inf if section.start_s is None else section.start_s
-        end = np.inf if section.end_s is None else section.end_s
+        start, end = _limits_of(section)
         if end <= start:
             raise StageError(
                 "bad_interval",
@@ -52,7 +62,8 @@ def find_spans_given(sections: Sequence[IntervalSection], where: str) -> list[Sp
                 where=where,
                 hint="Give [[interval]] a start_s below its end_s, in seconds from the run's start.",
             )
-        spans.append((start, end))
+        if section.topic is None:
+            spans.append((start, end))
     return spans
 
 

@@ -37,6 +37,7 @@ from pipeline.vehicles import (
     Sources,
     Vehicle,
 )
+from pipeline.vehicles.configuration import IntervalSection
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -46,6 +47,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+
+_DEFAULT_SECTION = IntervalSection(topic=DEFAULT_INTERVAL[0], equals=DEFAULT_INTERVAL[1])
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ class _Extraction:
         tables = {
             "poses": self._poses(spans),
             "commands": self._drive_table(self.sources.command, self.configuration.command, spans, held=True),
-            "wheels": self._drive_table(self.sources.wheels, self.configuration.wheels, spans, held=False),
+            "wheels": self._wheel_table(spans),
             "imu": self._imu(spans),
         }
         clocks: dict[str, dict[str, str | float]] = {
@@ -198,14 +201,15 @@ class _Extraction:
             return None
         if source is not None:
             found = self._ordered(source.topic)
-            value = next((s.equals for s in sections if s.topic and s.equals), DEFAULT_INTERVAL[1])
+            asked = [section for section in sections if section.topic] or [_DEFAULT_SECTION]
             if found is not None:
                 columns, clock, order = found
                 states = reading.texts(columns, "data")
-                spans += find_spans_of_state(
-                    self._seconds(clock.stamp[order]), [states[i] for i in order.tolist()], value
-                )
-            text = f"only stretches in which {source.topic} says {value!r} were used ({len(spans)} of them)"
+                times, said = self._seconds(clock.stamp[order]), [states[i] for i in order.tolist()]
+                for section in asked:
+                    spans += find_spans_of_state(times, said, section)
+            values = " or ".join(repr(section.equals or DEFAULT_INTERVAL[1]) for section in asked)
+            text = f"only stretches in which {source.topic} says {values} were used ({len(spans)} of them)"
             self.findings.append(
                 Finding("interval_applied", "info", text, where=source.topic, count=len(spans))
             )
@@ -302,6 +306,19 @@ class _Extraction:
             {**self._time_columns(times, stamp, log_time), **values, "active": is_inside(times, spans)}
         )
         return frame.with_columns(pl.lit(None, dtype=pl.Float64).alias(name) for name in absent)
+
+    def _wheel_table(self, spans: Sequence[Span] | None) -> pl.DataFrame:
+        """Measured wheels; where nobody named their topic, one without wheels is left out."""
+        source = self.sources.wheels
+        section = self.configuration.wheels
+        try:
+            return self._drive_table(source, section, spans, held=False)
+        except StageError as error:
+            if source is None or source.reason == "configured":
+                raise
+            text = f"{source} was taken for measured wheels by its type, but {error.what}: left out"
+            self.findings.append(Finding("no_measured_wheels", "info", text, where=str(source)))
+            return pl.DataFrame()
 
     def _read_single(
         self, source: DriveSource, section: DriveSection, columns: TopicColumns, times: Floats
