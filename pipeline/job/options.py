@@ -21,6 +21,8 @@ class Options:
     Attributes:
         out: results folder.
         config: configuration file in place of the one beside the log.
+        fleet: fleet file that holds for the log wherever it stands, beside those above the log.
+        run: name of the run; None finds one by the log's folder, name and content.
         overrides: configuration values from the command line, nested like the file.
         inputs: which inputs to compute slip for.
         report: whether to write `report.html`.
@@ -31,6 +33,8 @@ class Options:
 
     out: Path = Path("results")
     config: Path | None = None
+    fleet: Path | None = None
+    run: str | None = None
     overrides: Mapping[str, object] = field(default_factory=dict)
     inputs: tuple[str, ...] = INPUTS
     report: bool = True

@@ -51,7 +51,9 @@ def describe_subject(path: Path, options: Options) -> Subject:
         JobError: the log has no pose, or neither command nor measured wheels.
     """
     index = open_log(path)
-    configuration = load_configuration(path, given=options.config, overrides=options.overrides)
+    configuration = load_configuration(
+        path, given=options.config, fleet=options.fleet, overrides=options.overrides
+    )
     recorded = index.metadata.get("deployment", {})
     if not index.channels:
         raise JobError(
@@ -89,13 +91,18 @@ def _require_sources(sources: Sources, index: LogIndex, options: Options) -> Non
         )
 
 
+def name_plainly(path: Path) -> str:
+    """Name of the run of a log where no other run has it: folder/stem."""
+    return f"{path.parent.name}/{path.stem}" if path.parent.name else path.stem
+
+
 def name_run(path: Path, sha256: str, store: Store) -> str:
     """Name of the run of a log: folder/stem, with eight digits of its hash where another run has that name.
 
     Equal content counts once: a copy of a log that has results already gets their name.
     """
     absolute = path.resolve()
-    plain = f"{absolute.parent.name}/{absolute.stem}" if absolute.parent.name else absolute.stem
+    plain = name_plainly(absolute)
     manifest = store.manifest(plain)
     if manifest is None:
         for known in store.survey().manifests:

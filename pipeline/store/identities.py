@@ -12,6 +12,7 @@ import os
 import time
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from stat import S_ISDIR
 from typing import TYPE_CHECKING
 
 from pipeline.store.errors import StoreError
@@ -31,12 +32,12 @@ _TICK_NS = 20_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class LogSighting:
-    """What a log's file looked like at a moment.
+    """What a log looked like at a moment.
 
     Attributes:
         path: absolute, links resolved.
-        size: bytes.
-        mtime_ns: modification time [ns since 1970].
+        size: bytes, of all parts of a split recording.
+        mtime_ns: modification time [ns since 1970], the latest of a split recording's.
         inode: number of the file in its file system.
         seen_ns: when it was looked at [ns since 1970].
     """
@@ -65,10 +66,12 @@ def see_log(path: Path) -> LogSighting:
     """
     seen_ns = time.time_ns()
     status = path.stat()
+    # A part may grow without its folder noticing.
+    parts = [part.stat() for part in path.glob("*.mcap")] if S_ISDIR(status.st_mode) else [status]
     return LogSighting(
         path=os.path.realpath(path),
-        size=status.st_size,
-        mtime_ns=status.st_mtime_ns,
+        size=sum(part.st_size for part in parts),
+        mtime_ns=max([status.st_mtime_ns, *(part.st_mtime_ns for part in parts)]),
         inode=status.st_ino,
         seen_ns=seen_ns,
     )

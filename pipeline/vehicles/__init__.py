@@ -6,7 +6,7 @@ chosen by type and name, with a reason that is printed.
 
 from pipeline.vehicles.configuration import Configuration, DriveSection
 from pipeline.vehicles.errors import ConfigurationError
-from pipeline.vehicles.loading import load_configuration
+from pipeline.vehicles.loading import list_configuration_files, load_configuration
 from pipeline.vehicles.presets import Vehicle, find_preset, list_presets, resolve_vehicle
 from pipeline.vehicles.sources import DriveForm, DriveSource, PoseSource, Signal, Sources, TopicSource
 from pipeline.vehicles.topics import DEFAULT_INTERVAL, choose_sources
@@ -25,6 +25,7 @@ __all__ = [
     "Vehicle",
     "choose_sources",
     "find_preset",
+    "list_configuration_files",
     "list_presets",
     "load_configuration",
     "resolve_vehicle",

@@ -128,3 +128,15 @@ def test_many_writers_at_once(identities: LogIdentities, tmp_path: Path, store: 
     with ThreadPoolExecutor(8) as pool:
         assert all(pool.map(remember_and_look, range(400)))
     assert not list(store.root.rglob(".tmp-*"))
+
+
+def test_a_part_that_grows_makes_a_split_recording_unknown(identities: LogIdentities, tmp_path: Path) -> None:
+    recording = tmp_path / "split"
+    recording.mkdir()
+    for number in range(2):
+        (recording / f"split_{number}.mcap").write_bytes(b"part")
+    assert identities.remember(recording, "aa")
+    assert identities.lookup(recording) == "aa"
+    with (recording / "split_1.mcap").open("ab") as part:
+        part.write(b"more")
+    assert identities.lookup(recording) is None
