@@ -48,7 +48,7 @@ def load_configuration(
             layers.append(_checked(read_toml(place), place))
     if overrides:
         layers.append(overrides)
-    return convert(merge(layers), "the command line")
+    return convert(merge(_forget_other_vehicles(layers)), "the command line")
 
 
 def list_configuration_files(
@@ -62,6 +62,23 @@ def list_configuration_files(
     found += [] if fleet is None else [fleet]
     found += [given] if given is not None else [file for file in beside if file.is_file()]
     return tuple(found)
+
+
+def _forget_other_vehicles(layers: list[Tree]) -> list[Tree]:
+    """Drop what lower layers say of a vehicle where a higher one names another preset.
+
+    A track width given beside `preset = "husky_a200"` must not end up on a Warthog.
+    """
+    kept: list[Tree] = []
+    named: object = None
+    for layer in layers:
+        vehicle = layer.get("vehicle")
+        preset = vehicle.get("preset") if isinstance(vehicle, Mapping) else None
+        if preset is not None and named is not None and preset != named:
+            kept = [{key: value for key, value in below.items() if key != "vehicle"} for below in kept]
+        named = preset or named
+        kept.append(layer)
+    return kept
 
 
 def merge(layers: Iterable[Tree]) -> dict[str, object]:
@@ -152,7 +169,7 @@ def _match_fleet(path: Path, log: Path) -> list[Tree]:
 
 
 def _names_under(folder: Path, log: Path) -> list[str]:
-    """What a glob may match: the log's path below the fleet file or its name; elsewhere any end of its path."""
+    """What a glob may match: the log's path below the fleet file, or its name; else any end of its path."""
     if log.is_relative_to(folder):
         return [log.relative_to(folder).as_posix(), log.name]
     parts = log.parts[1:]
