@@ -24,6 +24,7 @@ _SCALE_FORGIVEN = 0.05
 _BIAS_FORGIVEN = 0.01
 _LATE = 0.04
 _GYRO_RATE = 20.0
+_LONGEST_SILENCE = 0.25
 
 
 @dataclass(frozen=True)
@@ -76,9 +77,18 @@ def fit_gyro(
 
 
 def rate_of_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -> Floats:
-    """The gyro's yaw rate [rad/s] at grid times, sign, scale and bias corrected, at its own clock."""
+    """The gyro's yaw rate [rad/s] at grid times, sign, scale and bias corrected, at its own clock.
+
+    NaN where the gyro was silent: a hole is not bridged.
+    """
     grid, rate = _smooth_gyro(times, imu, window)
     corrected: Floats = fit.sign * fit.scale * np.interp(times, grid, rate) + fit.bias
+    stamps = imu["t"].to_numpy()
+    left = timegrid.hold_indices(times, stamps)
+    before = stamps[np.maximum(left, 0)]
+    after = stamps[np.minimum(left + 1, stamps.size - 1)]
+    silent = (left < 0) | (times - before > _LONGEST_SILENCE) | (after - before > _LONGEST_SILENCE)
+    corrected[silent] = np.nan
     return corrected
 
 

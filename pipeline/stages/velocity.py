@@ -75,7 +75,7 @@ def compute_velocities(
         findings += more
     rate = rate_of_gyro(table["t"].to_numpy(), imu, fit, settings.window_s) if fit and fit.usable else None
     column = (
-        pl.Series("v_w_imu", rate, dtype=pl.Float64)
+        pl.Series("v_w_imu", rate, dtype=pl.Float64).fill_nan(None)
         if rate is not None
         else pl.lit(None, pl.Float64).alias("v_w_imu")
     )
@@ -88,6 +88,10 @@ def compute_velocities(
                 where=where,
                 hint="Use --yaw pose (the default).",
             )
+        silent = table["v_w_imu"].null_count()
+        if silent:
+            text = f"the gyro is silent in {silent} time steps: the poses' yaw rate stands in there"
+            findings.append(Finding("imu_gap", "warning", text, where="imu", count=silent))
         table = table.with_columns(pl.coalesce(pl.col("v_w_imu"), pl.col("v_w")).alias("v_w"))
     return VelocityResult(table, tuple(findings), fit)
 

@@ -209,6 +209,13 @@ class _Extraction:
                 for section in asked:
                     spans += find_spans_of_state(times, said, section)
             values = " or ".join(repr(section.equals or DEFAULT_INTERVAL[1]) for section in asked)
+            if not spans:
+                raise StageError(
+                    "no_interval",
+                    f"{source.topic} never says {values}, so that no command counts",
+                    where=self.where,
+                    hint="Set another `equals` in [[interval]], or take everything with --interval all.",
+                )
             text = f"only stretches in which {source.topic} says {values} were used ({len(spans)} of them)"
             self.findings.append(
                 Finding("interval_applied", "info", text, where=source.topic, count=len(spans))
