@@ -272,5 +272,9 @@ class ReportEffect(Effect):
         """Velocity as the reported poses show it."""
 
     def delay_s(self) -> float:
-        """How late the reported poses are stamped [s]."""
+        """How late the reported position is stamped beyond its heading, or beyond what is known [s]."""
         return 0.0
+
+    def report_gyro(self, velocity: Velocity, around: Surroundings) -> Velocity:
+        """As `report`, where the heading is a gyro's and not the poses' own."""
+        return self.report(velocity, around)

@@ -2,8 +2,8 @@
 
     reported yaw(t) = yaw(t - d):  v_y += d * v0 * w0 at first order
 
-d [s], up to 0.1. It looks like lateral skid of c = -d. It shows only against the reported heading: with a
-gyro as heading it is the difference of two delays instead (see the run's timing).
+d [s], up to 0.1. It looks like lateral skid of c = -d. Where a gyro is the heading, it is the position that
+is reported d earlier than the heading.
 
 Source: two clocks in one localization; measured on the DRIVE recordings.
 """
@@ -52,3 +52,8 @@ class HeadingSkew(ReportEffect):
             y=sine * velocity.x + cosine * velocity.y,
             w=rate,
         )
+
+    def report_gyro(self, velocity: Velocity, around: Surroundings) -> Velocity:
+        """The gyro's heading has no skew: nothing but the delay of the position is left."""
+        del around
+        return velocity

@@ -1,0 +1,224 @@
+"""One run made ready: its grid, heading, windows and horizons, and a model's residuals on them."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.motion.cells import interpolate_drive, make_cells
+from pipeline.motion.effect import ReportEffect
+from pipeline.motion.errors import MotionError
+from pipeline.motion.forward import Forward, Timing
+from pipeline.motion.heading import HeadingSource, choose_heading
+from pipeline.motion.signals import Surroundings
+from pipeline.motion.windows import gather_nodes, join_horizons, join_windows
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.motion.effect import Effect
+    from pipeline.motion.recording import MotionRun
+    from pipeline.motion.signals import Velocity
+    from pipeline.vehicles import Vehicle
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Complex = NDArray[np.complex128]
+
+CELL_RATE_HZ = 200.0
+_SETTLE_S = 0.6
+
+
+class Input(enum.Enum):
+    """What a model is fed with."""
+
+    COMMAND = "command"
+    MEASURED = "measured"
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Errors of predictions: position [m] and wrapped yaw [rad] at each row of the horizons, shape (n,)."""
+
+    position: Floats
+    yaw: Floats
+
+
+class Comparison:
+    """One run, one input: what a model predicts against what was measured.
+
+    Attributes:
+        run: the recording.
+        windows: displacements that are compared.
+        horizons: predictions that are compared.
+        heading: whose heading is used.
+    """
+
+    def __init__(
+        self,
+        run: MotionRun,
+        vehicle: Vehicle,
+        source: Input,
+        *,
+        heading: HeadingSource = HeadingSource.AUTO,
+        rate_hz: float = CELL_RATE_HZ,
+    ) -> None:
+        series = run.commands if source is Input.COMMAND else run.wheels
+        if series is None:
+            words = "commands" if source is Input.COMMAND else "measured wheels"
+            raise MotionError(
+                f"no_{source.value}",
+                f"the run has no {words} to feed a model with",
+                where=run.name,
+                hint="Choose the other input.",
+            )
+        self.run = run
+        self.source = source
+        self.cells = make_cells(run, rate_hz)
+        self.heading = choose_heading(run, self.cells, heading)
+        self.nodes = gather_nodes(run.track, self.cells)
+        self.windows = join_windows(run, self.cells, self.nodes)
+        self.horizons = join_horizons(run, self.cells, self.nodes)
+        self._pose_times = run.track.times[self.nodes.poses]
+        self._path = cast("Complex", self.nodes.average(run.track.path[self.nodes.poses]))
+        self._frames: dict[float, Complex] = {}
+        self._headings: dict[float, Floats] = {}
+        self.forward = Forward(series, self.cells, self._look_around(vehicle), has_gyro=self.has_gyro)
+
+    @property
+    def has_gyro(self) -> bool:
+        """Whether the gyro is heading and clock."""
+        return self.heading.gyro is not None
+
+    def predict_velocity(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
+        """Body velocity of a model on the cells, as the localization would report it."""
+        if self.source is Input.COMMAND:
+            return self.forward.run_commands(effects, timing)
+        return self.forward.run_wheels(effects, timing)
+
+    def find_residuals(self, effects: Sequence[Effect], timing: Timing) -> Floats:
+        """Measured less predicted displacement of every window, over its length.
+
+        Returns:
+            x, y [m/s] in the frame of the measured heading half-way, and w [rad/s], shape (n, 3).
+        """
+        velocity = self.predict_velocity(effects, timing)
+        delay = timing.pose_delay_s + self._find_delay(effects)
+        place = self.cells.locate_edges(self._pose_times - delay)
+        along = (velocity.x + 1j * velocity.y) * self._frame(delay)
+        travelled = self._at_nodes(self.cells.sum_up(along), place)
+        turned = self._at_nodes(self.cells.sum_up(velocity.w), place)
+        heading = self._node_headings(delay)
+        start, end = self.windows.start, self.windows.end
+        frame = np.exp(-0.5j * (heading[start] + heading[end]))
+        gap = frame * ((self._path[end] - self._path[start]) - (travelled[end] - travelled[start]))
+        rest = (heading[end] - heading[start]) - (turned[end] - turned[start])
+        return np.column_stack((gap.real, gap.imag, rest.real)) / self.windows.span_s[:, None]
+
+    def find_reach(self, effects: Sequence[Effect], timing: Timing) -> Reach:
+        """Errors of two-second predictions that start from measured poses and integrate the model's own yaw."""
+        velocity = self.predict_velocity(effects, timing)
+        delay = timing.pose_delay_s + self._find_delay(effects)
+        place = self.cells.locate_edges(self._pose_times - delay)
+        edges = cast("Floats", self.cells.sum_up(velocity.w))
+        own = np.exp(0.5j * (edges[1:] + edges[:-1]))
+        travelled = self._at_nodes(self.cells.sum_up((velocity.x + 1j * velocity.y) * own), place)
+        turned = self._at_nodes(edges, place).real
+        heading = self._node_headings(delay)
+        origin, node = self.horizons.origin, self.horizons.node
+        turn = np.exp(1j * (heading[origin] - turned[origin]))
+        predicted = self._path[origin] + turn * (travelled[node] - travelled[origin])
+        yaw = (heading[node] - heading[origin]) - (turned[node] - turned[origin])
+        return Reach(np.abs(predicted - self._path[node]), np.abs(np.angle(np.exp(1j * yaw))))
+
+    def _find_delay(self, effects: Sequence[Effect]) -> float:
+        """How much later the model itself says positions are stamped [s]."""
+        late = sum(effect.delay_s() for effect in effects if isinstance(effect, ReportEffect))
+        if self.has_gyro:
+            late -= sum(effect.values["d"] for effect in effects if effect.id == "heading_skew")
+        return late
+
+    def _at_nodes(self, edges: NDArray[np.generic], place: Floats) -> NDArray[np.generic]:
+        index = np.minimum(place.astype(np.int64), edges.size - 2)
+        values = edges[index] + (place - index) * (edges[index + 1] - edges[index])
+        return self.nodes.average(values)
+
+    def _node_headings(self, delay: float) -> Floats:
+        """Measured heading at the nodes [rad]."""
+        if delay not in self._headings:
+            offset = self.heading.offset[self.nodes.poses]
+            if self.heading.gyro is not None:
+                place = self.cells.locate_edges(self._pose_times - delay)
+                offset = offset + np.interp(place, np.arange(self.heading.edges.size), self.heading.edges)
+            _forget(self._headings)
+            self._headings[delay] = np.asarray(self.nodes.average(offset), dtype=np.float64)
+        return self._headings[delay]
+
+    def _frame(self, delay: float) -> Complex:
+        """Unit vectors along the measured heading on the cells."""
+        key = 0.0 if self.heading.gyro is not None else delay
+        if key not in self._frames:
+            times, offset = self.run.track.times, self.heading.offset
+            if self.heading.gyro is not None:
+                middle = 0.5 * (self.heading.edges[1:] + self.heading.edges[:-1])
+                late = self.heading.gyro.yaw_delay_s
+                heading = middle + np.interp(self.cells.times + late, times, offset)
+            else:
+                heading = np.interp(self.cells.times + delay, times, offset)
+            _forget(self._frames)
+            self._frames[key] = np.exp(1j * heading)
+        return self._frames[key]
+
+    def _look_around(self, vehicle: Vehicle) -> Surroundings:
+        run, cells = self.run, self.cells
+        at, track = cells.times, run.track
+        wheels = np.full((cells.first.size, 2), np.nan)
+        if run.wheels is not None:
+            first = interpolate_drive(run.wheels, cells.starts, 0.0)
+            wheels = np.column_stack((first.left, first.right))
+        settle, start = self._measure_starts()
+        return Surroundings(
+            vehicle=vehicle,
+            times=at,
+            step_s=cells.step_s,
+            span=cells.span,
+            first=cells.first,
+            duration_s=run.duration_s,
+            start_wheels=wheels,
+            settle=settle,
+            start_velocity=start,
+            attitude=np.column_stack([np.interp(at, track.times, column) for column in track.attitude.T]),
+            place=np.column_stack([np.interp(at, track.times, column) for column in track.place.T]),
+        )
+
+    def _measure_starts(self) -> tuple[Integers, Floats]:
+        """Body velocity over the first moments of every span: cells it counts from, and (v_x, v_y, v_w)."""
+        cells, nodes = self.cells, self.nodes
+        settle, start = cells.first.copy(), np.full((cells.first.size, 3), np.nan)
+        delay = self.heading.gyro.yaw_delay_s if self.heading.gyro is not None else 0.0
+        heading = self._node_headings(delay)
+        first = np.searchsorted(nodes.times, cells.starts)
+        last = np.searchsorted(nodes.times, cells.starts + _SETTLE_S) - 1
+        rows = np.flatnonzero((last > first) & (last < nodes.times.size))
+        one, two = first[rows], last[rows]
+        whole = (nodes.piece[one] == nodes.piece[two]) & (nodes.times[two] - nodes.times[one] > 0.3)  # noqa: PLR2004
+        rows, one, two = rows[whole], one[whole], two[whole]
+        span = nodes.times[two] - nodes.times[one]
+        moved = (self._path[two] - self._path[one]) * np.exp(-0.5j * (heading[one] + heading[two])) / span
+        start[rows] = np.column_stack((moved.real, moved.imag, (heading[two] - heading[one]) / span))
+        middle = 0.5 * (nodes.times[one] + nodes.times[two]) - delay
+        settle[rows] = np.clip(
+            cells.locate_edges(middle).astype(np.int64),
+            cells.first[rows],
+            np.append(cells.first[1:], cells.times.size)[rows] - 1,
+        )
+        return settle, start
+
+
+def _forget(kept: dict[float, NDArray[np.generic]]) -> None:
+    while len(kept) > 2:  # noqa: PLR2004 - the value in use and one beside it for derivatives
+        kept.pop(next(iter(kept)))

@@ -1,0 +1,225 @@
+"""Fitting: robust least squares over all free numbers at once, after a search where one start is not enough."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.motion.problem import Free, Problem, State, needs_search
+from pipeline.motion.starts import find_starts, refine_grid
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.motion.model import Model
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+_HUBER = 3.0
+_MOST_ITERATIONS = 25
+_CONVERGED = 1e-6
+_LEAST_SCALE = 1e-6
+
+
+@dataclass(frozen=True)
+class Weights:
+    """How much each residual counts: 1 / scale of its run and channel.
+
+    Attributes:
+        scale: typical size of a residual, shape (runs, 3).
+    """
+
+    scale: Floats
+
+    def normalise(self, residuals: Floats, problem: Problem) -> Floats:
+        """Residuals over their scales, shape (n, 3)."""
+        normal: Floats = residuals / self.scale[problem.run_of]
+        return normal
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fitted state and what is needed to judge it.
+
+    Attributes:
+        state: model, per-run values and delays.
+        free: the numbers that were fitted.
+        weights: of the residuals.
+        residuals: of all windows, shape (n, 3).
+        jacobian: change of the residuals with each number, shape (n, 3, p).
+        loss: mean robust loss over windows and channels.
+        used: windows that took part, shape (n,).
+    """
+
+    state: State
+    free: tuple[Free, ...]
+    weights: Weights
+    residuals: Floats
+    jacobian: Floats
+    loss: float
+    used: Flags = field(repr=False)
+
+    @property
+    def model(self) -> Model:
+        """The fitted model."""
+        return self.state.model
+
+
+def estimate_scales(problem: Problem, residuals: Floats, used: Flags) -> Weights:
+    """Spread of the residuals per run and channel: robust, but never far below their rms.
+
+    Where a vehicle mostly drives straight, the median of the yaw residual says nothing about turning.
+    """
+    scale = np.empty((len(problem.comparisons), 3))
+    for run in range(scale.shape[0]):
+        rows = residuals[(problem.run_of == run) & used]
+        size = np.abs(rows)
+        middle = 1.4826 * np.median(size, axis=0)
+        clipped = np.minimum(size, 6.0 * np.maximum(middle, 1e-9))
+        scale[run] = np.maximum(middle, 0.5 * np.sqrt(np.mean(clipped**2, axis=0)))
+    return Weights(np.maximum(scale, _LEAST_SCALE))
+
+
+def measure_loss(problem: Problem, residuals: Floats, weights: Weights, used: Flags) -> float:
+    """Mean Huber loss over the used windows and channels."""
+    size = np.abs(weights.normalise(residuals, problem)[used])
+    loss = np.where(size <= _HUBER, 0.5 * size**2, _HUBER * (size - 0.5 * _HUBER))
+    return float(loss.mean())
+
+
+def fit_model(
+    problem: Problem,
+    model: Model,
+    *,
+    per_run: Sequence[str] = (),
+    start: State | None = None,
+    used: Flags | None = None,
+    weights: Weights | None = None,
+) -> Fitted:
+    """Fit a model's free parameters and the recording's delays.
+
+    Args:
+        problem: the runs.
+        model: effects at neutral values are searched from several starts; others start where they are.
+        per_run: labels ``effect.name`` or ids whose values belong to each run alone.
+        start: state to start from, without a search, in place of the model's own values.
+        used: windows to fit, all by default.
+        weights: scales to use; by default they are found along the way.
+
+    Returns:
+        The fit; a number at its bound says that the data ask for more.
+    """
+    used = np.ones(problem.run_of.size, dtype=bool) if used is None else used
+    free = problem.list_free(model, per_run)
+    given = weights
+    if start is None:
+        state = find_starts(problem, model, free, used)
+    else:
+        state = State(model, start.own, start.timing)
+    residuals = problem.find_residuals(state)
+    weights = given or estimate_scales(problem, residuals, used)
+    smooth = tuple(number for number in free if not needs_search(number))
+    jacobian = problem.differentiate(state, smooth, residuals)
+    for _ in range(3 if given is None else 1):
+        state, residuals, jacobian = _descend(problem, smooth, weights, used, (state, residuals, jacobian))
+        if len(smooth) < len(free):
+            state = refine_grid(problem, state, free, weights, used)
+            residuals = problem.find_residuals(state)
+            jacobian = problem.differentiate(state, smooth, residuals)
+            state, residuals, jacobian = _descend(
+                problem, smooth, weights, used, (state, residuals, jacobian)
+            )
+        if given is None:
+            before, weights = weights, estimate_scales(problem, residuals, used)
+            if np.allclose(before.scale, weights.scale, rtol=0.01):
+                break
+    if len(smooth) < len(free):
+        jacobian = problem.differentiate(state, free, residuals)
+    loss = measure_loss(problem, residuals, weights, used)
+    return Fitted(state, free, weights, residuals, jacobian, loss, used)
+
+
+def solve_step(normal: Floats, gradient: Floats, values: Floats, bounds: Floats, damping: float) -> Floats:
+    """Damped Gauss-Newton step that stays inside bounds.
+
+    Args:
+        normal: J' W J, shape (p, p).
+        gradient: J' W r, shape (p,).
+        values: where the step starts, shape (p,).
+        bounds: shape (p, 2).
+        damping: Levenberg-Marquardt damping relative to the diagonal.
+    """
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    active = np.diag(normal) > 1e-12 * max(float(np.diag(normal).max(initial=0.0)), 1e-300)
+    step = np.zeros(values.size)
+    for _ in range(values.size + 1):
+        rows = np.flatnonzero(active)
+        if rows.size == 0:
+            break
+        scaled = normal[np.ix_(rows, rows)] / np.outer(size[rows], size[rows])
+        scaled = scaled + np.eye(rows.size) * (damping + 1e-9)
+        step[:] = 0.0
+        step[rows] = -np.linalg.solve(scaled, gradient[rows] / size[rows]) / size[rows]
+        clipped = np.clip(values + step, bounds[:, 0], bounds[:, 1]) - values
+        # A number that sits on its bound and is pushed outward leaves the system; the others are solved again.
+        stuck = active & (clipped == 0.0) & (step != 0.0)
+        step = clipped
+        if not stuck.any():
+            break
+        active &= ~stuck
+    return step
+
+
+def weigh_system(
+    problem: Problem, residuals: Floats, jacobian: Floats, weights: Weights, used: Flags
+) -> tuple[Floats, Floats]:
+    """Normal matrix and gradient under Huber weights."""
+    normal = weights.normalise(residuals, problem)[used]
+    size = np.abs(normal)
+    robust = np.sqrt(np.where(size <= _HUBER, 1.0, _HUBER / np.maximum(size, _HUBER)))
+    columns = jacobian[used] * (robust / weights.scale[problem.run_of[used]])[:, :, None]
+    flat = columns.reshape(-1, columns.shape[2])
+    return flat.T @ flat, flat.T @ (normal * robust).ravel()
+
+
+def _descend(
+    problem: Problem,
+    free: Sequence[Free],
+    weights: Weights,
+    used: Flags,
+    at: tuple[State, Floats, Floats],
+) -> tuple[State, Floats, Floats]:
+    """Levenberg-Marquardt until the loss no longer falls."""
+    state, residuals, jacobian = at
+    if not free:
+        return at
+    bounds = np.array([number.bounds for number in free])
+    loss = measure_loss(problem, residuals, weights, used)
+    damping = 1e-4
+    for _ in range(_MOST_ITERATIONS):
+        normal, gradient = weigh_system(problem, residuals, jacobian, weights, used)
+        values = np.array([state.get(number) for number in free])
+        fell = 0.0
+        while damping < 1e6:  # noqa: PLR2004 - beyond it no step is left
+            moved = state
+            step = solve_step(normal, gradient, values, bounds, damping)
+            for number, value in zip(free, (values + step).tolist(), strict=True):
+                moved = moved.set(number, value)
+            trial = problem.find_residuals(moved)
+            new = measure_loss(problem, trial, weights, used)
+            if new < loss:
+                fell = (loss - new) / loss
+                state, residuals, loss = moved, trial, new
+                damping = max(damping / 10.0, 1e-7)
+                break
+            if np.abs(step / np.maximum(np.abs(values), 1e-2)).max(initial=0.0) < 1e-5:  # noqa: PLR2004
+                return state, residuals, jacobian
+            damping *= 10.0
+        jacobian = problem.differentiate(state, free, residuals)
+        if fell < _CONVERGED:
+            break
+    return state, residuals, jacobian

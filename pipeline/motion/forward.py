@@ -1,0 +1,142 @@
+"""The forward model: from a run's input to the body velocity, each place's result kept for the next call."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar, cast
+
+import numpy as np
+
+from pipeline.motion.cells import begin_spans, hold_on_cells, interpolate_drive
+from pipeline.motion.effect import (
+    BodyEffect,
+    CommandEffect,
+    DriveEffect,
+    Effect,
+    KinematicEffect,
+    LinearEffect,
+    Place,
+    ReportEffect,
+)
+from pipeline.motion.signals import Rolling, Surroundings, Velocity, Wheels, roll_ideally
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from pipeline.motion.cells import Cells
+    from pipeline.motion.recording import DriveSeries
+
+Result = TypeVar("Result")
+
+_REMEMBERED = 3
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Delays that are no physics, per run.
+
+    Attributes:
+        pose_delay_s: how late the reported poses are against the gyro's clock, or the input's without one.
+        wheel_delay_s: how late measured wheels are.
+    """
+
+    pose_delay_s: float = 0.0
+    wheel_delay_s: float = 0.0
+
+
+class Forward:
+    """Velocities of one run for many models.
+
+    Args:
+        series: commands, or measured wheels.
+        cells: the grid.
+        around: what effects may know of the run.
+        has_gyro: whether the heading that velocities are compared in is a gyro's.
+    """
+
+    def __init__(self, series: DriveSeries, cells: Cells, around: Surroundings, *, has_gyro: bool) -> None:
+        self.series = series
+        self.cells = cells
+        self.around = around
+        self.has_gyro = has_gyro
+        self._kept: dict[Place, OrderedDict[object, object]] = {place: OrderedDict() for place in Place}
+
+    def run_commands(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
+        """Body velocity as reported, of commands; see `predict_velocity`."""
+        told = [e for e in effects if e.place is Place.COMMAND]
+        driven = [e for e in effects if e.place is Place.DRIVE]
+        key: tuple[object, ...] = tuple(e.key for e in told)
+        wheels = self._keep(Place.COMMAND, key, lambda: self._hold(told))
+        key = (*key, *(e.key for e in driven))
+        wheels = self._keep(Place.DRIVE, key, lambda: self._drive(wheels, driven))
+        del timing
+        return self._move(wheels, key, effects)
+
+    def run_wheels(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
+        """Body velocity as reported, of measured wheels: effects of the drivetrain drop out."""
+        key = (timing.wheel_delay_s,)
+        wheels = self._keep(
+            Place.DRIVE, key, lambda: interpolate_drive(self.series, self.around.times, timing.wheel_delay_s)
+        )
+        return self._move(wheels, key, effects)
+
+    def _keep(self, place: Place, key: object, make: Callable[[], Result]) -> Result:
+        kept = self._kept[place]
+        if key in kept:
+            kept.move_to_end(key)
+            return cast("Result", kept[key])
+        made = make()
+        kept[key] = made
+        if len(kept) > _REMEMBERED:
+            kept.popitem(last=False)
+        return made
+
+    def _hold(self, effects: Sequence[Effect]) -> Wheels:
+        commands = begin_spans(self.series, self.cells, self.around.start_wheels)
+        for effect in effects:
+            commands = cast("CommandEffect", effect).change_commands(commands, self.around)
+        return hold_on_cells(commands, self.cells)
+
+    def _drive(self, wheels: Wheels, effects: Sequence[Effect]) -> Wheels:
+        for effect in effects:
+            wheels = cast("DriveEffect", effect).drive_wheels(wheels, self.around)
+        return wheels
+
+    def _move(self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect]) -> Velocity:
+        rolled = [e for e in effects if e.place is Place.KINEMATICS]
+        key = (*key, "|", *(e.key for e in rolled))
+        rolling = self._keep(Place.KINEMATICS, key, lambda: self._roll(wheels, rolled))
+        body = [e for e in effects if e.place is Place.BODY]
+        key = (*key, "|", *(e.key for e in body))
+        moved = self._keep(Place.BODY, key, lambda: self._move_body(rolling, body))
+        velocity = moved
+        for effect in effects:
+            if effect.place is Place.GROUND:
+                velocity = cast("LinearEffect", effect).add_to(velocity, rolling, moved, self.around)
+        for effect in effects:
+            if effect.place is Place.CENTRE:
+                velocity = cast("LinearEffect", effect).add_to(velocity, rolling, velocity, self.around)
+        arm = self.around.vehicle.base_to_rear_axle_m
+        if self.around.vehicle.kind == "ackermann" and arm != 0.0:
+            velocity = velocity.add(y=arm * velocity.w)
+        for effect in effects:
+            if effect.place is Place.LOCALIZATION:
+                if isinstance(effect, LinearEffect):
+                    velocity = effect.add_to(velocity, rolling, velocity, self.around)
+                elif self.has_gyro:
+                    velocity = cast("ReportEffect", effect).report_gyro(velocity, self.around)
+                else:
+                    velocity = cast("ReportEffect", effect).report(velocity, self.around)
+        return velocity
+
+    def _roll(self, wheels: Wheels, effects: Sequence[Effect]) -> Rolling:
+        rolling = roll_ideally(wheels, self.around)
+        for effect in effects:
+            rolling = cast("KinematicEffect", effect).roll(rolling, self.around)
+        return rolling
+
+    def _move_body(self, rolling: Rolling, effects: Sequence[Effect]) -> Velocity:
+        for effect in effects:
+            return cast("BodyEffect", effect).move_body(rolling, self.around)
+        return Velocity(rolling.v0, np.zeros_like(rolling.v0), rolling.w0)
