@@ -11,6 +11,7 @@ import msgspec
 
 from pipeline.vehicles.configuration import Configuration
 from pipeline.vehicles.errors import ConfigurationError
+from pipeline.vehicles.presets import find_preset
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -74,6 +75,8 @@ def _forget_other_vehicles(layers: list[Tree]) -> list[Tree]:
     for layer in layers:
         vehicle = layer.get("vehicle")
         preset = vehicle.get("preset") if isinstance(vehicle, Mapping) else None
+        known = find_preset(preset) if isinstance(preset, str) else None
+        preset = preset if known is None else known.id
         if preset is not None and named is not None and preset != named:
             kept = [{key: value for key, value in below.items() if key != "vehicle"} for below in kept]
         named = preset or named
