@@ -1,0 +1,126 @@
+"""Where models compete: a problem, its metric and folds, and the effects that may be named."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.diagnosis.judge import Verdict, compare, hold_out, make_folds
+from pipeline.diagnosis.metric import Metric, make_metric, saturate
+from pipeline.diagnosis.plausibility import is_nameable
+from pipeline.diagnosis.polish import Fitted, polish
+from pipeline.diagnosis.screen import propose
+from pipeline.motion.effect import Effect
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from pipeline.diagnosis.judge import Fold
+    from pipeline.diagnosis.problem import Problem
+    from pipeline.diagnosis.screen import Largest
+    from pipeline.diagnosis.state import State
+
+Floats = NDArray[np.float64]
+EffectClass = type[Effect]
+
+# A number more must buy something: between models that predict alike the simpler one is named.
+_PRICE_OF_A_NUMBER = 0.004
+_PRICE = {"terrain_change": 0.05}
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A fitted model with its held-out residuals.
+
+    Attributes:
+        fitted: the model.
+        held: residuals under parameters fitted elsewhere, shape (n, 3).
+        score: held-out loss, a little more for every number.
+    """
+
+    fitted: Fitted
+    held: Floats
+    score: float
+
+    @property
+    def state(self) -> State:
+        """The model's state."""
+        return self.fitted.state
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Ids of its effects."""
+        return self.fitted.state.ids
+
+
+@dataclass
+class Arena:
+    """A problem with what is needed to judge models of it.
+
+    Attributes:
+        problem: what is explained.
+        candidates: effects that may be named.
+        largest: what relative starts are shares of.
+        noise: spread that a saturated fit leaves, shape (n, 3).
+        kept: effects that are never dropped: those of the model to start from.
+        metric: cost of residuals at the current model.
+    """
+
+    problem: Problem
+    candidates: tuple[EffectClass, ...]
+    largest: Largest
+    noise: Floats
+    folds: tuple[Fold, ...]
+    metric: Metric
+    kept: frozenset[str] = frozenset()
+    _known: dict[tuple[str, ...], Contender] = field(default_factory=dict)
+
+    def enter(self, state: State) -> Contender:
+        """Fit a state and hold it out."""
+        fitted = polish(self.problem, self.metric, state)
+        held = hold_out(fitted, self.metric, self.folds)
+        price = 1.0 + sum(
+            _PRICE.get(effect.id, 0.0)
+            + _PRICE_OF_A_NUMBER * sum(np.isfinite(value) for value in effect.values.values())
+            for effect in fitted.state.effects
+        )
+        return Contender(fitted, held, self.metric.loss(held) * price)
+
+    def judge(self, before: Contender, after: Contender) -> Verdict:
+        """How much better ``after`` is."""
+        return compare(self.problem, self.metric, before.held, after.held)
+
+    def adapt(self, contender: Contender) -> Contender:
+        """Take the metric from a model's own residuals, and fit it anew."""
+        self.metric = make_metric(contender.fitted.residual, self.noise, self.problem)
+        return self.enter(contender.state)
+
+    def suggest(self, base: Contender, count: int, without: Iterable[str] = ()) -> list[Contender]:
+        """The best few models with one effect more, fitted, by score."""
+        barred = set(without)
+        candidates = [c for c in self.candidates if c.id not in barred]
+        proposals = propose(self.problem, self.metric, base.fitted, candidates, self.largest)[:count]
+        entered = [self.enter(proposal.state) for proposal in proposals]
+        return sorted((c for c in entered if self.is_sound(c)), key=lambda c: c.score)
+
+    def is_sound(self, contender: Contender) -> bool:
+        """Whether every effect is large enough to be named, and no degenerate form of another."""
+        return all(
+            effect.id in self.kept or is_nameable(effect, self.largest) for effect in contender.state.effects
+        )
+
+
+def open_arena(
+    problem: Problem, start: State, candidates: tuple[EffectClass, ...], largest: Largest
+) -> tuple[Arena, Contender]:
+    """The arena of a problem, and the model to start from, fitted."""
+    residual = problem.find_residuals(start)
+    noise = saturate(problem, residual)
+    metric = make_metric(residual, noise, problem)
+    arena = Arena(
+        problem, candidates, largest, noise, make_folds(problem), metric, kept=frozenset(start.ids)
+    )
+    return arena, arena.adapt(arena.enter(start))

@@ -1,0 +1,108 @@
+"""Whether one model is better than another on data that neither has seen: blocked cross-validation.
+
+Residuals of field data are autocorrelated, so that textbook tests name what is not there. Here the unit is a
+stretch of ten seconds; parameters are refitted for every fold, through the Jacobian.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.diagnosis.polish import solve_step
+from pipeline.motion.effect import Search
+
+if TYPE_CHECKING:
+    from pipeline.diagnosis.metric import Metric
+    from pipeline.diagnosis.polish import Fitted
+    from pipeline.diagnosis.problem import Problem
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+FOLDS = 5
+GAP_S = 1.5
+LEAST_GAIN = 0.01
+LEAST_T = 2.5
+_FEWEST_WINDOWS = 6
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Windows that are fitted and windows that are judged."""
+
+    train: Flags
+    test: Flags
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How much better a model is.
+
+    Attributes:
+        gain: share of the other's held-out loss that it takes away.
+        t: larger of two block t values: of the loss difference, and of the log ratio.
+    """
+
+    gain: float
+    t: float
+
+    def accepts(self, least_gain: float = LEAST_GAIN) -> bool:
+        """Whether it is better beyond doubt."""
+        return self.gain >= least_gain and self.t >= LEAST_T
+
+
+def make_folds(problem: Problem) -> tuple[Fold, ...]:
+    """Five folds of ten-second stretches, with gaps of 1.5 s between what is fitted and what is judged."""
+    folds = []
+    begin, end = problem.times[:, 0], problem.times[:, 1]
+    for number in range(FOLDS):
+        test = problem.unit % FOLDS == number
+        near = np.zeros(test.size, dtype=bool)
+        for run in np.unique(problem.run).tolist():
+            rows = problem.run == run
+            starts, ends = np.sort(begin[rows & test]), np.sort(end[rows & test])
+            later = np.searchsorted(starts, end[rows] + GAP_S)
+            earlier = np.searchsorted(ends, begin[rows] - GAP_S)
+            near[rows] = later > earlier
+        folds.append(Fold(~near, test))
+    return tuple(folds)
+
+
+def hold_out(fitted: Fitted, metric: Metric, folds: tuple[Fold, ...]) -> Floats:
+    """Residuals of every window under parameters fitted without it and its surroundings, shape (n, 3)."""
+    smooth = [place for place, slot in enumerate(fitted.slots) if slot.search is not Search.GRID]
+    held = np.array(fitted.residual)
+    if not smooth:
+        return held
+    jacobian = fitted.jacobian[:, :, smooth]
+    for fold in folds:
+        if not fold.test.any() or not fold.train.any():
+            continue
+        part = type(metric)(metric.scale[fold.train], metric.clip[fold.train])
+        step, _ = solve_step(jacobian[fold.train], fitted.residual[fold.train], part)
+        held[fold.test] = fitted.residual[fold.test] - jacobian[fold.test] @ step
+    return held
+
+
+def compare(problem: Problem, metric: Metric, before: Floats, after: Floats) -> Verdict:
+    """Judge held-out residuals of two models under one metric."""
+    old, new = metric.cost(before), metric.cost(after)
+    count = np.bincount(problem.unit)
+    kept = count >= min(_FEWEST_WINDOWS, int(count.max()))
+    sums_old = np.bincount(problem.unit, old)[kept]
+    sums_new = np.bincount(problem.unit, new)[kept]
+    gain = 1.0 - float(new.sum()) / max(float(old.sum()), 1e-12)
+    difference = sums_old - sums_new
+    ratio = np.log(np.maximum(sums_old, 1e-9) / np.maximum(sums_new, 1e-9))
+    return Verdict(gain, max(_block_t(difference), _block_t(ratio)))
+
+
+def _block_t(values: Floats) -> float:
+    if values.size < 3:  # noqa: PLR2004 - no spread to judge by
+        return 0.0
+    spread = float(np.std(values, ddof=1)) / np.sqrt(values.size)
+    return float(values.mean()) / spread if spread > 0.0 else 0.0

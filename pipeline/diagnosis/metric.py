@@ -1,0 +1,133 @@
+"""What a residual costs: each channel by its own spread, outliers no more than linearly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from pipeline.diagnosis.problem import Problem
+
+Floats = NDArray[np.float64]
+
+_GAUSSIAN = 1.4826
+_CLIP = 6.0
+_RIDGE = 1e-6
+# Below these a residual is rounding of stamps, whatever its spread says.
+_LEAST_SPREAD = np.array([2e-4, 2e-4, 2e-4])
+
+
+@dataclass(frozen=True)
+class Metric:
+    """Weights of residuals.
+
+    Attributes:
+        scale: spread of each residual, shape (n, 3); infinite in channels that say nothing.
+        clip: where a residual stops to count quadratically, in units of `scale`, shape (n, 3).
+    """
+
+    scale: Floats
+    clip: Floats
+
+    def weigh(self, residual: Floats) -> Floats:
+        """Residuals in units of their spread, square-rooted Huber weights included, shape (n, 3)."""
+        scaled = residual / self.scale
+        size = np.abs(scaled)
+        shrunk: Floats = scaled * np.sqrt(self.clip / np.maximum(size, self.clip))
+        return shrunk
+
+    def weights(self, residual: Floats) -> Floats:
+        """Factors that turn rows of a Jacobian into those of `weigh`, shape (n, 3)."""
+        size = np.abs(residual / self.scale)
+        factors: Floats = np.sqrt(self.clip / np.maximum(size, self.clip)) / self.scale
+        return factors
+
+    def cost(self, residual: Floats) -> Floats:
+        """Huber cost of every window, shape (n,)."""
+        size = np.abs(residual / self.scale)
+        each = np.where(size <= self.clip, size**2, self.clip * (2.0 * size - self.clip))
+        total: Floats = each.sum(axis=1)
+        return total
+
+    def loss(self, residual: Floats) -> float:
+        """Mean cost of a window."""
+        return float(self.cost(residual).mean())
+
+
+def measure_spread(residual: Floats, run: NDArray[np.int64], channels: tuple[int, ...]) -> Floats:
+    """Robust spread of each run and channel, laid out like the residuals, shape (n, 3)."""
+    spread = np.full(residual.shape, np.inf)
+    for number in np.unique(run).tolist():
+        rows = run == number
+        for channel in channels:
+            size = _GAUSSIAN * float(np.median(np.abs(residual[rows, channel])))
+            spread[rows, channel] = max(size, float(_LEAST_SPREAD[channel]))
+    return spread
+
+
+def make_metric(residual: Floats, noise: Floats, problem: Problem) -> Metric:
+    """Metric at a model: spreads no larger than what a saturated fit leaves, clipped at six of the model's own.
+
+    Args:
+        residual: of the model, shape (n, 3).
+        noise: spread that a saturated fit leaves, shape (n, 3).
+        problem: whose residuals they are.
+    """
+    own = measure_spread(residual, problem.run, problem.channels)
+    scale = np.minimum(own, noise)
+    with np.errstate(invalid="ignore"):
+        clip = np.where(np.isfinite(scale), _CLIP * own / scale, 1.0)
+    return Metric(scale, clip)
+
+
+def saturate(problem: Problem, residual: Floats) -> Floats:
+    """Spread that remains when nearly anything linear in the input's past may act, shape (n, 3).
+
+    Args:
+        problem: what is explained.
+        residual: of the ideal model, or of the model to start from.
+    """
+    design = _make_features(problem)
+    rest = np.array(residual)
+    for number in np.unique(problem.run).tolist():
+        rows = problem.run == number
+        columns = design[rows]
+        columns = columns[:, columns.std(axis=0) > 0.0]
+        size = np.sqrt((columns**2).mean(axis=0))
+        columns = np.column_stack((columns / size, np.ones(columns.shape[0])))
+        for channel in problem.channels:
+            rest[rows, channel] = _fit_robustly(columns, residual[rows, channel])
+    return measure_spread(rest, problem.run, problem.channels)
+
+
+def _fit_robustly(columns: Floats, values: Floats) -> Floats:
+    weight = np.ones(values.size)
+    rest = values
+    ridge = _RIDGE * values.size * np.eye(columns.shape[1])
+    for _ in range(3):
+        weighted = columns * weight[:, None]
+        rest = values - columns @ np.linalg.solve(weighted.T @ columns + ridge, weighted.T @ values)
+        spread = _GAUSSIAN * float(np.median(np.abs(rest))) + 1e-12
+        weight = np.minimum(1.0, 3.0 * spread / np.maximum(np.abs(rest), 1e-12))
+    freedom = max(values.size - columns.shape[1], 0.25 * values.size)
+    rest = rest * np.sqrt(values.size / freedom)
+    return rest
+
+
+def _make_features(problem: Problem) -> Floats:
+    lags = problem.find_ideal()
+    forward, turning = lags[:, :, 0], lags[:, :, 1]
+    products = forward * turning
+    now = [
+        forward[:, 0] * np.abs(forward[:, 0]),
+        forward[:, 0] * np.abs(turning[:, 0]),
+        turning[:, 0] * np.abs(turning[:, 0]),
+        np.sign(forward[:, 0]),
+        np.sign(turning[:, 0]),
+        np.abs(forward[:, 0]),
+        np.abs(turning[:, 0]),
+    ]
+    return np.column_stack((forward, turning, products[:, [0, 1, 2, 4, 6]], *now))

@@ -1,0 +1,90 @@
+"""What is too small to be named, and what no vehicle does."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.diagnosis.screen import Largest
+    from pipeline.motion.effect import Effect
+
+# Below these an effect cannot be told from stamps, mounting and rounding, however small its interval.
+_LEAST: Mapping[tuple[str, str], float] = {
+    ("transport_delay", "d"): 0.012,
+    ("clock_offset", "d"): 0.012,
+    ("heading_skew", "d"): 0.012,
+    ("yaw_misalignment", "psi"): 0.003,
+    ("icr_offset", "x_icr"): 0.004,
+    ("icr_lateral", "y_icr"): 0.004,
+    ("drive_lag", "tau"): 0.015,
+    ("body_inertia", "tau"): 0.02,
+    ("steering_lag", "tau"): 0.015,
+    ("lateral_skid", "c"): 0.004,
+}
+# Sizes that vehicles show (a wider range than was ever seen): outside, a name stands for something else.
+_PLAUSIBLE: Mapping[tuple[str, str], tuple[float, float]] = {
+    ("wheel_radius", "k"): (0.5, 1.4),
+    ("wheel_asymmetry", "e"): (-0.2, 0.2),
+    ("effective_track", "k"): (0.7, 4.0),
+    ("icr_offset", "x_icr"): (-0.6, 0.6),
+    ("icr_lateral", "y_icr"): (-0.5, 0.5),
+    ("lateral_skid", "c"): (-0.02, 0.4),
+    ("speed_slip", "k"): (-0.02, 0.4),
+    ("turning_resistance", "k"): (-0.05, 0.6),
+    ("slope_drift", "k"): (-0.1, 2.5),
+    ("time_drift", "k"): (-0.4, 0.4),
+    ("terrain_change", "k_v"): (0.4, 1.7),
+    ("terrain_change", "k_w"): (0.4, 1.7),
+    ("drive_lag", "tau"): (0.0, 3.0),
+    ("turn_lag", "tau_mean"): (0.0, 3.0),
+    ("turn_lag", "tau_diff"): (0.0, 3.0),
+    ("transport_delay", "d"): (0.0, 0.8),
+    ("body_inertia", "tau"): (0.0, 3.0),
+    ("turn_droop", "gain"): (0.0, 0.97),
+    ("steering_gain", "g"): (0.5, 1.5),
+    ("understeer", "K"): (-0.02, 0.5),
+    ("yaw_misalignment", "psi"): (-0.35, 0.35),
+    ("heading_skew", "d"): (-0.3, 0.4),
+}
+_SHARE_OF_TURNING = 0.1
+_REACHED = 0.99
+
+
+def is_nameable(effect: Effect, largest: Largest) -> bool:
+    """Whether an effect is large enough to be named and is not another one in disguise."""
+    for (name, parameter), least in _LEAST.items():
+        if effect.id == name and abs(effect.values[parameter]) < least:
+            return False
+    if effect.id == "turn_droop":
+        # With its threshold at zero a droop is a wider track under another name.
+        return effect.values["threshold"] > _SHARE_OF_TURNING * 2.0 * largest.wheel
+    limit = {
+        "body_speed_limit": largest.speed,
+        "body_turn_limit": largest.turn,
+        "wheel_speed_limit": largest.wheel,
+    }.get(effect.id)
+    if limit is not None and effect.values["limit"] > _REACHED * limit:
+        return False
+    if effect.id == "turn_lag":
+        fast, slow = effect.values["tau_mean"], effect.values["tau_diff"]
+        return max(fast, slow) > 0.015  # noqa: PLR2004 - less is rounding of stamps
+    return True
+
+
+def find_implausible(effect: Effect) -> str | None:
+    """In words what no vehicle does, None where the numbers are those of a vehicle."""
+    for parameter in effect.parameters:
+        value = effect.values[parameter.name]
+        if not math.isfinite(value):
+            continue
+        low, high = _PLAUSIBLE.get((effect.id, parameter.name), parameter.bounds)
+        if not low <= value <= high:
+            unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+            return (
+                f"{effect.id}: {parameter.name} = {value:.3g}{unit} is outside of what vehicles show "
+                f"({low:g} to {high:g}{unit}); it may stand for another cause"
+            )
+    return None

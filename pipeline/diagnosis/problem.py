@@ -1,0 +1,153 @@
+"""What is explained: residuals of one or several runs as one long table, as a function of a state."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.diagnosis.state import DelayName, Slot, State
+from pipeline.motion.forward import Timing
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.motion.comparison import Comparison
+    from pipeline.motion.signals import Velocity
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+UNIT_S = 10.0
+_NO_DELAY = Timing()
+
+
+class Problem(Protocol):
+    """Residuals over windows of half a second: x [m/s], y [m/s], w [rad/s].
+
+    Attributes:
+        delays: which delays of a run are free beside the effects.
+        run: number of the run of each window, shape (n,).
+        times: start and end of each window [s], shape (n, 2).
+        unit: number of the stretch of ten seconds of each window; no stretch spans two runs, shape (n,).
+        channels: which of x, y, w say anything.
+    """
+
+    delays: tuple[DelayName, ...]
+    run: Integers
+    times: Floats
+    unit: Integers
+    channels: tuple[int, ...]
+
+    def find_residuals(self, state: State) -> Floats:
+        """Measured less predicted, shape (n, 3)."""
+
+    def find_ideal(self) -> Floats:
+        """Ideal velocity of the input (f_x, f_w) averaged over windows, now and up to 2 s earlier.
+
+        Returns:
+            shape (n, lags, 2), lags a quarter of a second apart.
+        """
+
+
+def number_units(run: Integers, times: Floats) -> Integers:
+    """Stretches of ten seconds, numbered through all runs."""
+    label = run * 1_000_000 + (times.mean(axis=1) // UNIT_S).astype(np.int64)
+    return np.unique(label, return_inverse=True)[1].astype(np.int64)
+
+
+class BodyProblem:
+    """From the input to the body's motion."""
+
+    def __init__(self, comparisons: Sequence[Comparison], delays: tuple[DelayName, ...]) -> None:
+        self.comparisons = tuple(comparisons)
+        self.delays = delays
+        self.channels = (0, 1, 2)
+        sizes = [c.windows.start.size for c in self.comparisons]
+        self.run = np.repeat(np.arange(len(sizes)), sizes).astype(np.int64)
+        self.times = np.concatenate([c.windows.times for c in self.comparisons])
+        self.unit = number_units(self.run, self.times)
+
+    def find_residuals(self, state: State) -> Floats:
+        """See `Problem`."""
+        return np.concatenate(
+            [
+                c.find_residuals(state.effects, timing)
+                for c, timing in zip(self.comparisons, state.timing, strict=True)
+            ]
+        )
+
+    def find_ideal(self) -> Floats:
+        """See `Problem`."""
+        parts = []
+        for comparison in self.comparisons:
+            velocity = comparison.predict_velocity((), _NO_DELAY)
+            parts.append(average_lags(comparison, velocity))
+        return np.concatenate(parts)
+
+
+class WheelProblem:
+    """From the command to the wheels: what the drivetrain does, free of the ground."""
+
+    def __init__(self, commanded: Sequence[Comparison], measured: Sequence[Comparison]) -> None:
+        self.comparisons = tuple(commanded)
+        self.measured = tuple(measured)
+        self.delays: tuple[DelayName, ...] = ()
+        self.channels = (0, 2)
+        sizes = [c.windows.start.size for c in self.comparisons]
+        self.run = np.repeat(np.arange(len(sizes)), sizes).astype(np.int64)
+        self.times = np.concatenate([c.windows.times for c in self.comparisons])
+        self.unit = number_units(self.run, self.times)
+        self._seen: dict[tuple[int, float], Floats] = {}
+
+    def find_residuals(self, state: State) -> Floats:
+        """See `Problem`; in terms of the ideal velocity of the wheels."""
+        parts = []
+        for index, (comparison, timing) in enumerate(zip(self.comparisons, state.timing, strict=True)):
+            key = (index, timing.wheel_delay_s)
+            if key not in self._seen:
+                wheels = self.measured[index].predict_velocity((), timing)
+                self._seen = {k: v for k, v in self._seen.items() if k[0] != index}
+                self._seen[key] = average_windows(comparison, wheels)
+            driven = comparison.predict_velocity(state.effects, _NO_DELAY)
+            parts.append(self._seen[key] - average_windows(comparison, driven))
+        return np.concatenate(parts)
+
+    def find_ideal(self) -> Floats:
+        """See `Problem`."""
+        return np.concatenate(
+            [average_lags(c, c.predict_velocity((), _NO_DELAY)) for c in self.comparisons]
+        )
+
+
+def average_windows(comparison: Comparison, velocity: Velocity, late: float = 0.0) -> Floats:
+    """Mean of (x, y, w) over every window, ``late`` seconds earlier, shape (n, 3)."""
+    cells, times = comparison.cells, comparison.windows.times
+    start = cells.locate_edges(times[:, 0] - late)
+    end = cells.locate_edges(times[:, 1] - late)
+    edges = np.arange(cells.times.size + 1)
+    width = np.maximum((end - start) * cells.step_s, cells.step_s)[:, None]
+    columns = []
+    for signal in (velocity.x, velocity.y, velocity.w):
+        total = np.asarray(cells.sum_up(signal), dtype=np.float64)
+        columns.append(np.interp(end, edges, total) - np.interp(start, edges, total))
+    return np.column_stack(columns) / width
+
+
+def average_lags(comparison: Comparison, velocity: Velocity, lags: int = 9) -> Floats:
+    """Means of (x, w) over windows now and earlier, shape (n, lags, 2)."""
+    means = [average_windows(comparison, velocity, 0.25 * lag)[:, [0, 2]] for lag in range(lags)]
+    return np.stack(means, axis=1)
+
+
+def differentiate(problem: Problem, state: State, residual: Floats, slots: Sequence[Slot]) -> Floats:
+    """Change of the prediction with each free number, shape (n, 3, p)."""
+    columns = np.empty((*residual.shape, len(slots)))
+    for place, slot in enumerate(slots):
+        value = state.read(slot)
+        step = slot.step if value + slot.step <= slot.bounds[1] else -slot.step
+        columns[:, :, place] = (residual - problem.find_residuals(state.write(slot, value + step))) / step
+    return columns
+
+

@@ -1,0 +1,165 @@
+"""Which effects look promising beside a model: one step of least squares for each, from several starts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.motion.effect import Effect, Parameter, Search
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from pipeline.diagnosis.metric import Metric
+    from pipeline.diagnosis.polish import Fitted
+    from pipeline.diagnosis.problem import Problem
+    from pipeline.diagnosis.state import State
+
+Floats = NDArray[np.float64]
+EffectClass = type[Effect]
+
+_LEAST_SHARE = 0.05
+
+
+@dataclass(frozen=True)
+class Largest:
+    """What relative starts are shares of: largest commanded speed, turn and wheel speed, and the duration.
+
+    Attributes:
+        places: x [m] in the map below which the tenths of the run lie, shape (11,).
+    """
+
+    speed: float
+    turn: float
+    wheel: float
+    duration: float
+    places: Floats
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A start of an effect and what it does to the residuals.
+
+    Attributes:
+        effect: at its start.
+        names: parameters that the columns are derivatives of; empty where the column is a secant.
+        columns: change of the prediction, shape (n, 3, p).
+        shift: change of the residual between the model and the start, shape (n, 3).
+    """
+
+    effect: Effect
+    names: tuple[str, ...]
+    columns: Floats
+    shift: Floats
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """An effect with values worth polishing, and the loss that one step promises."""
+
+    state: State
+    effect: str
+    loss: float
+
+
+def propose(
+    problem: Problem, metric: Metric, fitted: Fitted, candidates: Sequence[EffectClass], largest: Largest
+) -> list[Proposal]:
+    """Candidates by promised loss, the best start of each."""
+    found = []
+    for candidate in candidates:
+        if fitted.state.find(candidate.id) is not None:
+            continue
+        best: Proposal | None = None
+        for trial in list_trials(problem, fitted, candidate, largest):
+            proposal = _promise(metric, fitted, trial)
+            if proposal is not None and (best is None or proposal.loss < best.loss):
+                best = proposal
+        if best is not None:
+            found.append(best)
+    return sorted(found, key=lambda proposal: proposal.loss)
+
+
+def list_trials(
+    problem: Problem, fitted: Fitted, candidate: EffectClass, largest: Largest
+) -> Iterator[Trial]:
+    """Every start of an effect with its columns."""
+    for values in list_starts(candidate, largest):
+        start = candidate(**values)
+        direct = tuple(
+            p.name for p in start.parameters if p.search is Search.DIRECT and math.isfinite(p.neutral)
+        )
+        state = fitted.state.add(start)
+        if not direct:
+            residual = problem.find_residuals(state)
+            shift = fitted.residual - residual
+            yield Trial(start, (), shift[:, :, None], np.zeros_like(shift))
+            continue
+        base = fitted.residual if start.is_neutral else problem.find_residuals(state)
+        columns = []
+        for name in direct:
+            parameter = start.parameter(name)
+            changed = start.change(**{name: parameter.neutral + parameter.step})
+            after = problem.find_residuals(fitted.state.add(changed))
+            columns.append((base - after) / parameter.step)
+        yield Trial(start, direct, np.stack(columns, axis=2), fitted.residual - base)
+
+
+def list_starts(candidate: EffectClass, largest: Largest) -> list[dict[str, float]]:
+    """Values to start an effect from; parameters that follow linearly stay neutral."""
+    searched = [p for p in candidate.parameters if p.search is not Search.DIRECT]
+    if not searched:
+        return [{}]
+    if any(p.relative_to == "duration" for p in searched):
+        times = [{p.name: s * largest.duration for p in searched} for s in searched[0].starts]
+        places = [{"at_x": float(x)} for x in largest.places[2:9]]
+        return times + (places if largest.places[-1] - largest.places[0] > 1.0 else [])
+    if len(searched) == 1:
+        name, values = searched[0].name, _list_values(searched[0], largest)
+        return [{name: value} for value in values]
+    alone = [{p.name: value} for p in searched for value in _list_values(p, largest)]
+    together = [
+        dict(zip([p.name for p in searched], values, strict=True))
+        for values in zip(*(_list_values(p, largest) for p in searched), strict=False)
+    ]
+    return alone + together
+
+
+def _list_values(parameter: Parameter, largest: Largest) -> list[float]:
+    scale = {"speed": largest.speed, "turn": largest.turn, "wheel": largest.wheel}.get(
+        parameter.relative_to, 1.0
+    )
+    low, high = parameter.bounds
+    return [share * scale for share in parameter.starts if low <= share * scale <= high]
+
+
+def _promise(metric: Metric, fitted: Fitted, trial: Trial) -> Proposal | None:
+    """Loss after one joint step of the model's numbers and the effect's."""
+    base = fitted.residual - trial.shift
+    joint = np.concatenate((fitted.jacobian, trial.columns), axis=2)
+    own = fitted.jacobian.shape[2]
+    factor = metric.weights(fitted.residual)
+    rows = (joint * factor[:, :, None]).reshape(-1, joint.shape[2])
+    size = np.sqrt(np.einsum("ij,ij->j", rows, rows)) + 1e-12
+    if (size[own:] < 1e-6).any():  # noqa: PLR2004 - leaves no trace
+        return None
+    rows /= size
+    normal = rows.T @ rows + 1e-7 * np.eye(rows.shape[1])
+    step = np.linalg.solve(normal, rows.T @ (base * factor).reshape(-1)) / size
+    after = base - joint @ step
+    state = fitted.state
+    for slot, change in zip(fitted.slots, step[:own].tolist(), strict=True):
+        if slot.search is not Search.GRID:
+            state = state.write(slot, state.read(slot) + change)
+    effect = trial.effect
+    if trial.names:
+        for name, change in zip(trial.names, step[own:].tolist(), strict=True):
+            low, high = effect.parameter(name).bounds
+            effect = effect.change(**{name: min(max(effect.values[name] + change, low), high)})
+    elif step[own] < _LEAST_SHARE:
+        return None
+    return Proposal(state.add(effect), effect.id, metric.loss(after))
