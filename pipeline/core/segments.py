@@ -18,6 +18,7 @@ Integers = NDArray[np.int64]
 _GAUSSIAN = 1.4826
 _SIDE = 4
 _PLAINLY = 3.0
+_LONGEST_WAIT = 1.0
 
 
 def find_gaps(times: Floats, smallest: float) -> Flags:
@@ -59,13 +60,17 @@ def select_fresh_poses(times: Floats, held: Flags) -> Integers:
         held: repeats of the pose before, shape (n,).
     """
     fresh = np.flatnonzero(~held)
-    if fresh.size == held.size or fresh.size < 3:  # noqa: PLR2004 - too few changes to know the waiting time
+    if fresh.size == held.size:
         return fresh.astype(np.int64)
+    if fresh.size < 3:  # noqa: PLR2004 - too few changes to know the waiting time
+        stood = times[-1] - times[0] > _LONGEST_WAIT
+        return np.arange(held.size, dtype=np.int64) if stood else fresh.astype(np.int64)
     waits = np.diff(times[fresh])
     longest_wait = 3.0 * float(np.median(waits))
     previous = np.maximum.accumulate(np.where(held, 0, np.arange(held.size)))
     following = np.searchsorted(fresh, np.arange(held.size), side="right")
-    next_fresh = np.append(times[fresh], np.inf)[following]
+    # Nobody saw the next change after the last repeat: it may have come at once.
+    next_fresh = np.append(times[fresh], times[-1])[following]
     stands = held & (next_fresh - times[previous] > longest_wait)
     old_again = next_fresh - times < float(np.median(waits)) * 1.5
     return np.flatnonzero(~held | (stands & ~old_again)).astype(np.int64)
