@@ -1,0 +1,157 @@
+"""Configuration: which file wins, and that every mistake is one clear line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.vehicles import Configuration, ConfigurationError, load_configuration
+from pipeline.vehicles.loading import merge
+
+Write = Callable[[str, str], Path]
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    folder = tmp_path / "season" / "2026" / "monday"
+    folder.mkdir(parents=True)
+    path = folder / "warthog_ice.mcap"
+    path.touch()
+    return path
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    def write_file(name: str, text: str) -> Path:
+        path = tmp_path / "season" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write_file
+
+
+def test_without_any_file_everything_is_at_its_default(log: Path) -> None:
+    assert load_configuration(log) == Configuration()
+
+
+def test_folders_inherit_and_the_nearer_file_wins(log: Path, write: Write) -> None:
+    write("fleet.toml", '[run]\nterrain = "snow"\ndataset = "season"\n[velocity]\nrate_hz = 10\n')
+    write("2026/fleet.toml", '[run]\nterrain = "ice"\n')
+    found = load_configuration(log)
+    assert (found.run.terrain, found.run.dataset, found.velocity.rate_hz) == ("ice", "season", 10.0)
+
+
+def test_of_several_matches_the_last_wins(log: Path, write: Write) -> None:
+    write(
+        "fleet.toml",
+        '[run]\nterrain = "plain"\n'
+        '[[match]]\nglob = "2026/*/warthog*"\n[match.run]\nterrain = "first"\ndataset = "kept"\n'
+        '[[match]]\nglob = "*.mcap"\n[match.run]\nterrain = "last"\n'
+        '[[match]]\nglob = "2025/*"\n[match.run]\nterrain = "never"\n',
+    )
+    found = load_configuration(log)
+    assert (found.run.terrain, found.run.dataset) == ("last", "kept")
+
+
+def test_a_nearer_fleet_file_wins_over_a_match_further_up(log: Path, write: Write) -> None:
+    write("fleet.toml", '[[match]]\nglob = "*"\n[match.run]\nterrain = "far"\n')
+    write("2026/monday/fleet.toml", '[run]\nterrain = "near"\n')
+    assert load_configuration(log).run.terrain == "near"
+
+
+def test_the_run_file_wins_over_fleets_and_the_command_line_over_all(log: Path, write: Write) -> None:
+    write("fleet.toml", '[[match]]\nglob = "*"\n[match.run]\nterrain = "fleet"\n')
+    write("2026/monday/run.toml", '[run]\nterrain = "run"\ndataset = "run"\n')
+    assert load_configuration(log).run.terrain == "run"
+    found = load_configuration(log, overrides={"run": {"terrain": "typed"}})
+    assert (found.run.terrain, found.run.dataset) == ("typed", "run")
+
+
+def test_a_file_named_like_the_log_speaks_of_it_alone(log: Path, write: Write) -> None:
+    write("2026/monday/run.toml", '[run]\nterrain = "all"\n')
+    write("2026/monday/warthog_ice.toml", '[run]\nterrain = "this"\n')
+    other = log.with_name("husky.mcap")
+    other.touch()
+    assert load_configuration(log).run.terrain == "this"
+    assert load_configuration(other).run.terrain == "all"
+
+
+def test_a_given_file_stands_in_for_the_one_beside_the_log(log: Path, write: Write) -> None:
+    write("2026/monday/run.toml", '[run]\nterrain = "beside"\ndataset = "beside"\n')
+    given_file = write("elsewhere/my.toml", '[run]\nterrain = "given"\n')
+    found = load_configuration(log, given=given_file)
+    assert (found.run.terrain, found.run.dataset) == ("given", None)
+
+
+def test_another_preset_does_not_inherit_a_geometry(log: Path, write: Write) -> None:
+    write("fleet.toml", '[vehicle]\npreset = "husky"\ntrack_width_m = 0.56\nwheel_radius_m = 0.17\n')
+    write("2026/fleet.toml", '[vehicle]\npreset = "warthog"\n')
+    assert load_configuration(log).vehicle.track_width_m is None
+    write("2026/fleet.toml", '[vehicle]\npreset = "husky_a200"\nwheel_radius_m = 0.18\n')
+    found = load_configuration(log).vehicle
+    assert (found.track_width_m, found.wheel_radius_m) == (0.56, 0.18)
+
+
+def test_lists_are_replaced_whole() -> None:
+    assert merge([{"command": {"left": ["a", "b"]}}, {"command": {"left": ["c"]}}]) == {
+        "command": {"left": ["c"]}
+    }
+
+
+trees = st.recursive(
+    st.integers(), lambda below: st.dictionaries(st.sampled_from("abc"), below, max_size=3), max_leaves=8
+).filter(lambda tree: isinstance(tree, dict))
+
+
+@given(trees, trees, trees)
+def test_merging_is_associative_and_the_empty_layer_changes_nothing(a: dict, b: dict, c: dict) -> None:
+    assert merge([a, b, c]) == merge([merge([a, b]), c])
+    assert merge([a, {}]) == merge([{}, a]) == a
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("2026/monday/run.toml", "[velocity]\nrate = 20\n", ["run.toml", "rate", "velocity"]),
+        ("2026/monday/run.toml", "[vehicel]\n", ["run.toml", "vehicel"]),
+        ("2026/monday/run.toml", "[velocity]\nrate_hz = -1\n", ["run.toml", "velocity.rate_hz"]),
+        ("2026/monday/run.toml", '[velocity]\nrate_hz = "fast"\n', ["run.toml", "velocity.rate_hz"]),
+        ("2026/monday/run.toml", '[command]\nunit = "mph"\n', ["run.toml", "command.unit", "mph"]),
+        ("2026/monday/run.toml", '[pose]\nframes = ["map"]\n', ["run.toml", "pose.frames"]),
+        ("2026/monday/run.toml", "[run\n", ["run.toml", "line 1"]),
+        ("fleet.toml", '[[match]]\n[match.run]\nterrain = "x"\n', ["fleet.toml", "glob", "1"]),
+        ("fleet.toml", "match = 3\n", ["fleet.toml", "match"]),
+        ("fleet.toml", '[[match]]\nglob = "other"\n[match.runs]\n', ["fleet.toml", "runs"]),
+    ],
+)
+def test_a_mistake_is_one_line_with_its_file_and_its_key(
+    log: Path, write: Write, name: str, text: str, words: list[str]
+) -> None:
+    write(name, text)
+    with pytest.raises(ConfigurationError) as caught:
+        load_configuration(log)
+    said = str(caught.value)
+    assert "\n" not in said
+    assert [word for word in words if word not in said] == []
+
+
+def test_a_missing_file_says_so(log: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="no such configuration file") as caught:
+        load_configuration(log, given=tmp_path / "nowhere.toml")
+    assert caught.value.code == "config_not_found"
+
+
+def test_a_folder_in_place_of_a_file_says_so(log: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        load_configuration(log, given=tmp_path)
+    assert caught.value.code == "config_unreadable"
+
+
+def test_a_wrong_override_names_the_command_line(log: Path) -> None:
+    with pytest.raises(ConfigurationError, match="command line"):
+        load_configuration(log, overrides={"velocity": {"yaw": "gyro"}})

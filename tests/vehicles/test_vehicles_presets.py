@@ -1,0 +1,93 @@
+"""Presets, and the vehicle that a configuration and a log come to."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipeline.vehicles import ConfigurationError, Vehicle, find_preset, list_presets, resolve_vehicle
+from pipeline.vehicles.configuration import VehicleSection
+
+PRESETS = list_presets()
+
+
+@pytest.mark.parametrize("vehicle", PRESETS, ids=lambda vehicle: vehicle.id)
+def test_a_preset_has_the_geometry_of_its_ideal_model(vehicle: Vehicle) -> None:
+    needed = vehicle.track_width_m if vehicle.kind == "differential" else vehicle.wheelbase_m
+    assert needed is not None
+    assert 0.01 < vehicle.wheel_radius_m < 1.0
+
+
+@pytest.mark.parametrize("vehicle", PRESETS, ids=lambda vehicle: vehicle.id)
+def test_a_preset_is_found_by_id_and_alias_however_they_are_written(vehicle: Vehicle) -> None:
+    for name in (vehicle.id, *vehicle.aliases):
+        assert find_preset(name) == vehicle
+        assert find_preset(f" {name.upper().replace('_', '-')} ") == vehicle
+
+
+def test_no_two_presets_share_a_name() -> None:
+    names = [name for vehicle in PRESETS for name in {vehicle.id, *vehicle.aliases}]
+    assert len(names) == len(set(names))
+
+
+@pytest.mark.parametrize(
+    ("name", "radius", "track", "mass"),
+    [
+        ("husky_a200", 0.165, 0.55, 75.0),
+        ("warthog", 0.30, 1.08, 470.0),
+        ("marmotte_hd2", 0.116, 0.5927, None),
+    ],
+)
+def test_published_vehicles_have_their_published_numbers(
+    name: str, radius: float, track: float, mass: float | None
+) -> None:
+    vehicle = find_preset(name)
+    assert vehicle is not None
+    assert (vehicle.wheel_radius_m, vehicle.track_width_m, vehicle.mass_kg) == (radius, track, mass)
+
+
+def test_the_log_names_the_vehicle_when_nobody_else_does() -> None:
+    assert resolve_vehicle(VehicleSection(), recorded="Husky", where="a.mcap").id == "husky_a200"
+
+
+def test_the_configuration_wins_over_the_log() -> None:
+    found = resolve_vehicle(VehicleSection(preset="jackal"), recorded="husky", where="a.mcap")
+    assert found.id == "jackal"
+
+
+def test_values_win_over_the_preset_and_leave_the_rest() -> None:
+    found = resolve_vehicle(VehicleSection(preset="husky", track_width_m=0.6), recorded=None, where="a.mcap")
+    assert (found.track_width_m, found.wheel_radius_m) == (0.6, 0.165)
+
+
+def test_a_geometry_needs_no_preset() -> None:
+    section = VehicleSection(wheel_radius_m=0.1, track_width_m=0.4)
+    found = resolve_vehicle(section, recorded=None, where="a.mcap")
+    assert (found.kind, found.wheel_radius_m, found.track_width_m) == ("differential", 0.1, 0.4)
+    assert resolve_vehicle(section, recorded="Gold Digger", where="a.mcap").id == "gold_digger"
+
+
+@pytest.mark.parametrize(
+    ("section", "recorded", "code", "words"),
+    [
+        (VehicleSection(), None, "vehicle_unknown", ["does not name one", "--vehicle", "VEHICLE="]),
+        (VehicleSection(), "spot", "vehicle_unknown", ["spot", "husky_a200", "--wheel-radius"]),
+        (VehicleSection(preset="huskey"), "husky", "vehicle_unknown", ["huskey", "husky_a200"]),
+        (VehicleSection(wheel_radius_m=0.1), None, "vehicle_incomplete", ["track_width_m", "--track-width"]),
+        (
+            VehicleSection(wheel_radius_m=0.1, kind="ackermann"),
+            None,
+            "vehicle_incomplete",
+            ["wheelbase_m", "run.toml"],
+        ),
+    ],
+)
+def test_a_vehicle_that_cannot_be_determined_is_asked_for(
+    section: VehicleSection, recorded: str | None, code: str, words: list[str]
+) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        resolve_vehicle(section, recorded=recorded, where="a.mcap")
+    said = str(caught.value)
+    assert caught.value.code == code
+    assert "\n" not in said
+    assert said.startswith("a.mcap: ")
+    assert [word for word in words if word not in said] == []

@@ -1,0 +1,313 @@
+"""Which topics are chosen, on every layout that robots are known to have."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipeline.logs import ChannelInfo
+from pipeline.simulate import LAYOUTS
+from pipeline.vehicles import (
+    Configuration,
+    ConfigurationError,
+    DriveForm,
+    Signal,
+    Sources,
+    Vehicle,
+    choose_sources,
+    find_preset,
+)
+from pipeline.vehicles.loading import convert
+
+JOINTS = "sensor_msgs/msg/JointState"
+FLOAT = "std_msgs/msg/Float64"
+TWIST = "geometry_msgs/msg/Twist"
+STAMPED = "geometry_msgs/msg/TwistStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
+POSE = "geometry_msgs/msg/PoseStamped"
+POSE_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+TF = "tf2_msgs/msg/TFMessage"
+IMU = "sensor_msgs/msg/Imu"
+STRING = "std_msgs/msg/String"
+DRIVE = "ackermann_msgs/msg/AckermannDriveStamped"
+
+ICP = {"/mapping/icp_odom": ODOMETRY}
+
+
+def preset(name: str) -> Vehicle:
+    found = find_preset(name)
+    assert found is not None
+    return found
+
+
+def choose(
+    topics: dict[str, str],
+    vehicle: str = "husky",
+    configuration: dict[str, object] | None = None,
+    counts: dict[str, int] | None = None,
+) -> Sources:
+    channels = [
+        ChannelInfo(number, topic, kind, "ros2msg", "cdr", (counts or {}).get(topic, 100), {})
+        for number, (topic, kind) in enumerate(topics.items())
+    ]
+    settings = convert(configuration or {}, "test") if configuration else Configuration()
+    return choose_sources(channels, settings, preset(vehicle), where="a.mcap")
+
+
+def names(sources: Sources) -> dict[str, str | None]:
+    roles = {"command": sources.command, "wheels": sources.wheels, "pose": sources.pose, "imu": sources.imu}
+    return {role: None if source is None else str(source) for role, source in roles.items()}
+
+
+CASES: dict[str, tuple[str, dict[str, str], dict[str, str | None]]] = {
+    "husky with a body command": (
+        "husky",
+        {"/joint_states": JOINTS, "/controller/cmd_vel": STAMPED, "/mti100/data": IMU, **ICP},
+        {
+            "command": "/controller/cmd_vel",
+            "wheels": "/joint_states",
+            "pose": "/mapping/icp_odom",
+            "imu": "/mti100/data",
+        },
+    ),
+    "warthog of 2023, a Float64 a side": (
+        "warthog",
+        {
+            "/left_drive/status/speed": FLOAT,
+            "/right_drive/status/speed": FLOAT,
+            "/left_drive/velocity": FLOAT,
+            "/right_drive/velocity": FLOAT,
+            "/mti30/data": IMU,
+            **ICP,
+        },
+        {
+            "command": "/left_drive/velocity.data, /right_drive/velocity.data",
+            "wheels": "/left_drive/status/speed.data, /right_drive/status/speed.data",
+            "imu": "/mti30/data",
+        },
+    ),
+    "newer warthog names": (
+        "warthog",
+        {
+            f"/warthog/platform/motor/{side}/{what}": FLOAT
+            for side in ("left", "right")
+            for what in ("status/velocity", "cmd_velocity")
+        }
+        | ICP,
+        {
+            "command": "/warthog/platform/motor/left/cmd_velocity.data, "
+            "/warthog/platform/motor/right/cmd_velocity.data",
+            "wheels": "/warthog/platform/motor/left/status/velocity.data, "
+            "/warthog/platform/motor/right/status/velocity.data",
+        },
+    ),
+    "joint commands beside joint states": (
+        "husky",
+        {"/husky/joint_commands": JOINTS, "/joint_states": JOINTS, **ICP},
+        {"command": "/husky/joint_commands", "wheels": "/joint_states"},
+    ),
+    "a float a side that says cmd, and one that says nothing": (
+        "husky",
+        {f"/wheel_{side}/{what}": FLOAT for side in ("left", "right") for what in ("cmd", "velocity")}
+        | {"/localization/pose": POSE_COVARIANCE},
+        {
+            "command": "/wheel_left/cmd.data, /wheel_right/cmd.data",
+            "wheels": "/wheel_left/velocity.data, /wheel_right/velocity.data",
+            "pose": "/localization/pose",
+        },
+    ),
+    "wheel commands before the body command they come from": (
+        "husky",
+        {"/wheel_commands": JOINTS, "/controller/cmd_vel": STAMPED, "/joint_states": JOINTS, **ICP},
+        {"command": "/wheel_commands"},
+    ),
+    "a plain twist and poses in transforms": (
+        "jackal",
+        {"/cmd_vel": TWIST, "/tf": TF, "/tf_static": TF, "/joint_states": JOINTS},
+        {"command": "/cmd_vel", "pose": "/tf", "wheels": "/joint_states", "imu": None},
+    ),
+    "static transforms alone are no pose": ("jackal", {"/cmd_vel": TWIST, "/tf_static": TF}, {"pose": None}),
+    "a stamped pose": (
+        "jackal",
+        {"/cmd_vel": TWIST, "/robot/pose": POSE},
+        {"pose": "/robot/pose"},
+    ),
+    "a localization before transforms, transforms before wheel odometry": (
+        "jackal",
+        {"/cmd_vel": TWIST, "/tf": TF, "/amcl_pose": POSE_COVARIANCE, "/platform/odom": ODOMETRY},
+        {"pose": "/amcl_pose"},
+    ),
+    "transforms before an odometry of the controller": (
+        "jackal",
+        {"/cmd_vel": TWIST, "/tf": TF, "/jackal_velocity_controller/odom": ODOMETRY},
+        {"pose": "/tf"},
+    ),
+    "a decoy odometry and a decoy command": (
+        "husky",
+        {
+            "/platform/odom": ODOMETRY,
+            "/navigation/cmd_vel": TWIST,
+            "/controller/cmd_vel": STAMPED,
+            "/joint_states": JOINTS,
+            **ICP,
+        },
+        {"command": "/controller/cmd_vel", "pose": "/mapping/icp_odom"},
+    ),
+    "what the controller received of several commands": (
+        "jackal",
+        {
+            "/joy_teleop/cmd_vel": TWIST,
+            "/nav/cmd_vel": TWIST,
+            "/twist_marker/cmd_vel": TWIST,
+            "/jackal_velocity_controller/cmd_vel": TWIST,
+            **ICP,
+        },
+        {"command": "/jackal_velocity_controller/cmd_vel"},
+    ),
+    "goals and initial poses are no localization": (
+        "jackal",
+        {"/cmd_vel": TWIST, "/goal_pose": POSE, "/initialpose": POSE_COVARIANCE, "/robot/pose": POSE},
+        {"pose": "/robot/pose"},
+    ),
+    "a car": (
+        "ackermann_car",
+        {"/ackermann_cmd": DRIVE, "/joint_states": JOINTS, **ICP},
+        {"command": "/ackermann_cmd", "wheels": "/joint_states"},
+    ),
+    "a car that reports its drive": (
+        "ackermann_car",
+        {"/drive": DRIVE, "/drive/status": DRIVE, **ICP},
+        {"command": "/drive", "wheels": "/drive/status"},
+    ),
+    "a car with a number a topic": (
+        "ackermann_car",
+        {f"/vehicle/{what}{role}": FLOAT for what in ("speed", "steering") for role in ("", "_command")}
+        | ICP,
+        {
+            "command": "/vehicle/speed_command.data, /vehicle/steering_command.data",
+            "wheels": "/vehicle/speed.data, /vehicle/steering.data",
+        },
+    ),
+    "ROS 1 type names": (
+        "husky",
+        {"/joint_states": "sensor_msgs/JointState", "/cmd_vel": "geometry_msgs/Twist", "/tf": "tf/tfMessage"},
+        {"command": "/cmd_vel", "wheels": "/joint_states", "pose": "/tf"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_topics_are_chosen(name: str) -> None:
+    vehicle, topics, expected = CASES[name]
+    found = names(choose(topics, vehicle))
+    assert {role: found[role] for role in expected} == expected
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_every_simulated_layout_is_understood(name: str) -> None:
+    layout = LAYOUTS[name]
+    types = {
+        "joint_state": JOINTS,
+        "float_sides": FLOAT,
+        "float_speed_steering": FLOAT,
+        "twist": TWIST,
+        "twist_stamped": STAMPED,
+        "ackermann": DRIVE,
+        "odometry": ODOMETRY,
+        "pose_stamped": POSE,
+        "pose_covariance": POSE_COVARIANCE,
+        "tf": TF,
+    }
+    topics = {topic: types[each.form] for each in (*layout.commands, *layout.wheels) for topic in each.topics}
+    topics |= {layout.pose.topic: types[layout.pose.form]} | ({layout.imu: IMU} if layout.imu else {})
+    sources = choose(topics, "ackermann_car" if layout.kind == "ackermann" else "husky")
+    assert sources.command is not None
+    assert tuple(signal.topic for signal in sources.command.signals) == layout.commands[0].topics
+    measured = () if sources.wheels is None else tuple(signal.topic for signal in sources.wheels.signals)
+    assert measured == (layout.wheels[0].topics if layout.wheels else ())
+    assert sources.pose is not None
+    assert sources.pose.topic == layout.pose.topic
+
+
+def test_a_choice_between_several_says_which_and_why() -> None:
+    topics = {"/nav/cmd_vel": TWIST, "/controller/cmd_vel": TWIST, **ICP}
+    sources = choose(topics)
+    assert sources.command is not None
+    assert sources.command.reason
+    assert [note for note in sources.notes if "/nav/cmd_vel" in note and note.startswith("command")]
+
+
+def test_the_busier_of_two_equal_topics_is_taken() -> None:
+    topics = {"/imu_a": IMU, "/imu_b": IMU}
+    assert names(choose(topics, counts={"/imu_a": 5, "/imu_b": 500}))["imu"] == "/imu_b"
+
+
+def test_an_empty_topic_is_not_there() -> None:
+    assert names(choose({"/cmd_vel": TWIST, **ICP}, counts={"/cmd_vel": 0}))["command"] is None
+
+
+def test_what_is_configured_is_taken_whatever_it_is_called() -> None:
+    topics = {"/a": JOINTS, "/b": JOINTS, "/wheel_commands": JOINTS, "/odd": POSE, "/i": IMU, **ICP}
+    sources = choose(
+        topics,
+        configuration={
+            "command": {"topic": "/a"},
+            "wheels": {"topic": "/b"},
+            "pose": {"topic": "/odd"},
+            "imu": {"topic": "/i"},
+        },
+    )
+    assert names(sources) == {"command": "/a", "wheels": "/b", "pose": "/odd", "imu": "/i"}
+    assert sources.command is not None
+    assert sources.command.reason == "configured"
+
+
+def test_a_field_of_any_message_can_be_a_side() -> None:
+    topics = {"/drive": "my_msgs/msg/Drive", **ICP}
+    found = choose(
+        topics,
+        configuration={"command": {"left_topic": "/drive.speed[0]", "right_topic": "/drive.speed[1]"}},
+    )
+    assert found.command is not None
+    assert found.command.form is DriveForm.SIDES
+    assert found.command.signals == (Signal("/drive", "speed[0]"), Signal("/drive", "speed[1]"))
+
+
+def test_a_calib_state_topic_is_applied_by_default_and_can_be_turned_off() -> None:
+    topics = {"/drive/calib_state": STRING, **ICP}
+    applied = choose(topics).interval
+    assert applied is not None
+    assert "--interval all" in applied.reason
+    assert choose(topics, configuration={"use_intervals": "all"}).interval is None
+    assert choose(topics, configuration={"interval": [{"start_s": 1.0}]}).interval is None
+
+
+@pytest.mark.parametrize(
+    ("configuration", "code", "words"),
+    [
+        ({"command": {"topic": "/nowhere"}}, "topic_not_found", ["/nowhere", "command", "/mapping/icp_odom"]),
+        ({"pose": {"topic": "/joint_states"}}, "type_not_usable", ["/joint_states", "pose", "JointState"]),
+        ({"imu": {"topic": "/joint_states"}}, "type_not_usable", ["/joint_states", "imu"]),
+        ({"command": {"topic": "/mapping/icp_odom"}}, "type_not_usable", ["command", "left_topic"]),
+        (
+            {"command": {"left_topic": "/joint_states", "right_topic": "/joint_states"}},
+            "field_needed",
+            ["/joint_states", "field"],
+        ),
+        ({"pose": {"frames": ["map", "base_link"]}}, "topic_not_found", ["transforms", "pose.topic"]),
+        ({"interval": [{"topic": "/joint_states"}]}, "type_not_usable", ["interval", "String"]),
+        (
+            {"interval": [{"topic": "/a"}, {"topic": "/b"}]},
+            "intervals_disagree",
+            ["/a", "/b", "equals"],
+        ),
+    ],
+)
+def test_a_choice_that_cannot_be_followed_is_one_clear_line(
+    configuration: dict[str, object], code: str, words: list[str]
+) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        choose({"/joint_states": JOINTS, **ICP}, configuration=configuration)
+    said = str(caught.value)
+    assert caught.value.code == code
+    assert "\n" not in said
+    assert [word for word in words if word not in said] == []
