@@ -9,6 +9,8 @@ from pipeline.store.errors import StoreError
 from pipeline.store.generation import STEPS, Generation
 from pipeline.store.identities import LogIdentities, LogSighting, see_log
 from pipeline.store.manifest import JSON, FileEntry, Manifest, TableEntry, TableReport
+from pipeline.store.notes import Notes
+from pipeline.store.partitions import Partition
 from pipeline.store.results import Store, Survey
 from pipeline.store.verification import Problem
 
@@ -20,6 +22,8 @@ __all__ = [
     "LogIdentities",
     "LogSighting",
     "Manifest",
+    "Notes",
+    "Partition",
     "Problem",
     "Store",
     "StoreError",

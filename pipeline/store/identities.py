@@ -7,17 +7,11 @@ size, modification time and inode did not.
 
 from __future__ import annotations
 
-import json
 import os
 import time
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from stat import S_ISDIR
 from typing import TYPE_CHECKING
-
-from pipeline.store.errors import StoreError
-from pipeline.store.files import temporary_beside
-from pipeline.store.manifest import hash_bytes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -85,16 +79,16 @@ class LogIdentities:
     """
 
     def __init__(self, store: Store) -> None:
-        self._folder = store.root / FOLDER
+        self._notes = store.notes(FOLDER)
 
     def lookup(self, path: Path) -> str | None:
         """SHA-256 of a log that has not changed since it was remembered; None when it must be hashed."""
         try:
             now = see_log(path)
-            content = json.loads(self._entry_of(now).read_bytes())
+            content = dict(self._notes.read(now.path) or {})
             sha256 = content.pop("sha256")
-            then = LogSighting(**content)
-        except (OSError, ValueError, TypeError, KeyError, AttributeError):
+            then = LogSighting(**content)  # type: ignore[arg-type]
+        except (OSError, TypeError, KeyError):
             # Whatever is wrong with an entry, hashing the log is the answer to it.
             return None
         return str(sha256) if then.is_same_file(now) else None
@@ -115,22 +109,6 @@ class LogIdentities:
             now = see_log(path)
             if seen is not None and not (seen.is_same_file(now) and seen.seen_ns - seen.mtime_ns > _TICK_NS):
                 return False
-            self._write(self._entry_of(now), json.dumps({**asdict(now), "sha256": sha256}).encode())
-        except (OSError, StoreError):
+        except OSError:
             return False
-        return True
-
-    def _entry_of(self, log: LogSighting) -> Path:
-        name = hash_bytes(os.fsencode(log.path))
-        return self._folder / name[:2] / f"{name[2:]}.json"
-
-    def _write(self, entry: Path, data: bytes) -> None:
-        # No waiting for the disk: after a power cut an empty entry only costs a hash.
-        entry.parent.mkdir(parents=True, exist_ok=True)
-        temporary = temporary_beside(entry)
-        try:
-            temporary.write_bytes(data)
-            temporary.replace(entry)
-        finally:
-            with suppress(OSError):
-                temporary.unlink()
+        return self._notes.write(now.path, {**asdict(now), "sha256": sha256})

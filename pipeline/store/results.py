@@ -8,13 +8,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.store.errors import StoreError, name_disk_errors
-from pipeline.store.files import make_folder, remove_folder, remove_leftovers, replace_file
+from pipeline.store.files import (
+    make_folder,
+    remove_folder,
+    remove_leftovers,
+    replace_file,
+    temporary_beside,
+    write_new_file,
+)
 from pipeline.store.generation import Generation
 from pipeline.store.homes import point_latest, remove_orphans
 from pipeline.store.locks import hold_lock
-from pipeline.store.manifest import MANIFEST, MARKER, Manifest
+from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes
 from pipeline.store.manifest_file import encode_manifest, load_manifest
 from pipeline.store.names import check_file_name, check_key, encode_run
+from pipeline.store.notes import Notes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -22,10 +30,12 @@ if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.store.manifest import TableReport
+    from pipeline.store.partitions import Partition
     from pipeline.store.verification import Problem
 
 LOCK = ".lock"
 RUNS = "runs"
+CLAIMS = "batch/claims"
 
 
 def _ignore_step(step: str) -> None:
@@ -156,11 +166,12 @@ class Store:
                     raise
                 manifest = newer
 
-    def scan(self, table: str) -> pl.LazyFrame:
+    def scan(self, table: str, partition: Partition | None = None) -> pl.LazyFrame:
         """A table over the current generations of all runs, or one of the whole results (``datasets``).
 
         Args:
-            table: a table's name, or ``quarantine_<table>``.
+            table: a table's name, ``quarantine_<table>``, or ``runs`` for one row a run.
+            partition: the runs to look at, told from their manifests: no file of another one is opened.
 
         Returns:
             The contract's columns, empty when no run has any.
@@ -170,17 +181,27 @@ class Store:
         """
         from pipeline.store.queries import scan_table  # noqa: PLC0415 - heavy
 
-        return scan_table(table, root=self.root, manifests=self.manifests())
+        return scan_table(table, root=self.root, manifests=self._select(partition))
 
-    def query(self, sql: str) -> pl.DataFrame:
+    def query(self, sql: str, partition: Partition | None = None) -> pl.DataFrame:
         """Answer SQL over all tables by name.
+
+        Args:
+            sql: the question.
+            partition: the runs to look at, as for `scan`.
 
         Raises:
             StoreError: ``bad_query``, or a manifest is damaged.
         """
         from pipeline.store.queries import answer_query  # noqa: PLC0415 - heavy
 
-        return answer_query(sql, root=self.root, manifests=self.manifests())
+        return answer_query(sql, root=self.root, manifests=self._select(partition))
+
+    def _select(self, partition: Partition | None) -> tuple[Manifest, ...]:
+        manifests = self.manifests()
+        if partition is None:
+            return manifests
+        return tuple(manifest for manifest in manifests if partition.holds(manifest))
 
     def verify(self) -> tuple[Problem, ...]:
         """Rehash every file of every current generation; what differs from its manifest."""
@@ -238,6 +259,39 @@ class Store:
             remove_leftovers(path.parent)
             replace_file(path, text.encode())
         return path
+
+    def notes(self, folder: str) -> Notes:
+        """Small notes beside the results, in a folder of their own."""
+        return Notes(self.root / folder)
+
+    def check_writable(self) -> None:
+        """Find out before the work whether results can be written.
+
+        Raises:
+            StoreError: ``read_only``, ``permission_denied``, ``disk_full``, ``locked``, ...
+        """
+        with self._lock(self.root), name_disk_errors(self.root):
+            probe = temporary_beside(self.root / "probe")
+            write_new_file(probe, b"may be written")
+            probe.unlink()
+
+    @contextmanager
+    def claim(self, name: str) -> Iterator[bool]:
+        """Claim a piece of work for the length of the block, if nobody else has.
+
+        Yields:
+            Whether it is ours. Different names may, rarely, stand in each other's way.
+        """
+        folder = self.root / CLAIMS
+        with name_disk_errors(folder):
+            make_folder(folder)
+        try:
+            with hold_lock(folder / hash_bytes(name.encode())[:3], patience_s=0.0):
+                yield True
+        except StoreError as error:
+            if error.code != "locked" or error.where != str(folder):
+                raise
+            yield False
 
     def _home_of(self, run: str) -> Path:
         return self.root / RUNS / encode_run(run)

@@ -1,0 +1,86 @@
+"""Small notes beside the results, one file each: replaced whole, written by many at once without waiting.
+
+A note may be lost, for example in a power cut, and must then only cost time. What must not be lost belongs
+into a generation.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from pipeline.store.errors import StoreError, name_disk_errors
+from pipeline.store.files import temporary_beside
+from pipeline.store.manifest import hash_bytes
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from pipeline.store.manifest import JSON
+
+
+class Notes:
+    """Notes by name in one folder.
+
+    Args:
+        folder: where they stand; made when the first is written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def write(self, name: str, content: Mapping[str, JSON]) -> bool:
+        """Write a note in the place of the one before; failing to is no error.
+
+        Returns:
+            Whether it was written.
+        """
+        try:
+            self._write(self.path_of(name), json.dumps(content, sort_keys=True).encode())
+        except StoreError:
+            return False
+        return True
+
+    def read(self, name: str) -> dict[str, JSON] | None:
+        """A note; None when there is none that can be read."""
+        return _load(self.path_of(name))
+
+    def read_all(self) -> Iterator[dict[str, JSON]]:
+        """Every note that can be read, in no order that matters."""
+        for path in sorted(self._folder.glob("*/*.json")):
+            content = _load(path)
+            if content is not None:
+                yield content
+
+    def remove(self, name: str) -> None:
+        """Forget a note, which need not be there."""
+        with suppress(OSError):
+            self.path_of(name).unlink()
+
+    def path_of(self, name: str) -> Path:
+        """File of a note, which may be called anything."""
+        digits = hash_bytes(os.fsencode(name))
+        return self._folder / digits[:2] / f"{digits[2:]}.json"
+
+    def _write(self, path: Path, data: bytes) -> None:
+        # No waiting for the disk: after a power cut an empty note only costs time.
+        with name_disk_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary = temporary_beside(path)
+            try:
+                temporary.write_bytes(data)
+                temporary.replace(path)
+            finally:
+                with suppress(OSError):
+                    temporary.unlink()
+
+
+def _load(path: Path) -> dict[str, JSON] | None:
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) else None

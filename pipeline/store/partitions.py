@@ -1,0 +1,67 @@
+"""Which runs a question is about, told from their manifests alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.store.manifest import JSON, Manifest
+
+
+@dataclass(frozen=True, kw_only=True)
+class Partition:
+    """The part of the runs that a question is about; what is not said is not asked.
+
+    Attributes:
+        vehicle: id of the vehicle.
+        terrain: name of the terrain.
+        dataset: name of the dataset.
+        day: UTC day of the log's start, ``2026-07-31``; a beginning such as ``2026-07`` stands for all in it.
+    """
+
+    vehicle: str | None = None
+    terrain: str | None = None
+    dataset: str | None = None
+    day: str | None = None
+
+    def holds(self, manifest: Manifest) -> bool:
+        """Whether a run belongs to it."""
+        found = describe_run(manifest)
+        plain = {"vehicle": self.vehicle, "terrain": self.terrain, "dataset": self.dataset}
+        is_like = all(wanted is None or found[name] == wanted for name, wanted in plain.items())
+        return is_like and (self.day is None or str(found["day"] or "").startswith(self.day))
+
+
+def describe_run(manifest: Manifest) -> dict[str, JSON]:
+    """The row of a run in the table ``runs``."""
+    details = manifest.details
+    log = _part(details.get("log"))
+    start = _part(_part(_part(details.get("stages")).get("extract")).get("context")).get("start_ns")
+    is_stamp = isinstance(start, int) and start > 0
+    return {
+        "run": manifest.run,
+        "dataset": _text(details.get("dataset")),
+        "vehicle": _text(_part(details.get("vehicle")).get("id")),
+        "terrain": _text(details.get("terrain")),
+        "day": f"{datetime.fromtimestamp(start // 10**9, UTC):%Y-%m-%d}" if is_stamp else None,
+        "start_ns": start if is_stamp else None,
+        "duration_s": log.get("duration_s"),
+        "complete": log.get("complete"),
+        "bytes": log.get("bytes"),
+        "sha256": log.get("sha256"),
+        "log": log.get("path"),
+        "key": manifest.key,
+        "folder": str(manifest.folder),
+    }
+
+
+def _part(content: object) -> Mapping[str, JSON]:
+    return content if isinstance(content, dict) else {}
+
+
+def _text(content: object) -> str | None:
+    return content if isinstance(content, str) else None
