@@ -105,7 +105,6 @@ def begin_spans(series: DriveSeries, cells: Cells, measured: Floats) -> Commands
         measured: wheel speeds at each span's start, NaN where unknown, shape (k, 2).
     """
     following = np.minimum(np.searchsorted(series.times, cells.starts - 1e-6), series.times.size - 1)
-    before = np.searchsorted(series.times, cells.starts - 1e-6) - 1
     # At a hole nobody knows what was asked meanwhile; at the start of the recording nothing was.
     ends_before = np.concatenate(([-np.inf], cells.ends[:-1]))
     stamp = np.maximum(ends_before + 1e-3, cells.starts - _BEFORE)
@@ -115,7 +114,6 @@ def begin_spans(series: DriveSeries, cells: Cells, measured: Floats) -> Commands
         if column is not None:
             first = np.where(np.isfinite(measured[:, column]), measured[:, column], first)
         values.append(first)
-    del before
     inside = cells.find_span(series.times) >= 0
     times = np.concatenate((stamp, series.times[inside]))
     order = np.argsort(times, kind="stable")

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.motion.cells import interpolate_drive, make_cells
+from pipeline.motion.cells import make_cells
 from pipeline.motion.effect import ReportEffect
 from pipeline.motion.errors import MotionError
 from pipeline.motion.forward import Forward, Timing
 from pipeline.motion.heading import HeadingSource, choose_heading
-from pipeline.motion.signals import Surroundings
-from pipeline.motion.windows import gather_nodes, join_horizons, join_windows
+from pipeline.motion.signals import Resets, Surroundings
+from pipeline.motion.windows import WINDOW_S, find_lead, gather_nodes, join_horizons, join_windows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.motion.cells import Cells
     from pipeline.motion.effect import Effect
     from pipeline.motion.recording import MotionRun
     from pipeline.motion.signals import Velocity
@@ -31,6 +32,7 @@ Complex = NDArray[np.complex128]
 
 CELL_RATE_HZ = 200.0
 _SETTLE_S = 0.6
+_LEAST_S = 0.3
 
 
 class Input(enum.Enum):
@@ -81,24 +83,36 @@ class Comparison:
         self.cells = make_cells(run, rate_hz)
         self.heading = choose_heading(run, self.cells, heading)
         self.nodes = gather_nodes(run.track, self.cells)
-        self.windows = join_windows(run, self.cells, self.nodes)
-        self.horizons = join_horizons(run, self.cells, self.nodes)
+        lead = find_lead(run, self.usual_delay)
+        self.windows = join_windows(run, self.cells, self.nodes, lead)
+        self.horizons = join_horizons(run, self.cells, self.nodes, lead)
         self._pose_times = run.track.times[self.nodes.poses]
         self._path = cast("Complex", self.nodes.average(run.track.path[self.nodes.poses]))
         self._frames: dict[float, Complex] = {}
         self._headings: dict[float, Floats] = {}
-        self.forward = Forward(series, self.cells, self._look_around(vehicle), has_gyro=self.has_gyro)
+        base = self._look_around(vehicle)
+        more = {"encoders": run.wheels, "has_gyro": self.has_gyro}
+        self._forward = Forward(series, self.cells, base, **more)
+        self._reaching = Forward(series, self.cells, self._look_from_horizons(base), **more)
 
     @property
     def has_gyro(self) -> bool:
         """Whether the gyro is heading and clock."""
         return self.heading.gyro is not None
 
+    @property
+    def usual_delay(self) -> float:
+        """How late the poses are as far as it is known before any fit [s]: against the gyro."""
+        return self.heading.gyro.yaw_delay_s if self.heading.gyro is not None else 0.0
+
     def predict_velocity(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
         """Body velocity of a model on the cells, as the localization would report it."""
+        return self._run(self._forward, effects, timing)
+
+    def _run(self, forward: Forward, effects: Sequence[Effect], timing: Timing) -> Velocity:
         if self.source is Input.COMMAND:
-            return self.forward.run_commands(effects, timing)
-        return self.forward.run_wheels(effects, timing)
+            return forward.run_commands(effects, timing)
+        return forward.run_wheels(effects, timing)
 
     def find_residuals(self, effects: Sequence[Effect], timing: Timing) -> Floats:
         """Measured less predicted displacement of every window, over its length.
@@ -120,8 +134,12 @@ class Comparison:
         return np.column_stack((gap.real, gap.imag, rest.real)) / self.windows.span_s[:, None]
 
     def find_reach(self, effects: Sequence[Effect], timing: Timing) -> Reach:
-        """Errors of two-second predictions that start from measured poses and integrate the model's own yaw."""
-        velocity = self.predict_velocity(effects, timing)
+        """Errors of two-second predictions from a measured state, integrating the model's own yaw.
+
+        A prediction begins with the measured pose, the wheel speeds of the encoders where there are any, and
+        the body velocity of the half second before: what a planner knows at that moment.
+        """
+        velocity = self._run(self._reaching, effects, timing)
         delay = timing.pose_delay_s + self._find_delay(effects)
         place = self.cells.locate_edges(self._pose_times - delay)
         edges = cast("Floats", self.cells.sum_up(velocity.w))
@@ -174,49 +192,88 @@ class Comparison:
         return self._frames[key]
 
     def _look_around(self, vehicle: Vehicle) -> Surroundings:
-        run, cells = self.run, self.cells
-        at, track = cells.times, run.track
-        wheels = np.full((cells.first.size, 2), np.nan)
-        if run.wheels is not None:
-            first = interpolate_drive(run.wheels, cells.starts, 0.0)
-            wheels = np.column_stack((first.left, first.right))
-        settle, start = self._measure_starts()
+        cells, track = self.cells, self.run.track
+        at = cells.times
+        first, last = self._first_moments()
+        _, velocity = self._measure_velocity(first, last)
+        # What was seen over the first moments counts from their end on: nothing scored before has used it.
+        known = (self._locate_nodes(last), velocity)
+        unknown = np.full((cells.first.size, 2), np.nan)
+        spans = Resets(cells.span, cells.first, cells.first, unknown)
         return Surroundings(
             vehicle=vehicle,
             times=at,
             step_s=cells.step_s,
-            span=cells.span,
-            first=cells.first,
-            duration_s=run.duration_s,
-            start_wheels=wheels,
-            settle=settle,
-            start_velocity=start,
+            duration_s=self.run.duration_s,
+            spans=spans,
+            wheels=spans,
+            body=_reset_body(cells, cells.first, known),
             attitude=np.column_stack([np.interp(at, track.times, column) for column in track.attitude.T]),
             place=np.column_stack([np.interp(at, track.times, column) for column in track.place.T]),
         )
 
-    def _measure_starts(self) -> tuple[Integers, Floats]:
-        """Body velocity over the first moments of every span: cells it counts from, and (v_x, v_y, v_w)."""
+    def _look_from_horizons(self, base: Surroundings) -> Surroundings:
+        """The run with states that begin anew at every horizon, with what is known by then."""
         cells, nodes = self.cells, self.nodes
-        settle, start = cells.first.copy(), np.full((cells.first.size, 3), np.nan)
-        delay = self.heading.gyro.yaw_delay_s if self.heading.gyro is not None else 0.0
-        heading = self._node_headings(delay)
+        origin = np.unique(self.horizons.origin)
+        begin = cells.locate_edges(nodes.times[origin] - self.usual_delay).astype(np.int64)
+        begin = np.minimum(begin, cells.times.size - 1)
+        before = np.searchsorted(nodes.times, nodes.times[origin] - WINDOW_S - 0.01)
+        first = np.unique(np.concatenate((cells.first, begin)))
+        number = np.searchsorted(first, np.arange(cells.times.size), side="right") - 1
+        wheels = base.wheels
+        if self.run.wheels is not None:
+            wheels = Resets(number, first, first, np.full((first.size, 2), np.nan))
+        at, velocity = self._measure_velocity(before, origin)
+        good = np.isfinite(velocity).all(axis=1)
+        at = np.concatenate((base.body.at, at[good]))
+        velocity = np.concatenate((base.body.start, velocity[good]))
+        order = np.unique(at, return_index=True)[1]
+        rows = (at[order], velocity[order])
+        body = _reset_body(cells, np.unique(np.concatenate((cells.first, rows[0]))), rows)
+        return replace(base, wheels=wheels, body=body)
+
+    def _first_moments(self) -> tuple[Integers, Integers]:
+        """First node of every span and the last within its first moments."""
+        cells, nodes = self.cells, self.nodes
         first = np.searchsorted(nodes.times, cells.starts)
         last = np.searchsorted(nodes.times, cells.starts + _SETTLE_S) - 1
-        rows = np.flatnonzero((last > first) & (last < nodes.times.size))
-        one, two = first[rows], last[rows]
-        whole = (nodes.piece[one] == nodes.piece[two]) & (nodes.times[two] - nodes.times[one] > 0.3)  # noqa: PLR2004
-        rows, one, two = rows[whole], one[whole], two[whole]
+        return first, last
+
+    def _measure_velocity(self, first: Integers, last: Integers) -> tuple[Integers, Floats]:
+        """Body velocity between pairs of nodes: cells in their middle, and (v_x, v_y, v_w); NaN where unknown."""
+        cells, nodes = self.cells, self.nodes
+        delay = self.usual_delay
+        heading = self._node_headings(delay)
+        top = nodes.times.size - 1
+        one, two = np.clip(first, 0, top), np.clip(last, 0, top)
         span = nodes.times[two] - nodes.times[one]
-        moved = (self._path[two] - self._path[one]) * np.exp(-0.5j * (heading[one] + heading[two])) / span
-        start[rows] = np.column_stack((moved.real, moved.imag, (heading[two] - heading[one]) / span))
-        middle = 0.5 * (nodes.times[one] + nodes.times[two]) - delay
-        settle[rows] = np.clip(
-            cells.locate_edges(middle).astype(np.int64),
-            cells.first[rows],
-            np.append(cells.first[1:], cells.times.size)[rows] - 1,
+        good = (
+            (two > one) & (nodes.piece[one] == nodes.piece[two]) & (span > _LEAST_S) & (span < 2.0 * WINDOW_S)
         )
-        return settle, start
+        span = np.where(good, span, 1.0)
+        moved = (self._path[two] - self._path[one]) * np.exp(-0.5j * (heading[one] + heading[two])) / span
+        velocity = np.column_stack((moved.real, moved.imag, (heading[two] - heading[one]) / span))
+        velocity[~good] = np.nan
+        middle = 0.5 * (nodes.times[one] + nodes.times[two]) - delay
+        return np.minimum(cells.locate_edges(middle).astype(np.int64), cells.times.size - 1), velocity
+
+    def _locate_nodes(self, nodes: Integers) -> Integers:
+        """Cells in which nodes were reached."""
+        at = self.nodes.times[np.clip(nodes, 0, self.nodes.times.size - 1)] - self.usual_delay
+        return np.minimum(self.cells.locate_edges(at).astype(np.int64), self.cells.times.size - 1)
+
+
+def _reset_body(cells: Cells, first: Integers, known: tuple[Integers, Floats]) -> Resets:
+    """Resets of the body's state: at the cells given where a velocity is known, else at the first cell."""
+    at, velocity = known
+    good = np.isfinite(velocity).all(axis=1)
+    start = np.full((first.size, 3), np.nan)
+    place = first.copy()
+    number = np.searchsorted(first, np.arange(cells.times.size), side="right") - 1
+    rows = number[at[good]]
+    start[rows], place[rows] = velocity[good], at[good]
+    return Resets(number, first, place, start)
 
 
 def _forget(kept: dict[float, NDArray[np.generic]]) -> None:

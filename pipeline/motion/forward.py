@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
@@ -52,25 +52,36 @@ class Forward:
         series: commands, or measured wheels.
         cells: the grid.
         around: what effects may know of the run.
+        encoders: measured wheels, from which states begin; None without.
         has_gyro: whether the heading that velocities are compared in is a gyro's.
     """
 
-    def __init__(self, series: DriveSeries, cells: Cells, around: Surroundings, *, has_gyro: bool) -> None:
+    def __init__(
+        self,
+        series: DriveSeries,
+        cells: Cells,
+        around: Surroundings,
+        *,
+        encoders: DriveSeries | None,
+        has_gyro: bool,
+    ) -> None:
         self.series = series
         self.cells = cells
         self.around = around
+        self.encoders = encoders
         self.has_gyro = has_gyro
         self._kept: dict[Place, OrderedDict[object, object]] = {place: OrderedDict() for place in Place}
+        self._known: OrderedDict[float, Surroundings] = OrderedDict()
 
     def run_commands(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
-        """Body velocity as reported, of commands; see `predict_velocity`."""
+        """Body velocity as reported, of commands."""
         told = [e for e in effects if e.place is Place.COMMAND]
         driven = [e for e in effects if e.place is Place.DRIVE]
-        key: tuple[object, ...] = tuple(e.key for e in told)
-        wheels = self._keep(Place.COMMAND, key, lambda: self._hold(told))
-        key = (*key, *(e.key for e in driven))
-        wheels = self._keep(Place.DRIVE, key, lambda: self._drive(wheels, driven))
-        del timing
+        around = self._start_wheels(timing.wheel_delay_s)
+        key: tuple[object, ...] = (timing.wheel_delay_s, *(e.key for e in told))
+        wheels = self._keep(Place.COMMAND, key, lambda: self._hold(told, timing.wheel_delay_s))
+        key = (*key, "|", *(e.key for e in driven))
+        wheels = self._keep(Place.DRIVE, key, lambda: self._drive(wheels, driven, around))
         return self._move(wheels, key, effects)
 
     def run_wheels(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
@@ -80,6 +91,20 @@ class Forward:
             Place.DRIVE, key, lambda: interpolate_drive(self.series, self.around.times, timing.wheel_delay_s)
         )
         return self._move(wheels, key, effects)
+
+    def _start_wheels(self, delay_s: float) -> Surroundings:
+        """The run with wheel speeds as the encoders had them where states begin."""
+        if self.encoders is None:
+            return self.around
+        if delay_s not in self._known:
+            resets = self.around.wheels
+            at = self.around.times[resets.first] - 0.5 * self.around.step_s
+            seen = interpolate_drive(self.encoders, at, delay_s)
+            resets = replace(resets, start=np.column_stack((seen.left, seen.right)))
+            self._known[delay_s] = replace(self.around, wheels=resets)
+            if len(self._known) > _REMEMBERED:
+                self._known.popitem(last=False)
+        return self._known[delay_s]
 
     def _keep(self, place: Place, key: object, make: Callable[[], Result]) -> Result:
         kept = self._kept[place]
@@ -92,15 +117,19 @@ class Forward:
             kept.popitem(last=False)
         return made
 
-    def _hold(self, effects: Sequence[Effect]) -> Wheels:
-        commands = begin_spans(self.series, self.cells, self.around.start_wheels)
+    def _hold(self, effects: Sequence[Effect], delay_s: float) -> Wheels:
+        first = np.full((self.cells.first.size, 2), np.nan)
+        if self.encoders is not None:
+            seen = interpolate_drive(self.encoders, self.cells.starts, delay_s)
+            first = np.column_stack((seen.left, seen.right))
+        commands = begin_spans(self.series, self.cells, first)
         for effect in effects:
             commands = cast("CommandEffect", effect).change_commands(commands, self.around)
         return hold_on_cells(commands, self.cells)
 
-    def _drive(self, wheels: Wheels, effects: Sequence[Effect]) -> Wheels:
+    def _drive(self, wheels: Wheels, effects: Sequence[Effect], around: Surroundings) -> Wheels:
         for effect in effects:
-            wheels = cast("DriveEffect", effect).drive_wheels(wheels, self.around)
+            wheels = cast("DriveEffect", effect).drive_wheels(wheels, around)
         return wheels
 
     def _move(self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect]) -> Velocity:

@@ -119,7 +119,10 @@ def fit_gyro(run: MotionRun) -> GyroFit | None:
     coarse = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 1e-9, 5 * _DELAY_STEP)
     best = float(coarse[np.argmin([judge(float(d))[2] for d in coarse])])
     fine = best + np.arange(-5, 6) * _DELAY_STEP
-    delay = float(fine[np.argmin([judge(float(d))[2] for d in fine])])
+    losses = np.array([judge(float(d))[2] for d in fine])
+    # The loss is a median and not smooth: a parabola through all that is near averages its steps.
+    curve = np.polynomial.Polynomial.fit(fine, losses, 2).convert().coef
+    delay = float(np.clip(-0.5 * curve[1] / curve[2], fine[0], fine[-1])) if curve[2] > 0.0 else best
     scale, bias, loss = judge(delay)
     residual = loss / float(np.sqrt(np.mean(np.minimum(np.abs(turned), 3.0 * spread) ** 2)))
     if residual > _GOOD or not 0.5 < abs(scale) < 2.0:  # noqa: PLR2004 - no gyro is that wrong

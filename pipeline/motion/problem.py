@@ -28,6 +28,7 @@ Integers = NDArray[np.int64]
 _DELAY_BOUNDS = (-0.7, 0.9)
 _DELAY_STEP = 5e-3
 _FEWEST_WINDOWS = 20
+_COARSE_RATE_HZ = 50.0
 
 
 @dataclass(frozen=True)
@@ -132,6 +133,12 @@ class Problem:
         self.source = source
         self.comparisons = tuple(Comparison(run, vehicle, source, heading=heading, **more) for run in runs)
         self.given_timing = None if timing is None else tuple(timing)
+        # From commands, states begin with what the encoders say: their delay must be known beforehand.
+        late = source is Input.COMMAND and timing is None
+        self._late_wheels = tuple(
+            measure_wheel_delay(run, vehicle) if late and comparison.has_gyro else 0.0
+            for run, comparison in zip(runs, self.comparisons, strict=True)
+        )
         counts = []
         for comparison in self.comparisons:
             counts.append(comparison.windows.start.size)
@@ -211,7 +218,7 @@ class Problem:
             measured = self.source is Input.MEASURED
             if measured and not comparison.has_gyro and "clock_offset" not in model:
                 found.append(Free("", "pose_delay_s", run, _DELAY_BOUNDS, _DELAY_STEP))
-            if measured and comparison.has_gyro:
+            if comparison.has_gyro and measured:
                 found.append(Free("", "wheel_delay_s", run, _DELAY_BOUNDS, _DELAY_STEP))
         return found
 
@@ -237,6 +244,30 @@ class Problem:
                 rows = self.run_of == number.run
                 columns[rows, :, index] = (self.find_run_residuals(moved, number.run) - base[rows]) / step
         return columns
+
+
+def measure_wheel_delay(run: MotionRun, vehicle: Vehicle) -> float:
+    """How late the encoders are against the gyro [s]; zero where it cannot be told.
+
+    A body that follows its wheels late hides a part of the delay, so both are fitted together.
+    """
+    from pipeline.motion.catalogue import find_effect  # noqa: PLC0415 - finds the effects by importing them
+    from pipeline.motion.fit import fit_model  # noqa: PLC0415 - the two rely on each other
+    from pipeline.motion.model import Model  # noqa: PLC0415
+
+    if run.wheels is None:
+        return 0.0
+    usual = (
+        ("wheel_radius", "body_inertia")
+        if vehicle.kind == "ackermann"
+        else ("effective_track", "body_inertia")
+    )
+    try:
+        problem = Problem([run], vehicle, Input.MEASURED, rate_hz=_COARSE_RATE_HZ)
+    except MotionError:
+        return 0.0
+    fitted = fit_model(problem, Model(vehicle, tuple(find_effect(name)() for name in usual)))
+    return fitted.state.timing[0].wheel_delay_s
 
 
 def _is_used(effect: Effect, parameter: Parameter) -> bool:

@@ -97,6 +97,23 @@ class Velocity:
 
 
 @dataclass(frozen=True)
+class Resets:
+    """Where internal states begin anew, and with what.
+
+    Attributes:
+        number: which reset each cell follows, shape (n,).
+        first: first cell that follows each reset: nothing is carried over into it, shape (k,).
+        at: cell before which the state is set, shape (k,).
+        start: the state, one column a signal; NaN for the input's own value, shape (k, m).
+    """
+
+    number: Integers
+    first: Integers
+    at: Integers
+    start: Floats
+
+
+@dataclass(frozen=True)
 class Surroundings:
     """What an effect may know of a run beside the signal it acts on.
 
@@ -104,14 +121,10 @@ class Surroundings:
         vehicle: geometry.
         times: middles of the cells [s] since the run's start, shape (n,).
         step_s: width of a cell [s].
-        span: number of the span of each cell, shape (n,).
-        first: first cell of each span, shape (k,).
         duration_s: length of the run [s].
-        start_wheels: measured wheel speeds at each span's start (left, right) [rad/s], NaN where there are
-            none, shape (k, 2).
-        settle: cell of each span from which `start_velocity` counts, shape (k,).
-        start_velocity: body velocity measured over the span's first moments, before its `settle` cell's end;
-            NaN where there is none, shape (k, 3).
+        spans: begin where the recording begins anew; states unknown.
+        wheels: begin where wheel speeds are known: (left, right) [rad/s].
+        body: begin where the body velocity is known: (v_x, v_y, v_w).
         attitude: roll, pitch, yaw as reported [rad], shape (n, 3).
         place: x, y as reported [m], shape (n, 2).
     """
@@ -119,12 +132,10 @@ class Surroundings:
     vehicle: Vehicle
     times: Floats
     step_s: float
-    span: Integers
-    first: Integers
     duration_s: float
-    start_wheels: Floats
-    settle: Integers
-    start_velocity: Floats
+    spans: Resets
+    wheels: Resets
+    body: Resets
     attitude: Floats
     place: Floats
 
@@ -156,7 +167,8 @@ def roll_ideally(wheels: Wheels, around: Surroundings) -> Rolling:
 
 def earlier_in_span(around: Surroundings, late: float) -> Flags:
     """Whether the time ``late`` seconds before each cell lies in the same span (after it, when negative)."""
-    last = np.append(around.first[1:], around.times.size) - 1
+    spans = around.spans
+    last = np.append(spans.first[1:], around.times.size) - 1
     at = around.times - late
-    inside: Flags = (at >= around.times[around.first][around.span]) & (at <= around.times[last][around.span])
+    inside: Flags = (at >= around.times[spans.first][spans.number]) & (at <= around.times[last][spans.number])
     return inside

@@ -28,6 +28,7 @@ NODE_S = 0.25
 _GATHER_S = 0.066
 _DENSE_S = 0.08
 _LEAD_S = 0.5
+_LEAST_LEAD_S = 0.02
 _SHORTEST_BLOCK_S = 5.0
 _LONGEST_BLOCK_S = 12.0
 
@@ -136,7 +137,16 @@ def number_blocks(run: MotionRun, cells: Cells) -> Floats:
     return np.array(starts)
 
 
-def join_windows(run: MotionRun, cells: Cells, nodes: Nodes) -> Windows:
+def find_lead(run: MotionRun, delay_s: float) -> float:
+    """How long after its start a span is not compared [s].
+
+    Where encoders say what the wheels did when the recording began, only the delay of the poses must pass:
+    they report what happened before. Without them the state of the drive must settle first.
+    """
+    return _LEAD_S if run.wheels is None else max(delay_s, 0.0) + _LEAST_LEAD_S
+
+
+def join_windows(run: MotionRun, cells: Cells, nodes: Nodes, lead_s: float) -> Windows:
     """All windows of half a second, a quarter of a second apart where poses are dense."""
     start = np.arange(nodes.times.size)
     at = np.searchsorted(nodes.times, nodes.times + WINDOW_S)
@@ -148,7 +158,7 @@ def join_windows(run: MotionRun, cells: Cells, nodes: Nodes) -> Windows:
     end = np.where(nearer, after, before)
     length = nodes.times[end] - nodes.times
     kept = (length > 0.6 * WINDOW_S) & (length < 1.5 * WINDOW_S)
-    kept &= _is_clean(run, cells, nodes, start, end)
+    kept &= _is_clean(run, cells, nodes, (start, end), lead_s)
     start, end = start[kept], end[kept]
     times = np.column_stack((nodes.times[start], nodes.times[end]))
     blocks = number_blocks(run, cells)
@@ -156,18 +166,18 @@ def join_windows(run: MotionRun, cells: Cells, nodes: Nodes) -> Windows:
     return Windows(start, end, times[:, 1] - times[:, 0], block, times)
 
 
-def join_horizons(run: MotionRun, cells: Cells, nodes: Nodes) -> Horizons:
-    """Predictions of two seconds from nodes half a second apart."""
+def join_horizons(run: MotionRun, cells: Cells, nodes: Nodes, lead_s: float) -> Horizons:
+    """Predictions of two seconds, one after the other."""
     reach = nodes.times + HORIZON_S
     last = np.searchsorted(nodes.times, reach + 0.13, side="right") - 1
     origin = np.arange(nodes.times.size)
     whole = (nodes.piece[last] == nodes.piece) & (nodes.times[last] > reach - 0.3)
-    whole &= _is_clean(run, cells, nodes, origin, last)
+    whole &= _is_clean(run, cells, nodes, (origin, last), lead_s)
     chosen, next_start = [], -np.inf
     for index in np.flatnonzero(whole).tolist():
         if nodes.times[index] >= next_start - 1e-6:
             chosen.append(index)
-            next_start = nodes.times[index] + WINDOW_S
+            next_start = nodes.times[last[index]]
     picked = np.array(chosen, dtype=np.int64)
     counts = (last[picked] - picked) if picked.size else np.zeros(0, dtype=np.int64)
     number = np.repeat(np.arange(picked.size), counts)
@@ -180,10 +190,13 @@ def join_horizons(run: MotionRun, cells: Cells, nodes: Nodes) -> Horizons:
     return Horizons(origins, node, number, block, times)
 
 
-def _is_clean(run: MotionRun, cells: Cells, nodes: Nodes, start: Integers, end: Integers) -> Flags:
+def _is_clean(
+    run: MotionRun, cells: Cells, nodes: Nodes, ends: tuple[Integers, Integers], lead_s: float
+) -> Flags:
     """Whether a stretch stays in one piece, clear of what is barred, and clear of its span's first moments."""
+    start, end = ends
     begin, stop = nodes.times[start], nodes.times[end]
     clean = (nodes.piece[start] == nodes.piece[end]) & ~has_barred(run.barred, begin, stop)
     span = np.clip(cells.find_span(begin), 0, cells.starts.size - 1)
-    late_enough: Flags = begin - cells.starts[span] >= _LEAD_S
+    late_enough: Flags = begin - cells.starts[span] >= lead_s
     return clean & late_enough

@@ -42,9 +42,9 @@ class AccelerationLimit(DriveEffect):
 
     def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
         """See the formula above."""
-        limit, start = self.values["limit"], around.start_wheels
+        limit, resets, step = self.values["limit"], around.wheels, around.step_s
         return replace(
             wheels,
-            left=limit_rate(wheels.left, limit, around, start[:, 0]),
-            right=limit_rate(wheels.right, limit, around, start[:, 1]),
+            left=limit_rate(wheels.left, limit, step, resets, resets.start[:, 0]),
+            right=limit_rate(wheels.right, limit, step, resets, resets.start[:, 1]),
         )

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.motion.effect import BodyEffect, Excitation, Parameter, Search
-from pipeline.motion.filters import lag_complex
+from pipeline.motion.filters import lag_signal
 from pipeline.motion.signals import Velocity
 
 if TYPE_CHECKING:
@@ -46,14 +46,13 @@ class BodyInertia(BodyEffect):
 
     def move_body(self, rolling: Rolling, around: Surroundings) -> Velocity:
         """See the formula above."""
-        tau, start = self.values["tau"], around.start_velocity
+        tau, resets, step = self.values["tau"], around.body, around.step_s
         if tau <= 0.0:
             return Velocity(rolling.v0, np.zeros_like(rolling.v0), rolling.w0)
-        turn = np.where(np.isfinite(start[:, 2]), start[:, 2], np.nan).astype(np.complex128)
-        w = lag_complex(rolling.w0.astype(np.complex128), tau, around, turn, around.settle).real
+        w = lag_signal(rolling.w0, tau, step, resets, resets.start[:, 2])
+        heading = (np.cumsum(w) - 0.5 * w) * step
         # In a frame that does not turn the two equations of v_x and v_y are one lag of a complex number.
-        heading = np.cumsum(w) * around.step_s - 0.5 * w * around.step_s
         frame = np.exp(1j * heading)
-        start_slide = (start[:, 0] + 1j * start[:, 1]) * frame[around.settle]
-        slide = lag_complex(rolling.v0 * frame, tau, around, start_slide, around.settle) * np.conj(frame)
+        start = (resets.start[:, 0] + 1j * resets.start[:, 1]) * frame[resets.at]
+        slide = lag_signal(rolling.v0 * frame, tau, step, resets, start) * np.conj(frame)
         return Velocity(slide.real, slide.imag, w)

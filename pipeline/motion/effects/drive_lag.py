@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pipeline.motion.effect import DriveEffect, Excitation, Parameter, Search
-from pipeline.motion.filters import lag_real
+from pipeline.motion.filters import lag_signal
 
 if TYPE_CHECKING:
     from pipeline.motion.signals import Surroundings, Wheels
@@ -44,9 +44,9 @@ class DriveLag(DriveEffect):
 
     def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
         """See the formula above."""
-        tau, start = self.values["tau"], around.start_wheels
+        tau, resets, step = self.values["tau"], around.wheels, around.step_s
         return replace(
             wheels,
-            left=lag_real(wheels.left, tau, around, start[:, 0]),
-            right=lag_real(wheels.right, tau, around, start[:, 1]),
+            left=lag_signal(wheels.left, tau, step, resets, resets.start[:, 0]),
+            right=lag_signal(wheels.right, tau, step, resets, resets.start[:, 1]),
         )

@@ -12,10 +12,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from pipeline.motion.effect import ACKERMANN, DriveEffect, Excitation, Parameter, Search
-from pipeline.motion.filters import lag_real
+from pipeline.motion.filters import lag_signal
 
 if TYPE_CHECKING:
     from pipeline.motion.signals import Surroundings, Wheels
@@ -45,5 +43,6 @@ class SteeringLag(DriveEffect):
 
     def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
         """See the formula above."""
-        unknown = np.full(around.first.size, np.nan)
-        return replace(wheels, steering=lag_real(wheels.steering, self.values["tau"], around, unknown))
+        spans = around.spans
+        lagged = lag_signal(wheels.steering, self.values["tau"], around.step_s, spans, spans.start[:, 0])
+        return replace(wheels, steering=lagged)

@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pipeline.motion.effect import DIFFERENTIAL, DriveEffect, Excitation, Parameter, Search
-from pipeline.motion.filters import lag_real
+from pipeline.motion.filters import lag_signal
 
 if TYPE_CHECKING:
     from pipeline.motion.signals import Surroundings, Wheels
@@ -56,11 +56,12 @@ class TurnLag(DriveEffect):
 
     def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
         """See the formula above."""
-        start = around.start_wheels
         slow, fast = self.values["tau_diff"], self.values["tau_mean"]
         if slow <= 0.0 and fast <= 0.0:
             # Splitting into mean and difference and back would leave rounding behind.
             return wheels
-        mean = lag_real(0.5 * (wheels.left + wheels.right), fast, around, start.mean(axis=1))
-        difference = lag_real(wheels.right - wheels.left, slow, around, start[:, 1] - start[:, 0])
+        resets, step = around.wheels, around.step_s
+        left, right = resets.start[:, 0], resets.start[:, 1]
+        mean = lag_signal(0.5 * (wheels.left + wheels.right), fast, step, resets, 0.5 * (left + right))
+        difference = lag_signal(wheels.right - wheels.left, slow, step, resets, right - left)
         return replace(wheels, left=mean - 0.5 * difference, right=mean + 0.5 * difference)

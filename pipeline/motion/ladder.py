@@ -1,0 +1,97 @@
+"""The ladder: the ideal model, then one effect more at each rung, on data that no rung has seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from pipeline.motion.fit import Fitted, fit_model
+from pipeline.motion.score import HeldOut, hold_out
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.motion.model import Model
+    from pipeline.motion.problem import Problem
+    from pipeline.motion.score import Errors
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One step of the ladder: the fit and its held-out errors."""
+
+    fitted: Fitted
+    held_out: HeldOut
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Ids of the effects of this rung."""
+        return self.fitted.model.ids
+
+    @property
+    def errors(self) -> Errors:
+        """Held-out errors over all runs."""
+        return self.held_out.pooled
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """Rungs from the ideal model up, and effects that did not lower the error on data not seen."""
+
+    rungs: tuple[Rung, ...]
+    idle: tuple[str, ...]
+
+    def explained_shares(self, floor: Errors | None = None) -> tuple[float | None, ...]:
+        """Share of the removable error that is gone at each rung: (E_ideal - E) / (E_ideal - E_floor), on
+        the position error over 2 s; None where there is no room between ideal and floor."""
+        ideal = self.rungs[0].errors.t_mrmse_m
+        room = ideal - (0.0 if floor is None else floor.t_mrmse_m)
+        if not room > 0.02 * ideal:  # noqa: PLR2004 - two percent is no room
+            return (None,) * len(self.rungs)
+        return tuple((ideal - rung.errors.t_mrmse_m) / room for rung in self.rungs)
+
+
+def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Ladder:
+    """Build the ladder of a model's effects, the most useful first.
+
+    At each rung every remaining effect is tried on top of those below; the one that lowers the loss most is
+    taken if it lowers the held-out loss too. Effects that do not are left out and named.
+
+    Args:
+        problem: the runs.
+        model: whose effects may be taken, with their values as starts.
+        per_run: as in `fit_model`.
+    """
+    base = model.ideal
+    fitted = fit_model(problem, base)
+    rungs = [Rung(fitted, hold_out(problem, fitted))]
+    rest = [effect.id for effect in problem.active_effects(model)]
+    while rest:
+        tried = []
+        for name in rest:
+            candidate = fit_model(problem, fitted.model + model.effect(name), per_run=per_run)
+            tried.append((_scale_free(problem, candidate), name, candidate))
+        _, name, candidate = min(tried, key=lambda item: item[0])
+        held_out = hold_out(problem, candidate)
+        if compare_losses(held_out, rungs[-1].held_out) >= 1.0:
+            break
+        fitted = candidate
+        rungs.append(Rung(candidate, held_out))
+        rest.remove(name)
+    return Ladder(tuple(rungs), tuple(rest))
+
+
+def compare_losses(new: HeldOut, old: HeldOut) -> float:
+    """Ratio of two held-out losses, geometric over the channels, so that no scale enters."""
+    from numpy import exp, isfinite, log, mean  # noqa: PLC0415 - names that read well here
+
+    known = isfinite(new.residuals).all(axis=1) & isfinite(old.residuals).all(axis=1)
+    squares = [mean(side.residuals[known] ** 2, axis=0) for side in (new, old)]
+    return float(exp(mean(log(squares[0] / squares[1]))))
+
+
+def _scale_free(problem: Problem, fitted: Fitted) -> float:
+    from numpy import log, mean  # noqa: PLC0415 - names that read well here
+
+    del problem
+    return float(mean(log(mean(fitted.residuals**2, axis=0))))
