@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.logs.assemble import ColumnParts
 from pipeline.logs.cdr import DIALECTS, OTHER_ENCAPSULATIONS, ROS1, Cursor, Dialect
 from pipeline.logs.decode import Decoder, plan_fields, wanted_leaves
-from pipeline.logs.payloads import Block, Payloads, join_blocks
+from pipeline.logs.payloads import Block, Group, Payloads, join_groups
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -136,7 +136,7 @@ class ChannelBuffer:
     decoder: PayloadDecoder
     _log: list[Ints] = field(default_factory=list)
     _publish: list[Ints] = field(default_factory=list)
-    _pending: list[tuple[Ints, Block]] = field(default_factory=list)
+    _pending: list[tuple[int, Group]] = field(default_factory=list)
     _pending_bytes: int = 0
     _count: int = 0
 
@@ -144,15 +144,15 @@ class ChannelBuffer:
         """Take the messages of the next span."""
         self._log.append(payloads.log_time)
         self._publish.append(payloads.publish_time)
-        for block in payloads.blocks:
-            self._pending.append((block.rows + self._count, block))
-            self._pending_bytes += block.data.size
+        for group in payloads.groups:
+            self._pending.append((self._count, group))
+            self._pending_bytes += group.data.size
         self._count += payloads.log_time.size
         if self._pending_bytes > _ENOUGH:
             self._flush()
 
     def _flush(self) -> None:
-        for ids, block in join_blocks(self._pending):
+        for ids, block in join_groups(self._pending):
             self.decoder.decode(ids, block)
         self._pending = []
         self._pending_bytes = 0

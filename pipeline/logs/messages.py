@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 CHUNK_RECORDS: Final = (rec.SCHEMA, rec.CHANNEL, rec.MESSAGE)
 """Kinds of record that stand in a chunk."""
 
+_LAST_TIME: Final = np.uint64((1 << 63) - 1)
+"""Later log times are damage: they lie beyond the year 2262."""
+
 FIRST_PRIVATE: Final = 0x80
 """Opcodes from here on are private; the specification says to step over them."""
 
@@ -52,7 +55,7 @@ class Messages:
     Attributes:
         start: where each payload starts in the chunk, int64, shape (n,).
         size: bytes of each payload, int64.
-        channel: channel number, int64.
+        channel: channel number, uint16.
         log_time: [ns], int64.
         publish_time: [ns], int64.
         schemas: schema records of the chunk.
@@ -62,7 +65,7 @@ class Messages:
 
     start: Ints
     size: Ints
-    channel: Ints
+    channel: NDArray[np.uint16]
     log_time: Ints
     publish_time: Ints
     schemas: list[rec.SchemaRecord] = field(default_factory=list)
@@ -102,12 +105,16 @@ def locate_messages(chunk: Buffer, entries: Sequence[tuple[int, NDArray[np.uint6
         if found.offsets:
             offsets = np.sort(np.append(offsets, np.array(found.offsets, dtype=np.int64)))
             heads = _heads(data, offsets)
+    absurd = heads["log_time"] > _LAST_TIME
+    if absurd.any():
+        found.damage += [(int(place), int(place) + MESSAGE_OVERHEAD) for place in offsets[absurd]]
+        offsets, heads = offsets[~absurd], heads[~absurd]
     return Messages(
         start=offsets + MESSAGE_OVERHEAD,
         size=heads["length"].astype(np.int64) - (MESSAGE_OVERHEAD - rec.HEAD_SIZE),
-        channel=heads["channel"].astype(np.int64),
+        channel=heads["channel"].copy(),
         log_time=heads["log_time"].astype(np.int64),
-        publish_time=heads["publish_time"].astype(np.int64),
+        publish_time=np.minimum(heads["publish_time"], _LAST_TIME).astype(np.int64),
         schemas=found.schemas,
         channels=found.channels,
         damage=found.damage,
@@ -150,16 +157,17 @@ def _agreeing_messages(
 def _walk(chunk: Buffer, start: int, end: int, found: _Found) -> None:
     unpack, head_size = rec.HEAD.unpack_from, rec.HEAD_SIZE
     place = start
+    before: int | None = None
     while place < end:
         opcode, length = unpack(chunk, place) if place + head_size <= end else (0, 0)
         after = place + head_size + length
         if opcode == rec.MESSAGE and after <= end and length >= rec.LEAST_BODY[rec.MESSAGE]:
             found.offsets.append(place)
-            place = after
+            before, place = place, after
         elif opcode and after <= end and _take_side_record(opcode, chunk[place + head_size : after], found):
-            place = after
+            before, place = None, after
         else:
-            place = _resume(chunk, start, place, end, found)
+            before, place = None, _resume(chunk, before, place, end, found)
 
 
 def _take_side_record(opcode: int, body: Buffer, found: _Found) -> bool:
@@ -175,16 +183,18 @@ def _take_side_record(opcode: int, body: Buffer, found: _Found) -> bool:
     return True
 
 
-def _resume(chunk: Buffer, start: int, place: int, end: int, found: _Found) -> int:
+def _resume(chunk: Buffer, before: int | None, place: int, end: int, found: _Found) -> int:
     """Note damage at ``place`` and find where records go on.
 
-    When they go on inside the message before, its length was the damage and it is given up.
+    When they go on inside the message that ends there, which starts at ``before``, its length was the damage
+    and it is given up.
     """
-    last = found.offsets[-1] if found.offsets else place
-    first = last + 1 if start <= last < place else place + 1
+    first = place + 1 if before is None else before + 1
     again = find_record(chunk, first, end, CHUNK_RECORDS)
-    if again < place:
+    if before is not None and again < place:
         found.offsets.pop()
-        place = last
+        place = before
+    elif again <= place:
+        again = find_record(chunk, place + 1, end, CHUNK_RECORDS)
     found.damage.append((place, again))
     return again

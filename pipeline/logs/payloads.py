@@ -25,38 +25,55 @@ _COMMON: Final = 16
 """A length that fewer rows share is decoded together with other rare ones."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Block:
-    """Payloads in one buffer.
+@dataclass(slots=True, eq=False)
+class Group:
+    """Equally long payloads of one channel in one span.
 
     Attributes:
-        rows: number of each payload within its ``Payloads``, int64, shape (n,).
-        data: uint8, shape (m,).
-        start: where each payload starts in ``data``, int64.
-        size: bytes of each payload, int64.
-        stride: distance of neighbouring payloads when they stand end to end and are equally long, else None.
+        count: how many.
+        size: bytes of each.
+        data: uint8; the payloads end to end, or the whole chunk when ``start`` is given.
+        rows: their numbers among the span's messages of the channel, None when they are all of them.
+        start: where each payload starts in ``data``, None when they stand end to end.
     """
 
-    rows: Ints
+    count: int
+    size: int
     data: NDArray[np.uint8]
-    start: Ints
-    size: Ints
-    stride: int | None
+    rows: Ints | None = None
+    start: Ints | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Payloads:
     """The messages of one channel in one span.
 
     Attributes:
         log_time: [ns], int64, shape (n,), in the order of the file.
         publish_time: [ns], int64.
-        blocks: the payloads, by length.
+        groups: the payloads, by length.
     """
 
     log_time: Ints
     publish_time: Ints
-    blocks: list[Block]
+    groups: list[Group]
+
+
+@dataclass(slots=True, eq=False)
+class Block:
+    """Payloads in one buffer, ready to be decoded.
+
+    Attributes:
+        data: uint8, shape (m,).
+        start: where each payload starts in ``data``, int64, shape (n,).
+        size: bytes of each payload, int64, shape (n,).
+        stride: distance of neighbouring payloads when they stand end to end and are equally long, else None.
+    """
+
+    data: NDArray[np.uint8]
+    start: Ints
+    size: Ints
+    stride: int | None
 
 
 def gather_payloads(chunk: Buffer, messages: Messages, numbers: Iterable[int]) -> dict[int, Payloads]:
@@ -68,62 +85,73 @@ def gather_payloads(chunk: Buffer, messages: Messages, numbers: Iterable[int]) -
         numbers: channel numbers.
     """
     data = np.frombuffer(chunk, dtype=np.uint8)
-    found: dict[int, Payloads] = {}
-    for number in numbers:
-        rows = np.flatnonzero(messages.channel == number)
-        if rows.size:
-            blocks = _gather_blocks(data, messages.start[rows], messages.size[rows])
-            found[number] = Payloads(messages.log_time[rows], messages.publish_time[rows], blocks)
+    order = np.argsort(messages.channel, kind="stable")
+    channel, start, size = messages.channel[order], messages.start[order], messages.size[order]
+    log, publish = messages.log_time[order], messages.publish_time[order]
+    wanted = sorted(numbers)
+    low = channel.searchsorted(wanted).tolist()
+    high = channel.searchsorted(wanted, side="right").tolist()
+    return {
+        number: Payloads(log[a:b], publish[a:b], _group_by_size(data, start[a:b], size[a:b]))
+        for number, a, b in zip(wanted, low, high, strict=True)
+        if b > a
+    }
+
+
+def _group_by_size(data: NDArray[np.uint8], start: Ints, size: Ints) -> list[Group]:
+    first = int(size[0])
+    if size.min() == size.max():
+        return [_gather(data, None, start, first)]
+    order = np.argsort(size, kind="stable")
+    cuts = np.flatnonzero(np.diff(size[order])) + 1
+    return [_gather(data, rows, start[rows], int(size[rows[0]])) for rows in np.split(order, cuts)]
+
+
+def _gather(data: NDArray[np.uint8], rows: Ints | None, start: Ints, size: int) -> Group:
+    if size >= IN_PLACE:
+        return Group(start.size, size, data, rows, start)
+    if size == 0:
+        return Group(start.size, 0, data[:0], rows)
+    window: NDArray[np.void] = np.ndarray((data.size - size + 1,), f"V{size}", data, strides=(1,))
+    return Group(start.size, size, window[start].view(np.uint8), rows)
+
+
+def join_groups(groups: list[tuple[int, Group]]) -> list[tuple[Ints, Block]]:
+    """Join groups for decoding: equal lengths end to end, rare lengths into one mixed block.
+
+    Args:
+        groups: with the number that the span's first message has in the channel.
+
+    Returns:
+        Blocks with the numbers of their rows in the channel.
+    """
+    by_size: dict[int, list[tuple[int, Group]]] = {}
+    found: list[tuple[Ints, Block]] = []
+    for first, group in groups:
+        if group.start is None:
+            by_size.setdefault(group.size, []).append((first, group))
+        else:
+            size = np.full(group.count, group.size, dtype=np.int64)
+            found.append((_numbers(first, group), Block(group.data, group.start, size, None)))
+    rare: list[tuple[int, Group]] = []
+    for same in by_size.values():
+        if sum(group.count for _, group in same) < _COMMON:
+            rare += same
+        else:
+            found.append(_join(same))
+    if rare:
+        found.append(_join(rare))
     return found
 
 
-def _gather_blocks(data: NDArray[np.uint8], start: Ints, size: Ints) -> list[Block]:
-    first = int(size[0])
-    if (size == first).all():
-        everyone = np.arange(size.size)
-        return [_gather_equal(data, everyone, start, first)]
-    order = np.argsort(size, kind="stable")
-    cuts = np.flatnonzero(np.diff(size[order])) + 1
-    return [_gather_equal(data, rows, start[rows], int(size[rows[0]])) for rows in np.split(order, cuts)]
-
-
-def _gather_equal(data: NDArray[np.uint8], rows: Ints, start: Ints, size: int) -> Block:
-    sizes = np.full(rows.size, size, dtype=np.int64)
-    if size >= IN_PLACE:
-        return Block(rows, data, start, sizes, None)
-    if size == 0:
-        return Block(rows, np.empty(0, dtype=np.uint8), np.zeros(rows.size, dtype=np.int64), sizes, None)
-    window: NDArray[np.void] = np.ndarray(
-        (data.size - size + 1,), dtype=f"V{size}", buffer=data.data, strides=(1,)
-    )
-    copied = window[start].view(np.uint8)
-    return Block(rows, copied, np.arange(rows.size) * size, sizes, size)
-
-
-def join_blocks(blocks: list[tuple[Ints, Block]]) -> list[tuple[Ints, Block]]:
-    """Join small blocks for decoding: equal lengths end to end, rare lengths into one mixed block.
-
-    Args:
-        blocks: with each block the numbers of its rows in the whole channel.
-    """
-    by_size: dict[int, list[tuple[Ints, Block]]] = {}
-    apart: list[tuple[Ints, Block]] = []
-    for ids, block in blocks:
-        size = int(block.size[0])
-        if block.stride is None:
-            apart.append((ids, block))
-        else:
-            by_size.setdefault(size, []).append((ids, block))
-    joined = [_join(same) for same in by_size.values()]
-    rare = [each for each in joined if each[0].size < _COMMON]
-    apart += [each for each in joined if each[0].size >= _COMMON]
-    return [*apart, _join(rare)] if rare else apart
-
-
-def _join(blocks: list[tuple[Ints, Block]]) -> tuple[Ints, Block]:
-    ids = np.concatenate([each for each, _ in blocks])
-    data = np.concatenate([block.data for _, block in blocks])
-    size = np.concatenate([block.size for _, block in blocks])
+def _join(groups: list[tuple[int, Group]]) -> tuple[Ints, Block]:
+    ids = np.concatenate([_numbers(first, group) for first, group in groups])
+    data = np.concatenate([group.data for _, group in groups])
+    each = [group.size for _, group in groups]
+    size = np.repeat(each, [group.count for _, group in groups])
     start = np.cumsum(size) - size
-    stride = int(size[0]) if (size == size[0]).all() else None
-    return ids, Block(np.arange(ids.size), data, start, size, stride)
+    return ids, Block(data, start, size, each[0] if min(each) == max(each) and each[0] else None)
+
+
+def _numbers(first: int, group: Group) -> Ints:
+    return first + (np.arange(group.count) if group.rows is None else group.rows)

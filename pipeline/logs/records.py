@@ -58,6 +58,7 @@ LEAST_BODY: Final[Mapping[int, int]] = {
 }
 """Fewest bytes of the body of every kind of record."""
 
+_CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _INDEX_HEAD: Final = struct.Struct("<HI")
 _ENTRY_SIZE: Final = 16
 
@@ -206,12 +207,20 @@ def parse_chunk_head(body: Buffer, body_size: int) -> ChunkHead:
         body: at least the first bytes of the record's body.
         body_size: length of the whole body.
     """
-    parser = Parser(body)
-    start, end = parser.number(8), parser.number(8)
-    size, crc, compression, stored = parser.number(8), parser.number(4), parser.text(), parser.number(8)
-    if stored > body_size - parser.place:
+    if len(body) < LEAST_BODY[CHUNK]:
+        raise RecordError("the head of a chunk is cut")
+    start, end, size, crc, named = _CHUNK_HEAD.unpack_from(body)
+    place = _CHUNK_HEAD.size + named
+    if place + 8 > len(body):
+        raise RecordError("the head of a chunk is cut")
+    try:
+        compression = str(body[_CHUNK_HEAD.size : place], "utf-8")
+    except UnicodeDecodeError:
+        raise RecordError("a chunk's compression is no UTF-8") from None
+    stored = int.from_bytes(body[place : place + 8], "little")
+    if stored > body_size - place - 8:
         raise RecordError("a chunk says it is longer than its record")
-    return ChunkHead(start, end, size, crc, compression, stored, HEAD_SIZE + parser.place)
+    return ChunkHead(start, end, size, crc, compression, stored, HEAD_SIZE + place + 8)
 
 
 def parse_message_index(body: Buffer) -> tuple[int, NDArray[np.uint64]]:

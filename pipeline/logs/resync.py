@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 _CHAIN: Final = 4
 """Records in a row that must be possible; a random place passes one with a chance below 1e-4."""
 
-_BLOCK: Final = 1 << 20
+FIRST_BLOCK: Final = 1 << 12
+LAST_BLOCK: Final = 1 << 20
+"""A search looks at little first and at ever more, so that dense damage does not make it slow."""
 
 
 def find_record(buffer: Buffer, start: int, end: int, opcodes: Sequence[int]) -> int:
@@ -35,11 +37,13 @@ def find_record(buffer: Buffer, start: int, end: int, opcodes: Sequence[int]) ->
         opcodes: kinds of record that may stand there.
     """
     data = np.frombuffer(buffer, dtype=np.uint8)
-    for low in range(start, end - rec.HEAD_SIZE + 1, _BLOCK):
-        high = min(low + _BLOCK, end - rec.HEAD_SIZE + 1)
+    low, block = start, FIRST_BLOCK
+    while low <= end - rec.HEAD_SIZE:
+        high = min(low + block, end - rec.HEAD_SIZE + 1)
         for place in possible_places(data, low, high, end, opcodes).tolist():
             if _goes_on(buffer, place, end, opcodes):
                 return int(place)
+        low, block = high, min(2 * block, LAST_BLOCK)
     return end
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.logs import records as rec
 from pipeline.logs.errors import Loss
 from pipeline.logs.messages import FIRST_PRIVATE
-from pipeline.logs.resync import possible_places
+from pipeline.logs.resync import FIRST_BLOCK, LAST_BLOCK, possible_places
 from pipeline.logs.spans import Span, SpanKind
 
 if TYPE_CHECKING:
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 _WINDOW: Final = 1 << 18
 _LOOSE_SPAN: Final = 1 << 22
-_SEARCH_BLOCK: Final = 1 << 20
 _KNOWN: Final = tuple(rec.LEAST_BODY)
 _CHAIN: Final = 3
 _MAX_SIDE_RECORD: Final = 1 << 26
@@ -189,7 +188,11 @@ class Scanner:
             return stop, place
         last = self._catalog.spans[-1] if self._catalog.spans else None
         again = self._find(place + 1, stop)
-        if last is not None and last.kind is SpanKind.LOOSE and previous < place:
+        if (
+            last is not None
+            and last.kind is SpanKind.LOOSE
+            and last.offset <= previous < place == last.offset + last.length
+        ):
             inside = self._find(previous + 1, stop)
             if inside < place:
                 self._drop_message(previous)
@@ -203,16 +206,16 @@ class Scanner:
             self._catalog.spans.append(replace(last, length=place - last.offset))
 
     def _find(self, start: int, stop: int) -> int:
-        for low in range(start, max(start, stop - rec.HEAD_SIZE + 1), _SEARCH_BLOCK):
-            block = np.frombuffer(
-                self._source.read_at(low, _SEARCH_BLOCK + rec.HEAD_SIZE - 1), dtype=np.uint8
-            )
-            high = min(block.size - rec.HEAD_SIZE + 1, stop - rec.HEAD_SIZE + 1 - low)
+        low, size = start, FIRST_BLOCK
+        while low <= stop - rec.HEAD_SIZE:
+            block = np.frombuffer(self._source.read_at(low, size + rec.HEAD_SIZE - 1), dtype=np.uint8)
+            high = min(block.size, stop - low) - rec.HEAD_SIZE + 1
             if high <= 0:
                 break
             for inner in possible_places(block, 0, high, stop - low, _KNOWN).tolist():
                 if self._goes_on(low + inner, stop):
                     return low + int(inner)
+            low, size = low + high, min(2 * size, LAST_BLOCK)
         return stop
 
     def _take_cut_chunk(self, place: int, stop: int) -> bool:

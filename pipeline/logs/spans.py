@@ -144,7 +144,12 @@ def load_span(
         if span.kind is SpanKind.CUT_CHUNK:
             return _load_start(span, head, stored, "the file ends inside it")
         entries = _read_entries(blob[span.length :])
-        if head.crc == 0 and entries and wanted and set(span.channels or ()) == {number for number, _ in entries}:
+        if (
+            head.crc == 0
+            and entries
+            and wanted
+            and set(span.channels or ()) == {number for number, _ in entries}
+        ):
             needed = _needed_size(entries, wanted)
             if needed is not None and needed < head.uncompressed_size * _WORTHWHILE:
                 return _load_prefix(span, head, stored, entries, needed)

@@ -28,10 +28,12 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _TRANSFORM: Final = "transforms[]."
-_PARTS: Final = {
-    "translation": ("x", "y", "z"),
-    "rotation": ("x", "y", "z", "w"),
-}
+_NUMBERS: Final = (
+    "header.stamp.sec",
+    "header.stamp.nanosec",
+    *(f"transform.translation.{axis}" for axis in "xyz"),
+    *(f"transform.rotation.{axis}" for axis in "xyzw"),
+)
 _LEAST_NORM: Final = 1e-6
 _HELD_INTERVALS: Final = 3.0
 
@@ -236,18 +238,18 @@ class _Rows:
 def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[_Rows]:
     parents = columns.fields.get(f"{_TRANSFORM}header.frame_id")
     children = columns.fields.get(f"{_TRANSFORM}child_frame_id")
+    numbers = [columns.fields.get(f"{_TRANSFORM}{path}") for path in _NUMBERS]
     if not isinstance(parents, RaggedStrings) or not isinstance(children, RaggedStrings):
         return []
-    seconds = _values(columns, "header.stamp.sec").astype(np.int64)
-    time = seconds * 1_000_000_000 + _values(columns, "header.stamp.nanosec").astype(np.int64)
-    position, quaternion = (
-        np.stack([_values(columns, f"transform.{part}.{axis}").astype(np.float64) for axis in axes], axis=1)
-        if time.size
-        else np.empty((0, len(axes)))
-        for part, axes in _PARTS.items()
-    )
+    values = [column.values for column in numbers if isinstance(column, Ragged)]
+    if len(values) != len(_NUMBERS):
+        return []
+    time = values[0].astype(np.int64) * 1_000_000_000 + values[1].astype(np.int64)
+    position = np.stack(values[2:5], axis=1).astype(np.float64)
+    quaternion = np.stack(values[5:], axis=1).astype(np.float64)
     log_time = np.repeat(columns.log_time, np.diff(children.offsets))
-    norm = np.linalg.norm(quaternion, axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        norm = np.linalg.norm(quaternion, axis=1)
     valid = np.isfinite(position).all(axis=1) & np.isfinite(norm) & (norm > _LEAST_NORM)
     found: list[_Rows] = []
     pairs = np.stack((parents.codes, children.codes), axis=1)
@@ -267,13 +269,6 @@ def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[_Rows]:
             )
         )
     return found
-
-
-def _values(columns: TopicColumns, path: str) -> NDArray[np.generic]:
-    column = columns.fields[f"{_TRANSFORM}{path}"]
-    if not isinstance(column, Ragged):
-        raise TypeError(f"{columns.topic} is no topic of transforms")
-    return column.values
 
 
 def _join(rows: list[_Rows], *, fixed: bool) -> Link:

@@ -29,9 +29,10 @@ uint8[] data
 """
 START_NS = 1_700_000_000_000_000_000
 SMALL = (
-    ("/imu/data", "sensor_msgs/msg/Imu", 200.0),
-    ("/joint_states", "sensor_msgs/msg/JointState", 100.0),
+    ("/imu/data", "sensor_msgs/msg/Imu", 100.0),
+    ("/joint_states", "sensor_msgs/msg/JointState", 50.0),
     ("/odom", "nav_msgs/msg/Odometry", 50.0),
+    ("/odometry/filtered", "nav_msgs/msg/Odometry", 50.0),
     ("/tf", "tf2_msgs/msg/TFMessage", 50.0),
     ("/cmd_vel", "geometry_msgs/msg/Twist", 50.0),
     ("/left_drive/velocity", "std_msgs/msg/Float64", 50.0),
@@ -70,15 +71,25 @@ def small_fields(type_name: str, time: NDArray[np.int64], rng: np.random.Generat
         pose: dict[str, Given] = {"pose.pose.position.x": np.cumsum(wave), "pose.pose.orientation.w": 1.0}
         return {**stamp, "child_frame_id": "base_link", **pose, "twist.twist.linear.x": wave + noise[:, 0]}
     if type_name.endswith("TFMessage"):
-        names = {f"transforms[].{key}": value for key, value in stamp.items()}
+        frames = ("base_link", "front_left_wheel", "front_right_wheel", "rear_left_wheel", "rear_right_wheel")
+        several = len(frames)
+        names = {f"transforms[].{key}": repeat(value, rows, several) for key, value in stamp.items()}
         return {
             **names,
-            "transforms[].child_frame_id": ["base_link" if row % 3 else "imu_link" for row in range(rows)],
-            "transforms[].transform.translation.x": noise[:, 0],
+            "transforms[].child_frame_id": [list(frames)] * rows,
+            "transforms[].transform.rotation.z": np.repeat(noise[:, :1], several, axis=1),
+            "transforms[].transform.rotation.w": np.ones((rows, several)),
         }
     if type_name.endswith("Twist"):
         return {"linear.x": wave, "angular.z": noise[:, 0]}
     return {"data": wave + noise[:, 0]}
+
+
+def repeat(value: Given, rows: int, several: int) -> Given:
+    """The same value for all transforms of a message."""
+    if isinstance(value, str):
+        return [[value] * several] * rows
+    return np.repeat(np.asarray(value)[:, None], several, axis=1)
 
 
 def write_log(path: Path, duration_s: float, *, crc: bool = True) -> dict[str, int]:
@@ -129,3 +140,25 @@ def _register(writer: Writer) -> dict[str, int]:
         schema = writer.register_schema(kind, "ros2msg", text.encode())
         channels[topic] = writer.register_channel(topic, "cdr", schema)
     return channels
+
+
+def write_metadata(path: Path, counts: Mapping[str, int]) -> None:
+    """The ``metadata.yaml`` of rosbag2 beside the log, which rosbags needs."""
+    kinds = {topic: kind for topic, kind, _ in SMALL} | {
+        topic: "sensor_msgs/msg/Image" for topic, *_ in LARGE
+    }
+    topics = "".join(
+        f"    - topic_metadata:\n        name: {topic}\n        type: {kinds[topic]}\n"
+        "        serialization_format: cdr\n        offered_qos_profiles: ''\n"
+        f"      message_count: {count}\n"
+        for topic, count in counts.items()
+    )
+    path.with_name("metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: mcap\n"
+        f"  relative_file_paths:\n    - {path.name}\n"
+        "  duration:\n    nanoseconds: 1\n"
+        f"  starting_time:\n    nanoseconds_since_epoch: {START_NS}\n"
+        f"  message_count: {sum(counts.values())}\n"
+        f"  topics_with_message_count:\n{topics}"
+        "  compression_format: ''\n  compression_mode: ''\n"
+    )

@@ -40,7 +40,9 @@ TEXT = "std_msgs/msg/String"
 Truth = dict[tuple[str, int], object]
 
 
-def payloads(type_name: str, rows: int, fields: Mapping[str, Any], definition: str | None = None) -> list[bytes]:
+def payloads(
+    type_name: str, rows: int, fields: Mapping[str, Any], definition: str | None = None
+) -> list[bytes]:
     """Serialized messages of a type."""
     text = definition or definition_text(type_name)
     assert text is not None
@@ -172,7 +174,11 @@ def get_field(message: Any, path: str) -> Any:
         return value
     if head.endswith("[]"):
         below = [get_field(each, rest) for each in value]
-        nested = below and (isinstance(below[0], bytes) or hasattr(below[0], "__len__")) and not isinstance(below[0], str)
+        nested = (
+            below
+            and (isinstance(below[0], bytes) or hasattr(below[0], "__len__"))
+            and not isinstance(below[0], str)
+        )
         return [value for each in below for value in each] if nested else below
     return get_field(value, rest)
 

@@ -79,9 +79,7 @@ def test_a_cut_names_bytes_and_time(tmp_path: Path) -> None:
 
 
 def flip_bytes(path: Path, truth: Truth, content: bytes, places: range, mask: int) -> None:
-    largest = max(
-        int(np.ceil(len(truth) / len(chunk_places(content)))) * 3, 12
-    )
+    largest = max(int(np.ceil(len(truth) / len(chunk_places(content)))) * 3, 12)
     inside = np.zeros(len(content), dtype=bool)
     for start, end in chunk_places(content):
         inside[start:end] = True

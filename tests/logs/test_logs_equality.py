@@ -15,7 +15,16 @@ from mcap.stream_reader import StreamReader
 from mcap_files import SHARED, assert_equals_official, payloads
 from test_logs_formats import write_channels
 
-from pipeline.logs import LogError, Ragged, RaggedStrings, Wanted, bundled_types, definition_text, open_log, read_topics
+from pipeline.logs import (
+    LogError,
+    Ragged,
+    RaggedStrings,
+    Wanted,
+    bundled_types,
+    definition_text,
+    open_log,
+    read_topics,
+)
 from pipeline.logs.definitions import bundled_structure
 from pipeline.logs.schema import SEQUENCE, SIZES, Structure
 
@@ -74,7 +83,9 @@ def test_bags_of_the_ros_2_recorder_equal_the_official_reader() -> None:
             assert assert_equals_official(path) > 0
 
 
-def values_of(structure: Structure, rows: int, draw: Any, prefix: str = "", counts: Any = None) -> dict[str, Any]:
+def values_of(
+    structure: Structure, rows: int, draw: Any, prefix: str = "", counts: Any = None
+) -> dict[str, Any]:
     """Random columns for every leaf of a type."""
     found: dict[str, Any] = {}
     for member in structure.members:
@@ -90,16 +101,30 @@ def values_of(structure: Structure, rows: int, draw: Any, prefix: str = "", coun
             continue
         if member.count == SEQUENCE and counts is not None:
             continue
-        own = np.array(draw(st.lists(st.integers(0, 4), min_size=rows, max_size=rows))) if member.count == SEQUENCE else None
+        own = (
+            np.array(draw(st.lists(st.integers(0, 4), min_size=rows, max_size=rows)))
+            if member.count == SEQUENCE
+            else None
+        )
         sizes = counts if counts is not None else own
         total = rows if sizes is None else int(sizes.sum())
         seed = draw(st.integers(0, 2**32 - 1))
         rng = np.random.default_rng(seed)
         offsets = None if sizes is None else np.append(0, np.cumsum(sizes))
         if member.element == "string":
-            texts = tuple(draw(st.lists(st.text(st.characters(exclude_characters="\0", codec="utf-8"), max_size=9), min_size=3, max_size=3)))
+            texts = tuple(
+                draw(
+                    st.lists(
+                        st.text(st.characters(exclude_characters="\0", codec="utf-8"), max_size=9),
+                        min_size=3,
+                        max_size=3,
+                    )
+                )
+            )
             codes = rng.integers(0, 3, size=total).astype(np.int32)
-            found[path] = [texts[c] for c in codes] if offsets is None else RaggedStrings(codes, texts, offsets)
+            found[path] = (
+                [texts[c] for c in codes] if offsets is None else RaggedStrings(codes, texts, offsets)
+            )
             continue
         width = (member.count,) if member.count not in (None, SEQUENCE) else ()
         values = random_numbers(member.element, (total, *width), rng)
@@ -126,7 +151,11 @@ def test_random_messages_of_every_bundled_type_equal_the_official_reader(
     encoded = payloads(kind, rows, values_of(structure, rows, data.draw))
     path = tmp_path / "log.mcap"
     text = (definition_text(kind) or "").encode()
-    write_channels(path, [("/x", kind, "ros2msg", text, "cdr", encoded)], chunk_size=data.draw(st.sampled_from([50, 10**6])))
+    write_channels(
+        path,
+        [("/x", kind, "ros2msg", text, "cdr", encoded)],
+        chunk_size=data.draw(st.sampled_from([50, 10**6])),
+    )
     assert assert_equals_official(path) == rows
 
 
@@ -160,7 +189,11 @@ float64 x
 
 def nested_message(rng: np.random.Generator) -> Any:
     def inner() -> dict[str, Any]:
-        return {"tag": int(rng.integers(256)), "list": rng.normal(size=rng.integers(4)).tolist(), "name": "n" * int(rng.integers(5))}
+        return {
+            "tag": int(rng.integers(256)),
+            "list": rng.normal(size=rng.integers(4)).tolist(),
+            "name": "n" * int(rng.integers(5)),
+        }
 
     def point() -> dict[str, Any]:
         return {"x": float(rng.normal()), "flag": int(rng.integers(256))}

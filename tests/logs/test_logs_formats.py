@@ -11,7 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.writer import Writer
-from mcap_files import FLOAT, JOINTS, START, TEXT, payloads, read_small, small_truth, write_official, write_small
+from mcap_files import (
+    FLOAT,
+    JOINTS,
+    START,
+    TEXT,
+    payloads,
+    read_small,
+    small_truth,
+    write_official,
+    write_small,
+)
 
 from pipeline.logs import (
     LogError,
@@ -67,7 +77,9 @@ string frame_id
 """
 
 
-def write_channels(path: Path, channels: list[Channel], *, times: list[int] | None = None, **options: Any) -> None:
+def write_channels(
+    path: Path, channels: list[Channel], *, times: list[int] | None = None, **options: Any
+) -> None:
     """Channels as (topic, type, schema encoding, schema, message encoding, payloads)."""
     with path.open("wb") as stream:
         writer = Writer(stream, **options)
@@ -114,8 +126,22 @@ def test_one_name_with_two_definitions_is_decoded_by_each(tmp_path: Path) -> Non
     write_channels(
         path,
         [
-            ("/a", "demo/msg/Pair", "ros2msg", first.encode(), "cdr", payloads("demo/Pair", 1, values, first)),
-            ("/b", "demo/msg/Pair", "ros2msg", second.encode(), "cdr", payloads("demo/Pair", 1, values, second)),
+            (
+                "/a",
+                "demo/msg/Pair",
+                "ros2msg",
+                first.encode(),
+                "cdr",
+                payloads("demo/Pair", 1, values, first),
+            ),
+            (
+                "/b",
+                "demo/msg/Pair",
+                "ros2msg",
+                second.encode(),
+                "cdr",
+                payloads("demo/Pair", 1, values, second),
+            ),
         ],
     )
     for topic in ("/a", "/b"):
@@ -150,7 +176,9 @@ def test_plain_xcdr2_is_aligned_to_four_and_counts_bytes_of_sequences(tmp_path: 
     names = struct.pack("<I", 2) + struct.pack("<I", 2) + b"a\0" + b"\0\0" + struct.pack("<I", 2) + b"b\0"
     body = b"\x01\0\0\0" + struct.pack("<d", 2.25) + struct.pack("<I", len(names)) + names
     body += b"\0" * (-len(body) % 4) + struct.pack("<I", 1) + struct.pack("<d", -4.0)
-    write_channels(path, [("/x", "demo/msg/X", "ros2msg", text.encode(), "cdr", [b"\x00\x07\x00\x00" + body])])
+    write_channels(
+        path, [("/x", "demo/msg/X", "ros2msg", text.encode(), "cdr", [b"\x00\x07\x00\x00" + body])]
+    )
     fields = read_one(path, "/x").fields
     assert fields["value"].tolist() == [2.25]
     assert fields["names"].row(0) == ["a", "b"]
@@ -274,16 +302,16 @@ def test_a_split_recording_is_one_run(tmp_path: Path, *, listed: bool) -> None:
                 writer.write_columns("/tf_static", kind, np.array([first]), transform("base_link", "imu"))
             writer.write_columns("/tf", kind, np.array([first, first + 1]), transform("odom", "base_link"),
                                  header_time=np.array([first, first + 1]))  # fmt: skip
-            for topic in (sorted(topics) if part % 2 else sorted(topics, reverse=True)):
+            for topic in sorted(topics) if part % 2 else sorted(topics, reverse=True):
                 name, time, fields = topics[topic]
                 rows = slice(part * 20, part * 20 + 20)
-                chosen = {
-                    key: value[rows] if key != "name" else value for key, value in fields.items()
-                }
+                chosen = {key: value[rows] if key != "name" else value for key, value in fields.items()}
                 writer.write_columns(topic, name, time[rows], chosen)
     if listed:
         lines = "\n".join(f"    - run_{part}.mcap" for part in range(3))
-        (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:\n{lines}\n")
+        (folder / "metadata.yaml").write_text(
+            f"rosbag2_bagfile_information:\n  relative_file_paths:\n{lines}\n"
+        )
     index = open_log(folder)
     assert index.message_count == len(truth) + 7
     data = read_topics(index, [Wanted(topic) for topic in index.topics()])
@@ -352,7 +380,9 @@ def test_ros1_messages_are_columns(tmp_path: Path) -> None:
     write_channels(path, [("/r", "demo/Joints", "ros1msg", text.encode(), "ros1", [body])])
     columns = read_one(path, "/r")
     with path.open("rb") as stream:
-        ((_, _, _, official),) = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+        ((_, _, _, official),) = make_reader(
+            stream, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages()
     assert columns.fields["velocity"].row(0).tolist() == list(official.velocity)
     assert columns.fields["name"].row(0) == official.name
     assert columns.fields["header.frame_id"].to_list() == [official.header.frame_id]
@@ -365,7 +395,13 @@ def test_fields_are_chosen_by_path(tmp_path: Path) -> None:
     write_small(path, rows=5)
     wanted = [Wanted("/joints", ("velocity[1]", "velocity[5]", "name[0]", "header.stamp"))]
     fields: Any = read_topics(path, wanted).of("/joints")[0].fields
-    assert list(fields) == ["velocity[1]", "velocity[5]", "name[0]", "header.stamp.sec", "header.stamp.nanosec"]
+    assert list(fields) == [
+        "velocity[1]",
+        "velocity[5]",
+        "name[0]",
+        "header.stamp.sec",
+        "header.stamp.nanosec",
+    ]
     assert np.isnan(fields["velocity[5]"]).all()
     assert fields["name[0]"].to_list() == ["left"] * 5
     with pytest.raises(LogError) as missing:

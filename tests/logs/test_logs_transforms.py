@@ -38,7 +38,9 @@ def buffer_of(path: Path) -> TransformBuffer:
 
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1), lead=st.integers(-200_000_000, 800_000_000))
-def test_a_chain_is_the_product_of_its_links_at_the_child_stamps(tmp_path: Path, seed: int, lead: int) -> None:
+def test_a_chain_is_the_product_of_its_links_at_the_child_stamps(
+    tmp_path: Path, seed: int, lead: int
+) -> None:
     rng = np.random.default_rng(seed)
     times = START + np.arange(200) * STEP
     slow = times[::20]
@@ -48,7 +50,9 @@ def test_a_chain_is_the_product_of_its_links_at_the_child_stamps(tmp_path: Path,
     with LogWriter(path) as writer:
         correction = transforms("map", "odom", np.stack((drift, -drift, 0 * drift), axis=1), yaw)
         writer.write_columns("/tf", KIND, slow, correction, header_time=slow + lead)
-        writer.write_columns("/tf", KIND, times + 7, transforms("odom", "base_link", moved, turned), header_time=times)
+        writer.write_columns(
+            "/tf", KIND, times + 7, transforms("odom", "base_link", moved, turned), header_time=times
+        )
         fixed = transforms("base_link", "imu", np.array([[0.1, 0.2, 0.3]]), np.array([0.5]))
         writer.write_columns("/tf_static", KIND, times[-1:], fixed)
     buffer = buffer_of(path)
@@ -66,7 +70,9 @@ def test_a_chain_is_the_product_of_its_links_at_the_child_stamps(tmp_path: Path,
     reach = moved[rows] + rotate(inner, np.tile([0.1, 0.2, 0.3], (rows.size, 1)))
     expected = np.stack((2 * fraction, -2 * fraction, 0 * fraction), axis=1) + rotate(outer, reach)
     assert np.allclose(series.position, expected, atol=1e-6)
-    turn = multiply_quaternions(multiply_quaternions(outer, inner), quaternions_from_yaw(np.full(rows.size, 0.5)))
+    turn = multiply_quaternions(
+        multiply_quaternions(outer, inner), quaternions_from_yaw(np.full(rows.size, 0.5))
+    )
     assert np.allclose(np.abs((series.quaternion * turn).sum(axis=1)), 1.0, atol=1e-9)
     back = buffer.lookup_series("imu", "map", at=series.time)
     assert np.allclose(series.position + rotate(series.quaternion, back.position), 0.0, atol=1e-6)

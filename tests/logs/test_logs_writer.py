@@ -11,7 +11,16 @@ import pytest
 from mcap.reader import make_reader
 from mcap_files import FLOAT, JOINTS, START, TEXT, assert_equals_official, read_small, write_small
 
-from pipeline.logs import LogError, LogWriter, Ragged, RaggedStrings, Wanted, bundled_types, open_log, read_topics
+from pipeline.logs import (
+    LogError,
+    LogWriter,
+    Ragged,
+    RaggedStrings,
+    Wanted,
+    bundled_types,
+    open_log,
+    read_topics,
+)
 from pipeline.logs.spool import Spool
 
 if TYPE_CHECKING:
@@ -63,10 +72,16 @@ def test_every_way_to_give_a_column(tmp_path: Path) -> None:
     names = RaggedStrings(np.array([1, 1, 0], dtype=np.int32), ("a", "bé"), np.array([0, 0, 1, 3]))
     kind = "tf2_msgs/msg/TFMessage"
     with LogWriter(path) as writer:
-        writer.write_columns("/lists", JOINTS, times, {"name": [["a"], [], ["b", "c"]], "velocity": [[1.0], [], [2, 3]]})
+        writer.write_columns(
+            "/lists", JOINTS, times, {"name": [["a"], [], ["b", "c"]], "velocity": [[1.0], [], [2, 3]]}
+        )
         writer.write_columns("/ragged", JOINTS, times, {"name": names, "velocity": ragged}, header_time=times)
         writer.write_columns("/same", JOINTS, times, {"name": ["l", "r"], "velocity": np.ones((3, 2))})
-        pose = {"pose.covariance": np.arange(36.0), "child_frame_id": "base", "pose.pose.position.x": times * 1.0}
+        pose = {
+            "pose.covariance": np.arange(36.0),
+            "child_frame_id": "base",
+            "pose.pose.position.x": times * 1.0,
+        }
         writer.write_columns("/odom", ODOMETRY, times, pose, publish_time=times + 5)
         both = {"transforms[].child_frame_id": ["x", "y", "z"], "transforms[].transform.rotation.w": 1.0}
         writer.write_columns("/tf", kind, times, both, header_time=times)
@@ -115,7 +130,9 @@ def test_every_bundled_type_can_be_written_empty(tmp_path: Path) -> None:
 def test_a_type_with_its_own_definition(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     with LogWriter(path) as writer:
-        writer.write_columns("/x", "demo/msg/Pair", np.array([START]), {"b": 2.5}, definition="int8 a\nfloat64 b\n")
+        writer.write_columns(
+            "/x", "demo/msg/Pair", np.array([START]), {"b": 2.5}, definition="int8 a\nfloat64 b\n"
+        )
     assert read_topics(path, [Wanted("/x")]).of("/x")[0].fields["b"].tolist() == [2.5]
 
 
@@ -160,5 +177,7 @@ def test_a_hundred_thousand_messages_are_written_in_seconds(tmp_path: Path) -> N
     times = START + np.arange(100_000) * 10_000_000
     begin = time.process_time()
     with LogWriter(tmp_path / "log.mcap") as writer:
-        writer.write_columns("/odom", ODOMETRY, times, {"pose.pose.position.x": times * 1e-9}, header_time=times)
+        writer.write_columns(
+            "/odom", ODOMETRY, times, {"pose.pose.position.x": times * 1e-9}, header_time=times
+        )
     assert time.process_time() - begin < 3.0
