@@ -34,6 +34,7 @@ _FEWEST_STEPS = 6
 _SCALED = 0.18
 _DISAGREES = 0.2
 _SKEW = 0.05
+_SURE = 5.0
 
 
 def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
@@ -196,7 +197,7 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     turning = _delay_of(samples.velocity[:, 2], ideal[:, 2], places, samples)
     if along is not None and turning is not None and samples.measured is not None:
         skew = turning[0] - along[0]
-        if abs(skew) > max(_SKEW, 3.0 * np.hypot(along[1], turning[1])):
+        if abs(skew) > max(_SKEW, _SURE * float(np.hypot(along[1], turning[1]))):
             later = "later" if skew > 0.0 else "earlier"
             text = (
                 f"against the wheels the heading is {abs(skew) * 1e3:.0f} ms {later} than the position: "
@@ -216,9 +217,9 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
 def _delay_of(
     signal: Floats, reference: Floats, places: NDArray[np.int64], samples: Samples
 ) -> tuple[float, float] | None:
-    """Delay and its uncertainty [s] of a signal against a reference, None where they do not correlate."""
+    """Delay and its standard deviation [s] of a signal against a reference, None where they do not correlate."""
     times = samples.times[places]
     found = estimate_delay(times, signal[places], times, reference[places])
     if found is None or abs(found.correlation) < 0.7:  # noqa: PLR2004 - below it the lag means nothing
         return None
-    return found.seconds, found.half_width
+    return found.seconds, found.deviation

@@ -20,12 +20,13 @@ class Delay:
     Attributes:
         seconds: how late the signal is; negative when it is early.
         correlation: signed correlation at that lag.
-        half_width: lag [s] at which the correlation has fallen by its standard error: a rough uncertainty.
+        deviation: standard deviation of the delay [s]: the power that the signals do not share, over the
+            power of the signal's rate of change, over the number of independent samples.
     """
 
     seconds: float
     correlation: float
-    half_width: float
+    deviation: float
 
 
 def estimate_delay(
@@ -62,10 +63,11 @@ def estimate_delay(
         shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
     else:
         bend, shift = 0.0, 0.0
-    # Samples of smoothed signals repeat each other; a tenth of them is a cautious count of independent ones.
-    deviation = (1.0 - min(tall[best], 1.0) ** 2) / np.sqrt(times.size / 10.0)
-    half_width = float(_STEP * np.sqrt(2.0 * deviation / -bend)) if bend < 0.0 else largest
-    return Delay(float(lags[best] + shift * _STEP), float(scores[best]), half_width)
+    # What the signals do not share stays alike for about a second: seconds are counted, not samples.
+    seconds = max(float(np.median(np.diff(times))) * times.size, 1.0)
+    unshared = 1.0 - min(tall[best], 1.0) ** 2
+    deviation = float(_STEP * np.sqrt(unshared / (seconds * -bend))) if bend < 0.0 else largest
+    return Delay(float(lags[best] + shift * _STEP), float(scores[best]), deviation)
 
 
 def _correlate(centred: Floats, spread: float, other: Floats) -> float:
