@@ -1,0 +1,63 @@
+"""What the results of a log depend on beside the log: a hash to tell when to look at it again.
+
+It covers more than the keys of the stages do, so that it can be had without opening the log: when it differs,
+the keys decide what has to be computed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cache
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from pipeline.job.keys import TABLES, VERSIONS, hash_json
+from pipeline.vehicles import list_configuration_files, list_presets
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pipeline.job import Options
+
+
+class BasisHasher:
+    """Hashes the basis of many logs, reading each configuration file once.
+
+    Args:
+        options: what the user asked for.
+    """
+
+    def __init__(self, options: Options) -> None:
+        self._options = options
+        asked = [list(options.inputs), options.overrides, options.through]
+        self._shared = hash_json([asked, _describe_program()])
+        self._contents: dict[Path, str] = {}
+
+    def hash_basis(self, log: Path) -> str:
+        """Hash for one log."""
+        files = list_configuration_files(log, given=self._options.config, fleet=self._options.fleet)
+        return hash_json([self._shared, [[str(file), self._hash_content(file)] for file in files]])
+
+    def _hash_content(self, file: Path) -> str:
+        known = self._contents.get(file)
+        if known is None:
+            try:
+                known = hashlib.sha256(file.read_bytes()).hexdigest()
+            except OSError as error:
+                known = f"unreadable: {error.errno}"
+            self._contents[file] = known
+        return known
+
+
+@cache
+def _describe_program() -> object:
+    # The contracts bring a table library along, which a batch needs anyway.
+    from schemas import contract_of  # noqa: PLC0415
+
+    tables = sorted({table for names in TABLES.values() for table in names} | {"findings"})
+    return [
+        dict(VERSIONS),
+        {table: contract_of(table).version for table in tables},
+        [msgspec.to_builtins(vehicle) for vehicle in list_presets()],
+    ]

@@ -1,0 +1,9 @@
+"""What can keep a batch from its work."""
+
+from __future__ import annotations
+
+from pipeline.core.errors import SlipError
+
+
+class BatchError(SlipError):
+    """Logs that cannot be found, or workers that cannot be had."""

@@ -1,0 +1,52 @@
+"""Tables and pages over all runs, brought up to date at the end of a batch."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.job.keys import hash_json
+
+if TYPE_CHECKING:
+    from pipeline.store import Store
+
+_NOTES = "batch/pooled"
+_NOTE = "all runs"
+_MOST_ROUNDS = 20
+
+
+def refresh_pools(store: Store) -> bool:
+    """Bring `datasets.parquet` and the catalogue up to date with the runs there are.
+
+    Other batches may add runs meanwhile: it is done again until the runs are those that were pooled, so that
+    the last one to finish leaves the right tables, whoever wrote last.
+
+    Returns:
+        Whether anything had to be written.
+    """
+    notes = store.notes(_NOTES)
+    written = False
+    for _ in range(_MOST_ROUNDS):
+        runs = _hash_runs(store)
+        if (notes.read(_NOTE) or {}).get("runs") == runs and (store.root / "index.html").exists():
+            return written
+        _write_pools(store)
+        written = True
+        if _hash_runs(store) == runs:
+            notes.write(_NOTE, {"runs": runs})
+            return written
+    return written
+
+
+def _hash_runs(store: Store) -> str:
+    return hash_json(
+        [[manifest.run, manifest.key, manifest.folder.name] for manifest in store.survey().manifests]
+    )
+
+
+def _write_pools(store: Store) -> None:
+    # A batch with nothing to do needs none of these.
+    from pipeline.batch.catalogue import render_catalogue  # noqa: PLC0415
+    from pipeline.job.analyze import update_datasets  # noqa: PLC0415
+
+    update_datasets(store)
+    store.write_results_text("index.html", render_catalogue(store))

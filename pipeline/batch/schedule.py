@@ -1,0 +1,139 @@
+"""Units that run a batch every night: one at a time, caught up after downtime, heard in the journal."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from pipeline.batch.errors import BatchError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+System = Literal["systemd", "cron"]
+
+_CLOCK = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)")
+_STOP_S = 120
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nightly:
+    """What is to run when.
+
+    Attributes:
+        program: the program and its first words, absolute.
+        arguments: words of ``slip batch``.
+        folder: working folder, to which relative paths among the words are relative.
+        lock: lock file that keeps a second one from starting.
+        hour: of the day, local time.
+        minute: of the hour.
+    """
+
+    program: Sequence[str]
+    arguments: Sequence[str]
+    folder: Path
+    lock: Path
+    hour: int
+    minute: int
+
+
+def parse_clock(text: str) -> tuple[int, int]:
+    """Hour and minute of ``02:30``.
+
+    Raises:
+        BatchError: ``bad_time``.
+    """
+    match = _CLOCK.fullmatch(text)
+    if match is None:
+        raise BatchError("bad_time", f"{text!r} is no time of day", hint="Write HH:MM, for example 02:30")
+    return int(match[1]), int(match[2])
+
+
+def print_units(nightly: Nightly, system: System) -> str:
+    """The units as text, with comments that say where they go.
+
+    Args:
+        nightly: what is to run when.
+        system: ``systemd`` for a service and its timer, ``cron`` for lines of a crontab.
+    """
+    return _print_systemd(nightly) if system == "systemd" else _print_cron(nightly)
+
+
+def _print_systemd(nightly: Nightly) -> str:
+    # A service is never started twice, and the lock also keeps batches out that were started by hand.
+    words = ["/usr/bin/flock", "--nonblock", "--conflict-exit-code", "0", str(nightly.lock)]
+    command = " ".join(_quote_systemd(word) for word in [*words, *_command(nightly)])
+    return f"""\
+# ~/.config/systemd/user/slip-batch.service
+[Unit]
+Description=slip: bring results up to date with the logs
+
+[Service]
+Type=oneshot
+WorkingDirectory={_escape_systemd(str(nightly.folder))}
+ExecStart={command}
+# Exit code 3: done, but a log had losses, which the journal names.
+SuccessExitStatus=3
+Nice=10
+IOSchedulingClass=idle
+TimeoutStartSec=infinity
+TimeoutStopSec={_STOP_S}
+StandardOutput=journal
+StandardError=journal
+SyslogIdentifier=slip-batch
+
+# ~/.config/systemd/user/slip-batch.timer
+[Unit]
+Description=slip: every night
+
+[Timer]
+OnCalendar=*-*-* {nightly.hour:02d}:{nightly.minute:02d}:00
+# A night that the machine slept through is caught up when it wakes.
+Persistent=true
+RandomizedDelaySec=60
+
+[Install]
+WantedBy=timers.target
+
+# systemctl --user daemon-reload
+# systemctl --user enable --now slip-batch.timer
+# loginctl enable-linger        so that it also runs when nobody is logged in
+# journalctl --user -u slip-batch
+"""
+
+
+def _print_cron(nightly: Nightly) -> str:
+    inner = " ".join(shlex.quote(word) for word in _command(nightly))
+    flock = f"flock --nonblock --conflict-exit-code 0 {shlex.quote(str(nightly.lock))}"
+    line = f"cd {shlex.quote(str(nightly.folder))} && {flock} {inner} 2>&1 | logger --tag slip-batch"
+    # In a crontab a bare percent sign ends the command.
+    line = line.replace("%", r"\%")
+    return f"""\
+# crontab -e
+SHELL=/bin/sh
+PATH=/usr/local/bin:/usr/bin:/bin
+{nightly.minute} {nightly.hour} * * * {line}
+# A night that the machine slept through is caught up after it starts.
+@reboot sleep 300; {line}
+# journalctl --identifier slip-batch
+"""
+
+
+def _command(nightly: Nightly) -> list[str]:
+    return [*nightly.program, "batch", *nightly.arguments]
+
+
+def _escape_systemd(text: str) -> str:
+    return text.replace("%", "%%")
+
+
+def _quote_systemd(word: str) -> str:
+    """A word of an ExecStart line: quoted where needed, its % and $ taken literally."""
+    plain = _escape_systemd(word).replace("$", "$$")
+    if re.fullmatch(r"[A-Za-z0-9_@%+=:,./$-]+", plain):
+        return plain
+    escaped = plain.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'

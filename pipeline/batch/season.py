@@ -1,0 +1,218 @@
+"""A batch from beginning to end: find, plan, work, pool, tidy up."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+from pipeline.batch.executors import Settings, find_executor
+from pipeline.batch.ledger import STATES, Entry
+from pipeline.batch.plan import Item, Plan, make_plan
+from pipeline.batch.pooling import refresh_pools
+from pipeline.batch.pruning import prune_results
+from pipeline.batch.recordings import find_recordings
+from pipeline.batch.runner import Result, run_items
+from pipeline.batch.work import Report, work_on
+from pipeline.core.errors import SlipError
+from pipeline.store import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from pipeline.batch.request import Request, Shard
+    from pipeline.batch.work import Task
+
+
+class Watch(Protocol):
+    """Somebody who is told how a batch goes on."""
+
+    def plan(self, todo: int, settled: int, size: int) -> None:
+        """Told once: logs to work on, logs that are done, bytes of the former."""
+
+    def tell(self, line: Line, size: int) -> None:
+        """Told of each log that is finished, with its bytes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """What came of one log.
+
+    Attributes:
+        path: the recording.
+        run: name of its run.
+        state: one of `STATES`, or ``growing``, ``left`` for a log that was not begun.
+        code: of the error.
+        reason: why it failed, or what was lost.
+        hint: what to do.
+        seconds: time it took; 0 when there was nothing to do.
+        lossy: whether its results are there, but the log had losses.
+        peak_bytes: most memory its worker ever held.
+        rss_bytes: memory its worker held afterwards.
+    """
+
+    path: str
+    run: str = ""
+    state: str
+    code: str = ""
+    reason: str = ""
+    hint: str = ""
+    seconds: float = 0.0
+    lossy: bool = False
+    peak_bytes: int = 0
+    rss_bytes: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What came of a batch.
+
+    Attributes:
+        lines: one a log, sorted by path.
+        seconds: time it took.
+        problems: what went wrong beside the logs: with the tables over all runs, or the old generations.
+        removed: old generations that were removed.
+    """
+
+    lines: tuple[Line, ...]
+    seconds: float
+    problems: tuple[SlipError, ...] = ()
+    removed: int = 0
+    counts: Mapping[str, int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        states = [line.state for line in self.lines]
+        object.__setattr__(self, "counts", {state: states.count(state) for state in STATES})
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether something has no results although it should."""
+        is_short = any(line.state in {"failed", "quarantined", "left"} for line in self.lines)
+        return is_short or bool(self.problems)
+
+    @property
+    def has_losses(self) -> bool:
+        """Whether a log with results had losses."""
+        return any(line.lossy for line in self.lines)
+
+
+def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = work_on) -> Outcome:
+    """Bring the results up to date with the logs.
+
+    Args:
+        request: what the user asked for.
+        watch: told of the progress.
+        work: what is done with each log, importable by its name in a fresh process.
+
+    Raises:
+        BatchError: there are no such logs, or no workers.
+        StoreError: the results cannot be written at all.
+    """
+    started = time.monotonic()
+    store = Store(request.options.out)
+    found = find_recordings(request.targets, settle_s=request.settle_s)
+    store.check_writable()
+    plan = make_plan(found.recordings, store, request)
+    todo = _select(plan.todo, request.shard)
+    watch.plan(len(todo), len(plan.settled), sum(item.log.size for item in todo))
+    result = _work_through(todo, request, store, watch, work)
+    problems, removed = _tidy_up(store, request)
+    growing = [Line(path=str(path), state="growing", reason="still being written") for path in found.growing]
+    lines = [*_describe_plan(plan), *map(_describe_report, result.reports), *_describe_left(result), *growing]
+    return Outcome(
+        lines=tuple(sorted(lines, key=lambda line: line.path)),
+        seconds=time.monotonic() - started,
+        problems=problems,
+        removed=removed,
+    )
+
+
+def _tidy_up(store: Store, request: Request) -> tuple[tuple[SlipError, ...], int]:
+    """Pool the runs and remove old generations; what goes wrong there must not hide what came of the logs."""
+    problems: list[SlipError] = []
+    removed = 0
+    try:
+        refresh_pools(store)
+        if request.pruning is not None:
+            removed = len(prune_results(store, request.pruning))
+    except SlipError as error:
+        problems.append(error)
+    return (*problems, *store.survey().errors), removed
+
+
+def _select(todo: Sequence[Item], shard: Shard | None) -> list[Item]:
+    """The part of the logs that is this machine's: told by the run's name, so that machines need not talk."""
+    if shard is None:
+        return list(todo)
+    return [item for item in todo if _number(item.run) % shard.count == shard.number - 1]
+
+
+def _number(run: str) -> int:
+    return int.from_bytes(hashlib.sha256(run.encode()).digest()[:8], "big")
+
+
+def _work_through(
+    todo: Sequence[Item], request: Request, store: Store, watch: Watch, work: Callable[[Task], Report]
+) -> Result:
+    if not todo:
+        return Result(reports=(), left=())
+    settings = Settings(
+        jobs=min(request.jobs, len(todo)),
+        timeout_s=request.timeout_s,
+        memory_bytes=request.memory_bytes,
+        work=work,
+    )
+    executor = find_executor(request.executor, settings)
+    try:
+        return run_items(
+            todo,
+            executor,
+            options=request.options,
+            store=store,
+            tell=lambda report, item: watch.tell(_describe_report(report), item.log.size),
+        )
+    finally:
+        executor.close()
+
+
+def _describe_plan(plan: Plan) -> list[Line]:
+    lines = []
+    for entry in plan.settled:
+        if entry.state == "quarantined":
+            lines.append(_describe_entry(entry, "quarantined"))
+        elif entry.state == "copy":
+            reason = f"the same content as {entry.reason}"
+            lines.append(Line(path=entry.log.path, run=entry.reason, state="unchanged", reason=reason))
+        else:
+            lines.append(_describe_entry(entry, "unchanged"))
+    return lines
+
+
+def _describe_report(report: Report) -> Line:
+    entry = report.entry
+    is_fine = entry.state in {"done", "lossy"}
+    state = "unchanged" if is_fine and not report.computed else entry.state
+    return _describe_entry(entry, state, report)
+
+
+def _describe_entry(entry: Entry, state: str, report: Report | None = None) -> Line:
+    return Line(
+        path=entry.log.path,
+        run=entry.run,
+        state=state,
+        code=entry.code,
+        reason=entry.reason,
+        hint=entry.hint,
+        seconds=entry.seconds if report is not None else 0.0,
+        lossy=entry.state == "lossy",
+        peak_bytes=entry.peak_bytes if report is not None else 0,
+        rss_bytes=report.rss_bytes if report is not None else 0,
+    )
+
+
+def _describe_left(result: Result) -> list[Line]:
+    return [
+        Line(path=item.log.path, run=item.run, state="left", reason="not begun: see the errors of the others")
+        for item in result.left
+    ]

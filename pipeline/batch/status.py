@@ -1,0 +1,55 @@
+"""What is done, failed and quarantined, without looking at a log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from pipeline.batch.ledger import Entry, Ledger
+from pipeline.batch.pruning import measure_results
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.store import Store, StoreError
+
+_COUNTED = ("done", "lossy", "failed", "quarantined", "copy")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Status:
+    """What the results hold.
+
+    Attributes:
+        runs: runs with results.
+        entries: what became of each log in batches, sorted by path.
+        counts: logs by state: done, lossy, failed, quarantined, copy.
+        bytes: size of the results, old generations included.
+        old_generations: generations that are not current.
+        errors: runs that cannot be read.
+        last: when a batch last worked on a log [s since 1970]; None when none has.
+    """
+
+    runs: int
+    entries: tuple[Entry, ...]
+    counts: Mapping[str, int]
+    bytes: int
+    old_generations: int
+    errors: tuple[StoreError, ...]
+    last: float | None
+
+
+def tell_status(store: Store) -> Status:
+    """Look at the results and at what batches have noted."""
+    survey = store.survey()
+    entries = tuple(sorted(Ledger(store).read_all().values(), key=lambda entry: entry.log.path))
+    states = [entry.state for entry in entries]
+    return Status(
+        runs=len(survey.manifests),
+        entries=entries,
+        counts={state: states.count(state) for state in _COUNTED},
+        bytes=measure_results(store),
+        old_generations=sum(len(manifest.earlier) for manifest in survey.manifests),
+        errors=survey.errors,
+        last=max((entry.at for entry in entries), default=None),
+    )

@@ -1,0 +1,93 @@
+"""Are results and logs still what they were?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.core.errors import SlipError
+from pipeline.logs import hash_log
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pipeline.store import Problem, Store
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogProblem:
+    """A log that is not what its results were made of.
+
+    Attributes:
+        run: its run.
+        path: where it stood.
+        code: ``log_gone``, ``log_changed``, ``log_unreadable``, ...
+        what: one sentence without a full stop.
+    """
+
+    run: str
+    path: str
+    code: str
+    what: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verification:
+    """What was found.
+
+    Attributes:
+        files: problems of files of the results.
+        logs: problems of logs.
+        gone: logs that have been moved away since: no damage, but nothing to compute the run from again.
+        checked: runs looked at.
+    """
+
+    files: tuple[Problem, ...]
+    logs: tuple[LogProblem, ...]
+    gone: tuple[LogProblem, ...]
+    checked: int
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether nothing is damaged."""
+        return not self.files and not self.logs
+
+
+def verify_results(store: Store, *, logs: bool, tell: Callable[[str], None]) -> Verification:
+    """Hash all files of the results again, and the logs if wanted.
+
+    Args:
+        store: the results.
+        logs: whether to read the logs, which takes as long as the disk needs for them.
+        tell: told the name of each run whose log is about to be read.
+    """
+    files = store.verify()
+    manifests = store.survey().manifests
+    found: list[LogProblem] = []
+    for manifest in manifests if logs else ():
+        log = manifest.details.get("log")
+        if isinstance(log, dict):
+            tell(manifest.run)
+            problem = _check_log(manifest.run, str(log.get("path")), str(log.get("sha256")))
+            found += [] if problem is None else [problem]
+    return Verification(
+        files=files,
+        logs=tuple(problem for problem in found if problem.code != "log_gone"),
+        gone=tuple(problem for problem in found if problem.code == "log_gone"),
+        checked=len(manifests),
+    )
+
+
+def _check_log(run: str, path: str, sha256: str) -> LogProblem | None:
+    if not Path(path).exists():
+        return LogProblem(run=run, path=path, code="log_gone", what="the log is not there any more")
+    try:
+        content = hash_log(path)
+    except SlipError as error:
+        return LogProblem(run=run, path=path, code=error.code, what=error.what)
+    if content == sha256:
+        return None
+    return LogProblem(
+        run=run, path=path, code="log_changed", what="the log is not the one that the results were made of"
+    )

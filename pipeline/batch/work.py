@@ -1,0 +1,133 @@
+"""One log in a worker: every outcome, good or bad, comes back as a report that any process can carry."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+import traceback
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from pipeline.batch.ledger import Entry, Ledger
+from pipeline.core.errors import SlipError
+from pipeline.store import Store
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pipeline.job import Options
+    from pipeline.job.analyze import Outcome
+    from pipeline.store import LogSighting
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A log and what to do with it.
+
+    Attributes:
+        path: the recording.
+        log: what its file looked like when the batch was planned.
+        basis: hash of everything else the results depend on.
+        options: what it is analyzed with, the name of its run among them.
+    """
+
+    path: Path
+    log: LogSighting
+    basis: str
+    options: Options
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """What became of a task.
+
+    Attributes:
+        entry: what the ledger says of the log now.
+        computed: stages that were computed; none when nothing had changed.
+        is_busy: whether another batch is working on the same run: nothing was done.
+        rss_bytes: memory of the worker afterwards.
+    """
+
+    entry: Entry
+    computed: tuple[str, ...] = ()
+    is_busy: bool = False
+    rss_bytes: int = 0
+
+
+def work_on(task: Task) -> Report:
+    """Analyze one log and note the outcome in the ledger; raises nothing that a log can cause."""
+    store = Store(task.options.out)
+    started = time.monotonic()
+    entry = Entry(log=task.log, basis=task.basis, state="failed", run=task.options.run or "")
+    computed: tuple[str, ...] = ()
+    try:
+        with store.claim(entry.run) as is_ours:
+            if not is_ours:
+                return Report(entry=entry, is_busy=True)
+            entry, computed = _analyze(task, entry)
+    except SlipError as error:
+        where = f"{error.where}: " if error.where and error.where != str(task.path) else ""
+        entry = replace(entry, code=error.code, reason=f"{where}{error.what}", hint=error.hint)
+    entry = replace(entry, seconds=round(time.monotonic() - started, 3), peak_bytes=_peak_bytes())
+    Ledger(store).write(entry)
+    return Report(entry=entry, computed=computed, rss_bytes=read_rss())
+
+
+def _analyze(task: Task, entry: Entry) -> tuple[Entry, tuple[str, ...]]:
+    # Workers that find nothing to do need no table library.
+    from pipeline.job.analyze import REPORT, analyze_log  # noqa: PLC0415
+
+    try:
+        outcome = analyze_log(task.path, task.options)
+    except SlipError:
+        raise
+    except Exception as error:  # noqa: BLE001 - one log must not cost the others
+        return _describe_surprise(entry, error), ()
+    done = replace(
+        entry,
+        state="lossy" if outcome.lossy else "done",
+        run=outcome.manifest.run,
+        key=outcome.manifest.key,
+        reason=_describe_losses(outcome),
+        has_report=REPORT in outcome.manifest.files,
+    )
+    return done, outcome.computed
+
+
+def _describe_losses(outcome: Outcome) -> str:
+    from pipeline.job.work import stored_contexts  # noqa: PLC0415 - heavy
+
+    losses = stored_contexts(outcome.manifest).get("extract", {}).get("losses")
+    texts = (
+        [str(loss.get("text")) for loss in losses if isinstance(loss, dict)]
+        if isinstance(losses, list)
+        else []
+    )
+    return "; ".join(texts)
+
+
+def _describe_surprise(entry: Entry, error: Exception) -> Entry:
+    """An error that nobody foresaw: where it happened is what whoever mends it needs."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    text = " ".join(str(error).split()) or "no message"
+    return replace(
+        entry,
+        code="unexpected_error",
+        reason=f"{type(error).__name__}: {text} ({last.filename.rsplit('/', 1)[-1]}, line {last.lineno})",
+        hint="This is a defect of the program: report it with this line, and the log if you may",
+    )
+
+
+def _peak_bytes() -> int:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def read_rss() -> int:
+    """Memory that this process holds now [bytes]; the peak where the system does not tell."""
+    try:
+        with open("/proc/self/statm", "rb") as file:  # noqa: PTH123 - called for every log
+            return int(file.read().split()[1]) * resource.getpagesize()
+    except OSError:
+        return _peak_bytes()

@@ -1,0 +1,141 @@
+"""`slip batch`: many logs, incremental, resumable, isolated from each other."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+from cyclopts.types import PositiveFloat, PositiveInt
+
+from pipeline.batch import Pruning, Request, measure_memory, parse_shard, parse_size
+from pipeline.cli.choices import Choices, build_options
+from pipeline.cli.output import CLEAN, FAILED, LOSSY, describe_error, print_error, print_json
+from pipeline.core.errors import SlipError
+
+if TYPE_CHECKING:
+    from pipeline.batch.season import Line, Outcome
+
+_MEMORY_SHARE = 0.8
+_WORDS = (
+    ("done", "done"),
+    ("unchanged", "unchanged"),
+    ("lossy", "with losses"),
+    ("failed", "failed"),
+    ("quarantined", "quarantined"),
+)
+_EXPLAINED = (("lossy", "with losses"), ("failed", "failed"), ("quarantined", "quarantined"))
+
+
+def register(app: App) -> None:
+    """Add the verb."""
+    app.command(batch)
+
+
+def batch(  # noqa: D417 - the shared choices document themselves
+    logs: Annotated[
+        list[str] | None, Parameter(help="logs, folders, 'globs' and @lists", negative=())
+    ] = None,
+    /,
+    *,
+    choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
+    jobs: PositiveInt | None = None,
+    executor: str = "local",
+    shard: str | None = None,
+    reports: Annotated[bool, Parameter(negative=())] = False,
+    force: Annotated[bool, Parameter(negative=())] = False,
+    retry_quarantined: Annotated[bool, Parameter(negative=())] = False,
+    timeout: PositiveFloat = 3600.0,
+    memory: str | None = None,
+    settle: float = 120.0,
+    prune: Annotated[bool, Parameter(negative=())] = False,
+    keep: int = 1,
+    quota: str | None = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Bring the results up to date with a season of logs; the same command again continues.
+
+    Args:
+        jobs: logs worked on at once (default: the machine's cores).
+        executor: local; dask for a cluster on this machine; or a scheduler's address, tcp://host:8786.
+        shard: i/n, the i-th of n machines that share the logs.
+        reports: write report.html for every log.
+        force: compute again what is already there.
+        retry_quarantined: try logs again that killed their workers.
+        timeout: longest time for one log [s].
+        memory: most memory for one log, for example 2GB (default: a fair share of the machine's).
+        settle: a log without an end that changed within this time is still being written [s].
+        prune: remove old generations afterwards; without logs, only that.
+        keep: old generations of each run that stay.
+        quota: with --prune, size of the results above which the oldest go first, for example 200GB.
+        json: print one JSON object.
+        quiet: print nothing but errors.
+    """
+    from pipeline.cli.batch_progress import open_watch  # noqa: PLC0415 - only for this verb
+
+    if not logs and not prune:
+        raise SlipError("no_logs", "no log is given", hint="Say which: slip batch LOGS, a folder or a glob")
+    pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
+    options = build_options(choices, report=reports, force=force)
+    workers = jobs or os.cpu_count() or 1
+    request = Request(
+        targets=tuple(logs or ()),
+        options=replace(options, config=None, fleet=options.config),
+        executor=executor,
+        jobs=workers,
+        shard=None if shard is None else parse_shard(shard),
+        timeout_s=timeout,
+        memory_bytes=int(measure_memory() * _MEMORY_SHARE / workers)
+        if memory is None
+        else parse_size(memory),
+        settle_s=settle,
+        retries_quarantined=retry_quarantined,
+        pruning=pruning if prune else None,
+    )
+    from pipeline.batch.season import run_batch  # noqa: PLC0415 - heavy
+
+    with open_watch(quiet=quiet or json) as watch:
+        outcome = run_batch(request, watch)
+    for problem in outcome.problems:
+        print_error(problem)
+    if json:
+        print_json(_as_json(outcome))
+    elif not quiet:
+        print("\n".join(describe_outcome(outcome)))
+    if outcome.has_failed:
+        return FAILED
+    return LOSSY if outcome.has_losses else CLEAN
+
+
+def _as_json(outcome: Outcome) -> dict[str, object]:
+    return {
+        **outcome.counts,
+        "growing": sum(line.state == "growing" for line in outcome.lines),
+        "left": sum(line.state == "left" for line in outcome.lines),
+        "seconds": round(outcome.seconds, 3),
+        "removed_generations": outcome.removed,
+        "logs": [asdict(line) for line in outcome.lines],
+        "errors": [describe_error("", problem) for problem in outcome.problems],
+    }
+
+
+def describe_outcome(outcome: Outcome) -> list[str]:
+    """The closing table: how many logs came out how, and of those that need a look, why."""
+    lines = [f"{word:<14}{outcome.counts[state]:>6}" for state, word in _WORDS]
+    for state, word in (("growing", "being written"), ("left", "not begun")):
+        count = sum(line.state == state for line in outcome.lines)
+        lines += [f"{word:<14}{count:>6}"] if count else []
+    if outcome.removed:
+        lines.append(f"{'pruned':<14}{outcome.removed:>6} old generations")
+    for state, word in _EXPLAINED:
+        found = [line for line in outcome.lines if line.state == state or (state == "lossy" and line.lossy)]
+        if found:
+            lines += ["", word, *(text for line in found for text in _explain(line))]
+    return lines
+
+
+def _explain(line: Line) -> list[str]:
+    hint = [f"      {line.hint}"] if line.hint else []
+    return [f"  {line.path}", f"      {line.reason}", *hint]

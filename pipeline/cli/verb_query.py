@@ -1,0 +1,65 @@
+"""`slip query`: SQL over the tables of all runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from pipeline.cli.output import CLEAN
+
+if TYPE_CHECKING:
+    import polars as pl
+
+_WIDE = 200
+
+
+def register(app: App) -> None:
+    """Add the verb."""
+    app.command(query)
+
+
+def query(  # noqa: D417 - arguments document themselves
+    sql: Annotated[str, Parameter(help="for example: SELECT * FROM runs")],
+    /,
+    *,
+    out: Path = Path("results"),
+    vehicle: str | None = None,
+    terrain: str | None = None,
+    dataset: str | None = None,
+    day: str | None = None,
+    to: Literal["table", "csv", "json"] = "table",
+    json: Annotated[bool, Parameter(negative=())] = False,
+) -> int:
+    """Answer SQL over the tables (slip, windows, aggregates, datasets, ...) and `runs`, one row a run.
+
+    Args:
+        out: results folder.
+        vehicle: only runs of this vehicle; files of other runs are not opened.
+        terrain: only runs on this terrain.
+        dataset: only runs of this dataset.
+        day: only runs of this UTC day, 2026-07-31, or of a month, 2026-07.
+        to: how to print the answer.
+        json: print one JSON object: columns and rows.
+    """
+    from pipeline.store import Partition, Store  # noqa: PLC0415 - only for this verb
+
+    partition = Partition(vehicle=vehicle, terrain=terrain, dataset=dataset, day=day)
+    answer = Store(out).query(sql, partition)
+    _print(answer, "json" if json else to)
+    return CLEAN
+
+
+def _print(answer: pl.DataFrame, form: Literal["table", "csv", "json"]) -> None:
+    import polars as pl  # noqa: PLC0415 - heavy
+
+    if form == "csv":
+        sys.stdout.write(answer.write_csv())
+    elif form == "json":
+        names = ", ".join(f'"{name}"' for name in answer.columns)
+        sys.stdout.write(f'{{"columns": [{names}], "rows": {answer.write_json()}}}\n')
+    else:
+        with pl.Config(tbl_rows=-1, tbl_cols=-1, fmt_str_lengths=_WIDE, tbl_width_chars=_WIDE):
+            sys.stdout.write(f"{answer}\n")

@@ -1,0 +1,75 @@
+"""`slip verify`: hash results and logs again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+
+from pipeline.cli.output import CLEAN, FAILED, print_json, show_progress
+
+if TYPE_CHECKING:
+    from pipeline.batch.verification import Verification
+
+
+def register(app: App) -> None:
+    """Add the verb."""
+    app.command(verify)
+
+
+def verify(  # noqa: D417 - arguments document themselves
+    results: Annotated[Path | None, Parameter(help="results folder (default: results)")] = None,
+    /,
+    *,
+    out: Annotated[Path, Parameter(show=False)] = Path("results"),
+    logs: bool = True,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Check that results, and the logs they were made of, are still what they were.
+
+    Args:
+        logs: read the logs, too.
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.batch.verification import verify_results  # noqa: PLC0415 - only for this verb
+    from pipeline.store import Store  # noqa: PLC0415 - only for this verb
+
+    with show_progress("verify", quiet=quiet or json) as tell:
+        found = verify_results(Store(results or out), logs=logs, tell=tell)
+    if json:
+        print_json(_as_json(found))
+    elif not quiet:
+        print("\n".join(_describe(found)))
+    return CLEAN if found.is_clean else FAILED
+
+
+def _as_json(found: Verification) -> dict[str, object]:
+    files = [
+        {"run": problem.run, "path": str(problem.path), "code": problem.code, "message": problem.what}
+        for problem in found.files
+    ]
+    logs, gone = (
+        [
+            {"run": problem.run, "path": problem.path, "code": problem.code, "message": problem.what}
+            for problem in problems
+        ]
+        for problems in (found.logs, found.gone)
+    )
+    return {"runs": found.checked, "files": files, "logs": logs, "gone": gone}
+
+
+def _describe(found: Verification) -> list[str]:
+    lines = [f"{found.checked} runs looked at"]
+    lines += [f"damaged  {problem.path}: {problem.what}" for problem in found.files]
+    lines += [f"log      {problem.path}: {problem.what} ({problem.run})" for problem in found.logs]
+    lines += [f"gone     {problem.path} ({problem.run})" for problem in found.gone]
+    if found.is_clean:
+        lines.append("all is as it was written")
+    else:
+        lines.append(
+            "Analyze the logs of damaged runs again with --force; copy changed logs from their origin."
+        )
+    return lines
