@@ -278,7 +278,7 @@ class Cursor:
             offset=int(self.base[0]) + self.place + shift,
             strides=(self.stride, dtype.itemsize),
         )
-        return strided.astype(dtype.newbyteorder("="))
+        return strided
 
     def _gather(self, dtype: np.dtype[np.generic], count: int, position: Ints) -> NDArray[np.generic]:
         size = dtype.itemsize * count

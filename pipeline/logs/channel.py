@@ -63,14 +63,15 @@ class StructuredDecoder:
     Args:
         structure: the type.
         paths: wanted leaf fields.
-        ros1: whether payloads are ROS 1's, without encapsulation.
+        encoding: ``"cdr"`` or ``"ros1"``.
+        expected: how many messages the index promises.
     """
 
-    def __init__(self, structure: Structure, paths: set[str], encoding: str) -> None:
+    def __init__(self, structure: Structure, paths: set[str], encoding: str, expected: int) -> None:
         self._plan = plan_fields(structure, paths)
         self._ros1 = encoding == "ros1"
         self._decoder = Decoder(self._plan, {})
-        self._parts = {path: ColumnParts(leaf) for path, leaf in wanted_leaves(self._plan)}
+        self._parts = {path: ColumnParts(leaf, expected) for path, leaf in wanted_leaves(self._plan)}
         self._ids: list[Ints] = []
         self.rejected: list[Rejected] = []
 

@@ -58,7 +58,9 @@ def decoder_for(info: ChannelInfo, schema: bytes, fields: tuple[str, ...] | None
     leaves = tuple(leaf_paths(structure))
     chosen = select_leaves(leaves, fields, where=place)
     chosen |= {path for path in _STAMP if path in leaves}
-    return Recipe(StructuredDecoder(structure, chosen, info.message_encoding), leaves, notes)
+    return Recipe(
+        StructuredDecoder(structure, chosen, info.message_encoding, info.message_count), leaves, notes
+    )
 
 
 def _structure_of(

@@ -178,8 +178,15 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
     stems = {re.sub(r"_\d+$", "", file.stem) for file in here}
     if here and len(stems) == 1:
         return here, []
-    what = "the folder holds several recordings" if here else "the folder holds no MCAP recording"
-    raise LogError("not_a_recording", what, where=str(path), hint="Give one .mcap file or one rosbag2 folder")
+    what, hint = "the folder holds no MCAP recording", "Give one .mcap file or one rosbag2 folder"
+    if here:
+        what = "the folder holds several recordings"
+    elif any(path.glob("*.mcap.zstd")):
+        what, hint = (
+            "the recording's files are compressed as a whole",
+            "Unpack them: zstd -d --rm *.mcap.zstd",
+        )
+    raise LogError("not_a_recording", what, where=str(path), hint=hint)
 
 
 def _split_number(file: Path) -> tuple[str, int]:

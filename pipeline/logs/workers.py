@@ -14,7 +14,7 @@ Result = TypeVar("Result")
 
 
 def map_in_order(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
-    """Apply ``function`` to every item; results in order, at most ``threads + 1`` waiting at a time.
+    """Apply ``function`` to every item; results in order, at most twice as many waiting as run.
 
     Args:
         function: called on other threads; with one thread it is called on this one.
@@ -30,7 +30,7 @@ def map_in_order(function: Callable[[Item], Result], items: Iterable[Item], thre
         try:
             for item in items:
                 waiting.append(pool.submit(function, item))
-                if len(waiting) > threads:
+                if len(waiting) > 2 * threads:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()

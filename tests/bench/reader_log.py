@@ -39,7 +39,7 @@ SMALL = (
     ("/right_drive/velocity", "std_msgs/msg/Float64", 50.0),
 )
 LARGE = (("/camera/image_raw", 640, 480, 3), ("/lidar/image", 1024, 64, 8))
-LARGE_HZ = 1.5
+LARGE_HZ = 1.17
 
 
 def payloads_of(type_name: str, text: str, rows: int, fields: Mapping[str, Given]) -> list[bytes]:

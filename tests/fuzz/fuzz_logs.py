@@ -2,9 +2,9 @@
 
     python tests/fuzz/fuzz_logs.py --minutes 60 [--seed 1] [--finds folder]
 
-Each case is a small valid log of some kind with a few bytes changed, removed, doubled or mixed with another
-log. Memory is limited, and a case that takes longer than 20 s ends the run with a traceback. A case that fails
-is kept in the folder of finds.
+Each case is a small valid log of some kind with a few bytes changed, removed, doubled or mixed with
+another log. Memory is limited, and a case that takes longer than 20 s ends the run with a traceback. A case
+that fails is kept in the folder of finds.
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ def main() -> int:
     given = parser.parse_args()
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     cases = run(given.minutes * 60.0, given.seed, given.finds)
-    print(f"{cases} cases in {given.minutes:g} minutes, no find, peak {peak_mb():.0f} MB")
+    sys.stdout.write(f"{cases} cases in {given.minutes:g} minutes, no find, peak {peak_mb():.0f} MB\n")
     return 0
 
 

@@ -1,5 +1,6 @@
 """Every value is the one that the official reader returns."""
 
+# ruff: noqa: ANN401 - columns and messages come in many shapes
 from __future__ import annotations
 
 from collections import Counter
@@ -64,8 +65,7 @@ def test_every_file_of_the_corpus_is_read_to_its_end_or_refused() -> None:
         try:
             index = open_log(path)
         except LogError as error:
-            refused.append(path.name)
-            assert "\n" not in str(error)
+            refused.append((path.name, str(error).count("\n")))
             continue
         assert index.message_count == official_count(path), path
         data = read_topics(index, [Wanted(topic) for topic in index.topics()], threads=1)
@@ -73,7 +73,7 @@ def test_every_file_of_the_corpus_is_read_to_its_end_or_refused() -> None:
         got = Counter({columns.channel_id: len(columns) for columns in data.topics})
         assert all(got[number] == channels[number] for number in got), path
         assert {loss.kind for loss in data.losses} <= {"unsupported_encoding"}, path
-    assert refused == ["keelson_2024-05-15.mcap"]
+    assert refused == [("keelson_2024-05-15.mcap", 0)]
 
 
 @needs_shared

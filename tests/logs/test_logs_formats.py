@@ -1,5 +1,6 @@
 """Everything that is legal, and much that is not but met in the field, is read as it was meant."""
 
+# ruff: noqa: ANN401 - columns and messages come in many shapes
 from __future__ import annotations
 
 import io
@@ -35,7 +36,6 @@ from pipeline.logs import (
     hash_log,
     open_log,
     read_topics,
-    wanted_transforms,
 )
 
 Channel = tuple[str, str, str, bytes, str, list[bytes]]
@@ -369,8 +369,8 @@ def test_protobuf_messages_are_columns(tmp_path: Path) -> None:
 
 def test_ros1_messages_are_columns(tmp_path: Path) -> None:
     pytest.importorskip("mcap_ros1", reason="mcap-ros1-support is not installed")
-    from mcap_ros1.decoder import DecoderFactory  # noqa: PLC0415 - optional
     from mcap.reader import make_reader  # noqa: PLC0415 - optional
+    from mcap_ros1.decoder import DecoderFactory  # noqa: PLC0415 - optional
 
     path = tmp_path / "log.mcap"
     text = "Header header\nfloat64[] velocity\nstring[] name\nint8 level\n" + "=" * 80

@@ -1,5 +1,6 @@
 """Chains of transforms are what tf would answer, at the stamps of the child."""
 
+# ruff: noqa: ANN401 - columns and messages come in many shapes
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any

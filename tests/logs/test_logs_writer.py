@@ -58,9 +58,9 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     write_small(path)
     before = path.read_bytes()
-    with pytest.raises(RuntimeError, match="stop"), LogWriter(path) as writer:
-        writer.write_columns("/x", FLOAT, np.array([START]), {"data": 1.0})
-        raise RuntimeError("stop")
+    writer = LogWriter(path)
+    writer.write_columns("/x", FLOAT, np.array([START]), {"data": 1.0})
+    writer.__exit__(RuntimeError, RuntimeError("stop"), None)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
 
