@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.motion.signals import Commands, Wheels
+from pipeline.motion.signals import Commands, Signal, Wheels
 
 if TYPE_CHECKING:
     from pipeline.motion.recording import DriveSeries, MotionRun
@@ -47,9 +47,10 @@ class Cells:
         inside = (span >= 0) & (at <= self.ends[np.maximum(span, 0)])
         return np.where(inside, span, -1)
 
-    def sum_up(self, rate: NDArray[np.generic]) -> NDArray[np.generic]:
+    def sum_up(self, rate: Signal) -> Signal:
         """Integral of a rate at every cell edge: index 0 is the first edge of all, holes count nothing."""
-        return np.concatenate(([0.0], np.cumsum(rate))) * self.step_s
+        summed: Signal = np.concatenate((np.zeros(1, dtype=rate.dtype), np.cumsum(rate))) * self.step_s
+        return summed
 
     def locate_edges(self, at: Floats) -> Floats:
         """Place of times among the cell edges as a fractional index into `sum_up`'s result."""

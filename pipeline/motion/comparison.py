@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from pipeline.motion.cells import make_cells
 from pipeline.motion.effect import ReportEffect
 from pipeline.motion.errors import MotionError
-from pipeline.motion.forward import Forward, Timing
+from pipeline.motion.forward import Forward, Timing, replace_surroundings
 from pipeline.motion.heading import HeadingSource, choose_heading
-from pipeline.motion.signals import Resets, Surroundings
+from pipeline.motion.signals import Resets, Signal, Surroundings
 from pipeline.motion.windows import WINDOW_S, find_lead, gather_nodes, join_horizons, join_windows
 
 if TYPE_CHECKING:
@@ -87,18 +87,22 @@ class Comparison:
         self.windows = join_windows(run, self.cells, self.nodes, lead)
         self.horizons = join_horizons(run, self.cells, self.nodes, lead)
         self._pose_times = run.track.times[self.nodes.poses]
-        self._path = cast("Complex", self.nodes.average(run.track.path[self.nodes.poses]))
+        self._path = self.nodes.average(run.track.path[self.nodes.poses])
         self._frames: dict[float, Complex] = {}
         self._headings: dict[float, Floats] = {}
         base = self._look_around(vehicle)
-        more = {"encoders": run.wheels, "has_gyro": self.has_gyro}
-        self._forward = Forward(series, self.cells, base, **more)
-        self._reaching = Forward(series, self.cells, self._look_from_horizons(base), **more)
+        self._forward = Forward(series, self.cells, base, encoders=run.wheels, has_gyro=self.has_gyro)
+        self._reaching = replace_surroundings(self._forward, self._look_from_horizons(base))
 
     @property
     def has_gyro(self) -> bool:
         """Whether the gyro is heading and clock."""
         return self.heading.gyro is not None
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """What effects may know of the run."""
+        return self._forward.around
 
     @property
     def usual_delay(self) -> float:
@@ -131,7 +135,7 @@ class Comparison:
         frame = np.exp(-0.5j * (heading[start] + heading[end]))
         gap = frame * ((self._path[end] - self._path[start]) - (travelled[end] - travelled[start]))
         rest = (heading[end] - heading[start]) - (turned[end] - turned[start])
-        return np.column_stack((gap.real, gap.imag, rest.real)) / self.windows.span_s[:, None]
+        return np.column_stack((gap.real, gap.imag, rest)) / self.windows.span_s[:, None]
 
     def find_reach(self, effects: Sequence[Effect], timing: Timing) -> Reach:
         """Errors of two-second predictions from a measured state, integrating the model's own yaw.
@@ -142,10 +146,10 @@ class Comparison:
         velocity = self._run(self._reaching, effects, timing)
         delay = timing.pose_delay_s + self._find_delay(effects)
         place = self.cells.locate_edges(self._pose_times - delay)
-        edges = cast("Floats", self.cells.sum_up(velocity.w))
+        edges = self.cells.sum_up(velocity.w)
         own = np.exp(0.5j * (edges[1:] + edges[:-1]))
         travelled = self._at_nodes(self.cells.sum_up((velocity.x + 1j * velocity.y) * own), place)
-        turned = self._at_nodes(edges, place).real
+        turned = self._at_nodes(edges, place)
         heading = self._node_headings(delay)
         origin, node = self.horizons.origin, self.horizons.node
         turn = np.exp(1j * (heading[origin] - turned[origin]))
@@ -160,9 +164,9 @@ class Comparison:
             late -= sum(effect.values["d"] for effect in effects if effect.id == "heading_skew")
         return late
 
-    def _at_nodes(self, edges: NDArray[np.generic], place: Floats) -> NDArray[np.generic]:
+    def _at_nodes(self, edges: Signal, place: Floats) -> Signal:
         index = np.minimum(place.astype(np.int64), edges.size - 2)
-        values = edges[index] + (place - index) * (edges[index + 1] - edges[index])
+        values: Signal = edges[index] + (place - index) * (edges[index + 1] - edges[index])
         return self.nodes.average(values)
 
     def _node_headings(self, delay: float) -> Floats:
@@ -173,7 +177,7 @@ class Comparison:
                 place = self.cells.locate_edges(self._pose_times - delay)
                 offset = offset + np.interp(place, np.arange(self.heading.edges.size), self.heading.edges)
             _forget(self._headings)
-            self._headings[delay] = np.asarray(self.nodes.average(offset), dtype=np.float64)
+            self._headings[delay] = self.nodes.average(offset)
         return self._headings[delay]
 
     def _frame(self, delay: float) -> Complex:
@@ -276,6 +280,6 @@ def _reset_body(cells: Cells, first: Integers, known: tuple[Integers, Floats]) -
     return Resets(number, first, place, start)
 
 
-def _forget(kept: dict[float, NDArray[np.generic]]) -> None:
+def _forget(kept: dict[float, Signal]) -> None:
     while len(kept) > 2:  # noqa: PLR2004 - the value in use and one beside it for derivatives
         kept.pop(next(iter(kept)))

@@ -52,7 +52,7 @@ class Excitation(enum.Enum):
 
 
 class Search(enum.Enum):
-    """How a parameter is found: from one start, from several, or on a shrinking grid where it is not smooth."""
+    """How a parameter is found: from one start, from several, or on a shrinking grid if it is not smooth."""
 
     DIRECT = "direct"
     STARTS = "starts"
@@ -237,10 +237,25 @@ class BodyEffect(Effect):
 Column = tuple["Floats | float", "Floats | float", "Floats | float"]
 
 
-class LinearEffect(Effect):
-    """Adds parameter times column to the velocity; columns are made of the model, never of measurements."""
+class AddedEffect(Effect):
+    """Adds something to the velocity, made of the model and never of measurements."""
 
     place = Place.GROUND
+
+    @abstractmethod
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Velocity:
+        """Add the effect to ``total``.
+
+        Args:
+            total: velocity so far, other effects of this place included.
+            rolling: v0, w0 of the model.
+            velocity: what this place acts on; ground effects, which act in parallel, must not use it.
+            around: the run.
+        """
+
+
+class LinearEffect(AddedEffect):
+    """Adds parameter times column."""
 
     @abstractmethod
     def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
@@ -253,7 +268,7 @@ class LinearEffect(Effect):
         """
 
     def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Velocity:
-        """Add all columns to ``total``."""
+        """Add all columns, each times its parameter."""
         for name, (x, y, w) in self.columns(rolling, velocity, around).items():
             value = self.values[name]
             total = total.add(

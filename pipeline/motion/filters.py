@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from pipeline.motion.signals import Signal
 
 if TYPE_CHECKING:
     from pipeline.motion.signals import Floats, Integers, Resets
-
-Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 
 
 def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start: Signal) -> Signal:

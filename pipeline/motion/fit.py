@@ -1,4 +1,4 @@
-"""Fitting: robust least squares over all free numbers at once, after a search where one start is not enough."""
+"""Fitting: robust least squares over all free numbers at once, after a search for good starts."""
 
 from __future__ import annotations
 

@@ -10,12 +10,12 @@ import numpy as np
 
 from pipeline.motion.cells import begin_spans, hold_on_cells, interpolate_drive
 from pipeline.motion.effect import (
+    AddedEffect,
     BodyEffect,
     CommandEffect,
     DriveEffect,
     Effect,
     KinematicEffect,
-    LinearEffect,
     Place,
     ReportEffect,
 )
@@ -142,16 +142,16 @@ class Forward:
         velocity = moved
         for effect in effects:
             if effect.place is Place.GROUND:
-                velocity = cast("LinearEffect", effect).add_to(velocity, rolling, moved, self.around)
+                velocity = cast("AddedEffect", effect).add_to(velocity, rolling, moved, self.around)
         for effect in effects:
             if effect.place is Place.CENTRE:
-                velocity = cast("LinearEffect", effect).add_to(velocity, rolling, velocity, self.around)
+                velocity = cast("AddedEffect", effect).add_to(velocity, rolling, velocity, self.around)
         arm = self.around.vehicle.base_to_rear_axle_m
         if self.around.vehicle.kind == "ackermann" and arm != 0.0:
             velocity = velocity.add(y=arm * velocity.w)
         for effect in effects:
             if effect.place is Place.LOCALIZATION:
-                if isinstance(effect, LinearEffect):
+                if isinstance(effect, AddedEffect):
                     velocity = effect.add_to(velocity, rolling, velocity, self.around)
                 elif self.has_gyro:
                     velocity = cast("ReportEffect", effect).report_gyro(velocity, self.around)
@@ -169,3 +169,10 @@ class Forward:
         for effect in effects:
             return cast("BodyEffect", effect).move_body(rolling, self.around)
         return Velocity(rolling.v0, np.zeros_like(rolling.v0), rolling.w0)
+
+
+def replace_surroundings(forward: Forward, around: Surroundings) -> Forward:
+    """The same input in other surroundings."""
+    return Forward(
+        forward.series, forward.cells, around, encoders=forward.encoders, has_gyro=forward.has_gyro
+    )

@@ -7,6 +7,7 @@ it is brought into the map's frame by the slow part of its difference from the r
 from __future__ import annotations
 
 import enum
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,7 @@ _WINDOW_S = 0.5
 _LARGEST_DELAY = 0.7
 _DELAY_STEP = 0.01
 _FEWEST = 40
+_REFINEMENTS = 4
 _LEAST_TURNING = 0.02
 _GOOD = 0.35
 _ALIGN_S = 3.0
@@ -45,12 +47,14 @@ class GyroFit:
         scale: with the sign.
         bias: [rad/s].
         yaw_delay_s: how late the reported heading is against the gyro.
+        delay_error_s: standard error of that delay.
         residual: robust spread of what is left over that of the turning itself.
     """
 
     scale: float
     bias: float
     yaw_delay_s: float
+    delay_error_s: float
     residual: float
 
 
@@ -78,7 +82,7 @@ def choose_heading(run: MotionRun, cells: Cells, source: HeadingSource) -> Headi
         return Heading(None, np.zeros(0), track.heading)
     times, rate = run.gyro
     on_cells = fit.scale * np.interp(cells.times, times, rate) + fit.bias
-    edges = np.asarray(cells.sum_up(on_cells), dtype=np.float64)
+    edges = cells.sum_up(on_cells)
     seen = np.interp(cells.locate_edges(track.times - fit.yaw_delay_s), np.arange(edges.size), edges)
     difference = track.heading - seen
     offset = np.empty(track.times.size)
@@ -91,7 +95,7 @@ def choose_heading(run: MotionRun, cells: Cells, source: HeadingSource) -> Headi
     return Heading(fit, edges, offset)
 
 
-def fit_gyro(run: MotionRun) -> GyroFit | None:
+def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out is a reason
     """Compare turning over half a second; None where there is no gyro, little turning, or no agreement."""
     if run.gyro is None:
         return None
@@ -118,17 +122,29 @@ def fit_gyro(run: MotionRun) -> GyroFit | None:
 
     coarse = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 1e-9, 5 * _DELAY_STEP)
     best = float(coarse[np.argmin([judge(float(d))[2] for d in coarse])])
-    fine = best + np.arange(-5, 6) * _DELAY_STEP
-    losses = np.array([judge(float(d))[2] for d in fine])
-    # The loss is a median and not smooth: a parabola through all that is near averages its steps.
-    curve = np.polynomial.Polynomial.fit(fine, losses, 2).convert().coef
-    delay = float(np.clip(-0.5 * curve[1] / curve[2], fine[0], fine[-1])) if curve[2] > 0.0 else best
-    scale, bias, loss = judge(delay)
+    scale, bias, loss = judge(best)
     residual = loss / float(np.sqrt(np.mean(np.minimum(np.abs(turned), 3.0 * spread) ** 2)))
     if residual > _GOOD or not 0.5 < abs(scale) < 2.0:  # noqa: PLR2004 - no gyro is that wrong
         return None
+    fit, error = best, 0.0
+    # Gauss-Newton on scale, bias and delay together; the turning rate is the slope over the delay.
+    for _ in range(_REFINEMENTS):
+        gyro = np.interp(end - fit, times, angle) - np.interp(start - fit, times, angle)
+        late, early = fit + _DELAY_STEP, fit - _DELAY_STEP
+        ahead = np.interp(end - late, times, angle) - np.interp(start - late, times, angle)
+        behind = np.interp(end - early, times, angle) - np.interp(start - early, times, angle)
+        slope = scale * (ahead - behind) / (2.0 * _DELAY_STEP)
+        rest = turned - scale * gyro - bias * (end - start)
+        keep = np.abs(rest) <= 3.0 * loss
+        design = np.column_stack((gyro, end - start, slope))[keep]
+        step, *_ = np.linalg.lstsq(design, rest[keep], rcond=None)
+        scale, bias, fit = scale + step[0], bias + step[1], fit + float(np.clip(step[2], -0.05, 0.05))
+        # Windows overlap: one in a window's length is independent of the last.
+        overlap = max(_WINDOW_S / max(float(np.median(np.diff(start))), 1e-3), 1.0)
+        inverse = np.linalg.inv(design.T @ design + 1e-12 * np.eye(3))
+        error = float(np.sqrt(inverse[2, 2] * np.mean(rest[keep] ** 2) * overlap))
     # The poses' own errors are no reason to distrust the sensor's scale by a fraction of a percent.
-    return GyroFit(scale, bias, delay, residual)
+    return GyroFit(float(scale), float(bias), fit, error, residual)
 
 
 def _pair_up(track: Track, run: MotionRun) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -168,7 +184,7 @@ def _fit_robustly(gyro: Floats, span: Floats, turned: Floats) -> tuple[float, fl
 def _find_pieces(segment: NDArray[np.int64], span: NDArray[np.int64]) -> list[tuple[int, int]]:
     edges = np.flatnonzero((np.diff(segment) != 0) | (np.diff(span) != 0)) + 1
     bounds = [0, *edges.tolist(), segment.size]
-    return list(zip(bounds[:-1], bounds[1:], strict=True))
+    return list(itertools.pairwise(bounds))
 
 
 def _smooth(times: Floats, values: Floats, good: NDArray[np.bool_]) -> Floats:

@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.motion.fit import weigh_system
+from pipeline.motion.problem import Free, needs_search
+
 if TYPE_CHECKING:
     from pipeline.motion.fit import Fitted
-    from pipeline.motion.problem import Free, Problem
+    from pipeline.motion.problem import Problem
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -19,6 +22,8 @@ _DRAWS = 1000
 _HUBER = 3.0
 _SHORTEST_BLOCK_S = 6.0
 _TAUS = 5.0
+_DELAY_STEP = 5e-3
+_RISEN = 2.0
 _SEED = 20240513
 
 
@@ -98,10 +103,13 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
         correlation[np.ix_(rows, rows)] = spread / deviation
     freedom = max(pieces - rows.size, 2)
     wide = float(student.ppf(0.975, freedom)) * np.sqrt(pieces / max(pieces - rows.size, 1))
+    errors[rows] = np.hypot(errors[rows], _carry_delays(problem, fitted, total, rows, size))
     items = []
     for index, number in enumerate(fitted.free):
         value = fitted.state.get(number)
         half = wide * float(errors[index])
+        if needs_search(number):
+            half = _widen(problem, fitted, number, block)
         low, high = number.bounds
         margin = 1e-6 * (abs(low) + abs(high)) if np.isfinite(low + high) else 0.0
         items.append(
@@ -116,6 +124,50 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
             )
         )
     return Estimates(tuple(items), correlation, pieces)
+
+
+def _carry_delays(problem: Problem, fitted: Fitted, total: Floats, rows: Integers, size: Floats) -> Floats:
+    """Standard errors that come from not knowing the delay of the poses exactly, shape (rows,)."""
+    carried = np.zeros(rows.size)
+    if problem.given_timing is not None or rows.size == 0:
+        return carried
+    scaled = total[np.ix_(rows, rows)] / np.outer(size[rows], size[rows]) + 1e-9 * np.eye(rows.size)
+    for run, comparison in enumerate(problem.comparisons):
+        gyro = comparison.heading.gyro
+        if gyro is None or "clock_offset" in fitted.model:
+            continue
+        delay = Free("", "pose_delay_s", run, (-1.0, 1.0), _DELAY_STEP)
+        column = problem.differentiate(fitted.state, [delay], fitted.residuals)
+        jacobian = np.concatenate((fitted.jacobian, column), axis=2)
+        normal, _ = weigh_system(problem, fitted.residuals, jacobian, fitted.weights, fitted.used)
+        shift = np.linalg.solve(scaled, normal[rows, -1] / size[rows]) / size[rows]
+        carried = np.hypot(carried, np.abs(shift) * gyro.delay_error_s)
+    return carried
+
+
+def _widen(problem: Problem, fitted: Fitted, number: Free, block: Integers) -> float:
+    """Half-width for a number that is not smooth: where the blocks agree that the loss has risen."""
+    value, (low, high) = fitted.state.get(number), number.bounds
+    base = _sum_losses(problem, fitted, fitted.residuals, block)
+    ends = []
+    for side in (-1.0, 1.0):
+        width = number.step / 16.0
+        while width < 64.0 * number.step:
+            moved = fitted.state.set(number, float(np.clip(value + side * width, low, high)))
+            rise = _sum_losses(problem, fitted, problem.find_residuals(moved), block) - base
+            error = float(rise.std()) / np.sqrt(rise.size)
+            if rise.mean() > _RISEN * error > 0.0:
+                break
+            width *= 1.5
+        ends.append(width)
+    return max(ends)
+
+
+def _sum_losses(problem: Problem, fitted: Fitted, residuals: Floats, block: Integers) -> Floats:
+    size = np.abs(fitted.weights.normalise(residuals, problem))
+    loss = np.where(size <= _HUBER, 0.5 * size**2, _HUBER * (size - 0.5 * _HUBER)).sum(axis=1)
+    sums: Floats = np.bincount(block[fitted.used], loss[fitted.used], minlength=int(block.max()) + 1)
+    return sums
 
 
 def join_blocks(problem: Problem, fitted: Fitted) -> Integers:

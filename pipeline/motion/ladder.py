@@ -42,11 +42,13 @@ class Ladder:
     idle: tuple[str, ...]
 
     def explained_shares(self, floor: Errors | None = None) -> tuple[float | None, ...]:
-        """Share of the removable error that is gone at each rung: (E_ideal - E) / (E_ideal - E_floor), on
-        the position error over 2 s; None where there is no room between ideal and floor."""
+        """Share of the removable error that is gone at each rung.
+
+        (E_ideal - E) / (E_ideal - E_floor) on the position error over 2 s; None without room between them.
+        """
         ideal = self.rungs[0].errors.t_mrmse_m
         room = ideal - (0.0 if floor is None else floor.t_mrmse_m)
-        if not room > 0.02 * ideal:  # noqa: PLR2004 - two percent is no room
+        if not room > 0.02 * ideal:  # two percent is no room
             return (None,) * len(self.rungs)
         return tuple((ideal - rung.errors.t_mrmse_m) / room for rung in self.rungs)
 

@@ -164,7 +164,8 @@ class Problem:
 
     def horizon_blocks(self, run: int) -> Integers:
         """Block of every row of a run's horizons, numbered as `block_of`."""
-        return self.comparisons[run].horizons.block + self._block_shift[run]
+        shifted: Integers = self.comparisons[run].horizons.block + self._block_shift[run]
+        return shifted
 
     def start_state(self, model: Model) -> State:
         """A model before fitting: delays as given, or as the gyro shows them."""

@@ -8,7 +8,7 @@ are grouped in spans; between spans the recording had a hole.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Integers = NDArray[np.int64]
+Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 
 
 @dataclass(frozen=True)

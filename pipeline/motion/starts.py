@@ -1,4 +1,4 @@
-"""Where a fit starts: values for numbers whose loss has more than one valley, and grids for those not smooth."""
+"""Where a fit starts: values for numbers with several valleys, and grids for those that are not smooth."""
 
 from __future__ import annotations
 

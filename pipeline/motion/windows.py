@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.motion.heading import has_barred
+from pipeline.motion.signals import Signal
 
 if TYPE_CHECKING:
     from pipeline.motion.cells import Cells
@@ -51,9 +52,10 @@ class Nodes:
     times: Floats
     piece: Integers
 
-    def average(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
+    def average(self, values: Signal) -> Signal:
         """Mean over each group of values at `poses`."""
-        return np.add.reduceat(values, self.first) / self.count
+        means: Signal = np.add.reduceat(values, self.first) / self.count
+        return means
 
 
 @dataclass(frozen=True)
@@ -198,5 +200,5 @@ def _is_clean(
     begin, stop = nodes.times[start], nodes.times[end]
     clean = (nodes.piece[start] == nodes.piece[end]) & ~has_barred(run.barred, begin, stop)
     span = np.clip(cells.find_span(begin), 0, cells.starts.size - 1)
-    late_enough: Flags = begin - cells.starts[span] >= lead_s
-    return clean & late_enough
+    late_enough: Flags = clean & (begin - cells.starts[span] >= lead_s)
+    return late_enough

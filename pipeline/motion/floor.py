@@ -1,0 +1,136 @@
+"""The noise floor: what is left of the error when a flexible function of the inputs has taken all it can.
+
+A localization that wanders for seconds cannot be told from motion by its high frequencies, and a jittery one
+is far worse than they say. So the floor is measured the other way round: whatever of a model's residuals can
+be predicted from commands or wheels, lagged, multiplied and turned into the map, could be removed by some
+model; the rest could not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.motion.forward import Timing
+from pipeline.motion.score import HeldOut, assign_folds, list_training, measure_errors
+
+if TYPE_CHECKING:
+    from pipeline.motion.comparison import Comparison
+    from pipeline.motion.problem import Problem
+    from pipeline.motion.score import Errors
+
+Floats = NDArray[np.float64]
+
+_LAGS_S = (0.15, 0.3, 0.6, 1.2, 2.4)
+_RIDGES = (3e-4, 3e-3, 3e-2, 3e-1)
+_CLIP = 4.0
+
+
+def estimate_floor(problem: Problem, held_out: HeldOut) -> Errors:
+    """The error that no model fed with this input could remove, as far as these runs tell.
+
+    A ridge regression of the held-out residuals on functions of the input, fitted with the same blocks and
+    gaps, removes what is predictable; the predictions of two seconds shrink in the same proportion.
+
+    Args:
+        problem: the runs.
+        held_out: the best model's held-out errors: the better it is, the sharper the floor.
+
+    Returns:
+        Errors of which every part is at most the model's own.
+    """
+    residuals = held_out.residuals
+    known = np.isfinite(residuals).all(axis=1)
+    features = np.concatenate([describe_inputs(comparison) for comparison in problem.comparisons])
+    fold = assign_folds(problem)
+    left = residuals.copy()
+    best = np.sqrt(np.mean(residuals[known] ** 2, axis=0))
+    for ridge in _RIDGES:
+        rest = residuals - _predict_held_out(problem, features, residuals, known, (fold, ridge))
+        size = np.sqrt(np.mean(rest[known] ** 2, axis=0))
+        better = size < best
+        left[:, better], best[better] = rest[:, better], size[better]
+    share = best / np.maximum(np.sqrt(np.mean(residuals[known] ** 2, axis=0)), 1e-12)
+    # Position errors come from both speeds, and from yaw through the way driven: the yaw errors' part is
+    # small beside them at the floor.
+    along = np.sqrt(
+        np.sum(best[:2] ** 2) / np.maximum(np.sum(np.mean(residuals[known, :2] ** 2, axis=0)), 1e-24)
+    )
+    position = np.concatenate(held_out.position) * along
+    yaw = np.concatenate(held_out.yaw) * share[2]
+    return replace(measure_errors(left[known], position, yaw), windows=int(known.sum()))
+
+
+def describe_inputs(comparison: Comparison) -> Floats:
+    """Functions of the input at the middle of every window, shape (n, features)."""
+    around = comparison.surroundings
+    velocity = comparison.predict_velocity((), Timing())
+    middle = comparison.windows.times.mean(axis=1) - comparison.usual_delay
+    along, around_w = _average(velocity.x, around.step_s), _average(velocity.w, around.step_s)
+
+    def look(signal: Floats, late: float) -> Floats:
+        return np.interp(middle - late, around.times, signal)
+
+    v, w = look(along, 0.0), look(around_w, 0.0)
+    columns = [
+        np.ones(v.size),
+        v,
+        w,
+        v * w,
+        v * np.abs(v),
+        v * np.abs(w),
+        w * np.abs(w),
+        np.sign(v) * np.abs(w),
+    ]
+    columns += [np.abs(v), np.abs(w), np.abs(v) * w, v**2 * w, w**3, v**3]
+    for late in _LAGS_S:
+        one, two = look(along, late), look(around_w, late)
+        columns += [one, two, one * two, np.abs(one) * two, one * np.abs(two)]
+    yaw = look(around.attitude[:, 2], 0.0)
+    moving = np.clip(np.abs(v) + np.abs(w), 0.0, 0.1) * 10.0
+    columns += [moving, np.sin(yaw) * moving, np.cos(yaw) * moving]
+    columns += [np.sin(look(around.attitude[:, i], 0.0)) * moving for i in (0, 1)]
+    since = middle / max(around.duration_s, 1e-9)
+    columns += [since * v, since * w]
+    return np.column_stack(columns)
+
+
+def _average(signal: Floats, step_s: float) -> Floats:
+    """Running mean over a quarter of a second."""
+    width = max(round(0.25 / step_s), 1)
+    total = np.concatenate(([0.0], np.cumsum(signal)))
+    low = np.clip(np.arange(signal.size) - width // 2, 0, signal.size)
+    high = np.clip(np.arange(signal.size) + width // 2 + 1, 0, signal.size)
+    mean: Floats = (total[high] - total[low]) / (high - low)
+    return mean
+
+
+def _predict_held_out(
+    problem: Problem,
+    features: Floats,
+    residuals: Floats,
+    known: NDArray[np.bool_],
+    how: tuple[NDArray[np.int64], float],
+) -> Floats:
+    """Residuals as predicted from the inputs by regressions that had not seen their blocks."""
+    fold, ridge = how
+    predicted = np.zeros(residuals.shape)
+    spread = 1.4826 * np.median(np.abs(residuals[known]), axis=0) + 1e-12
+    target = np.clip(residuals, -_CLIP * 3.0 * spread, _CLIP * 3.0 * spread)
+    for number in range(int(fold.max()) + 1):
+        tested = (fold[problem.block_of] == number) & known
+        rows = list_training(problem, tested) & known
+        if not tested.any() or rows.sum() < 2 * features.shape[1]:
+            continue
+        centre = features[rows].mean(axis=0)
+        scale = features[rows].std(axis=0)
+        scale[scale == 0.0] = 1.0
+        design = (features[rows] - centre) / scale
+        normal = design.T @ design / design.shape[0] + ridge * np.eye(design.shape[1])
+        mean = target[rows].mean(axis=0)
+        weights = np.linalg.solve(normal, design.T @ (target[rows] - mean) / design.shape[0])
+        predicted[tested] = mean + (features[tested] - centre) / scale @ weights
+    return predicted
