@@ -10,13 +10,11 @@ import numpy as np
 from pipeline.logs import records as rec
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import checksum
+from pipeline.logs.loading import load_spans
 from pipeline.logs.scan import Catalog, Scanner
-from pipeline.logs.spans import Loaded, Span, SpanKind, StoredAs, load_span
-from pipeline.logs.workers import map_in_order
+from pipeline.logs.spans import Loaded, Span, SpanKind, StoredAs
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from pipeline.logs.source import ByteSource
 
 _MAX_SUMMARY: Final = 1 << 29
@@ -214,7 +212,11 @@ def _examine(source: ByteSource, catalog: Catalog, threads: int) -> None:
     examined: list[Span] = []
     schemas: dict[int, rec.SchemaRecord] = {}
     channels: dict[int, rec.ChannelRecord] = {}
-    for span, loaded in _load_all(source, catalog.spans, threads):
+    section = (
+        None if not catalog.data_crc or catalog.data_end is None else (catalog.data_end, catalog.data_crc)
+    )
+    summaries = load_spans(source, catalog.spans, _forget_chunk, threads=threads, data_section=section)
+    for span, loaded in summaries:
         messages = loaded.messages
         catalog.losses += [loss for loss in loaded.losses if loss not in catalog.losses]
         for schema in messages.schemas:
@@ -236,9 +238,8 @@ def _examine(source: ByteSource, catalog: Catalog, threads: int) -> None:
     catalog.channels |= channels
 
 
-def _load_all(source: ByteSource, spans: list[Span], threads: int) -> Iterator[tuple[Span, Loaded]]:
-    loaded = map_in_order(lambda span: load_span(source, span), spans, threads)
-    return zip(spans, loaded, strict=True)
+def _forget_chunk(span: Span, loaded: Loaded) -> tuple[Span, Loaded]:
+    return span, replace(loaded, chunk=b"")
 
 
 def _say_why(catalog: Catalog, reason: str) -> None:

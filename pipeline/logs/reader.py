@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import os
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -17,10 +15,10 @@ from pipeline.logs.codecs import decoder_for
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.fields import derive_columns
 from pipeline.logs.index import LogIndex, open_log
+from pipeline.logs.loading import load_spans
 from pipeline.logs.payloads import gather_payloads
 from pipeline.logs.source import ByteSource, FileSource, hash_sources
-from pipeline.logs.spans import SpanKind, load_span
-from pipeline.logs.workers import map_in_order
+from pipeline.logs.spans import SpanKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -31,11 +29,10 @@ if TYPE_CHECKING:
     from pipeline.logs.columns import Column
     from pipeline.logs.index import ChannelInfo, Part
     from pipeline.logs.payloads import Payloads
-    from pipeline.logs.spans import Span
+    from pipeline.logs.spans import Loaded, Span
 
     Ints = NDArray[np.int64]
 
-_CRC_BLOCK: Final = 1 << 20
 _LISTED: Final = 12
 """So many topics are named in an error."""
 
@@ -221,27 +218,13 @@ def _read_part(
     own = {number for number, merged in part.numbers.items() if merged in wanted}
     spans = [span for span in part.spans if span.channels is None or span.channels & own]
 
-    @cache
-    def trusts_data() -> bool:
-        return _data_is_whole(source, part)
-
-    def read(span: Span) -> tuple[dict[int, Payloads], list[Loss], bool]:
-        loaded = load_span(source, span, trusts_data, own)
+    def gather(span: Span, loaded: Loaded) -> tuple[dict[int, Payloads], list[Loss], bool]:
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)
         merged = {part.numbers[number]: each for number, each in payloads.items()}
         return merged, loaded.losses, loaded.unchecked and span.kind is SpanKind.CHUNK
 
-    return map_in_order(read, spans, threads)
-
-
-def _data_is_whole(source: ByteSource, part: Part) -> bool:
-    """Whether the file carries a checksum over its data section that holds."""
-    if part.data_end is None or part.data_crc == 0:
-        return False
-    crc = 0
-    for offset in range(0, part.data_end, _CRC_BLOCK):
-        crc = zlib.crc32(source.read_at(offset, min(_CRC_BLOCK, part.data_end - offset)), crc)
-    return crc == part.data_crc
+    section = None if not part.data_crc or part.data_end is None else (part.data_end, part.data_crc)
+    return load_spans(source, spans, gather, threads=threads, wanted=own, data_section=section)
 
 
 def _finish(job: _Job) -> tuple[TopicColumns, list[Loss]]:

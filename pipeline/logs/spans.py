@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from pipeline.logs.source import ByteSource
 
     Entries: TypeAlias = tuple[int, NDArray[np.uint64]]
+    Excuse: TypeAlias = Callable[[], str | None]
 
 
 _CRC_IN_HEAD: Final = 24
@@ -105,6 +106,11 @@ class Loaded:
     unchecked: bool = False
 
 
+def no_excuse() -> str | None:
+    """Nothing else shows that the records of a chunk are whole."""
+    return None
+
+
 class _SpanError(Exception):
     """A chunk that cannot be opened: kind of loss and reason."""
 
@@ -117,7 +123,7 @@ class _SpanError(Exception):
 def load_span(
     source: ByteSource,
     span: Span,
-    trusts_data: Callable[[], bool] = bool,
+    excuse: Excuse = no_excuse,
     wanted: AbstractSet[int] | None = None,
 ) -> Loaded:
     """Read, inflate and check one span.
@@ -129,8 +135,7 @@ def load_span(
         source: the file.
         span: which stretch.
         wanted: numbers of the channels whose messages are needed, None for all.
-        trusts_data: asked when a chunk's checksum differs: whether a checksum over the whole data section
-            holds, so that the chunk was written so.
+        excuse: asked when a chunk's checksum differs for what else shows that its records are whole.
     """
     blob = memoryview(source.read_at(span.offset, span.length + span.index_length))
     if span.kind is SpanKind.LOOSE:
@@ -153,7 +158,7 @@ def load_span(
             needed = _needed_size(entries, wanted)
             if needed is not None and needed < head.uncompressed_size * _WORTHWHILE:
                 return _load_prefix(span, head, stored, entries, needed)
-        chunk = _inflate_checked(span, head, stored, trusts_data, losses)
+        chunk = _inflate_checked(span, head, stored, excuse, losses)
     except _SpanError as error:
         return _lost(span, error.kind, error.reason)
     if chunk is None:
@@ -218,7 +223,7 @@ def _open_chunk(span: Span, blob: memoryview) -> tuple[rec.ChunkHead, list[Loss]
 
 
 def _inflate_checked(
-    span: Span, head: rec.ChunkHead, stored: Buffer, trusts_data: Callable[[], bool], losses: list[Loss]
+    span: Span, head: rec.ChunkHead, stored: Buffer, excuse: Excuse, losses: list[Loss]
 ) -> Buffer | None:
     """Records of a chunk; None where its end was never written. Notes a checksum that is wrong alone."""
     unwritten = len(stored) >= _ZERO_TAIL and not any(stored[-_ZERO_TAIL:])
@@ -231,9 +236,7 @@ def _inflate_checked(
     computed = checksum(chunk) if head.crc else 0
     if computed == head.crc:
         return chunk
-    reason = explain_checksum(head.crc, computed, stored, head.compression)
-    if reason is None and trusts_data():
-        reason = "the checksum of the whole file holds"
+    reason = explain_checksum(head.crc, computed, stored, head.compression) or excuse()
     if reason is not None:
         text = f"its checksum is wrong but its records are whole ({reason}); they were kept"
         losses.append(_loss(span, "wrong_crc", text, bytes_lost=0))

@@ -187,6 +187,18 @@ def test_a_wrong_checksum_over_good_records_is_told(tmp_path: Path, change: int)
     assert losses == ["wrong_crc"]
 
 
+@pytest.mark.parametrize("tail", [None, -60])
+def test_checksums_that_are_wrong_throughout_are_the_writers(tmp_path: Path, tail: int | None) -> None:
+    path = tmp_path / "log.mcap"
+    truth = write_small(path)
+    content = path.read_bytes()
+    for number, (start, _) in enumerate(chunk_places(content)):
+        content = set_crc(content, start, 0x12345678 + number)
+    found, losses = read_damaged(path, content[:tail], truth)
+    assert found == truth
+    assert losses.count("wrong_crc") == len(chunk_places(path.read_bytes()))
+
+
 def test_a_checksum_of_the_whole_file_clears_a_chunk(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     truth = write_small(path)
