@@ -1,4 +1,4 @@
-"""The aggregate stage: what a run comes to, and what the runs of a dataset come to."""
+"""The aggregate stage: what a run comes to."""
 
 from __future__ import annotations
 
@@ -145,29 +145,3 @@ def _height_rate(velocities: pl.DataFrame) -> float | None:
             later = np.interp(times + _ROUGHNESS_S, times, height)
             pieces.append(np.abs(later - height)[times <= times[-1] - _ROUGHNESS_S] / _ROUGHNESS_S)
     return float(np.median(np.concatenate(pieces))) if pieces else None
-
-
-def pool_datasets(aggregates: pl.DataFrame, keys: dict[str, str]) -> pl.DataFrame:
-    """Table `datasets`: runs are the unit, so a dataset's median is the median of its runs' medians.
-
-    Runs of unknown terrain are not pooled.
-
-    Args:
-        aggregates: table `aggregates` of all runs.
-        keys: generation of each run.
-    """
-    labelled = aggregates.filter((pl.col("subset") == "all") & (pl.col("terrain") != "unknown")).with_columns(
-        (pl.col("run") + "/" + pl.col("run").replace_strict(keys, default="")).alias("key")
-    )
-    return (
-        labelled.group_by("dataset", "vehicle", "terrain", "input")
-        .agg(
-            pl.lit("*").alias("run"),
-            pl.len().cast(pl.Int64).alias("runs"),
-            pl.col("samples").sum(),
-            pl.col("median_modulus").median(),
-            pl.col("median_window_norm").median(),
-            pl.col("key").sort().str.join(" ").alias("keys"),
-        )
-        .sort("dataset", "input")
-    )

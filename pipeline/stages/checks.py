@@ -30,6 +30,7 @@ _NET_OF_NO_MOTION = 0.5
 _PATH_OF_MOTION = 5.0
 _LIVE = 0.02
 _FEWEST = 100
+_FEWEST_LIVE = 20
 _FEWEST_STEPS = 6
 _SCALED = 0.18
 _DISAGREES = 0.2
@@ -88,13 +89,7 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     if path < _NET_OF_NO_MOTION and turned < _NET_OF_NO_MOTION:
         text = f"the vehicle was hardly asked to move: {path:.2g} m of path in the whole run"
         return [Finding("not_moving", "error", text, value=path)]
-    gains = [
-        float(
-            np.sum(samples.velocity[known, i] * ideal[known, i])
-            / max(float(np.sum(ideal[known, i] ** 2)), 1e-12)
-        )
-        for i in (0, 2)
-    ]
+    gains = [_gain_on(samples.velocity[known, axis], ideal[known, axis]) for axis in (0, 2)]
     reach = samples.position[known]
     net = float(np.linalg.norm(reach.max(axis=0) - reach.min(axis=0)))
     still = all(abs(gain) < _GAIN_OF_NO_MOTION for gain in gains)
@@ -106,6 +101,14 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         f"within {net:.2g} m (wheels in the air, blocked, or stopped)"
     )
     return [Finding("not_moving", "error", text, value=gains[0])]
+
+
+def _gain_on(velocity: Floats, ideal: Floats) -> float:
+    """Gain of a velocity on its ideal where anything is asked; zero where nothing is: noise is no motion."""
+    live = np.abs(ideal) > _LIVE
+    if live.sum() < _FEWEST_LIVE:
+        return 0.0
+    return float(np.sum(velocity[live] * ideal[live]) / np.sum(ideal[live] ** 2))
 
 
 def check_command_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
@@ -217,7 +220,7 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
 def _delay_of(
     signal: Floats, reference: Floats, places: NDArray[np.int64], samples: Samples
 ) -> tuple[float, float] | None:
-    """Delay and its standard deviation [s] of a signal against a reference, None where they do not correlate."""
+    """Delay and standard deviation [s] of a signal against a reference; None where they do not correlate."""
     times = samples.times[places]
     found = estimate_delay(times, signal[places], times, reference[places])
     if found is None or abs(found.correlation) < 0.7:  # noqa: PLR2004 - below it the lag means nothing

@@ -84,11 +84,11 @@ def rate_of_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) 
     grid, rate = _smooth_gyro(times, imu, window)
     corrected: Floats = fit.sign * fit.scale * np.interp(times, grid, rate) + fit.bias
     stamps = imu["t"].to_numpy()
-    left = timegrid.hold_indices(times, stamps)
-    before = stamps[np.maximum(left, 0)]
-    after = stamps[np.minimum(left + 1, stamps.size - 1)]
-    silent = (left < 0) | (times - before > _LONGEST_SILENCE) | (after - before > _LONGEST_SILENCE)
-    corrected[silent] = np.nan
+    following = np.searchsorted(stamps, times)
+    before = stamps[np.maximum(following - 1, 0)]
+    after = stamps[np.minimum(following, stamps.size - 1)]
+    away = np.maximum(np.abs(times - before), np.abs(after - times))
+    corrected[away > _LONGEST_SILENCE] = np.nan
     return corrected
 
 

@@ -321,7 +321,7 @@ class _Extraction:
         try:
             return self._drive_table(source, section, spans, held=False)
         except StageError as error:
-            if source is None or source.reason == "configured":
+            if source is None or section != DriveSection():
                 raise
             text = f"{source} was taken for measured wheels by its type, but {error.what}: left out"
             self.findings.append(Finding("no_measured_wheels", "info", text, where=str(source)))

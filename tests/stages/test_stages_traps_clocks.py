@@ -1,0 +1,274 @@
+"""Traps of time: clocks, latencies, the gyro as the better clock."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms
+
+from pipeline.simulate import Clock, Encoders, Imu, Program, Recording
+from pipeline.stages.delays import estimate_delay
+from pipeline.stages.extract.clocks import Recorded, align_clocks
+
+SECOND = 10**9
+START = 1_700_000_000 * SECOND
+EVERY_50_MS = np.arange(400) * SECOND // 20
+
+
+def recorded(
+    log: np.ndarray, header: np.ndarray | None, *, clock: str | None = None, topic: str = "/pose"
+) -> Recorded:
+    return Recorded(topic, log, log, header, clock)
+
+
+def align(**topics: Recorded) -> tuple[dict[str, np.ndarray], set[str]]:
+    clocks, findings = align_clocks(topics)
+    return {key: clock.stamp for key, clock in clocks.items()}, {finding.id for finding in findings}
+
+
+def test_trap_5_a_clock_that_goes_back_is_put_right_and_the_segment_ends() -> None:
+    log = START + EVERY_50_MS
+    header = log - SECOND // 10
+    header[200:] -= 3 * SECOND
+    clocks, findings = align_clocks({"pose": recorded(log, header)})
+    assert np.array_equal(np.diff(clocks["pose"].stamp), np.diff(log))
+    assert clocks["pose"].breaks == (int(log[200]),)
+    assert [(finding.id, finding.value) for finding in findings] == [("clock_jump", pytest.approx(3.0))]
+
+
+def test_trap_5_a_clock_that_leaps_ahead_is_put_right() -> None:
+    log = START + EVERY_50_MS
+    header = log.copy()
+    header[300:] += 40 * SECOND
+    stamps, ids = align(pose=recorded(log, header))
+    assert np.array_equal(stamps["pose"], log)
+    assert ids == {"clock_jump"}
+
+
+def test_trap_5_messages_that_were_written_late_are_no_clock_jump() -> None:
+    header = START + EVERY_50_MS
+    log = header + SECOND // 100
+    # A recorder that was busy for 2 s writes 40 messages in one breath.
+    log[100:140] = log[139]
+    stamps, ids = align(pose=recorded(log, header))
+    assert np.array_equal(stamps["pose"], header)
+    assert ids == set()
+
+
+def test_trap_5_a_hole_in_the_recording_is_no_clock_jump() -> None:
+    log = START + EVERY_50_MS
+    log[200:] += 30 * SECOND
+    stamps, ids = align(pose=recorded(log, log - SECOND // 20))
+    assert np.array_equal(stamps["pose"], log - SECOND // 20)
+    assert ids == set()
+
+
+def test_trap_5_stamps_from_before_the_clock_was_set_are_placed_by_their_log_times() -> None:
+    log = START + EVERY_50_MS
+    header = log.copy()
+    header[:100] = EVERY_50_MS[:100]
+    stamps, ids = align(pose=recorded(log, header))
+    assert np.allclose(stamps["pose"], log, atol=1000)
+    assert ids == {"clock_unset"}
+
+
+def test_trap_5_log_times_from_before_the_clock_was_set_are_left_out() -> None:
+    log = START + EVERY_50_MS
+    log[:100] = EVERY_50_MS[:100]
+    clocks, findings = align_clocks({"cmd": recorded(log, None, topic="/cmd_vel")})
+    assert clocks["cmd"].usable.tolist() == [False] * 100 + [True] * 300
+    assert [(finding.id, finding.count) for finding in findings] == [("clock_unset", 100)]
+
+
+def test_trap_5_a_clock_at_zero_throughout_is_a_clock() -> None:
+    clocks, findings = align_clocks({"pose": recorded(EVERY_50_MS, EVERY_50_MS)})
+    assert clocks["pose"].usable.all()
+    assert findings == []
+
+
+def test_trap_5_stamps_later_than_their_log_times_prove_a_clock_error() -> None:
+    log = START + EVERY_50_MS
+    _, findings = align_clocks({"pose": recorded(log, log + SECOND // 5)})
+    assert [(finding.id, finding.value) for finding in findings] == [
+        ("stamp_after_log_time", pytest.approx(-0.2))
+    ]
+
+
+def test_trap_5_a_type_without_header_has_log_times() -> None:
+    log = START + EVERY_50_MS
+    clocks, findings = align_clocks({"left": recorded(log, None)})
+    assert (clocks["left"].clock, findings) == ("log", [])
+
+
+def test_trap_5_header_stamps_that_are_all_zero_are_said_and_replaced() -> None:
+    log = START + EVERY_50_MS
+    stamps, ids = align(pose=recorded(log, np.zeros_like(log)))
+    assert np.array_equal(stamps["pose"], log)
+    assert ids == {"no_header_stamp"}
+
+
+def test_trap_5_clocks_far_apart_are_joined_through_the_log_time() -> None:
+    log = START + EVERY_50_MS
+    stamps, ids = align(
+        pose=recorded(log, log - SECOND // 50, topic="/pose"),
+        imu=recorded(log, log - 100 * SECOND, topic="/imu"),
+        wheels=recorded(log, log - SECOND // 50, topic="/joint_states"),
+    )
+    assert ids == {"clock_offset"}
+    assert np.abs(stamps["imu"] - stamps["pose"]).max() < SECOND // 100
+
+
+def test_trap_5_stamps_of_simulated_time_meet_topics_without_any() -> None:
+    log = START + EVERY_50_MS
+    stamps, ids = align(
+        pose=recorded(log, EVERY_50_MS + SECOND, topic="/pose"), cmd=recorded(log, None, topic="/cmd_vel")
+    )
+    assert ids == {"clock_offset"}
+    assert np.array_equal(stamps["cmd"], stamps["pose"])
+
+
+@given(st.floats(0.0, 0.3), st.integers(0, 10**6))
+def test_trap_5_plain_latency_changes_no_stamp(latency: float, seed: int) -> None:
+    header = START + EVERY_50_MS
+    noise = np.random.default_rng(seed).uniform(0.0, 0.1, header.size)
+    log = np.sort(header + ((latency + noise) * SECOND).astype(np.int64))
+    stamps, ids = align(pose=recorded(log, header))
+    assert np.array_equal(stamps["pose"], header)
+    assert ids == set()
+
+
+@pytest.mark.parametrize("clock", ["log", "publish", "header"])
+def test_trap_5_the_configured_time_is_taken(clock: str) -> None:
+    header = START + EVERY_50_MS
+    times = Recorded("/pose", header + 2 * SECOND // 10, header + SECOND // 10, header, clock)
+    clocks, _ = align_clocks({"pose": times})
+    offset = {"log": 2, "publish": 1, "header": 0}[clock]
+    assert np.array_equal(clocks["pose"].stamp, header + offset * SECOND // 10)
+
+
+def test_trap_5_a_recorder_whose_clock_goes_back_mixes_nothing(drive: TakeThrough) -> None:
+    back = Clock(backward_at_s=40.0, backward_s=3.0)
+    taken = drive(replace(FIELD, duration_s=80.0, clock=back))
+    assert taken.finding("clock_jump").value == pytest.approx(3.0, abs=0.6)
+    assert "pose_jump" not in taken.ids()
+    assert "imu_disagrees" not in taken.ids()
+    times = taken.velocities["t"].to_numpy()
+    assert not ((times > 37.5) & (times < 39.5)).any()
+    assert float(np.abs(taken.velocities["v_x"].to_numpy()).max()) < 1.3
+
+
+def test_trap_5_a_clock_set_late_loses_only_its_first_seconds(drive: TakeThrough) -> None:
+    taken = drive(replace(FIELD, clock=Clock(unset_s=5.0)))
+    assert "clock_unset" in taken.ids()
+    assert taken.velocities.height == pytest.approx(55 * 20, abs=20)
+    assert taken.velocities["t"].min() < 0.2
+
+
+def test_trap_5_a_hole_in_everything_is_crossed_by_nothing(drive: TakeThrough) -> None:
+    taken = drive(replace(FIELD, recording=Recording(gaps=2, gap_s=3.0)))
+    assert taken.velocities["segment"].n_unique() == 3
+    for windows in (taken.windows("command"), taken.windows("measured")):
+        spans = windows["t_end"] - windows["t_start"]
+        assert spans.max() == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_trap_6_the_sign_of_the_gyro_is_checked_and_corrected(drive: TakeThrough, sign: int) -> None:
+    taken = drive(replace(FIELD, imu=Imu(sign=sign)))  # type: ignore[arg-type]
+    assert ("imu_sign" in taken.ids()) == (sign < 0)
+    velocities = taken.velocities
+    assert rms(velocities["v_w_imu"] - velocities["v_w"]) < 0.03
+
+
+def test_trap_6_scale_and_bias_of_the_gyro_are_found_and_taken_off(drive: TakeThrough) -> None:
+    taken = drive(replace(FIELD, imu=Imu(scale=0.8, bias_radps=0.05)))
+    assert taken.finding("imu_scale").value == pytest.approx(1.25, rel=0.01)
+    assert taken.motion.gyro is not None
+    # Poses = scale x gyro + bias: an offset of 0.05 in the gyro is one of -0.0625 in the poses.
+    assert taken.motion.gyro.bias == pytest.approx(-0.0625, abs=2e-3)
+    assert rms(taken.velocities["v_w_imu"] - taken.velocities["v_w"]) < 0.03
+
+
+def test_trap_6_a_gyro_that_measures_something_else_is_not_used(drive: TakeThrough) -> None:
+    taken = drive(replace(FIELD, imu=Imu(scale=0.0, noise_radps=0.2)))
+    assert taken.finding("imu_disagrees").severity == "warning"
+    assert taken.velocities["v_w_imu"].null_count() == taken.velocities.height
+
+
+def test_trap_6_without_turning_the_gyro_cannot_be_checked(drive: TakeThrough) -> None:
+    taken = drive(replace(FIELD, program=Program("straight")))
+    assert "imu_unchecked" in taken.ids()
+    assert taken.motion.gyro is None
+
+
+@pytest.mark.parametrize("late", [-0.1, 0.0, 0.2, 0.35])
+def test_trap_15_how_late_the_poses_are_against_the_gyro_is_told(drive: TakeThrough, late: float) -> None:
+    taken = drive(replace(FIELD, effects={"drive_lag": 0.3, "clock_offset": late}))
+    assert taken.motion.gyro is not None
+    assert taken.motion.gyro.pose_delay_s == pytest.approx(late, abs=0.02)
+    assert ("pose_delay" in taken.ids()) == (abs(late) > 0.05)
+
+
+def test_trap_15_the_gyro_gives_the_yaw_rate_at_its_own_clock(drive: TakeThrough) -> None:
+    late = replace(PLAIN, pose=EXACT, effects={"drive_lag": 0.3, "clock_offset": 0.3})
+    taken = drive(late, {"velocity": {"yaw": "imu"}})
+    slip = taken.slip("measured")
+    # The wheels are exact: against the poses, 0.3 s late, the slip in turning is five times as large.
+    against_pose = drive(late).slip("measured")
+    assert rms(slip["g_w"]) < 0.35 * rms(against_pose["g_w"])
+    assert slip["v_x"].equals(against_pose["v_x"])
+
+
+@pytest.mark.parametrize("late", [0.0, 0.2])
+def test_trap_16_late_encoders_are_told(drive: TakeThrough, late: float) -> None:
+    taken = drive(replace(FIELD, encoders=Encoders(delay_s=late)))
+    if late > 0.0:
+        assert taken.finding("wheels_delay").value == pytest.approx(late, abs=0.04)
+    else:
+        assert "wheels_delay" not in taken.ids()
+
+
+def test_trap_16_a_body_that_follows_its_wheels_late_is_no_encoder(drive: TakeThrough) -> None:
+    taken = drive(replace(FIELD, effects={"body_inertia": 0.4}))
+    assert "wheels_delay" not in taken.ids()
+
+
+@given(st.floats(-0.4, 0.4), st.integers(0, 10**6))
+def test_a_delay_comes_back_with_its_sign(late: float, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    times = np.arange(0.0, 60.0, 0.05)
+    phases, speeds = generator.uniform(0.0, 6.0, 6), generator.uniform(0.3, 3.0, 6)
+
+    def signal(at: np.ndarray) -> np.ndarray:
+        return np.sum(np.sin(speeds[:, None] * at + phases[:, None]), axis=0)
+
+    found = estimate_delay(times, signal(times - late), times, signal(times))
+    assert found is not None
+    assert found.seconds == pytest.approx(late, abs=0.01)
+    mirrored = estimate_delay(times, -signal(times - late), times, signal(times))
+    assert mirrored is not None
+    assert mirrored.correlation < -0.95
+
+
+def test_constant_signals_have_no_delay() -> None:
+    times = np.arange(100) * 0.05
+    assert estimate_delay(times, np.ones(100), times, np.sin(times)) is None
+    assert estimate_delay(times, np.sin(times), times, np.ones(100)) is None
+    assert estimate_delay(times[:10], np.sin(times[:10]), times, np.sin(times)) is None
+
+
+def test_all_topics_start_at_one_zero(drive: TakeThrough) -> None:
+    taken = drive(replace(FIELD, pose=replace(ICP, rate_hz=10.0)))
+    tables = taken.extracted.tables
+    firsts = [tables[name]["t"].min() for name in ("poses", "commands", "wheels", "imu")]
+    assert min(firsts) == 0.0
+    assert max(firsts) < 0.2
+    for name in ("poses", "imu"):
+        frame = tables[name]
+        since = (frame["stamp"] - taken.extracted.start_ns).cast(pl.Float64) / 1e9
+        assert rms(since - frame["t"]) < 1e-6

@@ -1,0 +1,300 @@
+"""Traps of commands and wheels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms, slope
+
+from pipeline.core.errors import SlipError
+from pipeline.simulate import LAYOUTS, VEHICLES, Encoders, PoseSensor, Program, Recording
+from pipeline.stages import StageError
+
+LONGER = replace(FIELD, duration_s=150.0)
+
+
+def test_trap_7_wheels_are_told_apart_by_name_whatever_their_order(drive: TakeThrough) -> None:
+    # The simulated command lists its joints from the back, the encoders from the front.
+    taken = drive(replace(FIELD, recording=Recording("husky")))
+    command, measured = taken.slip("command"), taken.slip("measured")
+    steady = ~pl.col("transitory")
+    both = command.filter(steady).join(measured.filter(steady), on="stamp", suffix="_measured")
+    assert slope(both["f_w"], both["f_w_measured"]) == pytest.approx(1.0, abs=0.02)
+    assert slope(both["f_x"], both["f_x_measured"]) == pytest.approx(1.0, abs=0.02)
+
+
+def test_trap_7_swapped_names_in_the_configuration_swap_the_turn(drive: TakeThrough) -> None:
+    swapped = {"left": ["front_right_wheel"], "right": ["front_left_wheel"]}
+    plain = drive(replace(FIELD, recording=Recording("husky"))).slip("measured")
+    taken = drive(replace(FIELD, recording=Recording("husky")), {"wheels": swapped}).slip("measured")
+    assert np.allclose(taken["f_w"], -plain["f_w"])
+    assert np.allclose(taken["f_x"], plain["f_x"])
+
+
+def test_trap_7_positions_are_differentiated_where_there_is_no_velocity(drive: TakeThrough) -> None:
+    usual = replace(FIELD, encoders=Encoders(noise_radps=0.0, report="velocity"))
+    only = replace(FIELD, encoders=Encoders(noise_radps=0.0, report="position"))
+    plain = drive(usual).slip("measured")
+    taken = drive(only)
+    assert taken.finding("velocity_from_position").severity == "info"
+    steady = taken.slip("measured").filter(~pl.col("transitory"))
+    both = steady.join(plain, on="stamp", suffix="_plain")
+    assert rms(both["f_x"] - both["f_x_plain"]) < 5e-3
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("rad/s", 1.0), ("rpm", 2.0 * np.pi / 60.0), ("m/s", 1 / 0.3)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_units_and_signs_of_wheel_speeds_are_those_configured(
+    drive: TakeThrough, unit: str, factor: float, sign: int
+) -> None:
+    scenario = replace(PLAIN, vehicle=VEHICLES["warthog"], duration_s=20.0)
+    plain = drive(scenario).extracted.tables["wheels"]
+    sides = {"left_topic": "/left_drive/status/speed", "right_topic": "/right_drive/status/speed"}
+    taken = drive(scenario, {"wheels": {**sides, "unit": unit, "sign": sign}}).extracted.tables["wheels"]
+    assert np.allclose(taken["left"], plain["left"] * factor * sign)
+
+
+def test_trap_8_only_live_intervals_count_by_default(drive: TakeThrough) -> None:
+    by_hand = replace(LONGER, recording=Recording(hand_driven_s=40.0))
+    taken = drive(by_hand)
+    assert taken.finding("interval_applied").count == 1
+    assert taken.slip("command")["t"].min() >= 40.0 - 0.2
+    assert "stale_command" not in taken.ids()
+
+
+def test_trap_8_a_command_that_says_zero_while_someone_drives_is_noticed(drive: TakeThrough) -> None:
+    by_hand = replace(LONGER, recording=Recording(hand_driven_s=40.0))
+    taken = drive(by_hand, {"use_intervals": "all"})
+    assert taken.slip("command")["t"].min() < 1.0
+    stale = taken.finding("stale_command")
+    assert stale.t_start is not None
+    assert stale.t_start < 10.0
+    assert stale.count is not None
+    assert stale.count > 400
+
+
+def test_trap_8_a_vehicle_that_rests_under_zero_commands_is_not_stale(drive: TakeThrough) -> None:
+    taken = drive(replace(LONGER, program=Program("stop_and_go"), effects={"drive_lag": 0.6}))
+    assert "stale_command" not in taken.ids()
+
+
+def test_trap_8_a_command_is_held_only_as_long_as_it_counts(drive: TakeThrough) -> None:
+    # A joystick that is let go sends nothing; the controller stops half a second later.
+    released = replace(LONGER, program=Program("teleop"))
+    taken = drive(released)
+    gone = taken.finding("stale_command")
+    assert gone.count is not None
+    commands = taken.extracted.tables["commands"]["t"].to_numpy()
+    kept = taken.slip("command")["t"].to_numpy()
+    last = commands[np.searchsorted(commands, kept + 1e-6, side="right") - 1]
+    assert float((kept - last).max()) <= 0.5 + 1e-6
+    longer = drive(released, {"command": {"hold_s": 1e4}})
+    assert longer.slip("command").height > taken.slip("command").height
+    assert "stale_command" not in longer.ids()
+
+
+def test_trap_8_intervals_by_time_and_by_state(drive: TakeThrough) -> None:
+    by_hand = replace(LONGER, recording=Recording(hand_driven_s=40.0))
+    timed = drive(by_hand, {"interval": [{"start_s": 60.0, "end_s": 80.0}, {"start_s": 100.0}]})
+    times = timed.slip("command")["t"]
+    assert (times.min(), times.filter(times < 90.0).max()) == pytest.approx((60.0, 80.0), abs=0.1)
+    assert times.filter(times > 90.0).min() == pytest.approx(100.0, abs=0.1)
+    state = {"topic": "/drive/calib_state", "equals": "idle"}
+    idle = drive(by_hand, {"interval": [state]})
+    assert idle.slip("measured")["t"].max() == pytest.approx(40.0, abs=0.2)
+    either = drive(by_hand, {"interval": [state, {"topic": "/drive/calib_state", "equals": "calib"}]})
+    assert either.slip("measured").height > 2900
+    clipped = drive(by_hand, {"interval": [{**state, "start_s": 10.0, "end_s": 20.0}]})
+    found = clipped.slip("measured")["t"]
+    assert (found.min(), found.max()) == pytest.approx((10.0, 20.0), abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("interval", "code"),
+    [
+        ({"topic": "/drive/calib_state", "equals": "never said"}, "no_interval"),
+        ({"start_s": 9.0, "end_s": 3.0}, "bad_interval"),
+        ({"start_s": 1e6}, "no_command"),
+    ],
+)
+def test_trap_8_an_interval_without_anything_in_it_is_an_error(
+    drive: TakeThrough, interval: dict[str, object], code: str
+) -> None:
+    with pytest.raises(SlipError) as caught:
+        drive(replace(FIELD, recording=Recording(hand_driven_s=10.0)), {"interval": [interval]})
+    assert caught.value.code == code
+    assert "\n" not in str(caught.value)
+
+
+ODOMETRY = PoseSensor(source="wheels", noise_m=0.0, noise_rad=0.0, noise_z_m=0.0, noise_tilt_rad=0.0)
+
+
+@pytest.mark.parametrize("program", ["drive_steps", "slalom", "smooth", "teleop", "spins", "straight"])
+def test_trap_9_wheel_odometry_is_recognised_however_it_is_driven(drive: TakeThrough, program: str) -> None:
+    scenario = replace(LONGER, pose=ODOMETRY, program=Program(program), encoders=Encoders(noise_radps=0.02))  # type: ignore[arg-type]
+    taken = drive(scenario)
+    assert taken.finding("pose_from_wheels").severity == "error"
+
+
+@pytest.mark.parametrize("rates", [(10.0, 50.0), (50.0, 20.0), (20.0, 10.0)])
+def test_trap_9_wheel_odometry_is_recognised_at_any_rate(
+    drive: TakeThrough, rates: tuple[float, float]
+) -> None:
+    pose = replace(ODOMETRY, rate_hz=rates[0])
+    taken = drive(replace(LONGER, pose=pose, encoders=Encoders(rate_hz=rates[1])))
+    assert "pose_from_wheels" in taken.ids()
+
+
+def test_trap_9_wheel_odometry_with_a_wider_track_is_still_wheel_odometry(drive: TakeThrough) -> None:
+    taken = drive(replace(LONGER, pose=ODOMETRY), {"vehicle": {"track_width_m": 0.55 / 1.875}})
+    assert "pose_from_wheels" in taken.ids()
+
+
+@pytest.mark.parametrize("vehicle", ["husky", "warthog", "turtlebot3"])
+def test_trap_9_an_ideal_vehicle_with_a_good_localization_is_not_accused(
+    drive: TakeThrough, vehicle: str
+) -> None:
+    # 0.5 mm is better than any laser in the field.
+    pose = PoseSensor(noise_m=0.0005, noise_rad=0.0005)
+    taken = drive(replace(PLAIN, vehicle=VEHICLES[vehicle], pose=pose))
+    assert "pose_from_wheels" not in taken.ids()
+
+
+def test_trap_11_a_controller_that_widens_the_track_is_found(drive: TakeThrough) -> None:
+    clearpath = replace(VEHICLES["husky"], controller_track_multiplier=1.875)
+    scenario = replace(LONGER, vehicle=clearpath, recording=Recording("husky_body_command"))
+    taken = drive(scenario)
+    assert taken.finding("controller_multiplier").value == pytest.approx(1.875, rel=0.03)
+    assert "controller_track_multiplier = 1.8" in taken.finding("controller_multiplier").text
+    told = drive(scenario, {"vehicle": {"controller_track_multiplier": 1.875}})
+    assert "controller_multiplier" not in told.ids()
+    both = told.slip("command").join(told.slip("measured"), on="stamp", suffix="_measured")
+    steady = both.filter(~pl.col("transitory"))
+    assert slope(steady["f_w"], steady["f_w_measured"]) == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("layout", ["husky_body_command", "husky"])
+def test_trap_11_a_plain_controller_is_not_accused(drive: TakeThrough, layout: str) -> None:
+    taken = drive(replace(LONGER, recording=Recording(layout)))
+    assert {"controller_multiplier", "command_scale"} & taken.ids() == set()
+
+
+def test_trap_13_the_command_that_the_controller_received_is_taken(drive: TakeThrough) -> None:
+    decoyed = replace(LONGER, recording=Recording("husky_body_command", decoys="both"))
+    taken = drive(decoyed)
+    assert str(taken.sources.command) == "/controller/cmd_vel"
+    assert str(taken.sources.pose) == "/mapping/icp_odom"
+    steady = taken.slip("command").filter(~pl.col("transitory"))
+    assert float(steady["g_x"].abs().median()) < 0.03
+    assert [note for note in taken.sources.notes if "/navigation/cmd_vel" in note]
+
+
+@pytest.mark.parametrize("program", ["drive_steps", "slalom", "straight", "spins"])
+def test_trap_14_wheels_in_the_air_are_not_moving(drive: TakeThrough, program: str) -> None:
+    lifted = replace(
+        FIELD,
+        effects={"wheel_radius": 0.0},
+        program=Program(program, lead_s=0.5),
+        duration_s=90.0,  # type: ignore[arg-type]
+    )
+    taken = drive(lifted)
+    found = taken.finding("not_moving")
+    assert found.severity == "error"
+    assert abs(found.value or 0.0) < 0.05
+    assert {"bad_stretch", "command_scale"} & taken.ids() == set()
+
+
+def test_trap_14_encoders_that_say_zero_are_dead(drive: TakeThrough) -> None:
+    taken = drive(replace(FIELD, encoders=Encoders(gain=0.0, noise_radps=0.0)))
+    assert taken.finding("wheels_dead").severity == "error"
+    assert "not_moving" not in taken.ids()
+
+
+def test_trap_14_standing_under_live_commands_is_both(drive: TakeThrough) -> None:
+    stopped = replace(
+        FIELD, effects={"wheel_radius": 0.0}, encoders=Encoders(gain=0.0, noise_radps=0.0), duration_s=90.0
+    )
+    assert {"wheels_dead", "not_moving"} <= drive(stopped).warned()
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        replace(FIELD, program=Program("spins")),
+        replace(FIELD, program=Program("straight")),
+        replace(FIELD, program=Program(speed_scale=0.1, turn_scale=0.1)),
+        replace(FIELD, effects={"wheel_radius": 0.4, "effective_track": 2.5}),
+        replace(FIELD, vehicle=VEHICLES["warthog"], effects={"body_inertia": 1.5}),
+        replace(FIELD, duration_s=300.0, program=Program(lead_s=145.0)),
+    ],
+    ids=["spins", "straight", "slow", "half the radius", "ice", "mostly idle"],
+)
+def test_trap_14_a_vehicle_that_moves_is_not_accused(drive: TakeThrough, scenario: object) -> None:
+    assert {"not_moving", "wheels_dead"} & drive(scenario).ids() == set()
+
+
+def test_trap_19_commands_beyond_the_limits_are_told(drive: TakeThrough) -> None:
+    # The preset's Husky lets 1 m/s and 1 rad/s through.
+    eager = replace(VEHICLES["husky"], max_speed_mps=2.0, max_turn_radps=2.0)
+    taken = drive(replace(FIELD, vehicle=eager))
+    found = [finding for finding in taken.findings if finding.id == "command_beyond_limit"]
+    assert {finding.where for finding in found} == {"command speed", "command yaw rate"}
+    assert all(finding.value is not None and 0.2 < finding.value < 0.8 for finding in found)
+    assert "command_beyond_limit" not in drive(FIELD).ids()
+
+
+@pytest.mark.parametrize("scale", [1.82, 0.5])
+def test_trap_21_a_command_of_another_radius_is_found(drive: TakeThrough, scale: float) -> None:
+    taken = drive(replace(LONGER, recording=Recording(command_scale=scale)))
+    assert taken.finding("command_scale").value == pytest.approx(1.0 / scale, rel=0.02)
+    assert "controller_multiplier" not in taken.ids()
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        {"drive_lag": 0.6},
+        {"wheel_speed_limit": 4.5},
+        {"turn_lag": {"tau_mean": 0.3, "tau_diff": 1.0}},
+        {"body_speed_limit": 0.7, "body_turn_limit": 0.6},
+        {"deadband": 0.1},
+        {"wheel_radius": 0.8},
+    ],
+    ids=str,
+)
+def test_trap_21_what_the_drive_does_is_no_wrong_scale(drive: TakeThrough, effects: dict[str, float]) -> None:
+    taken = drive(replace(LONGER, effects=effects))
+    assert {"command_scale", "controller_multiplier"} & taken.ids() == set()
+
+
+def test_a_joint_state_without_wheels_is_left_out_and_the_command_serves(drive: TakeThrough) -> None:
+    arm = replace(FIELD, recording=Recording(replace(LAYOUTS["husky_body_command"], joints="shoulder")))
+    taken = drive(arm)
+    assert taken.finding("no_measured_wheels").where == "/joint_states"
+    assert set(taken.result.slip["input"]) == {"command"}
+    with pytest.raises(StageError, match="shoulder") as caught:
+        drive(arm, {"wheels": {"topic": "/joint_states"}})
+    assert caught.value.code == "no_wheels"
+
+
+@pytest.mark.parametrize("layout", ["ackermann", "ackermann_status", "ackermann_floats"])
+def test_a_car_is_read_from_every_form(drive: TakeThrough, layout: str) -> None:
+    car = replace(PLAIN, vehicle=VEHICLES["car"], pose=ICP, recording=Recording(layout))
+    taken = drive(car)
+    steady = taken.slip("measured").filter(~pl.col("transitory"))
+    assert slope(steady["f_x"], steady["v_x"]) == pytest.approx(1.0, abs=0.02)
+    assert slope(steady["f_w"], steady["v_w"]) == pytest.approx(1.0, abs=0.03)
+    assert taken.warned() == set()
+
+
+@pytest.mark.parametrize(
+    "layout", ["warthog_platform", "wheel_float", "pose_stamped", "tf", "husky_joint_commands"]
+)
+def test_a_skid_steer_is_read_from_every_form(drive: TakeThrough, layout: str) -> None:
+    taken = drive(replace(PLAIN, pose=EXACT, recording=Recording(layout)))
+    steady = taken.slip("measured").filter(~pl.col("transitory"))
+    assert slope(steady["f_x"], steady["v_x"]) == pytest.approx(1.0, abs=0.02)
+    assert slope(steady["f_w"], steady["v_w"]) == pytest.approx(1.0, abs=0.03)

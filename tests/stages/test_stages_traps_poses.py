@@ -1,0 +1,230 @@
+"""Traps on the way from poses to velocities; the numbers are those of the list of known traps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms, slope
+
+from pipeline.core import rigid
+from pipeline.simulate import VEHICLES, Ground, Imu, Program, Recording
+from pipeline.stages.extract.localization import cut_track, normalize_quaternions
+from pipeline.stages.extract.reading import PoseArrays
+from pipeline.stages.extract.transforms import to_base_link
+from pipeline.stages.velocity import compute_velocities
+from pipeline.vehicles import Configuration
+
+SETTINGS = Configuration().velocity
+
+
+def test_trap_1_held_poses_do_not_double_velocities(drive: TakeThrough) -> None:
+    taken = drive(replace(PLAIN, pose=replace(ICP, update_hz=5.0)))
+    assert taken.finding("held_poses").value == pytest.approx(0.75, abs=0.01)
+    assert float(np.abs(taken.velocities["v_x"].to_numpy()).max()) < 1.2  # a 1 m/s Husky
+    fast = taken.slip("measured").filter(~pl.col("transitory"))
+    assert rms(fast["g_x"]) < 0.05
+
+
+def test_trap_1_a_standing_vehicle_is_no_gap_and_has_no_velocity(drive: TakeThrough) -> None:
+    standing = replace(PLAIN, program=Program("stop_and_go"), pose=replace(EXACT, update_hz=5.0))
+    taken = drive(standing)
+    assert taken.velocities["segment"].n_unique() == 1
+    # Every other step of 6 s stands; after 2 s the lag has died away.
+    still = taken.velocities.filter(((pl.col("t") % 12.0) > 2.5) & ((pl.col("t") % 12.0) < 5.0))
+    assert float(np.abs(still.select("v_x", "v_y", "v_w").to_numpy()).max()) < 0.02
+
+
+def test_trap_2_a_circle_has_no_lateral_velocity(drive: TakeThrough) -> None:
+    slow = replace(PLAIN, program=Program("circle"), pose=replace(EXACT, rate_hz=4.0))
+    taken = drive(slow)
+    steady = taken.velocities.filter((pl.col("t") > 5.0) & (pl.col("t") < 55.0))
+    # Differencing in the frame of the start would give dt v w / 2 = 0.045 m/s.
+    assert float(np.abs(steady["v_y"].to_numpy()).max()) < 1e-3
+    assert steady["v_x"].mean() == pytest.approx(0.6, rel=2e-3)
+
+
+@pytest.mark.parametrize("ground", [Ground(pitch_rad=math.radians(9.0)), Ground(roll_rad=math.radians(9.0))])
+def test_trap_2_a_tilted_plane_changes_neither_speed_nor_turning(drive: TakeThrough, ground: Ground) -> None:
+    taken = drive(replace(PLAIN, program=Program("circle"), pose=EXACT, ground=ground))
+    steady = taken.slip("measured").filter((pl.col("t") > 5.0) & (pl.col("t") < 55.0))
+    # In the plane of the map both would be 1.2 % too small.
+    assert slope(steady["f_x"], steady["v_x"]) == pytest.approx(1.0, abs=2e-3)
+    assert slope(steady["f_w"], steady["v_w"]) == pytest.approx(1.0, abs=2e-3)
+
+
+def test_trap_3_a_late_heading_is_found_and_said(drive: TakeThrough) -> None:
+    taken = drive(replace(FIELD, duration_s=120.0, effects={"heading_skew": 0.12, "drive_lag": 0.3}))
+    assert taken.finding("heading_skew").value == pytest.approx(0.12, abs=0.03)
+
+
+@pytest.mark.parametrize("effects", [{}, {"clock_offset": 0.15}, {"drive_lag": 0.5}])
+def test_trap_3_what_delays_all_channels_alike_is_no_skew(
+    drive: TakeThrough, effects: dict[str, float]
+) -> None:
+    taken = drive(replace(FIELD, duration_s=120.0, effects={"drive_lag": 0.3, **effects}))
+    assert "heading_skew" not in taken.ids()
+
+
+def test_trap_4_a_motion_at_a_third_of_a_hertz_is_kept(drive: TakeThrough) -> None:
+    # The slalom's turn is a sine of period 2 step_s: 0.36 Hz, where the published spline keeps a half.
+    weave = replace(PLAIN, program=Program("slalom", step_s=1.0 / 0.72), pose=EXACT, effects={})
+    taken = drive(weave)
+    steady = taken.slip("measured").filter((pl.col("t") > 5.0) & (pl.col("t") < 55.0))
+    assert slope(steady["f_w"], steady["v_w"]) == pytest.approx(0.936, abs=0.02)
+
+
+def test_trap_10_a_pose_of_the_lidar_is_moved_to_base_link(drive: TakeThrough) -> None:
+    mounted = replace(EXACT, child_frame="lidar", mount_x_m=0.5, mount_y_m=0.1, mount_yaw_rad=0.3)
+    taken = drive(replace(PLAIN, pose=mounted))
+    assert taken.finding("child_frame").severity == "info"
+    assert rms(taken.velocities["v_y"]) < 2e-3  # not moved, 0.5 m of arm gives 0.3 m/s in turns
+
+
+def test_trap_10_a_frame_that_nothing_places_is_said() -> None:
+    arrays = PoseArrays(np.zeros((2, 3)), np.array([[0.0, 0.0, 0.0, 1.0]] * 2), "map", "lidar")
+    same, (finding,) = to_base_link(arrays, [], "/pose")
+    assert same is arrays
+    assert (finding.id, finding.severity) == ("child_frame", "warning")
+    assert "'lidar'" in finding.text
+
+
+@pytest.mark.parametrize("child", ["", "base_link", "/base_link", "husky/base_link", "base_footprint"])
+def test_trap_10_base_link_is_known_under_its_usual_names(child: str) -> None:
+    arrays = PoseArrays(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]), "map", child)
+    assert to_base_link(arrays, [], "/pose") == (arrays, [])
+
+
+def test_trap_10_a_chain_with_a_correction_dated_ahead_gives_the_pose(drive: TakeThrough) -> None:
+    chained = replace(PLAIN, vehicle=VEHICLES["jackal"], recording=Recording("tf"))
+    taken = drive(chained)
+    assert "map to base_link" in taken.finding("transforms").text
+    steady = taken.slip("measured").filter(~pl.col("transitory"))
+    assert float(steady["g_x"].abs().median()) < 5e-3
+    assert taken.velocities["t"].max() > 59.0
+
+
+def test_trap_12_invalid_poses_are_told_and_left_out(drive: TakeThrough) -> None:
+    taken = drive(replace(PLAIN, pose=replace(ICP, invalid=6)))
+    assert taken.finding("bad_pose").count == 3
+    assert taken.finding("bad_quaternion").count == 3
+    assert np.isfinite(taken.velocities.select("v_x", "v_y", "v_w").to_numpy()).all()
+    assert taken.velocities["segment"].n_unique() == 1
+
+
+def test_trap_12_quaternions_are_scaled_to_unit_length_and_that_is_said() -> None:
+    quaternion = np.array([[0.0, 0.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0], [np.nan] * 4])
+    unit, usable, findings = normalize_quaternions(quaternion, "/pose")
+    assert usable.tolist() == [True, True, False, False]
+    assert np.allclose(np.linalg.norm(unit[:2], axis=1), 1.0)
+    assert {finding.id: finding.count for finding in findings} == {
+        "quaternion_not_unit": 1,
+        "bad_quaternion": 2,
+    }
+
+
+def test_trap_12_a_yaw_that_wraps_is_no_jump_and_no_turn(drive: TakeThrough) -> None:
+    taken = drive(replace(PLAIN, program=Program("spins"), pose=ICP, start_pose=(0.0, 0.0, 3.1)))
+    assert "pose_jump" not in taken.ids()
+    assert float(np.abs(taken.velocities["v_w"].to_numpy()).max()) < 1.2
+    assert float(np.abs(np.diff(taken.velocities["yaw"].to_numpy())).max()) < 0.1
+
+
+def test_trap_12_a_correction_of_the_map_is_a_cut_not_a_velocity(drive: TakeThrough) -> None:
+    taken = drive(replace(PLAIN, pose=replace(ICP, jumps=3, jump_m=1.0)))
+    assert taken.finding("pose_jump").count == 3
+    assert taken.velocities["segment"].n_unique() == 4
+    assert float(np.abs(taken.velocities["v_x"].to_numpy()).max()) < 1.3
+
+
+def test_trap_17_jitter_of_the_stamps_cuts_nothing(drive: TakeThrough) -> None:
+    jittery = replace(ICP, rate_hz=10.0, jitter_s=0.02, stamp_jitter_s=0.01)
+    taken = drive(replace(PLAIN, pose=jittery))
+    assert taken.velocities["segment"].n_unique() == 1
+    assert taken.warned() - {"clock_unset"} == set()  # the first stamp lies before the start
+    steady = taken.slip("measured").filter(~pl.col("transitory"))
+    assert rms(steady["g_x"]) < 0.1
+
+
+@pytest.mark.parametrize("vehicle", ["husky", "warthog"])
+@pytest.mark.parametrize("update_hz", [None, 5.0])
+def test_trap_18_stretches_with_a_rotated_heading_are_found(
+    drive: TakeThrough, vehicle: str, update_hz: float | None
+) -> None:
+    turned = replace(ICP, rotated_stretches=3, update_hz=update_hz)
+    taken = drive(replace(FIELD, vehicle=VEHICLES[vehicle], duration_s=180.0, pose=turned))
+    found = taken.finding("bad_stretch")
+    # A stretch that falls into slow driving cannot be told, one over two steps may count twice.
+    assert found.count is not None
+    assert 2 <= found.count <= 6
+    bad = taken.slip("measured").filter(pl.col("suspect"))
+    assert float(bad["g_y"].abs().median() or 0.0) > 3.0 * float(
+        taken.slip("measured").filter(~pl.col("suspect"))["g_y"].abs().median() or 0.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "effects"),
+    [
+        ("husky", {"effective_track": 1.8}),
+        ("husky", {"effective_track": 1.5, "body_inertia": 0.5, "lateral_skid": 0.1}),
+        ("warthog", {"effective_track": 1.5, "body_inertia": 0.9, "acceleration_limit": 4.0}),
+        ("husky", {"yaw_misalignment": 0.1}),
+        ("husky", {"icr_offset": 0.2, "turning_resistance": 0.24}),
+    ],
+)
+def test_trap_18_sliding_is_no_bad_stretch(
+    drive: TakeThrough, vehicle: str, effects: dict[str, float]
+) -> None:
+    taken = drive(replace(FIELD, vehicle=VEHICLES[vehicle], duration_s=180.0, effects=effects))
+    assert "bad_stretch" not in taken.ids()
+
+
+def make_windowed_poses(steps: int = 5, *, speed: float = 1.0) -> pl.DataFrame:
+    """Poses of 6 s steps with a hole of 1 s between, each step going on where the last one ended."""
+    pieces = []
+    for step in range(steps):
+        since = np.arange(120) * 0.05
+        way = (step * 6.0 + since) * speed
+        pieces.append((step * 7.0 + since, way))
+    times = np.concatenate([piece[0] for piece in pieces])
+    position = np.stack((np.concatenate([piece[1] for piece in pieces]), 0.0 * times, 0.0 * times), axis=-1)
+    quaternion = rigid.quaternions_from_yaw(0.0 * times)
+    track = cut_track(times, position, quaternion, np.zeros(times.size, dtype=bool), SETTINGS, "/pose")
+    return pl.DataFrame(
+        {
+            "t": times,
+            "stamp": np.round(times * 1e9).astype(np.int64),
+            "segment": track.segment.astype(np.int32),
+            **{name: track.position[:, i] for i, name in enumerate("xyz")},
+            **{f"q_{name}": track.quaternion[:, i] for i, name in enumerate("xyzw")},
+            "held": track.held,
+        }
+    )
+
+
+def test_trap_20_steps_with_holes_between_are_segments_of_their_own() -> None:
+    made = compute_velocities(make_windowed_poses(), pl.DataFrame(), SETTINGS, where="x").table
+    assert made["segment"].n_unique() == 5
+    assert made.group_by("segment").len()["len"].to_list() == [120] * 5
+    # Across a hole the vehicle did not move: a line drawn there would slow it down.
+    assert np.allclose(made["v_x"].to_numpy(), 1.0, atol=1e-6)
+
+
+def test_a_short_hole_is_bridged_by_nothing_and_reported(drive: TakeThrough) -> None:
+    taken = drive(replace(PLAIN, pose=replace(ICP, dropouts=2, dropout_s=1.5)))
+    gap = taken.finding("pose_gap")
+    assert gap.count == 2
+    assert gap.value == pytest.approx(1.55, abs=0.06)
+    times = taken.velocities["t"].to_numpy()
+    assert int((np.diff(times) > 1.0).sum()) == 2
+
+
+def test_the_gyro_of_a_silent_stretch_is_unknown(drive: TakeThrough) -> None:
+    taken = drive(replace(PLAIN, imu=Imu(), recording=Recording(gaps=1, gap_s=3.0)))
+    known = taken.velocities.filter(pl.col("v_w_imu").is_not_null())
+    assert known.height > 0.9 * taken.velocities.height
+    assert rms(known["v_w_imu"].to_numpy() - known["v_w"].to_numpy()) < 0.05
