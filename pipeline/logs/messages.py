@@ -61,6 +61,7 @@ class Messages:
         schemas: schema records of the chunk.
         channels: channel records of the chunk.
         damage: stretches (start, end) of the chunk that hold no readable record.
+        walked: whether no message index told where they stand, or one that does not agree with the records.
     """
 
     start: Ints
@@ -71,6 +72,7 @@ class Messages:
     schemas: list[rec.SchemaRecord] = field(default_factory=list)
     channels: list[rec.ChannelRecord] = field(default_factory=list)
     damage: list[tuple[int, int]] = field(default_factory=list)
+    walked: bool = False
 
 
 @dataclass(slots=True)
@@ -118,6 +120,7 @@ def locate_messages(chunk: Buffer, entries: Sequence[tuple[int, NDArray[np.uint6
         schemas=found.schemas,
         channels=found.channels,
         damage=found.damage,
+        walked=agreed is None,
     )
 
 

@@ -130,14 +130,17 @@ def read_topics(
         sources = [stack.enter_context(FileSource(part.path)) for part in index.parts]
         beside = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="hash"))
         digest = None if sha256 is not None else beside.submit(hash_sources, sources)
-        unchecked = 0
+        unchecked = walked = 0
         for part, source in zip(index.parts, sources, strict=True):
-            for payloads, lost, free in _read_part(source, part, set(jobs), workers):
-                unchecked += free
-                losses.update(dict.fromkeys(lost))
-                for number, each in payloads.items():
-                    jobs[number].buffer.add(each)
+            for gathered in _read_part(source, part, set(jobs), workers):
+                unchecked += gathered.unchecked
+                walked += gathered.index_damaged
+                losses.update(dict.fromkeys(gathered.losses))
+                for number, payloads in gathered.payloads.items():
+                    jobs[number].buffer.add(payloads)
         found = digest.result() if digest is not None else (sha256 or "")
+    if walked:
+        notes.append(f"the message indexes of {walked} chunks are damaged; their records were walked")
     if unchecked:
         notes.append(f"{unchecked} chunks carry no checksum: damage inside them cannot be seen")
     topics: list[TopicColumns] = []
@@ -146,6 +149,16 @@ def read_topics(
         losses.update(dict.fromkeys(lost))
         topics.append(columns)
     return LogData(index, tuple(topics), tuple(losses), tuple(notes), found)
+
+
+@dataclass(slots=True, eq=False)
+class _Gathered:
+    """Wanted payloads of one span by the recording's channel number, and what is to be said of it."""
+
+    payloads: dict[int, Payloads]
+    losses: list[Loss]
+    unchecked: bool
+    index_damaged: bool
 
 
 @dataclass(slots=True, eq=False)
@@ -212,16 +225,15 @@ def _schema_of(index: LogIndex, number: int) -> bytes:
     return b""
 
 
-def _read_part(
-    source: ByteSource, part: Part, wanted: set[int], threads: int
-) -> Iterator[tuple[dict[int, Payloads], list[Loss], bool]]:
+def _read_part(source: ByteSource, part: Part, wanted: set[int], threads: int) -> Iterator[_Gathered]:
     own = {number for number, merged in part.numbers.items() if merged in wanted}
     spans = [span for span in part.spans if span.channels is None or span.channels & own]
 
-    def gather(span: Span, loaded: Loaded) -> tuple[dict[int, Payloads], list[Loss], bool]:
+    def gather(span: Span, loaded: Loaded) -> _Gathered:
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)
         merged = {part.numbers[number]: each for number, each in payloads.items()}
-        return merged, loaded.losses, loaded.unchecked and span.kind is SpanKind.CHUNK
+        unchecked = loaded.unchecked and span.kind is SpanKind.CHUNK
+        return _Gathered(merged, loaded.losses, unchecked, loaded.index_damaged)
 
     section = None if not part.data_crc or part.data_end is None else (part.data_end, part.data_crc)
     return load_spans(source, spans, gather, threads=threads, wanted=own, data_section=section)

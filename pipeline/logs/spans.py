@@ -98,12 +98,14 @@ class Loaded:
         messages: where its messages stand.
         losses: what was lost in it.
         unchecked: whether no checksum covered the records.
+        index_damaged: whether its message index is of no use, which loses nothing.
     """
 
     chunk: Buffer
     messages: Messages
     losses: list[Loss] = field(default_factory=list)
     unchecked: bool = False
+    index_damaged: bool = False
 
 
 def no_excuse() -> str | None:
@@ -166,7 +168,8 @@ def load_span(
         return _load_start(span, head, written, f"its last {len(stored) - len(written)} bytes are zero")
     messages = locate_messages(chunk, entries)
     losses += _damage_losses(span, messages, len(chunk))
-    return Loaded(chunk, messages, losses, unchecked=head.crc == 0)
+    index_damaged = span.index_length > 0 and messages.walked and messages.start.size > 0
+    return Loaded(chunk, messages, losses, unchecked=head.crc == 0, index_damaged=index_damaged)
 
 
 def _needed_size(entries: list[Entries], wanted: AbstractSet[int]) -> int | None:
