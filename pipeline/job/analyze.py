@@ -206,20 +206,19 @@ def _read_summary(manifest: Manifest, options: Options) -> dict[str, JSON]:
 
 
 def update_datasets(store: Store) -> None:
-    """Pool the runs of the results into `datasets.parquet`; equal content counts once."""
+    """Pool the runs of the results into `datasets.parquet`; equal content counts once.
+
+    What only `slip compare` works out is null until it is asked for.
+    """
     import polars as pl  # noqa: PLC0415 - heavy
 
-    from pipeline.stages.aggregate import pool_datasets  # noqa: PLC0415 - heavy
+    from pipeline.comparison import gather_runs, pool_runs  # noqa: PLC0415 - heavy
+    from pipeline.job.material import find_material  # noqa: PLC0415 - heavy
 
-    keys: dict[str, str] = {}
-    seen: set[str] = set()
-    for manifest in store.survey().manifests:
-        log = manifest.details.get("log")
-        sha256 = str(log.get("sha256")) if isinstance(log, dict) else manifest.run
-        if "aggregates" in manifest.tables and sha256 not in seen:
-            seen.add(sha256)
-            keys[manifest.run] = manifest.key
-    if not keys:
+    material = find_material(store, ("dataset",), trusted_only=False)
+    if not store.survey().manifests:
         return
-    aggregates = store.scan("aggregates").filter(pl.col("run").is_in(list(keys))).collect()
-    store.write_results_table("datasets", pool_datasets(aggregates, keys))
+    runs = list(material.manifests)
+    aggregates = material.scan("aggregates").filter(pl.col("run").is_in(runs)).collect()
+    pooled = pool_runs(gather_runs(aggregates, material.labels), ("dataset",))
+    store.write_results_table("datasets", pooled)

@@ -44,7 +44,7 @@ def render_report(report: RunReport) -> str:
     }
     scripts = [load_bundle(), _read_own("page.js")] if drawings else []
     body = _render_header(page) + _render_sections(page)
-    return _assemble(escape(report.text("run") or "run"), body, encode_json(data), scripts)
+    return assemble_page(escape(report.text("run") or "run"), body, encode_json(data), scripts)
 
 
 def _render_header(page: Page) -> str:
@@ -88,7 +88,15 @@ def _render_sections(page: Page) -> str:
     return f"<main>{chr(10).join(shown)}</main>"
 
 
-def _assemble(title: str, body: str, data: str, scripts: list[str]) -> str:
+def assemble_page(title: str, body: str, data: str, scripts: list[str]) -> str:
+    """A whole page that asks the network for nothing.
+
+    Args:
+        title: of the window, as HTML.
+        body: content as HTML.
+        data: figures and rows as JSON that may stand in a script element.
+        scripts: JavaScript; only these run.
+    """
     hashes = " ".join(f"'sha256-{_hash(script)}'" for script in scripts) or "'none'"
     policy = (
         f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data:; "

@@ -18,10 +18,17 @@ from pipeline.statistics.families import (
 from pipeline.statistics.intervals import Interval, bootstrap_median, bound_mean, bound_shift, bound_typical
 from pipeline.statistics.orders import kendall_tau, list_swaps
 from pipeline.statistics.pairs import Blocks, Comparison, compare_blocks, compare_runs, cut_blocks
-from pipeline.statistics.permutation import PermutationTest, permute_means, permute_studentized, smallest_p
+from pipeline.statistics.permutation import (
+    DRAWS,
+    PermutationTest,
+    permute_means,
+    permute_studentized,
+    smallest_p,
+)
 from pipeline.statistics.ranks import mann_whitney
 
 __all__ = [
+    "DRAWS",
     "MOST_GROUPS",
     "TIMES_PER_BLOCK",
     "Blocks",

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-MOST_GROUPS = 7
+MOST_GROUPS = 8
 _TIE = 1e-9
 _MOST_RUNS = 1_000
 

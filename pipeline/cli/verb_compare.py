@@ -1,0 +1,123 @@
+"""`slip compare`: datasets side by side, and whether they differ."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from pipeline.cli.output import CLEAN, print_json
+from pipeline.job.options import FigureFormat
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.job.compare import Answer
+
+_NAME = 34
+
+
+def register(app: App) -> None:
+    """Add the verb."""
+    app.command(compare)
+
+
+def compare(  # noqa: D417 - arguments document themselves
+    results: Annotated[Path, Parameter(help="results folder")] = Path("results"),
+    /,
+    *,
+    by: Annotated[
+        str,
+        Parameter(
+            help="what makes a dataset: dataset, vehicle, terrain, run, day, month, year, or several of them"
+        ),
+    ] = "dataset",
+    fed: Annotated[
+        Literal["command", "measured"] | None,
+        Parameter(
+            name="--input",
+            help="what the ideal model was fed with (default: the command where all runs have one)",
+        ),
+    ] = None,
+    as_published: Annotated[bool, Parameter(negative="")] = False,
+    figures: FigureFormat | None = None,
+    out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Compare the datasets of the results: medians with intervals, tests that count runs, effect sizes.
+
+    Writes datasets.parquet, comparisons.parquet, both as CSV and LaTeX, and comparison.html.
+
+    Args:
+        as_published: compare window norms of the published chain in place of median moduli.
+        figures: also write the figures in this format, for papers.
+        json: print one JSON object in place of the tables.
+        quiet: print nothing.
+    """
+    from pipeline.job.compare import (  # noqa: PLC0415 - heavy
+        Question,
+        compare_results,
+        describe_answer,
+        write_answer,
+    )
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    store = Store(out or results)
+    names = tuple(name.strip() for name in by.split(",") if name.strip())
+    answer = compare_results(store, Question(by=names, input=fed, as_published=as_published))
+    written = write_answer(store, answer, figures)
+    if json:
+        print_json({**describe_answer(answer), "page": str(written["comparison.html"])})
+    elif not quiet:
+        print(_describe(answer, written))
+    return CLEAN
+
+
+def _describe(answer: Answer, written: Mapping[str, Path]) -> str:
+    datasets = answer.datasets.filter(answer.datasets["input"] == answer.input)
+    label = "as published" if answer.quantity == "published_norm" else "median modulus"
+    lines = [
+        f"slip on {answer.input.replace('measured', 'measured wheels')}, {label} [m/s]",
+        "",
+        f"{'dataset':<{_NAME}}{'runs':>5}{'median':>9}   {'95 % interval':<16}{'window norm':>12}",
+    ]
+    lines += [
+        _describe_dataset(row, answer.quantity)
+        for row in datasets.sort(answer.quantity).iter_rows(named=True)
+    ]
+    lines += ["", *_describe_pairs(list(answer.comparisons.sort("p_adjusted", "p").iter_rows(named=True)))]
+    lines += ["", *(f"! {note}" for note in answer.notes), f"page    {written['comparison.html']}"]
+    return "\n".join(lines)
+
+
+def _describe_dataset(row: Mapping[str, object], quantity: str) -> str:
+    low, high = row["low"], row["high"]
+    ends = f"{low:.3g} to {high:.3g}" if isinstance(low, float) and isinstance(high, float) else "-"
+    if quantity != "median_modulus":
+        ends = "-"
+    only = " (this run)" if row["interval"] == "this run only" and ends != "-" else ""
+    return (
+        f"{str(row['dataset'])[: _NAME - 1]:<{_NAME}}{row['runs']:>5}{_number(row[quantity]):>9}   "
+        f"{ends:<16}{_number(row['median_window_norm']):>12}{only}"
+    )
+
+
+def _describe_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
+    shown = [row for row in rows if isinstance(row["p_adjusted"], float) and row["p_adjusted"] <= 0.05]  # noqa: PLR2004 - the usual level
+    lines = [
+        f"{row['a']} and {row['b']} differ: shift {_number(row['shift'])} m/s, "
+        f"Cliff's delta {_number(row['cliffs_delta'])} ({row['size']}), "
+        f"p = {_number(row['p_adjusted'])} corrected"
+        + (", this run against that run, not the terrain" if row["unit_of_analysis"] == "blocks" else "")
+        for row in shown
+    ]
+    rest = len(rows) - len(shown)
+    if rest:
+        lines.append(f"{rest} pair{'s' * (rest != 1)} not shown to differ")
+    return lines
+
+
+def _number(value: object) -> str:
+    return f"{value:.3g}" if isinstance(value, (int, float)) else "-"

@@ -1,0 +1,9 @@
+"""The error of this room."""
+
+from __future__ import annotations
+
+from pipeline.core.errors import SlipError
+
+
+class ComparisonError(SlipError):
+    """Results, or a table of deployments, that cannot be compared."""

@@ -1,0 +1,200 @@
+"""The page of `slip compare`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import polars as pl
+
+from pipeline.report.comparison.difficulty import render_difficulty
+from pipeline.report.comparison.figures import draw_boxes, draw_runs
+from pipeline.report.gallery import Chapter, Picture, render_gallery
+from pipeline.report.run import INPUT_WORDS
+from pipeline.report.words import begin_large, build_table, escape, say_distance, say_duration, say_number
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+_LEVEL = 0.05
+_SHOWN = (
+    "transitory_median_modulus", "steady_median_modulus", "median_window_norm", "published_norm",
+    "drivetrain_mean_square", "ground_mean_square", "cross_mean_square", "height_rate",
+    "largest_kinetic_energy",
+)  # fmt: skip
+
+
+def render_comparison(
+    *,
+    datasets: pl.DataFrame,
+    comparisons: pl.DataFrame,
+    runs: pl.DataFrame,
+    windows: pl.DataFrame,
+    input_name: str,
+    quantity: str,
+    notes: Sequence[str],
+) -> str:
+    """The whole page as HTML.
+
+    Args:
+        datasets: table `datasets`.
+        comparisons: table `comparisons`.
+        runs: one row a run and input.
+        windows: as of `spread_windows`.
+        input_name: what u was in the comparisons.
+        quantity: what was compared, a column of `datasets`.
+        notes: what must be known.
+    """
+    shown = datasets.filter(pl.col("input") == input_name)
+    pictures = list_pictures(shown, runs, windows, input_name=input_name, quantity=quantity)
+    told = "".join(f"<li>{escape(begin_large(note))}.</li>" for note in notes)
+    keys = "".join(
+        f"<li><b>{escape(row['dataset'])}</b> {escape(row['keys'])}</li>"
+        for row in shown.iter_rows(named=True)
+    )
+    chapters = [
+        Chapter(
+            "datasets",
+            "Which deployment is harder",
+            lead=f'<p class="lead">{escape(_say_verdict(comparisons))}</p>',
+            pictures=pictures,
+            rest=_tabulate_datasets(shown, input_name),
+        ),
+        Chapter("pairs", "How sure", rest=_tabulate_pairs(comparisons)),
+        Chapter("difficulty", "Fair between vehicles", rest=render_difficulty(shown)),
+        Chapter("notes", "What must be known", rest=f"<ul>{told}</ul>"),
+        Chapter("provenance", "Runs counted", rest=f"<ul>{keys}</ul>"),
+    ]
+    facts = [
+        f"{shown.height} datasets",
+        f"{shown['runs'].sum()} runs",
+        f"slip {INPUT_WORDS[input_name]}",
+        "as published" if quantity == "published_norm" else "median modulus",
+    ]
+    return render_gallery("Deployments compared", facts, chapters)
+
+
+def list_pictures(
+    shown: pl.DataFrame, runs: pl.DataFrame, windows: pl.DataFrame, *, input_name: str, quantity: str
+) -> list[Picture]:
+    """The published figure and the honest one.
+
+    Args:
+        shown: table `datasets` of one input.
+        runs: one row a run and input.
+        windows: as of `spread_windows`.
+        input_name: what u was.
+        quantity: column of the run medians.
+    """
+    boxes = windows.filter(pl.col("input") == input_name)
+    own = runs.filter(pl.col("input") == input_name)
+    pictures = []
+    if not boxes.is_empty():
+        told = ", ".join(f"{row['group']} {row['median']:.3g}" for row in boxes.iter_rows(named=True))
+        words = "of the published chain" if quantity == "published_norm" else INPUT_WORDS[input_name]
+        drawing = draw_boxes(boxes, input_name, title=f"2 s window norm {words} [m/s]")
+        pictures.append(
+            Picture("window_norms_by_dataset", "The published figure", drawing, f"Medians in m/s: {told}.")
+        )
+    rated = shown.filter(pl.col(quantity).is_not_null())
+    if not rated.is_empty():
+        if quantity == "published_norm":
+            title = "window norm of the published chain [m/s]"
+            rated = rated.with_columns(
+                pl.lit(None, pl.Float64).alias("low"), pl.lit(None, pl.Float64).alias("high")
+            )
+        else:
+            title = f"median slip modulus {INPUT_WORDS[input_name]} [m/s]"
+        told = ", ".join(
+            f"{row['dataset']} {row[quantity]:.3g}" for row in rated.sort(quantity).iter_rows(named=True)
+        )
+        drawing = draw_runs(own, rated, value=quantity, title=title)
+        pictures.append(Picture("run_medians_by_dataset", "The honest figure", drawing, f"In m/s: {told}."))
+    return pictures
+
+
+def _say_verdict(comparisons: pl.DataFrame) -> str:
+    if comparisons.is_empty():
+        return "There is one dataset only: nothing to compare it with."
+    different = comparisons.filter(pl.col("p_adjusted") <= _LEVEL)
+    over_runs = different.filter(pl.col("unit_of_analysis") == "runs").height
+    hopeless = comparisons.filter(pl.col("smallest_p") > _LEVEL).height
+    verdict = (
+        f"Of {comparisons.height} pairs {over_runs} differ as terrains (runs permuted) and "
+        f"{different.height - over_runs} as single runs only"
+    )
+    if hopeless:
+        verdict += f"; {hopeless} have too few runs to differ whatever the numbers"
+    return f"{verdict}. Corrected for asking often, 5 %."
+
+
+def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> str:
+    head = [
+        "dataset", "runs", "samples", "distance", "duration",
+        "median modulus <small>m/s</small>", "95 % interval", "transitory", "steady",
+        "window norm <small>m/s</small>", "as published", "drivetrain <small>m\u00b2/s\u00b2</small>",
+        "ground", "cross", "height rate <small>m/s</small>", "largest energy <small>J</small>",
+    ]  # fmt: skip
+    rows = [
+        [
+            escape(row["dataset"]),
+            str(row["runs"]),
+            f"{row['samples']:,}",
+            say_distance(row["distance"]),
+            say_duration(row["duration"]),
+            say_number(row["median_modulus"]),
+            _say_ends(row) + (" <small>this run</small>" if row["interval"] == "this run only" else ""),
+            *(say_number(row[name]) for name in _SHOWN),
+        ]
+        for row in shown.sort("median_modulus").iter_rows(named=True)
+    ]
+    caption = f"Medians over runs, slip {INPUT_WORDS[input_name]}; a run counts once, whatever its length"
+    return build_table(head, rows, caption=caption, numeric=range(1, len(head)))
+
+
+def _tabulate_pairs(comparisons: pl.DataFrame) -> str:
+    if comparisons.is_empty():
+        return ""
+    head = [
+        "pair", "shift b \u2212 a <small>m/s</small>", "95 % interval", "Cliff\u2019s delta", "p corrected",
+        "p of the pair", "smallest p", "verdict", "unit", "plain p, <small>not valid</small>",
+    ]  # fmt: skip
+    rows = [
+        [
+            f"{escape(row['a'])} | {escape(row['b'])} <small>{row['runs_a']} + {row['runs_b']}</small>",
+            say_number(row["shift"]),
+            _say_ends(row),
+            f"{say_number(row['cliffs_delta'], digits=2)} {escape(row['size'])}",
+            _say_p(row["p_adjusted"]),
+            _say_p(row["p"]),
+            _say_p(row["smallest_p"]),
+            _say_pair(row),
+            "whole runs" if row["unit_of_analysis"] == "runs" else "blocks: run against run",
+            f"<small>{_say_p(row['p_uncorrected'])}</small>",
+        ]
+        for row in comparisons.sort("p_adjusted", "p").iter_rows(named=True)
+    ]
+    methods = "; ".join(sorted(set(comparisons["method"].to_list())))[:400]
+    return build_table(head, rows, caption=f"Pairs: {methods}", numeric=(1, 2, 4, 5, 6, 9))
+
+
+def _say_pair(row: Mapping[str, object]) -> str:
+    if _number(row["p_adjusted"]) <= _LEVEL:
+        return "<b>different</b>"
+    if _number(row["smallest_p"]) > _LEVEL:
+        return "too few runs to tell"
+    return "not shown to differ"
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, (int, float)) else 1.0
+
+
+def _say_p(p: float) -> str:
+    return f"{p:.4f}" if p >= 1e-4 else "&lt; 0.0001"  # noqa: PLR2004 - as many digits as are shown
+
+
+def _say_ends(row: Mapping[str, object]) -> str:
+    low, high = row["low"], row["high"]
+    if not isinstance(low, float) or not isinstance(high, float):
+        return "\u2013"
+    return f"{say_number(low)} to {say_number(high)}"

@@ -1,0 +1,26 @@
+"""Parameters of the effects fitted to a run."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import dataframely as dy
+
+from schemas import fields
+from schemas.contract import Table
+from schemas.slip import INPUTS
+
+
+class Parameters(Table):
+    """One row a parameter of an effect that was fitted to the run."""
+
+    NAME: ClassVar[str] = "parameters"
+    VERSION: ClassVar[int] = 1
+
+    input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})
+    effect = dy.String(min_length=1, metadata={"description": "id of the effect"})
+    parameter = dy.String(min_length=1, metadata={"description": "name of the parameter"})
+    value = fields.number("1", "its value, in the unit of the column `unit`")
+    low = fields.number("1", "lower end of its 95 % interval", nullable=True)
+    high = fields.number("1", "upper end of it", nullable=True)
+    unit = fields.text("unit of value, low and high")
