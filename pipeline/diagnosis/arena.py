@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -67,6 +67,7 @@ class Arena:
         noise: spread that a saturated fit leaves, shape (n, 3).
         kept: effects that are never dropped: those of the model to start from.
         metric: cost of residuals at the current model.
+        only_early_clock: whether a late clock cannot be told from a late drive.
     """
 
     problem: Problem
@@ -76,7 +77,7 @@ class Arena:
     folds: tuple[Fold, ...]
     metric: Metric
     kept: frozenset[str] = frozenset()
-    _known: dict[tuple[str, ...], Contender] = field(default_factory=dict)
+    only_early_clock: bool = False
 
     def enter(self, state: State) -> Contender:
         """Fit a state and hold it out."""
@@ -108,6 +109,9 @@ class Arena:
 
     def is_sound(self, contender: Contender) -> bool:
         """Whether every effect is large enough to be named, and no degenerate form of another."""
+        clock = contender.state.find("clock_offset")
+        if self.only_early_clock and clock is not None and clock.values["d"] > 0.0:
+            return False
         return all(
             effect.id in self.kept or is_nameable(effect, self.largest) for effect in contender.state.effects
         )

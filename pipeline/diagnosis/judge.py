@@ -28,6 +28,7 @@ GAP_S = 1.5
 LEAST_GAIN = 0.01
 LEAST_T = 2.5
 _FEWEST_WINDOWS = 6
+_FEWEST_ACTIVE = 2.5
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ class Verdict:
 
     Attributes:
         gain: share of the other's held-out loss that it takes away.
-        t: larger of two block t values: of the loss difference, and of the log ratio.
+        t: largest of three block t values: of the loss difference, of the log ratio of losses, and of the
+            loss taken away in proportion to how far predictions moved.
     """
 
     gain: float
@@ -98,7 +100,27 @@ def compare(problem: Problem, metric: Metric, before: Floats, after: Floats) -> 
     gain = 1.0 - float(new.sum()) / max(float(old.sum()), 1e-12)
     difference = sums_old - sums_new
     ratio = np.log(np.maximum(sums_old, 1e-9) / np.maximum(sums_new, 1e-9))
-    return Verdict(gain, max(_block_t(difference), _block_t(ratio)))
+    moved = (((before - after) / metric.scale) ** 2).sum(axis=1)
+    action = np.bincount(problem.unit, moved)[kept]
+    return Verdict(gain, max(_block_t(difference), _block_t(ratio), _ratio_t(difference, action)))
+
+
+def _ratio_t(difference: Floats, action: Floats) -> float:
+    """Evidence where an effect acts in few stretches: is the loss taken away where predictions moved?
+
+    If the effect is real the loss falls in each stretch in proportion to how far it moved the prediction
+    there; the spread about that proportion, with each stretch's own leverage taken out, is the noise.
+    """
+    total = float(action.sum())
+    if total <= 0.0:
+        return 0.0
+    leverage = action / total
+    if 1.0 / float(np.sum(leverage**2)) < _FEWEST_ACTIVE:
+        return 0.0
+    slope = float(difference.sum()) / total
+    rest = (difference - slope * action) / (1.0 - leverage)
+    spread = float(np.sqrt(np.sum(rest**2)))
+    return float(difference.sum()) / spread if spread > 0.0 else 0.0
 
 
 def _block_t(values: Floats) -> float:

@@ -15,9 +15,8 @@ Floats = NDArray[np.float64]
 
 _GAUSSIAN = 1.4826
 _CLIP = 6.0
+_SHARE_OF_RMS = 0.5
 _RIDGE = 1e-6
-# Below these a residual is rounding of stamps, whatever its spread says.
-_LEAST_SPREAD = np.array([2e-4, 2e-4, 2e-4])
 
 
 @dataclass(frozen=True)
@@ -57,14 +56,21 @@ class Metric:
         return float(self.cost(residual).mean())
 
 
-def measure_spread(residual: Floats, run: NDArray[np.int64], channels: tuple[int, ...]) -> Floats:
-    """Robust spread of each run and channel, laid out like the residuals, shape (n, 3)."""
+def measure_spread(residual: Floats, problem: Problem) -> Floats:
+    """Robust spread of each run and channel while it drives, laid out like the residuals, shape (n, 3).
+
+    It is never far below the clipped rms: where a vehicle mostly drives straight, the median of the yaw
+    residual says nothing about turning.
+    """
     spread = np.full(residual.shape, np.inf)
-    for number in np.unique(run).tolist():
-        rows = run == number
-        for channel in channels:
-            size = _GAUSSIAN * float(np.median(np.abs(residual[rows, channel])))
-            spread[rows, channel] = max(size, float(_LEAST_SPREAD[channel]))
+    for number in np.unique(problem.run).tolist():
+        rows = problem.run == number
+        live = rows & problem.live
+        for channel in problem.channels:
+            size = np.abs(residual[live if live.any() else rows, channel])
+            middle = max(_GAUSSIAN * float(np.median(size)), float(problem.least[channel]))
+            clipped = float(np.sqrt(np.mean(np.minimum(size, _CLIP * middle) ** 2)))
+            spread[rows, channel] = max(middle, _SHARE_OF_RMS * clipped)
     return spread
 
 
@@ -76,7 +82,7 @@ def make_metric(residual: Floats, noise: Floats, problem: Problem) -> Metric:
         noise: spread that a saturated fit leaves, shape (n, 3).
         problem: whose residuals they are.
     """
-    own = measure_spread(residual, problem.run, problem.channels)
+    own = measure_spread(residual, problem)
     scale = np.minimum(own, noise)
     with np.errstate(invalid="ignore"):
         clip = np.where(np.isfinite(scale), _CLIP * own / scale, 1.0)
@@ -100,7 +106,7 @@ def saturate(problem: Problem, residual: Floats) -> Floats:
         columns = np.column_stack((columns / size, np.ones(columns.shape[0])))
         for channel in problem.channels:
             rest[rows, channel] = _fit_robustly(columns, residual[rows, channel])
-    return measure_spread(rest, problem.run, problem.channels)
+    return measure_spread(rest, problem)
 
 
 def _fit_robustly(columns: Floats, values: Floats) -> Floats:

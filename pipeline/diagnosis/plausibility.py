@@ -22,7 +22,18 @@ _LEAST: Mapping[tuple[str, str], float] = {
     ("drive_lag", "tau"): 0.015,
     ("body_inertia", "tau"): 0.02,
     ("steering_lag", "tau"): 0.015,
-    ("lateral_skid", "c"): 0.004,
+    ("lateral_skid", "c"): 0.012,
+}
+# How far from its neutral value a gain must be: less is a vehicle's data sheet, not an effect.
+_LEAST_GAIN: Mapping[str, tuple[tuple[str, ...], float]] = {
+    "wheel_radius": (("k",), 0.004),
+    "wheel_asymmetry": (("e",), 0.003),
+    "effective_track": (("k",), 0.01),
+    "steering_gain": (("g",), 0.01),
+    "steering_offset": (("o",), 0.002),
+    "time_drift": (("k",), 0.015),
+    "terrain_change": (("k_v", "k_w"), 0.03),
+    "turn_droop": (("gain",), 0.03),
 }
 # Sizes that vehicles show (a wider range than was ever seen): outside, a name stands for something else.
 _PLAUSIBLE: Mapping[tuple[str, str], tuple[float, float]] = {
@@ -49,7 +60,15 @@ _PLAUSIBLE: Mapping[tuple[str, str], tuple[float, float]] = {
     ("yaw_misalignment", "psi"): (-0.35, 0.35),
     ("heading_skew", "d"): (-0.3, 0.4),
 }
+# What only ever takes motion away: the other sign is no physics, but a clock or chance.
+_ONE_SIGN: Mapping[str, str] = {
+    "lateral_skid": "c",
+    "speed_slip": "k",
+    "turning_resistance": "k",
+    "slope_drift": "k",
+}
 _SHARE_OF_TURNING = 0.1
+_LEAST_RAMP_S = 0.08
 _REACHED = 0.99
 
 
@@ -58,6 +77,14 @@ def is_nameable(effect: Effect, largest: Largest) -> bool:
     for (name, parameter), least in _LEAST.items():
         if effect.id == name and abs(effect.values[parameter]) < least:
             return False
+    if effect.id in _LEAST_GAIN:
+        names, least = _LEAST_GAIN[effect.id]
+        if max(abs(effect.values[name] - effect.parameter(name).neutral) for name in names) < least:
+            return False
+    if effect.id in _ONE_SIGN and effect.values[_ONE_SIGN[effect.id]] < 0.0:
+        return False
+    if effect.id == "acceleration_limit":
+        return effect.values["limit"] * _LEAST_RAMP_S < largest.wheel
     if effect.id == "turn_droop":
         # With its threshold at zero a droop is a wider track under another name.
         return effect.values["threshold"] > _SHARE_OF_TURNING * 2.0 * largest.wheel

@@ -18,9 +18,14 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 UNIT_S = 10.0
 _NO_DELAY = Timing()
+_LEAST_SPREAD = 2e-4
+_STANDING = 0.02
+# Encoders are read between commands: half a period of one is half a percent of half a second of the other.
+_LEAST_SHARE = 0.005
 
 
 class Problem(Protocol):
@@ -32,6 +37,8 @@ class Problem(Protocol):
         times: start and end of each window [s], shape (n, 2).
         unit: number of the stretch of ten seconds of each window; no stretch spans two runs, shape (n,).
         channels: which of x, y, w say anything.
+        live: whether the input moves the vehicle during a window or just before, shape (n,).
+        least: spread below which a residual is rounding of stamps [m/s, m/s, rad/s], shape (3,).
     """
 
     delays: tuple[DelayName, ...]
@@ -39,6 +46,8 @@ class Problem(Protocol):
     times: Floats
     unit: Integers
     channels: tuple[int, ...]
+    live: Flags
+    least: Floats
 
     def find_residuals(self, state: State) -> Floats:
         """Measured less predicted, shape (n, 3)."""
@@ -64,10 +73,12 @@ class BodyProblem:
         self.comparisons = tuple(comparisons)
         self.delays = delays
         self.channels = (0, 1, 2)
+        self.least = np.full(3, _LEAST_SPREAD)
         sizes = [c.windows.start.size for c in self.comparisons]
         self.run = np.repeat(np.arange(len(sizes)), sizes).astype(np.int64)
         self.times = np.concatenate([c.windows.times for c in self.comparisons])
         self.unit = number_units(self.run, self.times)
+        self.live = find_live(self.find_ideal())
 
     def find_residuals(self, state: State) -> Floats:
         """See `Problem`."""
@@ -90,7 +101,10 @@ class BodyProblem:
 class WheelProblem:
     """From the command to the wheels: what the drivetrain does, free of the ground."""
 
-    def __init__(self, commanded: Sequence[Comparison], measured: Sequence[Comparison]) -> None:
+    def __init__(
+        self, commanded: Sequence[Comparison], measured: Sequence[Comparison], *, speed: float, turn: float
+    ) -> None:
+        self.least = np.array([speed, 1.0, turn]) * _LEAST_SHARE
         self.comparisons = tuple(commanded)
         self.measured = tuple(measured)
         self.delays: tuple[DelayName, ...] = ()
@@ -99,6 +113,7 @@ class WheelProblem:
         self.run = np.repeat(np.arange(len(sizes)), sizes).astype(np.int64)
         self.times = np.concatenate([c.windows.times for c in self.comparisons])
         self.unit = number_units(self.run, self.times)
+        self.live = find_live(self.find_ideal())
         self._seen: dict[tuple[int, float], Floats] = {}
 
     def find_residuals(self, state: State) -> Floats:
@@ -119,6 +134,13 @@ class WheelProblem:
         return np.concatenate(
             [average_lags(c, c.predict_velocity((), _NO_DELAY)) for c in self.comparisons]
         )
+
+
+def find_live(ideal: Floats) -> Flags:
+    """Whether any of the ideal velocities (n, lags, 2) is more than 2 % of the largest."""
+    size = np.abs(ideal)
+    live: Flags = (size > _STANDING * size.max(axis=(0, 1))).any(axis=(1, 2))
+    return live
 
 
 def average_windows(comparison: Comparison, velocity: Velocity, late: float = 0.0) -> Floats:

@@ -1,0 +1,152 @@
+"""What is diagnosed: the runs made ready, and the problems and candidates that follow from what they recorded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.diagnosis.errors import DiagnosisError
+from pipeline.diagnosis.problem import BodyProblem, WheelProblem
+from pipeline.diagnosis.screen import Largest
+from pipeline.diagnosis.timing import LEAST_DELAY, YawDelay, measure_yaw_delay
+from pipeline.motion.catalogue import list_effects
+from pipeline.motion.comparison import Comparison, Input
+from pipeline.motion.effect import Effect, Place
+from pipeline.motion.forward import Timing
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.motion.recording import MotionRun
+    from pipeline.vehicles import Vehicle
+
+EffectClass = type[Effect]
+
+# Cell means of held commands are exact: finer cells change residuals in the sixth digit.
+_RATE_HZ = 50.0
+_FEWEST_WINDOWS = 60
+# A point beside base_link is a shifted centre of rotation: it is searched under that name.
+_TWINS = frozenset({"lever_arm"})
+_DRIVETRAIN = frozenset({Place.COMMAND, Place.DRIVE})
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Runs of one vehicle, ready to be asked.
+
+    Attributes:
+        runs: the recordings.
+        vehicle: geometry.
+        commanded: fed with commands, one a run; empty where a run has none.
+        measured: fed with measured wheels; empty where a run has none.
+        yaw_delays: of each run's heading against its gyro; None without a good gyro.
+        largest: what relative starts are shares of.
+    """
+
+    runs: tuple[MotionRun, ...]
+    vehicle: Vehicle
+    commanded: tuple[Comparison, ...]
+    measured: tuple[Comparison, ...]
+    yaw_delays: tuple[YawDelay | None, ...]
+    largest: Largest
+
+    @property
+    def has_gyro(self) -> bool:
+        """Whether every run has a good gyro as heading and clock."""
+        return all(delay is not None for delay in self.yaw_delays)
+
+    def compare(self, source: Input) -> tuple[Comparison, ...]:
+        """The comparisons of an input."""
+        return self.commanded if source is Input.COMMAND else self.measured
+
+    def start_timing(self) -> tuple[Timing, ...]:
+        """Delays to start from: the heading's against the gyro."""
+        return tuple(
+            Timing() if delay is None or abs(delay.seconds) < 0.5 * LEAST_DELAY else Timing(delay.seconds)
+            for delay in self.yaw_delays
+        )
+
+    def list_candidates(self, source: Input) -> tuple[EffectClass, ...]:
+        """Effects that can be told on an input of this vehicle."""
+        found = []
+        for effect in list_effects():
+            if self.vehicle.kind not in effect.kinds or effect.id in _TWINS:
+                continue
+            if source is Input.MEASURED and effect.place in _DRIVETRAIN:
+                continue
+            if effect.id == "heading_skew" and self.has_gyro:
+                continue
+            found.append(effect)
+        return tuple(found)
+
+    def list_drivetrain(self) -> tuple[EffectClass, ...]:
+        """Effects between command and wheels."""
+        return tuple(
+            effect
+            for effect in list_effects()
+            if self.vehicle.kind in effect.kinds and effect.place in _DRIVETRAIN
+        )
+
+    def pose_body(self, source: Input) -> BodyProblem:
+        """The problem from an input to the body."""
+        late = source is Input.MEASURED and self.has_gyro
+        return BodyProblem(self.compare(source), ("wheel_delay_s",) if late else ())
+
+    def pose_wheels(self) -> WheelProblem:
+        """The problem from command to wheels."""
+        return WheelProblem(
+            self.commanded, self.measured, speed=self.largest.speed, turn=self.largest.turn
+        )
+
+
+def prepare(runs: Sequence[MotionRun], vehicle: Vehicle) -> Ground:
+    """Make runs ready.
+
+    Raises:
+        DiagnosisError: ``too_short``, fewer than a quarter of a minute of driving can be compared.
+    """
+    commanded = _compare_all(runs, vehicle, Input.COMMAND)
+    measured = _compare_all(runs, vehicle, Input.MEASURED)
+    leading = commanded or measured
+    windows = sum(comparison.windows.start.size for comparison in leading)
+    if windows < _FEWEST_WINDOWS:
+        raise DiagnosisError(
+            "too_short",
+            f"only {windows} stretches of half a second have both a live input and good poses",
+            where=", ".join(run.name for run in runs),
+            hint=f"At least {_FEWEST_WINDOWS} are needed: drive longer, or check the poses with `slip inspect`.",
+        )
+    delays = []
+    for comparison in leading:
+        gyro = comparison.heading.gyro
+        delays.append(None if gyro is None else measure_yaw_delay(comparison.run, gyro))
+    return Ground(tuple(runs), vehicle, commanded, measured, tuple(delays), _measure_largest(runs, vehicle))
+
+
+def _compare_all(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> tuple[Comparison, ...]:
+    series = [run.commands if source is Input.COMMAND else run.wheels for run in runs]
+    if any(one is None for one in series):
+        return ()
+    return tuple(Comparison(run, vehicle, source, rate_hz=_RATE_HZ) for run in runs)
+
+
+def _measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
+    speed = turn = wheel = 0.0
+    for run in runs:
+        series = run.commands or run.wheels
+        if series is None:
+            continue
+        radius = vehicle.wheel_radius_m
+        forward = np.abs(0.5 * radius * (series.left + series.right))
+        if vehicle.kind == "ackermann":
+            around = forward * np.abs(np.tan(series.steering)) / (vehicle.wheelbase_m or 1.0)
+        else:
+            track = (vehicle.track_width_m or 1.0) * vehicle.controller_track_multiplier
+            around = np.abs(radius * (series.right - series.left) / track)
+        speed, turn = max(speed, float(forward.max())), max(turn, float(around.max()))
+        wheel = max(wheel, float(np.abs(series.left).max()), float(np.abs(series.right).max()))
+    places = np.concatenate([run.track.place[run.track.active, 0] for run in runs])
+    tenths = np.quantile(places, np.linspace(0.0, 1.0, 11)) if places.size else np.zeros(11)
+    return Largest(speed, turn, wheel, max(run.duration_s for run in runs), tenths)

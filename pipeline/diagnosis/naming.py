@@ -1,0 +1,67 @@
+"""Which effects are missing: on every way that the recording opens into the vehicle.
+
+With measured wheels there are two: from command to wheels, which is the drivetrain alone, and from wheels to
+body, which is the ground alone. Without them the command must answer for both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from pipeline.diagnosis.arena import open_arena
+from pipeline.diagnosis.search import search_effects
+from pipeline.diagnosis.state import State
+from pipeline.motion.comparison import Input
+from pipeline.motion.effect import Place
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.diagnosis.arena import Arena, Contender
+    from pipeline.diagnosis.ground import Ground
+    from pipeline.motion.effect import Effect
+
+Way = Literal["command", "measured", "wheels"]
+
+
+@dataclass(frozen=True)
+class Search:
+    """What the search on one way came to.
+
+    Attributes:
+        way: `command` to body, `measured` wheels to body, or command to `wheels`.
+        arena: where the models were judged.
+        start: the model to start from, fitted.
+        final: the model that no move improves, fitted.
+    """
+
+    way: Way
+    arena: Arena
+    start: Contender
+    final: Contender
+
+    @property
+    def new(self) -> tuple[str, ...]:
+        """Ids of the effects that were found."""
+        return tuple(name for name in self.final.ids if name not in self.arena.kept)
+
+
+def search_body(ground: Ground, source: Input, known: Sequence[Effect]) -> Search:
+    """Search from an input to the body."""
+    usable = [e for e in known if source is Input.COMMAND or e.place > Place.DRIVE]
+    start = State((), ground.start_timing()).add(*usable)
+    arena, first = open_arena(
+        ground.pose_body(source), start, ground.list_candidates(source), ground.largest
+    )
+    # Without encoders and gyro a late clock is a late drive; only an early one can be nothing else.
+    arena.only_early_clock = source is Input.COMMAND and not ground.has_gyro and not ground.measured
+    return Search(source.value, arena, first, search_effects(arena, first))
+
+
+def search_wheels(ground: Ground, known: Sequence[Effect], body: Search) -> Search:
+    """Search from command to wheels, the encoders' own delay taken from the way to the body."""
+    usable = [e for e in known if e.place <= Place.DRIVE]
+    start = State((), body.final.state.timing).add(*usable)
+    arena, first = open_arena(ground.pose_wheels(), start, ground.list_drivetrain(), ground.largest)
+    return Search("wheels", arena, first, search_effects(arena, first))

@@ -1,0 +1,331 @@
+"""Logs whose missing effect is drawn by seed, and the sealed answers to them.
+
+What is drawn spans what field logs have: vehicles, topic layouts, programs, pose rates and noise, random
+motion, drop-outs, jumps, decoys. The generator of the logs shares no code with the estimators.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from odd_physics import ODD
+from pipeline.simulate import (
+    LAYOUTS,
+    MACHINES,
+    VEHICLES,
+    Disturbance,
+    Encoders,
+    Ground,
+    Imu,
+    PoseSensor,
+    Program,
+    Recording,
+    Scenario,
+    SkidSteer,
+    simulate_run,
+    simulate_skid_steer,
+    write_log,
+)
+
+Category = Literal["single", "small", "sets", "empty", "poor", "odd", "rigid", "equipped"]
+CATEGORIES: tuple[Category, ...] = ("single", "small", "sets", "empty", "poor", "odd", "rigid", "equipped")
+
+DIFFERENTIAL = (
+    "wheel_radius", "wheel_asymmetry", "effective_track", "icr_offset", "icr_lateral", "lateral_skid",
+    "speed_slip", "turning_resistance", "slope_drift", "lateral_drift", "yaw_drift", "time_drift",
+    "terrain_change", "drive_lag", "turn_lag", "transport_delay", "body_speed_limit", "body_turn_limit",
+    "turn_droop", "acceleration_limit", "wheel_speed_limit", "deadband", "body_inertia", "heading_skew",
+    "yaw_misalignment", "lever_arm", "clock_offset",
+)  # fmt: skip
+CAR = ("steering_offset", "steering_gain", "steering_lag", "understeer")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a log hides.
+
+    Attributes:
+        category: kind of riddle.
+        effects: id to parameters, as simulated.
+        odd: name of physics that no catalogue has.
+        channel: channels that the odd physics acts on.
+        program: what was driven.
+        note: anything else.
+    """
+
+    category: str
+    effects: dict[str, dict[str, float]] = field(default_factory=dict)
+    odd: str = ""
+    channel: str = ""
+    program: str = ""
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Riddle:
+    """A scenario to simulate with its answer."""
+
+    scenario: Scenario
+    answer: Answer
+    machine: SkidSteer | None = None
+
+
+def draw_riddle(category: Category, seed: int, effect: str | None = None) -> Riddle:
+    """The riddle of a seed.
+
+    Args:
+        category: kind of riddle.
+        seed: from which everything is drawn.
+        effect: for singles, the effect; drawn when None.
+    """
+    maker: dict[Category, Callable[[np.random.Generator, int, str | None], Riddle]] = {
+        "single": lambda g, s, e: _draw_single(g, s, e, "single", 1.0),
+        "small": lambda g, s, e: _draw_single(g, s, e, "small", 0.4),
+        "equipped": lambda g, s, e: _draw_equipped(g, s, e),
+        "sets": lambda g, s, _e: _draw_set(g, s),
+        "empty": lambda g, s, _e: _draw_empty(g, s),
+        "poor": lambda g, s, e: _draw_poor(g, s, e),
+        "odd": lambda g, s, e: _draw_odd(g, s, e),
+        "rigid": lambda g, s, e: _draw_rigid(g, s, e),
+    }
+    generator = np.random.default_rng([CATEGORIES.index(category), seed])
+    return maker[category](generator, seed, effect)
+
+
+def write_riddle(riddle: Riddle, path: Path) -> None:
+    """Simulate and record a riddle; its answer stands beside it, sealed."""
+    if riddle.machine is None:
+        run = simulate_run(riddle.scenario)
+    else:
+        run = simulate_skid_steer(riddle.scenario, riddle.machine)
+    write_log(run, path)
+    path.with_suffix(".sealed").write_text(seal(riddle.answer), encoding="ascii")
+
+
+def seal(answer: Answer) -> str:
+    """An answer that nobody reads by accident."""
+    return base64.b64encode(zlib.compress(json.dumps(vars(answer), sort_keys=True).encode())).decode()
+
+
+def open_seal(text: str) -> Answer:
+    """The answer of a seal."""
+    return Answer(**json.loads(zlib.decompress(base64.b64decode(text))))
+
+
+def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Generator) -> dict[str, float]:
+    """Parameters of an effect: magnitudes of METHODS, section 4, times ``share``, signs drawn where free."""
+    vehicle = scenario.vehicle
+    sign = float(draw.choice([-1.0, 1.0]))
+    size = share * float(draw.uniform(0.8, 1.2))
+    speed = vehicle.max_speed_mps * scenario.program.speed_scale
+    turn = vehicle.max_turn_radps * scenario.program.turn_scale
+    wheel = (speed + 0.5 * vehicle.track_width_m * turn) / vehicle.wheel_radius_m
+    small = min(speed, 1.0)
+    sizes: dict[str, dict[str, float]] = {
+        "wheel_radius": {"k": 1.0 + sign * 0.09 * size},
+        "wheel_asymmetry": {"e": sign * 0.05 * size},
+        "effective_track": {"k": 1.0 + 0.8 * size},
+        "icr_offset": {"x_icr": sign * 0.14 * size},
+        "icr_lateral": {"y_icr": sign * 0.1 * size},
+        "lateral_skid": {"c": 0.1 * size},
+        "speed_slip": {"k": min(0.1 * size, 0.2 * size / speed)},
+        "turning_resistance": {"k": min(0.24 * size, 0.35 * size / max(turn, 0.1))},
+        "slope_drift": {"k": 0.6 * size},
+        "lateral_drift": {"c": sign * 0.06 * size * small},
+        "yaw_drift": {"c": sign * 0.07 * size},
+        "time_drift": {"k": 0.15 * size},
+        "terrain_change": {"k_v": 1.0 - 0.2 * size, "k_w": 1.0 - 0.25 * size},
+        "drive_lag": {"tau": 0.6 * size},
+        "turn_lag": {"tau_mean": 0.3 * size, "tau_diff": 1.1 * size},
+        "transport_delay": {"d": 0.25 * size},
+        "body_speed_limit": {"limit": (1.0 - 0.4 * size) * speed},
+        "body_turn_limit": {"limit": (1.0 - 0.4 * size) * turn},
+        "turn_droop": {
+            "threshold": 0.4 * vehicle.track_width_m * turn / vehicle.wheel_radius_m,
+            "gain": 1.0 - 0.6 * size,
+        },
+        "acceleration_limit": {"limit": wheel / (2.0 * size)},
+        "wheel_speed_limit": {"limit": (1.0 - 0.4 * size) * wheel},
+        "deadband": {"d": 0.2 * size * small},
+        "body_inertia": {"tau": 0.5 * size},
+        "heading_skew": {"d": 0.12 * size},
+        "yaw_misalignment": {"psi": sign * math.radians(3.5) * size},
+        "lever_arm": {"l_x": 0.2 * size, "l_y": sign * 0.1 * size},
+        "clock_offset": {"d": -0.2 * size},
+        "steering_offset": {"o": sign * 0.04 * size},
+        "steering_gain": {"g": 1.0 - 0.15 * size},
+        "steering_lag": {"tau": 0.4 * size},
+        "understeer": {"K": 0.035 * size},
+    }
+    return sizes[effect]
+
+
+def _draw_scene(draw: np.random.Generator, seed: int, effect: str | None = None) -> Scenario:
+    """Everything but the riddle itself."""
+    car = effect in CAR or (effect in {"drive_lag", "wheel_radius", "time_drift"} and draw.random() < 0.1)
+    name = "car" if car else str(draw.choice(["husky", "husky", "warthog", "jackal", "marmotte"]))
+    vehicle = VEHICLES[name]
+    layouts = [key for key, item in LAYOUTS.items() if item.kind == vehicle.kind]
+    layout = str(draw.choice(layouts))
+    program = str(draw.choice(["drive_steps", "drive_steps", "smooth", "teleop", "stop_and_go"]))
+    scale = 0.6 if name in {"warthog", "car"} else 1.0
+    rate = float(draw.choice([20.0, 20.0, 50.0, 100.0]))
+    noise = float(draw.choice([0.001, 0.003, 0.01]))
+    return Scenario(
+        vehicle=vehicle,
+        program=Program(
+            program,  # type: ignore[arg-type]
+            rate_hz=float(draw.choice([10.0, 20.0, 50.0])),
+            speed_scale=scale,
+            turn_scale=scale,
+            step_s=float(draw.choice([3.0, 4.0, 6.0])),
+            jitter_s=float(draw.choice([0.0, 0.005])),
+        ),
+        duration_s=float(draw.choice([120.0, 180.0, 300.0, 600.0], p=[0.3, 0.3, 0.3, 0.1])),
+        seed=seed,
+        disturbance=Disturbance(0.03, 0.05),
+        pose=PoseSensor(
+            rate_hz=rate,
+            noise_m=noise,
+            noise_rad=0.5 * noise,
+            noise_z_m=noise,
+            noise_tilt_rad=0.25 * noise,
+            drift_m=float(draw.choice([0.0, 0.005, 0.015])),
+            drift_rad=float(draw.choice([0.0, 0.003])),
+            jitter_s=float(draw.choice([0.0, 0.004])),
+            latency_s=0.05,
+            latency_jitter_s=0.005,
+            dropouts=int(draw.integers(0, 4)),
+            jumps=int(draw.integers(0, 3)),
+        ),
+        encoders=Encoders(),
+        imu=Imu(bias_radps=float(draw.normal(0.0, 0.005)), sign=int(draw.choice([1, 1, 1, -1]))),  # type: ignore[arg-type]
+        recording=Recording(layout, decoys=str(draw.choice(["none", "odometry", "both"]))),  # type: ignore[arg-type]
+        start_pose=(0.0, 0.0, float(draw.uniform(-3.0, 3.0))),
+    )
+
+
+def _draw_single(
+    draw: np.random.Generator, seed: int, effect: str | None, category: str, share: float
+) -> Riddle:
+    chosen = effect or str(draw.choice(DIFFERENTIAL + CAR))
+    scene = _excite(_draw_scene(draw, seed, chosen), chosen, draw)
+    asked = {chosen: draw_size(chosen, scene, share, draw)}
+    return Riddle(
+        replace(scene, effects=asked), Answer(category, asked, program=scene.program.name)
+    )
+
+
+def _excite(scene: Scenario, effect: str, draw: np.random.Generator) -> Scenario:
+    """What an effect needs to show at all: a slope, or both directions."""
+    if effect == "slope_drift":
+        tilt = math.radians(float(draw.uniform(6.0, 11.0)))
+        way = float(draw.uniform(0.0, 2.0 * math.pi))
+        scene = replace(scene, ground=Ground(tilt * math.cos(way), tilt * math.sin(way)))
+    if effect in {"terrain_change", "time_drift"}:
+        scene = replace(scene, duration_s=max(scene.duration_s, 240.0))
+    return scene
+
+
+def _draw_set(draw: np.random.Generator, seed: int) -> Riddle:
+    pools = (
+        ("effective_track", "drive_lag"), ("drive_lag", "lateral_skid"), ("effective_track", "turn_lag"),
+        ("effective_track", "icr_offset", "drive_lag"), ("body_inertia", "effective_track"),
+        ("transport_delay", "effective_track"), ("yaw_misalignment", "effective_track"),
+        ("speed_slip", "turning_resistance"), ("wheel_asymmetry", "lateral_drift"),
+        ("body_turn_limit", "drive_lag", "effective_track"), ("wheel_radius", "transport_delay"),
+        ("acceleration_limit", "effective_track"), ("deadband", "effective_track", "icr_offset"),
+        ("heading_skew", "effective_track"), ("yaw_drift", "icr_lateral", "drive_lag"),
+        ("slope_drift", "effective_track"), ("lever_arm", "effective_track", "transport_delay"),
+        ("turning_resistance", "effective_track", "turn_lag"),
+    )  # fmt: skip
+    names = pools[int(draw.integers(len(pools)))]
+    scene = _draw_scene(draw, seed)
+    for name in names:
+        scene = _excite(scene, name, draw)
+    asked = {name: draw_size(name, scene, float(draw.uniform(0.7, 1.0)), draw) for name in names}
+    return Riddle(replace(scene, effects=asked), Answer("sets", asked, program=scene.program.name))
+
+
+def _draw_equipped(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:
+    """A vehicle that already has effective track and drive lag, and one thing more."""
+    pool = [name for name in DIFFERENTIAL if name not in {"effective_track", "drive_lag", "turn_lag"}]
+    chosen = effect or str(draw.choice(pool))
+    scene = _excite(_draw_scene(draw, seed), chosen, draw)
+    asked = {
+        "effective_track": {"k": float(draw.uniform(1.4, 1.9))},
+        "drive_lag": {"tau": float(draw.uniform(0.3, 0.7))},
+        chosen: draw_size(chosen, scene, 1.0, draw),
+    }
+    return Riddle(replace(scene, effects=asked), Answer("equipped", asked, program=scene.program.name))
+
+
+def _draw_empty(draw: np.random.Generator, seed: int) -> Riddle:
+    scene = _draw_scene(draw, seed)
+    kind = ("plain", "jumps", "noisy", "tilted")[int(draw.integers(4))]
+    if kind == "jumps":
+        scene = replace(scene, pose=replace(scene.pose, jumps=6))
+    elif kind == "noisy":
+        scene = replace(scene, pose=replace(scene.pose, rate_hz=10.0, noise_m=0.02, noise_rad=0.01))
+    elif kind == "tilted":
+        scene = replace(scene, ground=Ground(math.radians(7.0), math.radians(-4.0)))
+    return Riddle(scene, Answer("empty", program=scene.program.name, note=kind))
+
+
+def _draw_poor(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:
+    chosen = effect or str(draw.choice([name for name in DIFFERENTIAL if name != "slope_drift"]))
+    scene = _draw_scene(draw, seed)
+    program = str(draw.choice(["straight", "circle", "spins"]))
+    scene = replace(scene, program=replace(scene.program, name=program))  # type: ignore[arg-type]
+    asked = {chosen: draw_size(chosen, scene, 1.0, draw)}
+    return Riddle(replace(scene, effects=asked), Answer("poor", asked, program=program))
+
+
+def _draw_odd(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:
+    name = effect or str(draw.choice(sorted(ODD)))
+    scene = _draw_scene(draw, seed)
+    odd = ODD[name]
+    scene = replace(scene, extra=odd.make(scene.vehicle), duration_s=max(scene.duration_s, 180.0))
+    answer = Answer("odd", odd=name, channel=odd.channels, program=scene.program.name)
+    return Riddle(scene, answer)
+
+
+def _draw_rigid(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:
+    kinds = ("track", "payload", "small_wheels", "slope", "slow_motors")
+    kind = effect or str(draw.choice(kinds))
+    scene = _draw_scene(draw, seed)
+    name = str(draw.choice(["husky", "warthog"]))
+    machine = MACHINES[name]
+    layouts = [key for key, item in LAYOUTS.items() if item.kind == "differential"]
+    scene = replace(
+        scene,
+        vehicle=VEHICLES[name],
+        recording=replace(scene.recording, layout=str(draw.choice(layouts))),
+        duration_s=150.0,
+        disturbance=Disturbance(),
+        program=replace(scene.program, name="drive_steps", speed_scale=0.5, turn_scale=0.5),
+    )
+    expected: dict[str, dict[str, float]] = {"effective_track": {}}
+    if kind == "payload":
+        load = 35.0 if name == "husky" else 250.0
+        machine = replace(machine, payload_kg=load, payload_x_m=-0.15 if name == "husky" else -0.3)
+        expected["icr_offset"] = {}
+    elif kind == "small_wheels":
+        machine = replace(machine, left_radius_scale=0.94)
+        expected["wheel_asymmetry"] = {}
+    elif kind == "slope":
+        scene = replace(scene, ground=Ground(math.radians(10.0)))
+        expected["slope_drift"] = {}
+    elif kind == "slow_motors":
+        scene = replace(scene, effects={"drive_lag": {"tau": 0.5}})
+        expected["drive_lag"] = {"tau": 0.5}
+    return Riddle(scene, Answer("rigid", expected, note=kind, program="drive_steps"), machine)
