@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pipeline.batch.errors import BatchError
@@ -13,7 +14,20 @@ if TYPE_CHECKING:
     from pipeline.store import Store
 
 
-def prune_results(store: Store, pruning: Pruning) -> tuple[Path, ...]:
+@dataclass(frozen=True, kw_only=True)
+class Pruned:
+    """What pruning did.
+
+    Attributes:
+        removed: folders of generations that were removed.
+        problem: why the results are still larger than the quota; None when they are not.
+    """
+
+    removed: tuple[Path, ...]
+    problem: BatchError | None = None
+
+
+def prune_results(store: Store, pruning: Pruning) -> Pruned:
     """Remove generations that are not current.
 
     First all but the newest of each run that are to be kept; where the results are still larger than the
@@ -23,29 +37,26 @@ def prune_results(store: Store, pruning: Pruning) -> tuple[Path, ...]:
         store: the results.
         pruning: how many are kept, and how large the results may be.
 
-    Returns:
-        The folders removed.
-
     Raises:
-        BatchError: ``over_quota``, the current generations alone are larger.
         StoreError: a run is being written for too long, or the disk refuses.
     """
     removed = list(store.prune(pruning.keep))
-    if pruning.quota_bytes is None:
-        return tuple(removed)
     keep = pruning.keep
-    while (size := measure_results(store)) > pruning.quota_bytes:
+    while pruning.quota_bytes is not None and (size := measure_results(store)) > pruning.quota_bytes:
         if keep == 0:
-            raise BatchError(
-                "over_quota",
-                f"the results hold {size / 1e9:.3g} GB without any old generation, "
-                f"more than {pruning.quota_bytes / 1e9:.3g} GB",
-                where=str(store.root),
-                hint="Raise --quota, or move runs elsewhere",
-            )
+            return Pruned(removed=tuple(removed), problem=_over_quota(store, size, pruning.quota_bytes))
         keep -= 1
         removed += store.prune(keep)
-    return tuple(removed)
+    return Pruned(removed=tuple(removed))
+
+
+def _over_quota(store: Store, size: int, quota: int) -> BatchError:
+    return BatchError(
+        "over_quota",
+        f"the results hold {size / 1e9:.3g} GB without any old generation, more than {quota / 1e9:.3g} GB",
+        where=str(store.root),
+        hint="Raise --quota, or move runs elsewhere",
+    )
 
 
 def measure_results(store: Store) -> int:

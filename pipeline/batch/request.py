@@ -44,7 +44,7 @@ class Request:
     Attributes:
         targets: logs, folders, globs and lists.
         options: what each log is analyzed with.
-        executor: ``local``, ``dask``, or the address of a scheduler.
+        executor: ``local``, ``inline``, ``dask``, or the address of a scheduler.
         jobs: logs worked on at once.
         shard: the part of the logs that is this machine's.
         timeout_s: longest time for one log [s].

@@ -135,10 +135,13 @@ def _tidy_up(store: Store, request: Request) -> tuple[tuple[SlipError, ...], int
     try:
         refresh_pools(store)
         if request.pruning is not None:
-            removed = len(prune_results(store, request.pruning))
+            pruned = prune_results(store, request.pruning)
+            removed = len(pruned.removed)
+            problems += [] if pruned.problem is None else [pruned.problem]
     except SlipError as error:
         problems.append(error)
-    return (*problems, *store.survey().errors), removed
+    every = {str(problem): problem for problem in (*problems, *store.survey().errors)}
+    return tuple(every.values()), removed
 
 
 def _select(todo: Sequence[Item], shard: Shard | None) -> list[Item]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import resource
 import sys
 import time
@@ -14,6 +15,7 @@ from pipeline.core.errors import SlipError
 from pipeline.store import Store
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from pipeline.job import Options
@@ -55,6 +57,22 @@ class Report:
     rss_bytes: int = 0
 
 
+def work_safely(work: Callable[[Task], Report], task: Task) -> Report:
+    """Do the work so that whatever comes of it can leave the process: a report, if need be of a failure.
+
+    Args:
+        work: what to do.
+        task: the task.
+    """
+    entry = Entry(log=task.log, basis=task.basis, state="failed", run=task.options.run or "")
+    try:
+        report = work(task)
+        pickle.dumps(report)
+    except Exception as error:  # noqa: BLE001 - one log must not cost the others
+        return Report(entry=_describe_surprise(entry, error))
+    return report
+
+
 def work_on(task: Task) -> Report:
     """Analyze one log and note the outcome in the ledger; raises nothing that a log can cause."""
     store = Store(task.options.out)
@@ -69,6 +87,8 @@ def work_on(task: Task) -> Report:
     except SlipError as error:
         where = f"{error.where}: " if error.where and error.where != str(task.path) else ""
         entry = replace(entry, code=error.code, reason=f"{where}{error.what}", hint=error.hint)
+    except Exception as error:  # noqa: BLE001 - one log must not cost the others
+        entry = _describe_surprise(entry, error)
     entry = replace(entry, seconds=round(time.monotonic() - started, 3), peak_bytes=_peak_bytes())
     Ledger(store).write(entry)
     return Report(entry=entry, computed=computed, rss_bytes=read_rss())
@@ -78,12 +98,7 @@ def _analyze(task: Task, entry: Entry) -> tuple[Entry, tuple[str, ...]]:
     # Workers that find nothing to do need no table library.
     from pipeline.job.analyze import REPORT, analyze_log  # noqa: PLC0415
 
-    try:
-        outcome = analyze_log(task.path, task.options)
-    except SlipError:
-        raise
-    except Exception as error:  # noqa: BLE001 - one log must not cost the others
-        return _describe_surprise(entry, error), ()
+    outcome = analyze_log(task.path, task.options)
     done = replace(
         entry,
         state="lossy" if outcome.lossy else "done",

@@ -41,14 +41,14 @@ def describe_run(manifest: Manifest) -> dict[str, JSON]:
     details = manifest.details
     log = _part(details.get("log"))
     start = _part(_part(_part(details.get("stages")).get("extract")).get("context")).get("start_ns")
-    is_stamp = isinstance(start, int) and start > 0
+    stamp = start if isinstance(start, int) and start > 0 else None
     return {
         "run": manifest.run,
         "dataset": _text(details.get("dataset")),
         "vehicle": _text(_part(details.get("vehicle")).get("id")),
         "terrain": _text(details.get("terrain")),
-        "day": f"{datetime.fromtimestamp(start // 10**9, UTC):%Y-%m-%d}" if is_stamp else None,
-        "start_ns": start if is_stamp else None,
+        "day": None if stamp is None else f"{datetime.fromtimestamp(stamp // 10**9, UTC):%Y-%m-%d}",
+        "start_ns": stamp,
         "duration_s": log.get("duration_s"),
         "complete": log.get("complete"),
         "bytes": log.get("bytes"),

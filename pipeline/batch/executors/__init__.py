@@ -92,5 +92,5 @@ def find_executor(word: str, settings: Settings) -> Executor:
     raise BatchError(
         "no_such_executor",
         f"no executor is called {word!r}",
-        hint="Use local, dask, or the address of a dask scheduler such as tcp://host:8786",
+        hint="Use local, inline, dask, or the address of a dask scheduler such as tcp://host:8786",
     )

@@ -12,6 +12,7 @@ from pebble import ProcessExpired, ProcessPool
 
 from pipeline.batch.executors import Blame, Settings
 from pipeline.batch.memory import MemoryWatchdog
+from pipeline.batch.work import work_safely
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -22,7 +23,8 @@ _TASKS_PER_WORKER = 500
 """A worker is replaced after so many logs: whatever leaks in a library stays small."""
 
 _ORPHAN_PERIOD_S = 0.5
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
+"""What tells numeric libraries how many threads to take."""
 
 
 def accepts(word: str) -> bool:
@@ -42,7 +44,7 @@ class LocalExecutor:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         # Spawned processes take the environment over; more threads than cores only get in each other's way.
-        for variable in _THREAD_VARIABLES:
+        for variable in THREAD_VARIABLES:
             os.environ.setdefault(variable, "1")
         self._pool = ProcessPool(
             max_workers=settings.jobs,
@@ -61,7 +63,7 @@ class LocalExecutor:
 
     def submit(self, task: Task) -> Future[Report]:
         """Work on a task some time."""
-        future = self._pool.submit(self._settings.work, self._settings.timeout_s, task)
+        future = self._pool.submit(work_safely, self._settings.timeout_s, self._settings.work, task)
         return cast("Future[Report]", future)
 
     def blame(self, task: Task, error: BaseException) -> Blame:

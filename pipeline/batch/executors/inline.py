@@ -1,0 +1,52 @@
+"""This very process, one log after the other: for debugging, and where processes cannot be started.
+
+Nothing is isolated here: a log that crashes, hangs or eats memory takes the batch along.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from typing import TYPE_CHECKING
+
+from pipeline.batch.executors import Blame, Settings
+from pipeline.batch.work import work_safely
+
+if TYPE_CHECKING:
+    from pipeline.batch.work import Report, Task
+
+
+def accepts(word: str) -> bool:
+    """Whether ``--executor`` means this one."""
+    return word == "inline"
+
+
+def open_executor(word: str, settings: Settings) -> InlineExecutor:
+    """Nothing has to be started."""
+    del word
+    return InlineExecutor(settings)
+
+
+class InlineExecutor:
+    """Works on a task as soon as it is submitted."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._work = settings.work
+
+    @property
+    def slots(self) -> int:
+        """One."""
+        return 1
+
+    def submit(self, task: Task) -> Future[Report]:
+        """Work on a task now."""
+        future: Future[Report] = Future()
+        future.set_result(work_safely(self._work, task))
+        return future
+
+    def blame(self, task: Task, error: BaseException) -> Blame:
+        """What the exception of a future means; none is raised by a log."""
+        del task
+        return Blame("bad_result", f"it gave no result: {type(error).__name__}: {error}", 0)
+
+    def close(self) -> None:
+        """Nothing has to be ended."""

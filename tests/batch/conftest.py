@@ -1,0 +1,31 @@
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.simulate import simulate_case
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+NAMES = ("a", "b", "c", "d")
+
+
+@pytest.fixture(scope="session")
+def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Short logs with known physics, of two vehicles."""
+    folder = tmp_path_factory.mktemp("originals")
+    for number, name in enumerate(NAMES):
+        case = "warthog_ice" if name == "d" else "husky_tile"
+        simulate_case(case, out=folder / f"{name}.mcap", duration_s=12.0 + number, seed=number)
+    return folder
+
+
+@pytest.fixture
+def season(originals: Path, tmp_path: Path) -> Path:
+    """A folder of logs that a test may change."""
+    folder = tmp_path / "season"
+    shutil.copytree(originals, folder)
+    return folder

@@ -1,0 +1,58 @@
+"""Poisoned logs cost themselves and nothing else, and are named."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from batch_tools import batch, counts, read_tables
+from batch_works import work_poisoned
+
+KINDS = ("raises", "hangs", "eats", "dies", "leaves", "unpicklable")
+LIMITS = {"executor": "local", "timeout_s": 4.0, "memory_bytes": 700_000_000}
+
+
+def test_each_kind_of_poison_is_named_and_the_others_are_done(season: Path, tmp_path: Path) -> None:
+    for name in "cd":
+        (season / f"{name}.mcap").unlink()
+    batch(season, tmp_path / "clean")
+    for number, kind in enumerate(KINDS):
+        # Every one a content of its own, or they would be copies.
+        (season / f"{kind}.mcap").write_bytes((season / "a.mcap").read_bytes() + bytes(number + 1))
+
+    outcome = batch(season, tmp_path / "out", work=work_poisoned, **LIMITS)
+    assert counts(outcome) == {"done": 2, "failed": 2, "quarantined": 4}
+    found = {Path(line.path).stem: (line.state, line.code) for line in outcome.lines}
+    assert {kind: found[kind] for kind in KINDS} == {
+        "raises": ("failed", "unexpected_error"),
+        "hangs": ("quarantined", "timed_out"),
+        "eats": ("quarantined", "out_of_memory"),
+        "dies": ("quarantined", "worker_died"),
+        "leaves": ("quarantined", "worker_died"),
+        "unpicklable": ("failed", "unexpected_error"),
+    }
+    reasons = {Path(line.path).stem: line.reason for line in outcome.lines}
+    assert "poison" in reasons["raises"]
+    assert "4 s" in reasons["hangs"]
+    assert "GB" in reasons["eats"]
+    assert "signal 11" in reasons["dies"]
+    assert "exit code 7" in reasons["leaves"]
+    assert read_tables(tmp_path / "out") == read_tables(tmp_path / "clean")
+
+    # The quarantined ones are left alone; the others have another chance.
+    again = batch(season, tmp_path / "out")
+    assert counts(again)["quarantined"] == 4
+    assert {Path(line.path).stem for line in again.lines if line.state == "quarantined"} == {
+        "hangs", "eats", "dies", "leaves",
+    }  # fmt: skip
+    retried = batch(season, tmp_path / "out", retries_quarantined=True)
+    assert "quarantined" not in counts(retried)
+
+
+def test_a_log_that_changed_leaves_the_quarantine(season: Path, tmp_path: Path) -> None:
+    log = season / "dies.mcap"
+    shutil.copy(season / "a.mcap", log)
+    (season / "a.mcap").unlink()
+    assert counts(batch(log, tmp_path / "out", work=work_poisoned, **LIMITS)) == {"quarantined": 1}
+    log.write_bytes((season / "b.mcap").read_bytes())
+    assert counts(batch(log, tmp_path / "out")) == {"done": 1}

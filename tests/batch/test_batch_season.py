@@ -1,0 +1,267 @@
+"""A season from the outside: what is done, what is left alone, what becomes of whom."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import polars as pl
+from batch_tools import Watch, ask, batch, counts, read_tables
+
+from pipeline.batch import Pruning, Shard, basis, parse_shard, parse_size
+from pipeline.batch.season import run_batch
+from pipeline.batch.status import tell_status
+from pipeline.batch.verification import verify_results
+from pipeline.job import keys
+from pipeline.job.analyze import analyze_log, update_datasets
+from pipeline.store import Partition, Store
+
+if TYPE_CHECKING:
+    import pytest
+
+
+def hash_all(folder: Path) -> dict[str, str]:
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*.mcap")}
+
+
+def test_a_season_with_good_and_bad_logs(season: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    whole = (season / "a.mcap").read_bytes()
+    (season / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
+    (season / "text.mcap").write_text("this is no recording\n" * 10)
+    shutil.copy(season / "b.mcap", season / "copy.mcap")
+    before = hash_all(season)
+    for path in season.glob("*.mcap"):
+        path.chmod(0o444)
+
+    first = batch(season, out)
+    assert counts(first) == {"done": 4, "lossy": 1, "failed": 1, "unchanged": 1}
+    by_name = {Path(line.path).stem: line for line in first.lines}
+    assert (by_name["text"].code, by_name["text"].run) == ("not_mcap", "season/text")
+    assert "MCAP" in by_name["text"].reason
+    assert "cut" in by_name["cut"].reason
+    assert by_name["copy"].run == "season/b"
+    assert first.has_failed
+    assert first.has_losses
+    assert first.problems == ()
+    assert hash_all(season) == before
+
+    tables = read_tables(out)
+    watch = Watch()
+    second = run_batch(ask(season, out), watch)
+    assert counts(second) == {"unchanged": 6, "failed": 1}
+    assert watch.plans == [(1, 6)]
+    assert second.has_losses
+    assert read_tables(out) == tables
+
+    status = tell_status(Store(out))
+    assert status.counts == {"done": 4, "lossy": 1, "failed": 1, "quarantined": 0, "copy": 1}
+    assert status.runs == 5
+    assert verify_results(Store(out), logs=True, tell=print).is_clean
+
+
+def test_the_bytes_are_those_of_one_log_after_the_other(season: Path, tmp_path: Path) -> None:
+    batch(season, tmp_path / "many", executor="local")
+    one = ask(season, tmp_path / "one").options
+    for log in sorted(season.glob("*.mcap")):
+        analyze_log(log, one)
+    update_datasets(Store(one.out))
+    many = read_tables(tmp_path / "many")
+    assert many.pop("index.html")
+    assert many == read_tables(tmp_path / "one")
+
+
+def test_only_what_a_change_touches_is_done_again(
+    season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    batch(season, out)
+    files = {path.stem: read_files(out, f"season/{path.stem}") for path in season.glob("*.mcap")}
+
+    (season / "a.toml").write_text("[slip]\nlength_scale_m = 2.0\n")
+    (season / "b.toml").write_text("[velocity]\nrate_hz = 20.0\n")
+    again = batch(season, out)
+    lines = {Path(line.path).stem: line.state for line in again.lines}
+    # What is said in a file and was the default anyway changes no key.
+    assert lines == {"a": "done", "b": "unchanged", "c": "unchanged", "d": "unchanged"}
+    changed = read_files(out, "season/a")
+    assert changed["velocities.parquet"] == files["a"]["velocities.parquet"]
+    assert changed["slip.parquet"] != files["a"]["slip.parquet"]
+
+    monkeypatch.setattr("pipeline.batch.basis._describe_program", lambda: "a newer version")
+    assert counts(batch(season, out)) == {"unchanged": 4}
+
+
+def read_files(out: Path, run: str) -> dict[str, bytes]:
+    manifest = Store(out).manifest(run)
+    assert manifest is not None
+    return {path.name: path.read_bytes() for path in manifest.folder.iterdir()}
+
+
+def test_a_new_version_of_a_stage_is_noticed(
+    monkeypatch: pytest.MonkeyPatch, season: Path, tmp_path: Path
+) -> None:
+    hasher = basis.BasisHasher(ask(season, tmp_path).options)
+    before = hasher.hash_basis(season / "a.mcap")
+    monkeypatch.setattr(basis, "VERSIONS", dict(keys.VERSIONS) | {"slip": 99})
+    basis._describe_program.cache_clear()
+    try:
+        after = basis.BasisHasher(ask(season, tmp_path).options).hash_basis(season / "a.mcap")
+    finally:
+        basis._describe_program.cache_clear()
+    assert before != after
+
+
+def test_a_changed_log_takes_the_place_of_the_old_one(season: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    batch(season, out)
+    shutil.copy(season / "c.mcap", tmp_path / "kept.mcap")
+    (season / "c.mcap").write_bytes((season / "d.mcap").read_bytes())
+    (season / "d.mcap").unlink()
+    outcome = batch(season, out)
+    assert {Path(line.path).stem: (line.state, line.run) for line in outcome.lines}["c"] == (
+        "done",
+        "season/c",
+    )
+    manifest = Store(out).manifest("season/c")
+    assert manifest is not None
+    assert len(manifest.earlier) == 1
+
+
+def test_logs_of_one_name_get_runs_of_their_own(season: Path, tmp_path: Path) -> None:
+    other = season / "elsewhere" / "season"
+    other.mkdir(parents=True)
+    (season / "d.mcap").rename(other / "a.mcap")
+    outcome = batch(season, tmp_path / "out")
+    runs = [line.run for line in outcome.lines]
+    assert runs[:3] == ["season/a", "season/b", "season/c"]
+    assert runs[3].startswith("season/a-")
+    assert Store(tmp_path / "out").runs() == tuple(sorted(runs))
+
+
+def test_a_moved_season_is_done_already(season: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    batch(season, out)
+    season.rename(tmp_path / "archive")
+    assert counts(batch(tmp_path / "archive", out)) == {"unchanged": 4}
+    assert len(Store(out).runs()) == 4
+
+
+def test_shards_share_the_logs_and_leave_what_one_machine_would(season: Path, tmp_path: Path) -> None:
+    batch(season, tmp_path / "one")
+    shards = [batch(season, tmp_path / "many", shard=Shard(number=i, count=3), jobs=1) for i in (1, 2, 3)]
+    worked = [line.run for outcome in shards for line in outcome.lines if line.state == "done"]
+    assert len(worked) == len(set(worked)) == 4
+    assert read_tables(tmp_path / "many") == read_tables(tmp_path / "one")
+
+
+def test_a_fleet_file_from_elsewhere_holds_for_its_globs(season: Path, tmp_path: Path) -> None:
+    fleet = tmp_path / "fleet.toml"
+    fleet.write_text(
+        '[run]\nterrain = "field"\n[[match]]\nglob = "season/d*"\n[match.run]\nterrain = "lake"\n'
+    )
+    request = ask(season, tmp_path / "out")
+    run_batch(replace(request, options=replace(request.options, fleet=fleet)), Watch())
+    runs = Store(tmp_path / "out").scan("runs").select("run", "terrain").collect()
+    assert dict(runs.iter_rows()) == {f"season/{x}": "field" for x in "abc"} | {"season/d": "lake"}
+
+
+def test_partitions_open_only_their_files(season: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    batch(season, out)
+    store = Store(out)
+    for manifest in store.manifests():
+        if manifest.details["dataset"] != "warthog_ice":
+            (manifest.folder / "slip.parquet").write_bytes(b"not to be opened")
+    ice = Partition(vehicle="warthog", terrain="ice", dataset="warthog_ice")
+    assert store.scan("slip", ice).select("run").unique().collect()["run"].to_list() == ["season/d"]
+    day = store.scan("runs").collect()["day"][0]
+    answer = store.query("SELECT DISTINCT run FROM slip", replace(ice, day=day[:7]))
+    assert answer["run"].to_list() == ["season/d"]
+    assert store.query("SELECT run FROM slip", Partition(day="1999")).is_empty()
+
+
+def test_old_generations_go_when_the_disk_needs_the_room(season: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for rate in (20.0, 10.0, 5.0):
+        (season / "run.toml").write_text(f"[velocity]\nrate_hz = {rate}\n")
+        batch(season, out)
+    assert tell_status(Store(out)).old_generations == 8
+    assert batch(season, out, pruning=Pruning(keep=1)).removed == 4
+    outcome = batch(season, out, pruning=Pruning(keep=1, quota_bytes=1000))
+    assert outcome.removed == 4
+    assert [problem.code for problem in outcome.problems] == ["over_quota"]
+    assert outcome.has_failed
+    assert len(Store(out).runs()) == 4
+    assert Store(out).verify() == ()
+
+
+def test_verification_names_what_changed(season: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    batch(season, out)
+    with (season / "a.mcap").open("r+b") as log:
+        log.seek(1000)
+        log.write(b"\xff\xff\xff")
+    (season / "b.mcap").unlink()
+    manifest = Store(out).manifest("season/c")
+    assert manifest is not None
+    manifest.path("slip").write_bytes(b"other")
+    found = verify_results(Store(out), logs=True, tell=print)
+    assert [(problem.run, problem.code) for problem in found.logs] == [("season/a", "log_changed")]
+    assert [(problem.run, problem.code) for problem in found.gone] == [("season/b", "log_gone")]
+    assert [(problem.run, problem.code) for problem in found.files] == [("season/c", "file_damaged")]
+    assert not found.is_clean
+
+
+def test_a_damaged_manifest_is_said_and_costs_one_run(season: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    batch(season, out)
+    (out / "runs" / "season" / "a" / "manifest.json").write_text("{")
+    outcome = batch(season, out)
+    assert outcome.has_failed
+    assert [problem.code for problem in outcome.problems] == ["manifest_damaged"]
+    lines = {Path(line.path).stem: (line.state, line.code) for line in outcome.lines}
+    assert lines["a"] == ("failed", "manifest_damaged")
+    assert lines["b"] == ("unchanged", "")
+
+
+def test_reports_are_made_on_demand(season: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    log = season / "a.mcap"
+    batch(log, out)
+    assert not list(out.rglob("report.html"))
+    batch(log, out, report=True)
+    assert list(out.rglob("report.html"))
+    assert 'href="runs/season/a/' in (out / "index.html").read_text()
+    assert "report.html" in (out / "index.html").read_text()
+    assert counts(batch(log, out)) == {"unchanged": 1}
+
+
+def test_the_catalogue_names_every_run_safely(season: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (season / "a.mcap").rename(season / "<b>&'\".mcap")
+    batch(season, out)
+    page = (out / "index.html").read_text()
+    assert "<b>&'" not in page
+    assert "&lt;b&gt;&amp;" in page
+    assert page.count("<tr>") == 5
+    assert "http" not in page.replace("http-equiv", "")
+
+
+def test_sizes_and_shards_are_read() -> None:
+    assert parse_size("500MB") == 500_000_000
+    assert parse_size("1.5 g") == 1_500_000_000
+    assert parse_size("10") == 10
+    assert parse_shard("2/4") == Shard(number=2, count=4)
+
+
+def test_datasets_pool_the_runs(season: Path, tmp_path: Path) -> None:
+    batch(season, tmp_path / "out")
+    pools = Store(tmp_path / "out").scan("datasets").filter(pl.col("input") == "command").collect()
+    assert dict(pools.select("dataset", "runs").unique().iter_rows()) == {
+        "husky_a200_tile": 3,
+        "warthog_ice": 1,
+    }
