@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
     from pipeline.logs.columns import Column
 
+STAMPS: Final = ("header.stamp.", "timestamp.")
+"""Where messages carry the time they are about: ROS headers, and the protobuf and JSON types of Foxglove."""
+
 _INDEXED: Final = re.compile(r"^(?P<path>.*[^\]])\[(?P<number>\d+)\]$")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.logs.channel import Rejected
 from pipeline.logs.columns import Ragged, RaggedStrings
 from pipeline.logs.errors import LogError
-from pipeline.logs.fields import select_leaves
+from pipeline.logs.fields import STAMPS, select_leaves
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -80,7 +80,7 @@ class ObjectDecoder:
         if not messages:
             return {}
         chosen = select_leaves(leaves, self._fields, where=self._where)
-        chosen |= {path for path in leaves if path.startswith("header.stamp.")}
+        chosen |= {path for path in leaves if path.startswith(STAMPS)}
         return {path: self._column(path, messages) for path in leaves if path in chosen}
 
     def _column(self, path: str, messages: list[dict[str, list[Leaf]]]) -> Column:

@@ -100,9 +100,20 @@ def _read_summary(source: ByteSource, catalog: Catalog) -> _Summary:
     if crc and checksum(body + tail[: rec.HEAD_SIZE + 16]) != crc:
         raise _NoSummaryError("the summary is damaged")
     try:
-        return _parse_summary(body, start, catalog)
+        summary = _parse_summary(body, start, catalog)
     except rec.RecordError as error:
         raise _NoSummaryError(f"the summary is damaged ({error})") from None
+    if not crc:
+        _compare_chunks(source, summary.chunks)
+    return summary
+
+
+def _compare_chunks(source: ByteSource, chunks: list[rec.ChunkIndexRecord]) -> None:
+    """Look whether chunks stand where a summary without checksum says."""
+    for chunk in chunks:
+        head = source.read_at(chunk.offset, rec.HEAD_SIZE)
+        if head != rec.HEAD.pack(rec.CHUNK, chunk.length - rec.HEAD_SIZE):
+            raise _NoSummaryError("the summary disagrees with the chunks")
 
 
 def _parse_summary(body: bytes, start: int, catalog: Catalog) -> _Summary:

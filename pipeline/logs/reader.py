@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.logs.channel import ChannelBuffer
 from pipeline.logs.codecs import decoder_for
 from pipeline.logs.errors import LogError, Loss
-from pipeline.logs.fields import derive_columns
+from pipeline.logs.fields import STAMPS, derive_columns
 from pipeline.logs.index import LogIndex, open_log
 from pipeline.logs.loading import load_spans
 from pipeline.logs.payloads import gather_payloads
@@ -263,8 +263,10 @@ def _finish(job: _Job) -> tuple[TopicColumns, list[Loss]]:
 
 
 def _header_time(leaves: Mapping[str, Column]) -> Ints | None:
-    seconds, nanoseconds = leaves.get("header.stamp.sec"), leaves.get("header.stamp.nanosec")
-    if not isinstance(seconds, np.ndarray) or not isinstance(nanoseconds, np.ndarray):
-        return None
-    stamp: Ints = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
-    return stamp
+    for prefix in STAMPS:
+        seconds, nanoseconds = leaves.get(f"{prefix}sec"), leaves.get(f"{prefix}nanosec")
+        if isinstance(seconds, np.ndarray) and isinstance(nanoseconds, np.ndarray):
+            with np.errstate(invalid="ignore"):
+                stamp: Ints = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
+            return stamp
+    return None

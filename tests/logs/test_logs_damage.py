@@ -156,6 +156,19 @@ def test_a_log_without_summary_is_whole(tmp_path: Path) -> None:
     assert any("rebuilt" in note for note in data.notes)
 
 
+def test_a_wrong_summary_without_checksum_is_found_out(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    truth = write_official(path, enable_crcs=False)
+    content = bytearray(path.read_bytes())
+    index = next(start for start in record_starts(bytes(content)) if content[start] == 8)
+    for place in (index + 9 + 16, index + 9 + 24):
+        damaged = bytearray(content)
+        damaged[place] ^= 0x10
+        found, losses = read_damaged(path, bytes(damaged), truth)
+        assert found == truth
+        assert losses == ["damaged_summary"]
+
+
 def test_a_lost_message_index_loses_nothing(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     truth = write_small(path)

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 from typing import TYPE_CHECKING, Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -14,6 +16,8 @@ from mcap.exceptions import McapError
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap_files import SHARED, assert_equals_official, payloads
+from mcap_ros2 import _dynamic
+from mcap_ros2._cdr import CdrWriter, EncapsulationKind
 from test_logs_formats import write_channels
 
 from pipeline.logs import (
@@ -214,13 +218,17 @@ def nested_message(rng: np.random.Generator) -> Any:
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(seed=st.integers(0, 2**32 - 1), rows=st.integers(1, 30))
-def test_nested_sequences_of_the_official_encoder_are_read(tmp_path: Path, seed: int, rows: int) -> None:
-    from mcap_ros2._dynamic import serialize_dynamic  # noqa: PLC0415 - the oracle's own encoder
-
-    encode = serialize_dynamic("demo/msg/Outer", NESTED)["demo/msg/Outer"]
+@given(seed=st.integers(0, 2**32 - 1), rows=st.integers(1, 30), orders=st.sets(st.integers(0, 1), min_size=1))
+def test_nested_sequences_of_the_official_encoder_are_read(
+    tmp_path: Path, seed: int, rows: int, orders: set[int]
+) -> None:
+    encode = _dynamic.serialize_dynamic("demo/msg/Outer", NESTED)["demo/msg/Outer"]
     rng = np.random.default_rng(seed)
-    encoded = [encode(nested_message(rng)) for _ in range(rows)]
+    encoded = []
+    for _ in range(rows):
+        kind = EncapsulationKind(int(rng.choice(sorted(orders))))
+        with mock.patch.object(_dynamic, "CdrWriter", partial(CdrWriter, kind=kind)):
+            encoded.append(encode(nested_message(rng)))
     path = tmp_path / "log.mcap"
     write_channels(path, [("/x", "demo/msg/Outer", "ros2msg", NESTED.encode(), "cdr", encoded)])
     assert assert_equals_official(path) == rows
