@@ -69,3 +69,11 @@ def work_slowly(task: Task) -> Report:
     marker.write_bytes(b"")
     time.sleep(float(os.environ.get("PAUSE_S", "0.5")))
     return work_on(task)
+
+
+def work_killing_the_batch(task: Task) -> Report:
+    """As usual, but at the step that ``DIE_AT`` names the batch is killed with all its workers."""
+    if task.path.stem != os.environ["DIE_AT"]:
+        return work_on(task)
+    with watch_commits(task, lambda: os.killpg(0, signal.SIGKILL)):
+        return work_on(task)

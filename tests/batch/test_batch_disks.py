@@ -1,0 +1,82 @@
+"""A disk that refuses: one clear line, nothing half visible, and the same command goes on afterwards."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from batch_tools import batch, counts, read_tables
+
+from pipeline.store import Store, StoreError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 400 kB, too small for the tables of four logs."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(place)]
+    try:
+        mounted = subprocess.run(mount, capture_output=True, check=False)
+    except FileNotFoundError:
+        pytest.skip("there is no mount command")
+    if mounted.returncode:
+        pytest.skip("mounting a small disk is not allowed here")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+def test_a_full_disk_stops_the_batch_and_more_room_lets_it_go_on(
+    season: Path, small_disk: Path, tmp_path: Path
+) -> None:
+    out = small_disk / "out"
+    outcome = batch(season, out)
+    states = [line.state for line in outcome.lines]
+    assert "failed" in states
+    full = next(line for line in outcome.lines if line.state == "failed")
+    assert full.code == "disk_full"
+    assert "--out" in full.hint
+    assert Store(out).verify() == ()
+    assert outcome.has_failed
+
+    subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
+    assert "failed" not in counts(batch(season, out))
+    batch(season, tmp_path / "clean")
+    assert read_tables(out) == read_tables(tmp_path / "clean")
+
+
+def test_a_read_only_target_is_said_before_the_work(season: Path, small_disk: Path) -> None:
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    with pytest.raises(StoreError) as caught:
+        batch(season, small_disk / "out")
+    assert caught.value.code == "read_only"
+
+
+def test_a_forbidden_target_is_said_before_the_work(
+    season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    if os.geteuid():
+        out.chmod(0o500)
+    else:
+        # Nothing is forbidden to root: the system's answer is put in its mouth.
+        opened = os.open
+
+        def refuse(path: str, flags: int, *rest: int) -> int:
+            if flags & os.O_CREAT and str(path).startswith(str(out)):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+            return opened(path, flags, *rest)
+
+        monkeypatch.setattr(os, "open", refuse)
+    with pytest.raises(StoreError) as caught:
+        batch(season, out)
+    assert caught.value.code == "permission_denied"
+    assert str(out) in caught.value.where

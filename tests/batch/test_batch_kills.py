@@ -1,0 +1,166 @@
+"""Killed at any moment: readers see whole runs, and the same command again leaves what one run would have."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import polars as pl
+import pytest
+from batch_tools import HERE, batch, counts, read_tables, start_slip
+from batch_works import work_dying_at_steps
+
+from pipeline.store import STEPS, Store
+
+FEW_ROUNDS, MANY_ROUNDS = 20, 200
+
+
+@pytest.fixture(scope="module")
+def field(originals: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Logs that take long enough to be killed at."""
+    folder = tmp_path_factory.mktemp("kills") / "season"
+    shutil.copytree(originals, folder)
+    for number in range(8):
+        # Bytes behind the end make a content of its own; the log then has losses, which is a state as well.
+        (folder / f"e{number}.mcap").write_bytes((folder / "a.mcap").read_bytes() + bytes(number + 1))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(field: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    batch(field, out)
+    return read_tables(out)
+
+
+def assert_whole(out: Path, undisturbed: dict[str, bytes]) -> None:
+    """Whatever readers see is whole, and what it will be at the end."""
+    store = Store(out)
+    assert store.verify() == ()
+    for manifest in store.manifests():
+        for name in manifest.names():
+            path = manifest.path(name)
+            assert path.read_bytes() == undisturbed[str(path.relative_to(out))]
+    assert store.scan("slip").select(pl.len()).collect().item() >= 0
+
+
+def time_whole_batch(field: Path, out: Path) -> float:
+    started = time.monotonic()
+    start_slip("batch", field, "--out", out, "--jobs", "2", "--settle", "0", "--quiet").communicate()
+    return time.monotonic() - started
+
+
+def kill_at_random(field: Path, out: Path, undisturbed: dict[str, bytes], *, rounds: int) -> int:
+    chance = random.Random(rounds)  # noqa: S311 - moments, not secrets
+    longest_s = time_whole_batch(field, out.parent / "timed")
+    killed = 0
+    for number in range(rounds):
+        process = start_slip("batch", field, "--out", out, "--jobs", "2", "--settle", "0", "--quiet")
+        try:
+            process.wait(chance.uniform(0.2, longest_s))
+        except subprocess.TimeoutExpired:
+            killed += 1
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        assert_whole(out, undisturbed)
+        if (out / "runs").exists() and len(Store(out).runs()) == len(list(field.glob("*.mcap"))):
+            # Everything is done: begin again, so that every round has something to kill.
+            shutil.rmtree(out / ("runs" if number % 2 else "batch"))
+    return killed
+
+
+@pytest.mark.parametrize("rounds", [FEW_ROUNDS, pytest.param(MANY_ROUNDS, marks=pytest.mark.long)])
+def test_killed_at_random_moments(
+    field: Path, tmp_path: Path, undisturbed: dict[str, bytes], rounds: int
+) -> None:
+    out = tmp_path / "out"
+    killed = kill_at_random(field, out, undisturbed, rounds=rounds)
+    assert killed > rounds // 2
+    batch(field, out)
+    assert read_tables(out) == undisturbed
+    assert not list(out.rglob(".tmp-*"))
+
+
+def name_logs_after_steps(originals: Path, folder: Path) -> None:
+    folder.mkdir()
+    whole = (originals / "a.mcap").read_bytes()
+    for number, step in enumerate(STEPS):
+        (folder / f"{step}.mcap").write_bytes(whole + bytes(number + 1))
+
+
+def test_a_worker_killed_at_every_step_of_a_commit_costs_nothing(originals: Path, tmp_path: Path) -> None:
+    season = tmp_path / "season"
+    name_logs_after_steps(originals, season)
+    batch(season, tmp_path / "clean")
+    outcome = batch(season, tmp_path / "out", work=work_dying_at_steps, executor="local")
+    assert len(list(season.glob("*.killed"))) == len(STEPS)
+    # Behind the last steps the results are there already when the log is tried again.
+    assert sum(counts(outcome).get(state, 0) for state in ("done", "lossy", "unchanged")) == len(STEPS)
+    assert not outcome.problems
+    assert read_tables(tmp_path / "out") == read_tables(tmp_path / "clean")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("step", STEPS)
+def test_a_batch_killed_with_all_its_workers_at_a_step_goes_on(
+    originals: Path, tmp_path: Path, step: str
+) -> None:
+    season = tmp_path / "season"
+    name_logs_after_steps(originals, season)
+    batch(season, tmp_path / "clean")
+    code = (
+        "import sys; from pathlib import Path; from batch_tools import batch; from batch_works import *;"
+        "batch(Path(sys.argv[1]), Path(sys.argv[2]), work=work_killing_the_batch, executor='local')"
+    )
+    process = subprocess.Popen(
+        ["python", "-c", code, season, tmp_path / "out"],
+        start_new_session=True,
+        env=os.environ | {"DIE_AT": step, "PYTHONPATH": os.pathsep.join((str(HERE), str(HERE.parents[1])))},
+    )
+    assert process.wait(60) == -signal.SIGKILL
+    assert Store(tmp_path / "out").verify() == ()
+    batch(season, tmp_path / "out")
+    assert read_tables(tmp_path / "out") == read_tables(tmp_path / "clean")
+
+
+def test_workers_end_with_their_batch(field: Path, tmp_path: Path) -> None:
+    process = start_slip("batch", field, "--out", tmp_path / "out", "--jobs", "2", "--settle", "0", "--quiet")
+    deadline = time.monotonic() + 30.0
+    while not list((tmp_path / "out").glob("runs/*/*/manifest.json")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.kill()
+    process.communicate()
+    deadline = time.monotonic() + 20.0
+    while list_group(process.pid) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert list_group(process.pid) == []
+
+
+def list_group(group: int) -> list[int]:
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[2]) == group and fields[0] != "Z":
+            found.append(int(path.parent.name))
+    return found
+
+
+def test_two_batches_at_once_do_every_log_once(
+    field: Path, tmp_path: Path, undisturbed: dict[str, bytes]
+) -> None:
+    out = tmp_path / "out"
+    both = [
+        start_slip("batch", field, "--out", out, "--jobs", "1", "--settle", "0", "--json") for _ in range(2)
+    ]
+    answers = [process.communicate(timeout=120) for process in both]
+    assert [process.returncode for process in both] == [3, 3], answers
+    assert read_tables(out) == undisturbed
+    assert all(manifest.earlier == () for manifest in Store(out).manifests())
