@@ -157,6 +157,13 @@ class Comparison:
         yaw = (heading[node] - heading[origin]) - (turned[node] - turned[origin])
         return Reach(np.abs(predicted - self._path[node]), np.abs(np.angle(np.exp(1j * yaw))))
 
+    def list_starts(self, timing: Timing) -> tuple[Floats, Floats]:
+        """Where predictions begin: stamps [s], shape (k,), and poses (x, y [m], yaw [rad]), shape (k, 3)."""
+        origin = np.unique(self.horizons.origin)
+        heading = self._node_headings(timing.pose_delay_s)[origin]
+        path = self._path[origin]
+        return self.nodes.times[origin], np.column_stack((path.real, path.imag, heading))
+
     def _find_delay(self, effects: Sequence[Effect]) -> float:
         """How much later the model itself says positions are stamped [s]."""
         late = sum(effect.delay_s() for effect in effects if isinstance(effect, ReportEffect))
@@ -245,7 +252,7 @@ class Comparison:
         return first, last
 
     def _measure_velocity(self, first: Integers, last: Integers) -> tuple[Integers, Floats]:
-        """Body velocity between pairs of nodes: cells in their middle, and (v_x, v_y, v_w); NaN where unknown."""
+        """Body velocity between pairs of nodes: cells in their middle, and (v_x, v_y, v_w) or NaN."""
         cells, nodes = self.cells, self.nodes
         delay = self.usual_delay
         heading = self._node_headings(delay)

@@ -6,10 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.motion.signals import Signal
-
 if TYPE_CHECKING:
-    from pipeline.motion.signals import Floats, Integers, Resets
+    from pipeline.motion.signals import Floats, Integers, Resets, Signal
 
 
 def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start: Signal) -> Signal:

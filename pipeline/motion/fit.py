@@ -165,7 +165,7 @@ def solve_step(normal: Floats, gradient: Floats, values: Floats, bounds: Floats,
         step[:] = 0.0
         step[rows] = -np.linalg.solve(scaled, gradient[rows] / size[rows]) / size[rows]
         clipped = np.clip(values + step, bounds[:, 0], bounds[:, 1]) - values
-        # A number that sits on its bound and is pushed outward leaves the system; the others are solved again.
+        # A number on its bound that is pushed outward leaves the system; the others are solved again.
         stuck = active & (clipped == 0.0) & (step != 0.0)
         step = clipped
         if not stuck.any():

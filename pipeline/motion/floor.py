@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pipeline.motion.score import Errors
 
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 _LAGS_S = (0.15, 0.3, 0.6, 1.2, 2.4)
 _RIDGES = (3e-4, 3e-3, 3e-2, 3e-1)
@@ -43,7 +44,7 @@ def estimate_floor(problem: Problem, held_out: HeldOut) -> Errors:
         Errors of which every part is at most the model's own.
     """
     residuals = held_out.residuals
-    known = np.isfinite(residuals).all(axis=1)
+    known: Flags = np.asarray(np.isfinite(residuals).all(axis=1))
     features = np.concatenate([describe_inputs(comparison) for comparison in problem.comparisons])
     fold = assign_folds(problem)
     left = residuals.copy()
@@ -72,7 +73,7 @@ def describe_inputs(comparison: Comparison) -> Floats:
     along, around_w = _average(velocity.x, around.step_s), _average(velocity.w, around.step_s)
 
     def look(signal: Floats, late: float) -> Floats:
-        return np.interp(middle - late, around.times, signal)
+        return np.asarray(np.interp(middle - late, around.times, signal), dtype=np.float64)
 
     v, w = look(along, 0.0), look(around_w, 0.0)
     columns = [
@@ -112,7 +113,7 @@ def _predict_held_out(
     problem: Problem,
     features: Floats,
     residuals: Floats,
-    known: NDArray[np.bool_],
+    known: Flags,
     how: tuple[NDArray[np.int64], float],
 ) -> Floats:
     """Residuals as predicted from the inputs by regressions that had not seen their blocks."""

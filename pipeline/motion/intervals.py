@@ -69,12 +69,16 @@ class Estimates:
         raise KeyError(label)
 
 
+NOTHING = Estimates((), np.zeros((0, 0)), 0)
+"""Estimates of a model that was not fitted."""
+
+
 def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
     """Intervals of all numbers of a fit.
 
-    Whole blocks are drawn with replacement and the fit is repeated through its derivatives. Blocks are command
-    steps; where those are short against the correlation of the residuals, several are joined, to at least
-    five integrated autocorrelation times and six seconds. The interval is symmetric, with Student's t for the
+    Whole blocks are drawn with replacement and the fit is repeated through its derivatives. Blocks are
+    command steps; where those are short against the correlation of the residuals, several are joined, to at
+    least five integrated autocorrelation times and six seconds. The interval is symmetric, with Student's t for the
     number of blocks.
 
     Args:
@@ -85,7 +89,7 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
 
     count = len(fitted.free)
     if count == 0:
-        return Estimates((), np.zeros((0, 0)), 0)
+        return NOTHING
     block = join_blocks(problem, fitted)
     pieces = int(block.max()) + 1
     normals, gradients = _sum_blocks(problem, fitted, block, pieces)
@@ -166,8 +170,8 @@ def _widen(problem: Problem, fitted: Fitted, number: Free, block: Integers) -> f
 def _sum_losses(problem: Problem, fitted: Fitted, residuals: Floats, block: Integers) -> Floats:
     size = np.abs(fitted.weights.normalise(residuals, problem))
     loss = np.where(size <= _HUBER, 0.5 * size**2, _HUBER * (size - 0.5 * _HUBER)).sum(axis=1)
-    sums: Floats = np.bincount(block[fitted.used], loss[fitted.used], minlength=int(block.max()) + 1)
-    return sums
+    sums = np.bincount(block[fitted.used], weights=loss[fitted.used], minlength=int(block.max()) + 1)
+    return sums.astype(np.float64)
 
 
 def join_blocks(problem: Problem, fitted: Fitted) -> Integers:

@@ -108,7 +108,7 @@ def load_run(
         vehicle: geometry.
         name: of the run.
         sha256: of the recording.
-        hold_s: the controller stops this long after its last command; five periods by default, at least 0.5 s.
+        hold_s: how long after its last command the controller stops; by default five periods, at least 0.5 s.
 
     Raises:
         MotionError: ``no_poses``, fewer than ten poses carry information.

@@ -33,7 +33,7 @@ class Errors:
 
     Attributes:
         velocity_rms: rms of displacement over half a second, over half a second: x, y [m/s], w [rad/s].
-        velocity_spread: 1.4826 times the median size of the same: where it is far below the rms, few stretches
+        velocity_spread: 1.4826 times the median size of the same: far below the rms, few stretches
             carry the error.
         t_mrmse_m: root mean square position error over windows and steps of a 2 s horizon [m].
         r_mrmse_rad: the same of the wrapped yaw [rad].
@@ -99,7 +99,7 @@ def list_training(problem: Problem, tested: Flags) -> Flags:
         if not at.any():
             continue
         starts, ends = times[at, 0] - GAP_S, times[at, 1] + GAP_S
-        # A window is near when more tested windows have begun before its end than have ended before its start.
+        # A window is near when more tested ones have begun before its end than have ended before its start.
         near = np.searchsorted(np.sort(starts), times[:, 1]) > np.searchsorted(np.sort(ends), times[:, 0])
         training[rows] &= ~near
     return training

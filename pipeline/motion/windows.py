@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.motion.heading import has_barred
-from pipeline.motion.signals import Signal
 
 if TYPE_CHECKING:
     from pipeline.motion.cells import Cells
     from pipeline.motion.recording import MotionRun, Track
+    from pipeline.motion.signals import Signal
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -54,8 +54,8 @@ class Nodes:
 
     def average(self, values: Signal) -> Signal:
         """Mean over each group of values at `poses`."""
-        means: Signal = np.add.reduceat(values, self.first) / self.count
-        return means
+        sums: Signal = np.add.reduceat(values, self.first)
+        return sums / self.count
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def gather_nodes(track: Track, cells: Cells) -> Nodes:
 
 
 def number_blocks(run: MotionRun, cells: Cells) -> Floats:
-    """Starts of blocks [s]: command steps, short ones joined and long ones divided; and every span's start."""
+    """Starts of blocks [s]: command steps, short ones joined, long ones divided; and spans."""
     hard = cells.starts
     soft = run.step_starts
     starts: list[float] = []
@@ -195,7 +195,7 @@ def join_horizons(run: MotionRun, cells: Cells, nodes: Nodes, lead_s: float) -> 
 def _is_clean(
     run: MotionRun, cells: Cells, nodes: Nodes, ends: tuple[Integers, Integers], lead_s: float
 ) -> Flags:
-    """Whether a stretch stays in one piece, clear of what is barred, and clear of its span's first moments."""
+    """Whether a stretch stays in one piece, clear of what is barred and of its span's first moments."""
     start, end = ends
     begin, stop = nodes.times[start], nodes.times[end]
     clean = (nodes.piece[start] == nodes.piece[end]) & ~has_barred(run.barred, begin, stop)

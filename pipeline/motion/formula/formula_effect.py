@@ -99,8 +99,10 @@ class FormulaEffect(AddedEffect):
         signals = _Signals(rolling, around)
         added = {}
         for channel, expression in self._expressions.items():
-            known = {name: self.values[name] for name in expression.names if name in self.values}
-            known |= {name: signals.read(name) for name in expression.names if name not in known}
+            known: dict[str, NDArray[np.float64] | float] = {
+                name: self.values[name] if name in self.values else signals.read(name)
+                for name in expression.names
+            }
             added[channel] = expression.evaluate(known)
         return total.add(added.get("v_x"), added.get("v_y"), added.get("v_w"))
 
@@ -143,7 +145,7 @@ class FormulaEffect(AddedEffect):
                 )
 
     def _check_neutral(self) -> None:
-        """The effect must change nothing at neutral values, or its absence would be no model of the ladder."""
+        """The effect must change nothing at neutral values: the ladder compares with its absence."""
         generator = np.random.default_rng(1)
         signals = {name: generator.uniform(0.1, 1.0, 8) for name in SIGNAL_UNITS}
         neutral = {p.name: p.neutral for p in self.parameters}

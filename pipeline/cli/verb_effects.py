@@ -1,0 +1,61 @@
+"""`slip effects`: the catalogue of physical effects, and the page of one."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+
+from pipeline.cli.output import CLEAN, print_json
+
+if TYPE_CHECKING:
+    from pipeline.motion.effect import Effect
+
+
+def register(app: App) -> None:
+    """Add the verb."""
+    app.command(effects)
+
+
+def effects(  # noqa: D417 - the arguments document themselves
+    effect: Annotated[str | None, Parameter(help="id of an effect; without one, all are listed")] = None,
+    /,
+    *,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """List the physical effects, or print one's page: formula, parameters, source, twins, what shows it.
+
+    Args:
+        json: print one JSON object.
+        quiet: print nothing but errors.
+    """
+    from pipeline.motion.catalogue import find_effect, list_effects  # noqa: PLC0415 - heavy
+    from pipeline.motion.describe import describe_effect, list_pages  # noqa: PLC0415 - heavy
+
+    chosen = list_effects() if effect is None else (find_effect(effect),)
+    if json:
+        print_json({"effects": [_as_json(item) for item in chosen]})
+    elif not quiet:
+        lines = list_pages(chosen) if effect is None else [describe_effect(chosen[0])]
+        sys.stdout.write("\n".join(lines) + "\n")
+    return CLEAN
+
+
+def _as_json(effect: type[Effect]) -> dict[str, object]:
+    from pipeline.motion.describe import describe_effect  # noqa: PLC0415 - heavy
+
+    return {
+        "id": effect.id,
+        "place": effect.place.name.lower(),
+        "kinds": list(effect.kinds),
+        "parameters": [
+            {"name": p.name, "unit": p.unit, "about": p.about, "typical": p.typical}
+            for p in effect.parameters
+        ],
+        "needs": [need.value for need in effect.needs],
+        "confused_with": list(effect.confused_with),
+        "equivalent_to": list(effect.equivalent_to),
+        "page": describe_effect(effect),
+    }

@@ -1,0 +1,369 @@
+"""`slip model`: make, show, change, fit, compare and export a model file."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from pipeline.cli.output import CLEAN, print_json
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.motion.model_file import ModelFile
+    from pipeline.motion.recording import MotionRun
+    from pipeline.motion.transfer import Transfer
+    from pipeline.motion.workshop import Judgement
+
+
+@dataclass(frozen=True, kw_only=True)
+class On:
+    """On what a model is fitted and judged, and how the answer is printed."""
+
+    on: Annotated[list[str], Parameter(help="logs, or runs of the results folder", consume_multiple=True)]
+    input: Annotated[
+        Literal["command", "measured"] | None,
+        Parameter(help="what the model is fed with (default: as last time, else measured wheels if there)"),
+    ] = None
+    out: Annotated[Path, Parameter(help="results folder")] = Path("results")
+    json: Annotated[bool, Parameter(help="print one JSON object", negative="")] = False
+    quiet: Annotated[bool, Parameter(help="print no progress and no table", negative="")] = False
+
+
+Spoken = Annotated[On, Parameter(name="*")]
+
+
+def register(app: App) -> None:
+    """Add the verb and its own verbs."""
+    model = App(name="model", help="Make, show, change, fit, compare and export a motion model.")
+    for command in (new, show, add, drop, fit, compare, export):
+        model.command(command)
+    app.command(model)
+
+
+def new(
+    model: Path,
+    /,
+    *,
+    vehicle: str,
+    effects: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
+    force: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Make a model file for a vehicle.
+
+    Args:
+        model: the file to make.
+        vehicle: vehicle preset, for example husky_a200.
+        effects: effects to begin with, at neutral values.
+        force: replace a file that is there.
+        quiet: print nothing.
+    """
+    from pipeline.motion.catalogue import find_effect  # noqa: PLC0415 - heavy
+    from pipeline.motion.errors import MotionError  # noqa: PLC0415
+    from pipeline.motion.model import Model  # noqa: PLC0415
+    from pipeline.motion.model_file import ModelFile  # noqa: PLC0415
+    from pipeline.motion.model_text import write_model  # noqa: PLC0415
+    from pipeline.vehicles import resolve_vehicle  # noqa: PLC0415
+    from pipeline.vehicles.configuration import VehicleSection  # noqa: PLC0415
+
+    if model.exists() and not force:
+        raise MotionError(
+            "model_exists", "the file is there already", where=str(model), hint="Give --force to replace it."
+        )
+    chosen = resolve_vehicle(VehicleSection(preset=vehicle), recorded=None, where=str(model))
+    made = Model(chosen, tuple(find_effect(name)() for name in effects or ()))
+    write_model(ModelFile(made), model)
+    if not quiet:
+        sys.stdout.write(f"{model}: {chosen.name}, {_list_effects(made.ids)}\n")
+    return CLEAN
+
+
+def show(model: Path, /, *, json: bool = False) -> int:
+    """Show a model: its effects, values, intervals, and what they were fitted on.
+
+    Args:
+        model: the model file.
+        json: print one JSON object.
+    """
+    from pipeline.motion.describe import describe_parameters, parameters_as_json  # noqa: PLC0415 - heavy
+    from pipeline.motion.export import export_json  # noqa: PLC0415
+    from pipeline.motion.intervals import NOTHING  # noqa: PLC0415
+    from pipeline.motion.model_file import read_model  # noqa: PLC0415
+
+    file = read_model(model)
+    if json:
+        sys.stdout.write(export_json(file))
+        return CLEAN
+    parameters = parameters_as_json(file.model, NOTHING)
+    for label, (low, high) in file.intervals.items():
+        parameters[label] |= {"low": low, "high": high}
+    lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *describe_parameters(parameters)]
+    runs = file.fit.get("runs")
+    if isinstance(runs, list):
+        lines.append(f"fitted on {file.fit.get('input')}: {', '.join(str(run['run']) for run in runs)}")
+    sys.stdout.write("\n".join(lines) + "\n")
+    return CLEAN
+
+
+def add(  # noqa: D417 - the shared options document themselves
+    model: Path, /, *effects: str, spoken: Spoken
+) -> int:
+    """Add effects to a model, fit it, and show the ladder before and after.
+
+    Args:
+        model: the model file.
+        effects: ids of effects, as `slip effects` lists them.
+    """
+    from pipeline.motion.catalogue import find_effect, load_effects  # noqa: PLC0415 - heavy
+    from pipeline.motion.model_file import read_model  # noqa: PLC0415
+
+    file = read_model(model)
+    own = {
+        name: kind for text in file.effect_files for name, kind in load_effects(model.parent / text).items()
+    }
+    changed = file.model
+    for name in effects:
+        changed = changed + find_effect(name, own)()
+    return _change(model, file, replace(file, model=changed), spoken)
+
+
+def drop(  # noqa: D417 - the shared options document themselves
+    model: Path, /, *effects: str, spoken: Spoken
+) -> int:
+    """Drop effects from a model, fit the rest, and show the ladder before and after.
+
+    Args:
+        model: the model file.
+        effects: ids of effects that the model has.
+    """
+    from pipeline.motion.model_file import read_model  # noqa: PLC0415 - heavy
+
+    file = read_model(model)
+    changed = file.model
+    for name in effects:
+        changed = changed - name
+    return _change(model, file, replace(file, model=changed), spoken)
+
+
+def fit(  # noqa: D417 - the shared options document themselves
+    model: Path,
+    /,
+    *,
+    spoken: Spoken,
+    predict: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
+    afresh: bool = False,
+) -> int:
+    """Fit a model's values; with --predict, show what carries over to other runs.
+
+    Args:
+        model: the model file.
+        predict: logs or runs that the fit must not see, to be predicted with it.
+        afresh: forget the values there are and search anew.
+    """
+    from pipeline.motion.model_file import read_model  # noqa: PLC0415 - heavy
+
+    file = read_model(model)
+    changed = file
+    if afresh:
+        neutral = [effect.change(**{p.name: p.neutral for p in effect.parameters}) for effect in file.model]
+        changed = replace(file, model=file.model.swap(*neutral), intervals={})
+    return _change(model, file, changed, spoken, predict=predict or ())
+
+
+def compare(  # noqa: D417 - the shared options document themselves
+    model: Path, other: Path, /, *, spoken: Spoken
+) -> int:
+    """Compare two models, with their values as they are, on runs; a fit of each to the runs stands beside.
+
+    Args:
+        model: a model file.
+        other: another one.
+    """
+    from pipeline.motion.model_file import read_model  # noqa: PLC0415 - heavy
+    from pipeline.motion.transfer import carry_over  # noqa: PLC0415
+    from pipeline.motion.workshop import choose_input  # noqa: PLC0415
+
+    rows: list[tuple[str, Transfer]] = []
+    for path in (model, other):
+        file = read_model(path)
+        runs = _gather(spoken, file, spoken.on)
+        source = choose_input(runs, spoken.input or _last_input(file))
+        rows += [
+            (str(path), item) for item in carry_over(file.model, runs, source, fitted_on=_terrains(file))
+        ]
+    warnings = [item.warning for _, item in rows if item.warning]
+    if spoken.json:
+        print_json({"compared": [_transfer_as_json(name, item) for name, item in rows], "warnings": warnings})
+    elif not spoken.quiet:
+        sys.stdout.write("\n".join(_describe_transfers(rows)) + "\n")
+        _warn(warnings)
+    return CLEAN
+
+
+def export(  # noqa: D417 - the options document themselves
+    model: Path,
+    /,
+    *,
+    to: Literal["ros2_control", "json", "python"],
+    out: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
+) -> int:
+    """Export a model to what people run.
+
+    Args:
+        model: the model file.
+        to: controller and nav2 parameters, JSON, or a Python function without dependencies.
+    """
+    from pipeline.motion import export as exports  # noqa: PLC0415 - heavy
+    from pipeline.motion.model_file import read_model  # noqa: PLC0415
+
+    write = {
+        "ros2_control": exports.export_ros2_control,
+        "json": exports.export_json,
+        "python": exports.export_python,
+    }[to]
+    text = write(read_model(model))
+    if out is None:
+        sys.stdout.write(text)
+    else:
+        out.write_text(text, encoding="utf-8")
+    return CLEAN
+
+
+def _change(
+    path: Path, before: ModelFile, after: ModelFile, spoken: On, *, predict: Sequence[str] = ()
+) -> int:
+    """Judge a model before and after a change, fit it, write its file, and print."""
+    from pipeline.motion.model_text import write_model  # noqa: PLC0415 - heavy
+    from pipeline.motion.problem import Problem  # noqa: PLC0415
+    from pipeline.motion.transfer import carry_over  # noqa: PLC0415
+    from pipeline.motion.workshop import choose_input, judge_model, note_fit  # noqa: PLC0415
+
+    runs = _gather(spoken, after, spoken.on)
+    source = choose_input(runs, spoken.input or _last_input(before))
+    problem = Problem(runs, after.model.vehicle, source)
+    old = judge_model(problem, before.model, per_run=before.per_run)
+    new_one = old
+    if after.model.effects != before.model.effects:
+        new_one = judge_model(problem, after.model, per_run=after.per_run)
+    written = note_fit(after, new_one)
+    write_model(written, path)
+    terrains = [run.terrain for run in runs]
+    others = _gather(spoken, after, predict)
+    carried = carry_over(written.model, others, source, fitted_on=terrains) if others else []
+    warnings = [item.warning for item in carried if item.warning]
+    if spoken.json:
+        print_json(_as_json(path, old, new_one, carried, warnings))
+    elif not spoken.quiet:
+        lines = _describe(old, new_one)
+        if carried:
+            lines += ["", *_describe_transfers([(str(path), item) for item in carried])]
+        sys.stdout.write("\n".join(lines) + "\n")
+        _warn(warnings)
+    return CLEAN
+
+
+def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> list[MotionRun]:
+    from pipeline.cli.model_runs import gather_runs  # noqa: PLC0415 - heavy
+
+    return gather_runs(names, file.model.vehicle, spoken.out, quiet=spoken.quiet or spoken.json)
+
+
+def _last_input(file: ModelFile) -> str | None:
+    found = file.fit.get("input")
+    return found if isinstance(found, str) else None
+
+
+def _terrains(file: ModelFile) -> list[str]:
+    runs = file.fit.get("runs")
+    return [str(run.get("terrain")) for run in runs] if isinstance(runs, list) else []
+
+
+def _as_json(
+    path: Path, old: Judgement, new_one: Judgement, carried: Sequence[Transfer], warnings: Sequence[str]
+) -> Mapping[str, object]:
+    from pipeline.motion.describe import (  # noqa: PLC0415 - heavy
+        correlations_as_json,
+        errors_as_json,
+        ladder_as_json,
+        parameters_as_json,
+    )
+
+    problem, fitted = new_one.problem, new_one.fitted
+    return {
+        "model": str(path),
+        "input": problem.source.value,
+        "runs": list(problem.names),
+        "ladder_before": ladder_as_json(old.ladder, old.floor),
+        "ladder": ladder_as_json(new_one.ladder, new_one.floor),
+        "idle": list(new_one.ladder.idle),
+        "by_run": {
+            name: errors_as_json(errors)
+            for name, errors in zip(problem.names, new_one.whole.held_out.by_run, strict=True)
+        },
+        "noise_floor": errors_as_json(new_one.floor),
+        "parameters": parameters_as_json(fitted.model, new_one.estimates),
+        "correlated": correlations_as_json(new_one.estimates),
+        "timing": [
+            {"run": name, "pose_delay_s": timing.pose_delay_s, "wheel_delay_s": timing.wheel_delay_s}
+            for name, timing in zip(problem.names, fitted.state.timing, strict=True)
+        ],
+        "carried_over": [_transfer_as_json(str(path), item) for item in carried],
+        "warnings": list(warnings),
+    }
+
+
+def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
+    from pipeline.motion.describe import errors_as_json  # noqa: PLC0415 - heavy
+
+    return {
+        "model": name,
+        "run": item.run,
+        "terrain": item.terrain,
+        "carried": errors_as_json(item.carried.pooled),
+        "own_fit": errors_as_json(item.own.pooled),
+        "ideal": errors_as_json(item.ideal.pooled),
+        "ratio": item.ratio,
+        "warning": item.warning,
+    }
+
+
+def _describe(old: Judgement, new_one: Judgement) -> list[str]:
+    from pipeline.motion.describe import (  # noqa: PLC0415 - heavy
+        describe_ladder,
+        describe_parameters,
+        parameters_as_json,
+    )
+
+    runs = ", ".join(new_one.problem.names)
+    lines = [f"on {new_one.problem.source.value} of {runs}"]
+    if old is not new_one:
+        lines += ["", "before", *describe_ladder(old.ladder, old.floor), "", "after"]
+    lines += describe_ladder(new_one.ladder, new_one.floor)
+    parameters = parameters_as_json(new_one.fitted.model, new_one.estimates)
+    return [*lines, "", "parameters", *describe_parameters(parameters)]
+
+
+def _describe_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
+    from pipeline.motion.describe import describe_errors  # noqa: PLC0415 - heavy
+
+    lines = [describe_errors("held-out error of", None)]
+    for name, item in rows:
+        lines.append(describe_errors(f"{item.run}: ideal", item.ideal.pooled))
+        lines.append(describe_errors(f"  {Path(name).name} as it is", item.carried.pooled))
+        lines.append(describe_errors("  its effects fitted to this run", item.own.pooled))
+        lines.append(f"  carried over / own fit: {item.ratio:.2f}")
+    return lines
+
+
+def _list_effects(ids: Sequence[str]) -> str:
+    return ", ".join(ids) if ids else "the ideal model, no effect"
+
+
+def _warn(warnings: Sequence[str]) -> None:
+    for text in warnings:
+        sys.stderr.write(f"slip: {text}\n")

@@ -1,0 +1,102 @@
+"""Predicting: velocities and poses of a run from a model, over a horizon from measured states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.motion.comparison import Comparison, Input
+from pipeline.motion.forward import Timing
+from pipeline.motion.heading import HeadingSource
+
+if TYPE_CHECKING:
+    from pipeline.motion.model import Model
+    from pipeline.motion.recording import MotionRun
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a model says of a run.
+
+    Attributes:
+        times: times of the grid [s], shape (n,).
+        span: number of the stretch without a hole in the recording, shape (n,).
+        velocity: body velocity (v_x [m/s], v_y [m/s], v_w [rad/s]) as the localization would report it,
+            shape (n, 3).
+        start_times: times at which predictions begin [s], shape (k,).
+        poses: (x [m], y [m], yaw [rad]) in the map, by prediction and time since its start, shape (k, m, 3).
+        horizon_times: times since a prediction's start [s], shape (m,).
+    """
+
+    times: Floats
+    span: NDArray[np.int64]
+    velocity: Floats
+    start_times: Floats
+    poses: Floats
+    horizon_times: Floats
+
+
+def predict(
+    model: Model,
+    run: MotionRun,
+    source: Input,
+    *,
+    timing: Timing | None = None,
+    heading: HeadingSource = HeadingSource.AUTO,
+    horizon_s: float = 2.0,
+    rate_hz: float = 20.0,
+) -> Prediction:
+    """Predict a run.
+
+    Args:
+        model: with its values.
+        run: whose commands or wheels are followed, and from whose poses predictions begin.
+        source: what the model is fed with.
+        timing: delays of the recording; by default those that the gyro shows.
+        heading: whose heading predictions begin with.
+        horizon_s: length of a prediction.
+        rate_hz: grid of the result; the model itself runs at 200 Hz.
+
+    Raises:
+        MotionError: the run lacks the input.
+    """
+    comparison = Comparison(run, model.vehicle, source, heading=heading)
+    timing = timing or Timing(comparison.usual_delay)
+    effects = model.effects
+    velocity = comparison.predict_velocity(effects, timing)
+    cells = comparison.cells
+    every = max(round(1.0 / (rate_hz * cells.step_s)), 1)
+    kept = slice(every // 2, None, every)
+    start_times, start = comparison.list_starts(timing)
+    turned = cells.sum_up(velocity.w)
+    own = np.exp(0.5j * (turned[1:] + turned[:-1]))
+    travelled = cells.sum_up((velocity.x + 1j * velocity.y) * own)
+    since = np.arange(0.0, horizon_s + 0.5 / rate_hz, 1.0 / rate_hz)
+    at = cells.locate_edges((start_times[:, None] + since).ravel() - timing.pose_delay_s)
+    index = np.arange(turned.size, dtype=np.float64)
+    yaw = np.interp(at, index, turned).reshape(start_times.size, since.size)
+    path = np.interp(at, index, travelled.real) + 1j * np.interp(at, index, travelled.imag)
+    path = path.reshape(yaw.shape)
+    turn = np.exp(1j * (start[:, 2] - yaw[:, 0]))
+    moved = turn[:, None] * (path - path[:, :1])
+    poses = np.stack(
+        (
+            start[:, :1] + moved.real,
+            start[:, 1:2] + moved.imag,
+            start[:, 2:] + yaw - yaw[:, :1],
+        ),
+        axis=-1,
+    )
+    return Prediction(
+        times=cells.times[kept],
+        span=cells.span[kept],
+        velocity=np.column_stack((velocity.x[kept], velocity.y[kept], velocity.w[kept])),
+        start_times=start_times,
+        poses=poses,
+        horizon_times=since,
+    )
