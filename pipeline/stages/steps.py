@@ -10,7 +10,8 @@ Flags = NDArray[np.bool_]
 
 _SHARE_OF_RANGE = 0.02
 _SMALLEST_CHANGE = 0.02
-_NOISES = 6.0
+_NOISES = 8.0
+_GROWTH = 0.6745 * 6.0**0.5
 _SHORTEST_STEP = 1.0
 _HELD = 2.0
 
@@ -18,7 +19,7 @@ _HELD = 2.0
 def find_changes(times: Floats, ideal: Floats, length: float) -> Flags:
     """Whether the command changes before each sample.
 
-    It does where its ideal velocity has moved by more than 2 % of its range (and six times the noise, where
+    It does where its ideal velocity has moved by more than 2 % of its range (and eight times the noise, where
     measured wheels stand for a command) from its level, but no sooner than one second after the last change.
     The level is what the command has become one second after a change, so that a short ramp is one change.
 
@@ -39,7 +40,7 @@ def find_changes(times: Floats, ideal: Floats, length: float) -> Flags:
         return changes
     tolerance = max(
         _SHARE_OF_RANGE * float(np.quantile(size, 0.99)),
-        _NOISES * float(np.median(jitter)),
+        _NOISES * _estimate_noise(scaled),
         _SMALLEST_CHANGE,
     )
     begin, level = 0, scaled[0]
@@ -52,6 +53,13 @@ def find_changes(times: Floats, ideal: Floats, length: float) -> Flags:
         if times[place] - times[begin] < _SHORTEST_STEP:
             level = scaled[place]
     return changes
+
+
+def _estimate_noise(scaled: Floats) -> float:
+    """Size of the white noise in a series (n, 3), from its second differences: what moves evenly has none."""
+    if scaled.shape[0] < 3:  # noqa: PLR2004 - a second difference needs three
+        return 0.0
+    return float(np.median(np.linalg.norm(np.diff(scaled, n=2, axis=0), axis=1))) / _GROWTH
 
 
 def number_steps(times: Floats, segment: NDArray[np.int32], changes: Flags) -> NDArray[np.int32]:
@@ -70,7 +78,8 @@ def number_steps(times: Floats, segment: NDArray[np.int32], changes: Flags) -> N
         Step numbers, shape (n,), starting at zero.
     """
     places = np.flatnonzero(changes)
-    lasts = np.diff(times[places], append=times[-1:] + _HELD)
+    period = times[1] - times[0] if times.size > 1 else 0.0
+    lasts = np.diff(times[places], append=times[-1] + period)
     held = lasts >= _HELD - 1e-6
     starts = np.zeros(times.size, dtype=bool)
     starts[places[held | np.concatenate(([True], held[:-1]))]] = True

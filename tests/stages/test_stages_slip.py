@@ -1,0 +1,246 @@
+"""Slip: f(u) - v, its modulus, and the published window norm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from stage_logs import FIELD, PLAIN, TakeThrough, rms, slope
+
+from pipeline.motion.ideal import (
+    invert_ackermann,
+    invert_differential,
+    predict_ackermann,
+    predict_differential,
+)
+from pipeline.simulate import VEHICLES, Program, Recording
+from pipeline.stages import StageError
+from pipeline.stages.slip import compute_slip, cut_windows, hold_commands, interpolate_wheels
+from pipeline.vehicles import Vehicle, find_preset
+from pipeline.vehicles.loading import convert
+
+speeds = st.floats(-20.0, 20.0)
+
+
+def preset(name: str, **changes: float) -> Vehicle:
+    found = find_preset(name)
+    assert found is not None
+    from msgspec.structs import replace as change  # noqa: PLC0415 - presets are structs, scenarios are not
+
+    return change(found, **changes)
+
+
+HUSKY = preset("husky")
+
+
+@given(speeds, speeds)
+def test_the_ideal_differential_drive_is_the_published_one(left: float, right: float) -> None:
+    (found,) = predict_differential(np.array([left]), np.array([right]), HUSKY)
+    assert np.allclose(found, [0.165 * (left + right) / 2.0, 0.0, 0.165 * (right - left) / 0.55])
+
+
+@given(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
+def test_a_body_command_comes_back_from_its_wheels(forward: float, yaw_rate: float) -> None:
+    left, right = invert_differential(np.array([forward]), np.array([yaw_rate]), HUSKY)
+    assert np.allclose(predict_differential(left, right, HUSKY), [[forward, 0.0, yaw_rate]])
+    assert (right[0] > left[0]) == (yaw_rate > 0.0) or abs(yaw_rate) < 1e-9
+
+
+def test_a_controller_that_widens_the_track_asks_for_more_difference() -> None:
+    wide = preset("husky", controller_track_multiplier=1.875)
+    left, right = invert_differential(np.array([0.0]), np.array([1.0]), wide)
+    assert np.allclose(predict_differential(left, right, wide), [[0.0, 0.0, 1.875]])
+
+
+@given(st.floats(0.1, 8.0), st.floats(-0.5, 0.5), st.floats(-2.0, 2.0))
+def test_a_car_turns_about_its_rear_axle(speed: float, steering: float, ahead: float) -> None:
+    car = preset("car", base_to_rear_axle_m=ahead)
+    (found,) = predict_ackermann(np.array([speed]), np.array([steering]), car)
+    yaw_rate = speed * np.tan(steering) / 2.6
+    # The rear axle itself does not move sideways; base_link ahead of it swings out with the turn.
+    assert np.allclose(found, [speed, ahead * yaw_rate, yaw_rate])
+    assert found[1] - ahead * found[2] == pytest.approx(0.0, abs=1e-12)
+
+
+@given(st.floats(0.1, 8.0), st.floats(-1.0, 1.0))
+def test_a_cars_body_command_comes_back_within_its_steering(speed: float, yaw_rate: float) -> None:
+    car = preset("car")
+    forward, steering = invert_ackermann(np.array([speed]), np.array([yaw_rate]), car)
+    assert abs(steering[0]) <= 0.6
+    if abs(steering[0]) < 0.6:
+        assert predict_ackermann(forward, steering, car)[0, 2] == pytest.approx(yaw_rate, abs=1e-9)
+
+
+def test_a_car_that_stands_has_its_wheels_straight() -> None:
+    _, steering = invert_ackermann(np.zeros(1), np.ones(1), preset("car"))
+    assert steering.tolist() == [0.0]
+
+
+def test_slip_is_ideal_minus_measured_and_its_modulus_takes_the_length_scale(drive: TakeThrough) -> None:
+    plain = drive(FIELD).result.slip
+    longer = drive(FIELD, {"slip": {"length_scale_m": 2.5}}).result.slip
+    for axis in "xyw":
+        assert np.allclose(plain[f"g_{axis}"], plain[f"f_{axis}"] - plain[f"v_{axis}"], atol=1e-12)
+    for frame, length in ((plain, 1.0), (longer, 2.5)):
+        parts = [frame["g_x"], frame["g_y"], frame["g_w"] * length]
+        assert np.allclose(frame["modulus"] ** 2, sum(part**2 for part in parts))
+    assert np.array_equal(plain["g_w"], longer["g_w"])
+
+
+def test_a_known_slip_comes_out(drive: TakeThrough) -> None:
+    taken = drive(replace(PLAIN, effects={"drive_lag": 0.3, "effective_track": 1.8, "wheel_radius": 0.9}))
+    steady = taken.slip("measured").filter(~pl.col("transitory"))
+    assert slope(steady["f_x"], steady["g_x"]) == pytest.approx(0.1, abs=0.01)
+    assert slope(steady["f_w"], steady["g_w"]) == pytest.approx(1.0 - 0.9 / 1.8, abs=0.01)
+
+
+def make_slip(
+    count: int, rate: float, modulus: float = 0.5, *, step: int = 0, start: float = 0.0
+) -> pl.DataFrame:
+    return pl.DataFrame(
+        {
+            "t": start + np.arange(count) / rate,
+            "segment": np.zeros(count, dtype=np.int32),
+            "step": np.full(count, step, dtype=np.int32),
+            "input": pl.Series(["command"] * count, dtype=pl.Enum(["command", "measured"])),
+            "transitory": np.zeros(count, dtype=bool),
+            "suspect": np.zeros(count, dtype=bool),
+            "modulus": np.full(count, modulus),
+        }
+    )
+
+
+@pytest.mark.parametrize("rate", [10.0, 20.0, 50.0])
+def test_the_window_norm_is_root_40_times_the_root_mean_square_at_any_rate(rate: float) -> None:
+    windows = cut_windows(make_slip(round(2.0 * rate) * 3, rate), rate)
+    assert windows.height == 3
+    assert windows["samples"].to_list() == [round(2.0 * rate)] * 3
+    assert np.allclose(windows["window_norm"], np.sqrt(40.0) * 0.5)
+    assert np.allclose(windows["rms_modulus"], 0.5)
+    assert np.allclose(windows["t_end"] - windows["t_start"], 2.0)
+
+
+def test_at_20_hz_it_is_the_norm_of_the_windows_matrix() -> None:
+    slip = make_slip(40, 20.0).with_columns(modulus=pl.Series(np.linspace(0.0, 2.0, 40)))
+    assert cut_windows(slip, 20.0)["window_norm"][0] == pytest.approx(np.linalg.norm(slip["modulus"]))
+
+
+@given(st.integers(1, 300))
+def test_a_remainder_is_dropped(count: int) -> None:
+    windows = cut_windows(make_slip(count, 20.0), 20.0)
+    assert windows.height == count // 40
+
+
+def test_windows_start_at_each_step_and_cross_none() -> None:
+    slip = pl.concat([make_slip(110, 20.0, 0.1, step=0), make_slip(90, 20.0, 0.9, step=1, start=5.5)])
+    windows = cut_windows(slip, 20.0)
+    assert windows["t_start"].to_list() == pytest.approx([0.0, 2.0, 5.5, 7.5])
+    assert windows["step"].to_list() == [0, 0, 1, 1]
+    assert set(windows["rms_modulus"].round(9)) == {0.1, 0.9}
+
+
+def test_windows_cross_no_hole_inside_a_step() -> None:
+    slip = pl.concat([make_slip(50, 20.0), make_slip(100, 20.0, start=3.0)])
+    windows = cut_windows(slip, 20.0)
+    # Of a step from 0 to 8 s with a hole from 2.5 to 3 s, three of four windows are whole.
+    assert windows["t_start"].to_list() == pytest.approx([0.0, 4.0, 6.0])
+
+
+def test_a_suspect_sample_makes_its_window_suspect() -> None:
+    slip = make_slip(80, 20.0).with_columns(suspect=pl.Series(np.arange(80) == 50))
+    assert cut_windows(slip, 20.0)["suspect"].to_list() == [False, True]
+
+
+@pytest.mark.parametrize("program", ["drive_steps", "smooth", "ramps", "slalom", "teleop", "circle"])
+def test_every_way_of_driving_has_windows_inside_steps_and_segments(drive: TakeThrough, program: str) -> None:
+    taken = drive(replace(FIELD, program=Program(program)), {"velocity": {"rate_hz": 20}})  # type: ignore[arg-type]
+    for name in ("command", "measured"):
+        slip, windows = taken.slip(name), taken.windows(name)
+        # At least half of the run stands in full windows, however restless the command.
+        assert windows.height * 2.0 > 0.5 * slip.height / 20.0
+        for window in windows.iter_rows(named=True):
+            inside = slip.filter(pl.col("t").is_between(window["t_start"], window["t_end"], closed="left"))
+            assert inside["step"].n_unique() == inside["segment"].n_unique() == 1
+
+
+def test_windows_of_windowed_recordings_start_at_their_steps(drive: TakeThrough) -> None:
+    taken = drive(replace(FIELD, recording=Recording(gaps=3, gap_s=2.5)))
+    starts = taken.slip("command").group_by("step").agg(pl.col("t").min())["t"].to_numpy()
+    since = taken.windows("command")["t_start"].to_numpy()[:, None] - starts[None, :]
+    into = np.where(since >= -1e-6, since, np.inf).min(axis=1)
+    assert np.allclose(into / 2.0, np.round(into / 2.0), atol=1e-6)
+
+
+def test_both_inputs_have_the_same_steps_whichever_is_asked_for(drive: TakeThrough) -> None:
+    both = drive(FIELD).windows("measured")
+    alone = drive(FIELD, inputs=("measured",)).windows("measured")
+    assert alone.equals(both)
+
+
+def test_without_any_input_there_is_nothing_to_compare() -> None:
+    velocities = pl.DataFrame({"t": [0.0, 0.05], "stamp": [0, 1], "segment": [0, 0]})
+    with pytest.raises(StageError, match="no command") as caught:
+        compute_slip(
+            velocities,
+            pl.DataFrame(),
+            pl.DataFrame(),
+            vehicle=HUSKY,
+            configuration=convert({}, "test"),
+            inputs=("command",),
+            where="a.mcap",
+        )
+    assert caught.value.code == "no_command"
+
+
+def make_drive(times: list[float], left: list[float]) -> pl.DataFrame:
+    return pl.DataFrame({"t": times, "left": left, "right": left, "active": [True] * len(times)})
+
+
+def test_a_command_is_held_until_the_next_one_or_until_it_is_stale() -> None:
+    commands = make_drive([1.0, 1.1, 1.2, 5.0], [1.0, 2.0, 3.0, 4.0])
+    at = np.array([0.9, 1.0, 1.15, 1.7, 1.71, 5.0])
+    found = hold_commands(at, commands, HUSKY, 0.5)
+    speed = found.velocity[:, 0] / 0.165
+    assert np.allclose(speed, [np.nan, 1.0, 2.0, 3.0, np.nan, 4.0], equal_nan=True)
+    assert found.stale.tolist() == [False, False, False, False, True, False]
+
+
+def test_a_pair_of_topics_at_2_hz_is_held_for_its_own_period() -> None:
+    stamps = np.sort(np.concatenate((np.arange(20) * 0.5, np.arange(20) * 0.5 + 1e-4)))
+    commands = make_drive(stamps.tolist(), [1.0] * 40)
+    found = hold_commands(np.arange(0.1, 9.4, 0.05), commands, HUSKY, None)
+    assert not found.stale.any()
+
+
+def test_measured_wheels_are_interpolated_but_not_across_holes() -> None:
+    stamps = [0.0, 0.1, 0.2, 3.0, *(3.1 + 0.1 * np.arange(20)).tolist()]
+    wheels = make_drive(stamps, [0.0, 1.0, 2.0, *[9.0] * 21])
+    found = interpolate_wheels(np.array([-0.1, 0.05, 0.2, 1.0, 3.05, 5.2]), wheels, HUSKY)
+    speed = found.velocity[:, 0] / 0.165
+    assert np.allclose(speed, [np.nan, 0.5, 2.0, np.nan, 9.0, np.nan], equal_nan=True)
+
+
+def test_with_yaw_imu_the_gyro_gives_the_yaw_rate_and_nothing_else(drive: TakeThrough) -> None:
+    pose, imu = drive(FIELD), drive(FIELD, {"velocity": {"yaw": "imu"}})
+    assert np.array_equal(pose.velocities["v_x"], imu.velocities["v_x"])
+    assert np.array_equal(imu.velocities["v_w"], imu.velocities["v_w_imu"])
+    assert rms(pose.velocities["v_w"] - imu.velocities["v_w"]) > 1e-4
+
+
+def test_with_yaw_imu_and_no_gyro_it_says_what_to_do(drive: TakeThrough) -> None:
+    with pytest.raises(StageError, match="--yaw pose") as caught:
+        drive(replace(FIELD, imu=None), {"velocity": {"yaw": "imu"}})
+    assert caught.value.code == "no_gyro"
+
+
+def test_a_car_with_base_link_between_its_axles_has_no_lateral_slip(drive: TakeThrough) -> None:
+    middle = replace(VEHICLES["car"], name="ackermann_car")
+    scenario = replace(PLAIN, vehicle=middle, effects={"lever_arm": {"l_x": 1.3, "l_y": 0.0}})
+    rear = drive(scenario).slip("measured")
+    told = drive(scenario, {"vehicle": {"base_to_rear_axle_m": 1.3}}).slip("measured")
+    assert float(rear["g_y"].abs().median()) > 0.1
+    assert float(told["g_y"].abs().median()) < 0.02
