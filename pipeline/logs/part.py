@@ -21,7 +21,11 @@ _MAX_SUMMARY: Final = 1 << 29
 
 
 class _NoSummaryError(Exception):
-    """The summary is absent or not whole; the text says which and why."""
+    """The summary is absent or does not say everything; the text says what."""
+
+
+class _DamagedSummaryError(_NoSummaryError):
+    """The summary was there once; the text says what is wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +55,12 @@ def catalog_file(source: ByteSource, *, threads: int = 1) -> Catalog:
         damaged = catalog.losses
         catalog = Catalog(losses=list(damaged))
         _rebuild(source, catalog, start, stop, threads)
-        _say_why(catalog, str(reason))
+        catalog.notes.append(f"{reason}; the index was rebuilt by walking the records")
+        if isinstance(reason, _DamagedSummaryError) and all(
+            each.kind != "truncated" for each in catalog.losses
+        ):
+            text = f"{reason}; all records were walked in its place"
+            catalog.losses.append(Loss("damaged_summary", text))
     else:
         _scan_gaps(source, catalog, start, summary.start)
         _take_statistics(source, catalog, summary, threads)
@@ -85,24 +94,24 @@ def _read_summary(source: ByteSource, catalog: Catalog) -> _Summary:
     tail_size = rec.FOOTER_SIZE + len(rec.MAGIC)
     tail = source.read_at(max(0, source.size - tail_size), tail_size)
     if len(tail) < rec.FOOTER_SIZE + len(rec.MAGIC) or not tail.endswith(rec.MAGIC):
-        raise _NoSummaryError("the file does not end as MCAP does")
+        raise _DamagedSummaryError("the file does not end as MCAP does")
     opcode, length = rec.HEAD.unpack_from(tail, 0)
     if opcode != rec.FOOTER or length != rec.LEAST_BODY[rec.FOOTER]:
-        raise _NoSummaryError("the footer is damaged")
+        raise _DamagedSummaryError("the footer is damaged")
     parser = rec.Parser(tail[rec.HEAD_SIZE :])
     start, _offsets, crc = parser.number(8), parser.number(8), parser.number(4)
     footer_at = source.size - rec.FOOTER_SIZE - len(rec.MAGIC)
     if start == 0:
         raise _NoSummaryError("there is no summary")
     if not len(rec.MAGIC) <= start <= footer_at or footer_at - start > _MAX_SUMMARY:
-        raise _NoSummaryError("the footer is damaged")
+        raise _DamagedSummaryError("the footer is damaged")
     body = source.read_at(start, footer_at - start)
     if crc and checksum(body + tail[: rec.HEAD_SIZE + 16]) != crc:
-        raise _NoSummaryError("the summary is damaged")
+        raise _DamagedSummaryError("the summary is damaged")
     try:
         summary = _parse_summary(body, start, catalog)
     except rec.RecordError as error:
-        raise _NoSummaryError(f"the summary is damaged ({error})") from None
+        raise _DamagedSummaryError(f"the summary is damaged ({error})") from None
     if not crc:
         _compare_chunks(source, summary.chunks)
     return summary
@@ -113,7 +122,7 @@ def _compare_chunks(source: ByteSource, chunks: list[rec.ChunkIndexRecord]) -> N
     for chunk in chunks:
         head = source.read_at(chunk.offset, rec.HEAD_SIZE)
         if head != rec.HEAD.pack(rec.CHUNK, chunk.length - rec.HEAD_SIZE):
-            raise _NoSummaryError("the summary disagrees with the chunks")
+            raise _DamagedSummaryError("the summary disagrees with the chunks")
 
 
 def _parse_summary(body: bytes, start: int, catalog: Catalog) -> _Summary:
@@ -160,7 +169,7 @@ def _check_summary(
     end = len(rec.MAGIC)
     for chunk in sorted(chunks, key=lambda each: each.offset):
         if chunk.offset < end or chunk.length < rec.LEAST_BODY[rec.CHUNK]:
-            raise _NoSummaryError("the summary places its chunks one over the other")
+            raise _DamagedSummaryError("the summary places its chunks one over the other")
         end = chunk.offset + chunk.length + chunk.index_length
         catalog.compressions.add(chunk.compression)
         known = frozenset(chunk.index_offsets) or None
@@ -177,7 +186,7 @@ def _check_summary(
             )
         )
     if end > start:
-        raise _NoSummaryError("the summary places chunks beyond the data")
+        raise _DamagedSummaryError("the summary places chunks beyond the data")
 
 
 def _scan_gaps(source: ByteSource, catalog: Catalog, start: int, stop: int) -> None:
@@ -247,14 +256,10 @@ def _examine(source: ByteSource, catalog: Catalog, threads: int) -> None:
     catalog.spans = examined
     catalog.schemas |= schemas
     catalog.channels |= channels
+    for number in sorted(catalog.counts.keys() - catalog.channels.keys()):
+        text = f"{catalog.counts.pop(number)} messages of channel {number}, whose own record is lost"
+        catalog.losses.append(Loss("unknown_channel", text, start_ns=catalog.start_ns, end_ns=catalog.end_ns))
 
 
 def _forget_chunk(span: Span, loaded: Loaded) -> tuple[Span, Loaded]:
     return span, replace(loaded, chunk=b"")
-
-
-def _say_why(catalog: Catalog, reason: str) -> None:
-    catalog.notes.append(f"{reason}; the index was rebuilt by walking the records")
-    missing = reason.startswith(("there is no summary", "the summary has no", "the summary does not"))
-    if not missing and not any(loss.kind == "truncated" for loss in catalog.losses):
-        catalog.losses.append(Loss("damaged_summary", f"{reason}; all records were walked in its place"))

@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 
 _CRC_IN_HEAD: Final = 24
 _INVERTED: Final = 0xFFFFFFFF
+
 _ZERO_TAIL: Final = 64
 """So many zeros at the end of a chunk are bytes that were never written."""
-
 
 _WORTHWHILE: Final = 0.8
 """Stopping early pays when this share of a chunk or less is needed."""
@@ -136,8 +136,8 @@ def load_span(
     Args:
         source: the file.
         span: which stretch.
-        wanted: numbers of the channels whose messages are needed, None for all.
         excuse: asked when a chunk's checksum differs for what else shows that its records are whole.
+        wanted: numbers of the channels whose messages are needed, None for all.
     """
     blob = memoryview(source.read_at(span.offset, span.length + span.index_length))
     if span.kind is SpanKind.LOOSE:
@@ -151,13 +151,8 @@ def load_span(
         if span.kind is SpanKind.CUT_CHUNK:
             return _load_start(span, head, stored, "the file ends inside it")
         entries = _read_entries(blob[span.length :])
-        if (
-            head.crc == 0
-            and entries
-            and wanted
-            and set(span.channels or ()) == {number for number, _ in entries}
-        ):
-            needed = _needed_size(entries, wanted)
+        if head.crc == 0 and entries and wanted:
+            needed = _needed_size(span, entries, wanted)
             if needed is not None and needed < head.uncompressed_size * _WORTHWHILE:
                 return _load_prefix(span, head, stored, entries, needed)
         chunk = _inflate_checked(span, head, stored, excuse, losses)
@@ -172,8 +167,10 @@ def load_span(
     return Loaded(chunk, messages, losses, unchecked=head.crc == 0, index_damaged=index_damaged)
 
 
-def _needed_size(entries: list[Entries], wanted: AbstractSet[int]) -> int | None:
-    """Bytes up to the end of the last wanted message, None when no message behind it tells where that is."""
+def _needed_size(span: Span, entries: list[Entries], wanted: AbstractSet[int]) -> int | None:
+    """Bytes up to the end of the last wanted message, None when that is not certain."""
+    if span.channels != {number for number, _ in entries}:
+        return None
     last = max((int(e[:, 1].max()) for c, e in entries if c in wanted and e.size), default=-1)
     behind = [int(later.min()) for _, e in entries if (later := e[e[:, 1] > last, 1]).size]
     return min(behind, default=None)

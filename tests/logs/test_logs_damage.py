@@ -169,6 +169,18 @@ def test_a_wrong_summary_without_checksum_is_found_out(tmp_path: Path) -> None:
         assert losses == ["damaged_summary"]
 
 
+def test_messages_whose_channel_is_lost_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    truth = write_small(path)
+    content = bytearray(path.read_bytes()[:-60])
+    start, end = chunk_places(path.read_bytes())[0]
+    summary = next(s for s in record_starts(path.read_bytes()) if path.read_bytes()[s] == 0x0F)
+    content[(start + end) // 2] ^= 0xFF
+    found, losses = read_damaged(path, bytes(content[:summary]), truth)
+    assert not found
+    assert losses.count("unknown_channel") == 3
+
+
 def test_a_lost_message_index_loses_nothing(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     truth = write_small(path)
