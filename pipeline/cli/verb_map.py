@@ -1,0 +1,125 @@
+"""`slip map`: deployments of the literature and own ones, and the table behind them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+
+from pipeline.cli.output import CLEAN, print_json
+from pipeline.job.options import FigureFormat
+
+if TYPE_CHECKING:
+    import polars as pl
+
+_OWN = Path("deployments.csv")
+
+
+def register(app: App) -> None:
+    """Add the verb and its two commands."""
+    verb = App(
+        name="map", help="Draw deployments by kinetic energy and terrain complexity, own runs on them."
+    )
+    verb.default(draw)
+    verb.command(add)
+    verb.command(merge)
+    app.command(verb)
+
+
+def draw(  # noqa: D417 - arguments document themselves
+    results: Annotated[Path, Parameter(help="results folder; may be empty")] = Path("results"),
+    /,
+    *,
+    deployments: Annotated[
+        Path | None, Parameter(help="table of deployments in place of the project's own")
+    ] = None,
+    figures: FigureFormat | None = None,
+    out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Write map.html: the literature, with the datasets of the results coloured by their slip.
+
+    Args:
+        figures: also write the figure in this format, for papers.
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.job.map import draw_up_map, write_map  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    store = Store(out or results)
+    drawn = draw_up_map(store, deployments)
+    page = write_map(store, drawn, figures)
+    if json:
+        print_json(
+            {
+                "deployments": drawn.points.to_dicts(),
+                "datasets": drawn.own.to_dicts(),
+                "notes": list(drawn.notes),
+                "page": str(page),
+            }
+        )
+    elif not quiet:
+        for row in drawn.own.sort("energy", descending=True).iter_rows(named=True):
+            print(
+                f"{row['dataset']:<34}{row['energy']:>10.3g} J   complexity {row['complexity']:.1f}   "
+                f"slip {row['slip']:.3g} m/s   {row['zone']} risk"
+            )
+        for note in drawn.notes:
+            print(f"! {note}")
+        print(f"page    {page}    ({drawn.points.height} of {drawn.deployments.height} deployments placed)")
+    return CLEAN
+
+
+def add(  # noqa: D417 - arguments document themselves
+    entry: Annotated[Path, Parameter(help="TOML file with one deployment: column = value")],
+    /,
+    *,
+    to: Annotated[Path, Parameter(help="table to add it to; made when it is not there")] = _OWN,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Append a deployment to a table, checked against the schema.
+
+    Args:
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.comparison.deployments import add_deployment, write_deployments  # noqa: PLC0415 - heavy
+
+    table = add_deployment(to, entry)
+    write_deployments(table, to)
+    _tell(table, to, json=json, quiet=quiet)
+    return CLEAN
+
+
+def merge(  # noqa: D417 - arguments document themselves
+    first: Annotated[Path, Parameter(help="a table of deployments")],
+    second: Annotated[Path, Parameter(help="another")],
+    /,
+    *,
+    to: Annotated[Path, Parameter(help="table to write; may be one of them")] = _OWN,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Merge two tables of deployments; the same deployment counts once, contradictions are refused.
+
+    Args:
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.comparison.deployments import merge_deployments, write_deployments  # noqa: PLC0415 - heavy
+
+    table = merge_deployments(first, second)
+    write_deployments(table, to)
+    _tell(table, to, json=json, quiet=quiet)
+    return CLEAN
+
+
+def _tell(table: pl.DataFrame, path: Path, *, json: bool, quiet: bool) -> None:
+    if json:
+        print_json({"table": str(path), "deployments": table.height, "keys": table["key"].to_list()})
+    elif not quiet:
+        print(f"{path}: {table.height} deployments")

@@ -1,0 +1,219 @@
+"""The map itself."""
+
+from __future__ import annotations
+
+import math
+
+import altair as alt
+import polars as pl
+
+from pipeline.comparison.place import ZONES
+from pipeline.report import theme
+from pipeline.report.deployments.labels import place_labels
+from pipeline.report.figures import Drawing
+
+_LOWEST, _HIGHEST = 1.0, 1.0e6
+_ARROW = 1.9
+_WIDTH, _HEIGHT = 720.0, 520.0
+_SHAPES = {
+    "kinematic": "circle",
+    "dynamic": "square",
+    "learned": "diamond",
+    "dataset": "cross",
+    "several": "triangle-right",
+    "unknown": "stroke",
+}
+_ZONE_OPACITY = {"low": 0.0, "medium": 0.45, "high": 0.85}
+
+
+def draw_map(points: pl.DataFrame, own: pl.DataFrame) -> Drawing:
+    """Deployments at kinetic energy [J, log] against terrain complexity, with the user's datasets on top.
+
+    Args:
+        points: as of `place_deployments`.
+        own: as of `place_datasets`; may be empty.
+    """
+    arrows = points.filter(pl.col("bound").is_in(["upper", "lower"])).with_columns(
+        pl.when(pl.col("bound") == "lower")
+        .then(pl.col("energy") * _ARROW)
+        .otherwise(pl.col("energy") / _ARROW)
+        .alias("end")
+    )
+    rows = {
+        "zones": _tabulate_zones(),
+        "names": _name_marks(points, own),
+        "literature": points,
+        "bounds": arrows,
+        "own": own,
+    }
+    layers = [_shade_zones(), _name_zones(), *_draw_bounds(), *_draw_literature(points)]
+    if not own.is_empty():
+        layers.append(_draw_own())
+    layers += _draw_names()
+    chart = alt.layer(*layers).resolve_scale(color="independent", shape="independent")
+    note = (
+        "Arrows: bounds. Hollow: mass or speed unconfirmed, inferred or second-hand. The complexity is a "
+        "convention (slope, roughness, sinkage, friction); the zones end where log10(energy / J) + "
+        "complexity / 10 is 3.5 and 4.8."
+    )
+    return Drawing(chart.properties(width=_WIDTH, height=_HEIGHT, usermeta={"gutter": 70}), rows, note)
+
+
+def _tabulate_zones() -> pl.DataFrame:
+    """Lower and upper edge of each risk zone at both ends of the axis, and where its name stands."""
+    rows = []
+    start = -1.0e9
+    for name, end in ZONES:
+        for place in (0.0, 10.0):
+            low, high = (10.0 ** min(max(edge - place / 10.0, 0.0), 6.0) for edge in (start, end))
+            rows.append(
+                {
+                    "zone": f"{name} risk",
+                    "place": place,
+                    "low": low,
+                    "high": high,
+                    "opacity": _ZONE_OPACITY[name],
+                }
+            )
+        start = end
+    return pl.DataFrame(rows)
+
+
+def _energy(field: str) -> alt.Y:
+    scale = alt.Scale(type="log", domain=[_LOWEST, _HIGHEST])
+    return alt.Y(
+        f"{field}:Q", scale=scale, axis=alt.Axis(title="maximum kinetic energy [J]", format="~s", tickCount=6)
+    )
+
+
+def _complexity(field: str = "complexity") -> alt.X:
+    return alt.X(
+        f"{field}:Q",
+        scale=alt.Scale(domain=[0.0, 10.0], nice=False),
+        axis=alt.Axis(title="terrain complexity (0 flat asphalt, 10 impassable)", tickCount=10),
+    )
+
+
+def _shade_zones() -> alt.Chart:
+    shaded: alt.Chart = (
+        alt.Chart(alt.NamedData("zones"))
+        .mark_area(color=theme.SUSPECT, clip=True)
+        .encode(
+            x=_complexity("place"),
+            y=_energy("low"),
+            y2="high:Q",
+            detail="zone:N",
+            opacity=alt.Opacity("opacity:Q", scale=None, legend=None),
+        )
+    )
+    return shaded
+
+
+def _name_zones() -> alt.Chart:
+    named: alt.Chart = (
+        alt.Chart(alt.NamedData("zones"))
+        .mark_text(align="right", baseline="top", dx=-6, dy=6, color=theme.QUIET, fontStyle="italic")
+        .encode(x=_complexity("place"), y=_energy("high"), text="zone:N")
+        .transform_filter("datum.place == 10")
+    )
+    return named
+
+
+def _draw_bounds() -> list[alt.Chart]:
+    base = alt.Chart(alt.NamedData("bounds")).encode(x=_complexity())
+    heads = [
+        base.mark_point(shape=shape, size=36, filled=True, color=theme.QUIET, opacity=1)
+        .encode(y=_energy("end"))
+        .transform_filter(f"datum.bound == '{bound}'")
+        for bound, shape in (("upper", "triangle-down"), ("lower", "triangle-up"))
+    ]
+    return [base.mark_rule(color=theme.QUIET).encode(y=_energy("energy"), y2="end:Q"), *heads]
+
+
+def _draw_literature(points: pl.DataFrame) -> list[alt.Chart]:
+    kinds = [kind for kind in _SHAPES if kind in set(points["model_type"])]
+    shape = alt.Shape(
+        "model_type:N",
+        scale=alt.Scale(domain=kinds, range=[_SHAPES[kind] for kind in kinds]),
+        legend=alt.Legend(title="model"),
+    )
+    marks = (
+        alt.Chart(alt.NamedData("literature"))
+        .mark_point(size=80, strokeWidth=1.4, opacity=1)
+        .encode(
+            x=_complexity(),
+            y=_energy("energy"),
+            shape=shape,
+            stroke=alt.value(theme.MEASURED),
+            fill=alt.condition("datum.sure", alt.value(theme.CROSS), alt.value(theme.PAPER)),
+            tooltip=[
+                alt.Tooltip("key:N"),
+                alt.Tooltip("vehicle:N"),
+                alt.Tooltip("terrain:N"),
+                alt.Tooltip("energy:Q", format=",.3~r", title="J"),
+                alt.Tooltip("bound:N"),
+            ],
+        )
+    )
+    return [marks]
+
+
+def _draw_own() -> alt.Chart:
+    colour = alt.Color(
+        "slip:Q",
+        scale=alt.Scale(range=list(theme.SLIP_RAMP), interpolate="rgb"),
+        legend=alt.Legend(
+            title="own runs: median slip [m/s]", gradientLength=150, gradientThickness=8, tickCount=3
+        ),
+    )
+    marks: alt.Chart = (
+        alt.Chart(alt.NamedData("own"))
+        .mark_point(size=170, filled=True, shape="circle", stroke=theme.MEASURED, strokeWidth=1.5, opacity=1)
+        .encode(
+            x=_complexity(),
+            y=_energy("energy"),
+            color=colour,
+            tooltip=[
+                alt.Tooltip("dataset:N"),
+                alt.Tooltip("runs:Q"),
+                alt.Tooltip("energy:Q", format=",.3~r", title="J"),
+                alt.Tooltip("slip:Q", format=".3"),
+            ],
+        )
+    )
+    return marks
+
+
+def _draw_names() -> list[alt.Chart]:
+    base = alt.Chart(alt.NamedData("names")).encode(
+        x=_complexity("place"), y=_energy("height"), text="name:N"
+    )
+    quiet = base.mark_text(align="left", baseline="middle", fontSize=10, color=theme.QUIET)
+    strong = base.mark_text(align="left", baseline="middle", fontSize=10.5, fontWeight=600, color=theme.INK)
+    return [quiet.transform_filter("!datum.own"), strong.transform_filter("datum.own")]
+
+
+def _name_marks(points: pl.DataFrame, own: pl.DataFrame) -> pl.DataFrame:
+    """Names with the places where they hide least, own ones first."""
+    marks = pl.concat(
+        [
+            own.select(
+                pl.col("dataset").alias("name"), "complexity", "energy", pl.lit(value=True).alias("own")
+            ),
+            points.select(
+                pl.col("key").alias("name"), "complexity", "energy", pl.lit(value=False).alias("own")
+            ),
+        ]
+    )
+    across, up = _WIDTH / 10.0, _HEIGHT / (math.log10(_HIGHEST) - math.log10(_LOWEST))
+    pixels = [
+        (x * across, math.log10(energy) * up)
+        for x, energy in zip(marks["complexity"].to_list(), marks["energy"].to_list(), strict=True)
+    ]
+    placed = place_labels(pixels, marks["name"].to_list(), width=_WIDTH)
+    return marks.select(
+        "name",
+        "own",
+        pl.Series("place", [x / across for x, _ in placed], dtype=pl.Float64),
+        pl.Series("height", [10.0 ** (y / up) for _, y in placed], dtype=pl.Float64),
+    )
