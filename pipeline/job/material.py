@@ -26,6 +26,7 @@ _SCHEMA = {
     "vehicle": pl.String,
     "terrain": pl.String,
     "day": pl.String,
+    "start": pl.Int64,
     "mass": pl.Float64,
     "inertia": pl.Float64,
 }
@@ -143,7 +144,7 @@ def _read_digest(manifest: Manifest) -> str:
     return str(log.get("sha256")) if isinstance(log, dict) else manifest.run
 
 
-def _label_run(manifest: Manifest) -> dict[str, str | float | None]:
+def _label_run(manifest: Manifest) -> dict[str, str | float | int | None]:
     details = manifest.details
     vehicle = details.get("vehicle")
     facts = vehicle if isinstance(vehicle, dict) else {}
@@ -154,7 +155,8 @@ def _label_run(manifest: Manifest) -> dict[str, str | float | None]:
         "dataset": str(details.get("dataset") or "unknown"),
         "vehicle": str(facts.get("id") or "unknown"),
         "terrain": str(details.get("terrain") or "unknown"),
-        "day": read_day(manifest.run) or _read_stamp(manifest),
+        "day": read_day(manifest.run) or _read_day_of(_read_start(manifest)),
+        "start": _read_start(manifest),
         "mass": mass,
         "inertia": inertia,
     }
@@ -173,13 +175,18 @@ def _weigh(vehicle: Mapping[str, object]) -> tuple[float | None, float | None]:
     return float(mass), float(mass) * squared / 12.0
 
 
-def _read_stamp(manifest: Manifest) -> str | None:
-    """Day of the log's first stamp (UTC); None for clocks that were never set."""
+def _read_start(manifest: Manifest) -> int | None:
+    """Stamp of the log's first sample [ns]."""
     stages = manifest.details.get("stages")
     extract = stages.get("extract") if isinstance(stages, dict) else None
     context = extract.get("context") if isinstance(extract, dict) else None
     start = context.get("start_ns") if isinstance(context, dict) else None
-    if not isinstance(start, int):
+    return start if isinstance(start, int) else None
+
+
+def _read_day_of(start: int | None) -> str | None:
+    """Day of a stamp (UTC); None for clocks that were never set."""
+    if start is None:
         return None
     try:
         day = datetime.fromtimestamp(start / 1e9, UTC)

@@ -1,0 +1,86 @@
+"""`slip trend`: what changed over the runs of a vehicle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+from cyclopts.types import NonNegativeFloat
+
+from pipeline.cli.output import CLEAN, print_json
+from pipeline.core.errors import SlipError
+
+if TYPE_CHECKING:
+    from pipeline.job.trend import Trend
+
+ALERT = 4
+
+
+def register(app: App) -> None:
+    """Add the verb."""
+    app.command(trend)
+
+
+def trend(  # noqa: D417 - arguments document themselves
+    results: Annotated[Path, Parameter(help="results folder")] = Path("results"),
+    /,
+    *,
+    by: Annotated[
+        str, Parameter(help="whose trends: dataset, vehicle, terrain, or several of them")
+    ] = "dataset",
+    threshold: Annotated[
+        NonNegativeFloat, Parameter(help="relative change of level that raises an alert")
+    ] = 0.1,
+    limit: Annotated[
+        tuple[str, ...], Parameter(help="QUANTITY=VALUE, an alert where the last run is above", negative="")
+    ] = (),
+    out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Follow slip, fitted parameters and data health over dates; exit code 4 when something moved.
+
+    Writes trend.html. A level has moved where the runs' means step more than chance allows, and by more than
+    the threshold; at least eight runs are needed.
+
+    Args:
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.job.trend import describe_trend, follow_trend, write_trend  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    store = Store(out or results)
+    names = tuple(name.strip() for name in by.split(",") if name.strip())
+    found = follow_trend(store, names, threshold=threshold, limits=dict(map(_read_limit, limit)))
+    page = write_trend(store, found)
+    if json:
+        print_json({**describe_trend(found), "page": str(page)})
+    elif not quiet:
+        print(_describe(found, page))
+    return ALERT if found.alerts else CLEAN
+
+
+def _read_limit(text: str) -> tuple[str, float]:
+    name, _, value = text.rpartition("=")
+    try:
+        return name.strip() or text, float(value)
+    except ValueError as error:
+        raise SlipError(
+            "bad_limit", f"{text!r} is no limit", hint="Write --limit QUANTITY=VALUE, as median_modulus=1.2"
+        ) from error
+
+
+def _describe(found: Trend, page: Path) -> str:
+    lines = [f"!! {alert.text}" for alert in found.alerts] or ["nothing moved beyond the threshold"]
+    groups = list(dict.fromkeys(one.group for one in found.series))
+    for group in groups:
+        own = [one for one in found.series if one.group == group]
+        slip = next((one for one in own if one.quantity.startswith("median_modulus")), own[0])
+        runs = slip.points.height
+        lines.append(
+            f"{group:<34}{runs:>4} run{'s' * (runs != 1):<2} {slip.quantity} {slip.latest:.3g} {slip.unit}"
+        )
+    lines += [*(f"! {note}" for note in found.notes), f"page    {page}"]
+    return "\n".join(lines)
