@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.diagnosis.judge import Verdict, compare, hold_out, make_folds
+from pipeline.diagnosis.judge import LEAST_GAIN, Verdict, compare, hold_out, make_folds
 from pipeline.diagnosis.metric import Metric, make_metric, saturate
 from pipeline.diagnosis.plausibility import is_nameable
 from pipeline.diagnosis.polish import Fitted, polish
@@ -68,6 +68,8 @@ class Arena:
         kept: effects that are never dropped: those of the model to start from.
         metric: cost of residuals at the current model.
         only_early_clock: whether a late clock cannot be told from a late drive.
+        least_delay: delays below it are a matter of sampling [s].
+        least_share: share of the asked motion (rms) that an effect must account for.
     """
 
     problem: Problem
@@ -78,6 +80,8 @@ class Arena:
     metric: Metric
     kept: frozenset[str] = frozenset()
     only_early_clock: bool = False
+    least_delay: float = 0.0
+    least_share: float = 0.0
 
     def enter(self, state: State) -> Contender:
         """Fit a state and hold it out."""
@@ -93,6 +97,18 @@ class Arena:
     def judge(self, before: Contender, after: Contender) -> Verdict:
         """How much better ``after`` is."""
         return compare(self.problem, self.metric, before.held, after.held)
+
+    def prefers(self, before: Contender, after: Contender, least_gain: float = LEAST_GAIN) -> bool:
+        """Whether ``after`` is better beyond doubt, and by enough to matter."""
+        return self.judge(before, after).accepts(least_gain) and self._matters(before, after)
+
+    def _matters(self, before: Contender, after: Contender) -> bool:
+        """Whether enough of the motion itself is explained: encoders are so exact that all else is certain."""
+        if self.least_share == 0.0:
+            return True
+        asked = (self.problem.find_ideal()[:, 0, :] ** 2).mean(axis=0)
+        fall = (before.held**2 - after.held**2).mean(axis=0)[[0, 2]]
+        return bool((fall > self.least_share**2 * asked).any())
 
     def adapt(self, contender: Contender) -> Contender:
         """Take the metric from a model's own residuals, and fit it anew."""
@@ -113,7 +129,8 @@ class Arena:
         if self.only_early_clock and clock is not None and clock.values["d"] > 0.0:
             return False
         return all(
-            effect.id in self.kept or is_nameable(effect, self.largest) for effect in contender.state.effects
+            effect.id in self.kept or is_nameable(effect, self.largest, self.least_delay)
+            for effect in contender.state.effects
         )
 
 
@@ -124,7 +141,5 @@ def open_arena(
     residual = problem.find_residuals(start)
     noise = saturate(problem, residual)
     metric = make_metric(residual, noise, problem)
-    arena = Arena(
-        problem, candidates, largest, noise, make_folds(problem), metric, kept=frozenset(start.ids)
-    )
+    arena = Arena(problem, candidates, largest, noise, make_folds(problem), metric, kept=frozenset(start.ids))
     return arena, arena.adapt(arena.enter(start))

@@ -61,6 +61,12 @@ class Ground:
         """The comparisons of an input."""
         return self.commanded if source is Input.COMMAND else self.measured
 
+    @property
+    def sampling_s(self) -> float:
+        """Delay that sampled encoders may feign: a little more than half their period."""
+        periods = [float(np.median(np.diff(run.wheels.times))) for run in self.runs if run.wheels is not None]
+        return 0.6 * max(periods, default=0.0)
+
     def start_timing(self) -> tuple[Timing, ...]:
         """Delays to start from: the heading's against the gyro."""
         return tuple(
@@ -96,9 +102,7 @@ class Ground:
 
     def pose_wheels(self) -> WheelProblem:
         """The problem from command to wheels."""
-        return WheelProblem(
-            self.commanded, self.measured, speed=self.largest.speed, turn=self.largest.turn
-        )
+        return WheelProblem(self.commanded, self.measured, speed=self.largest.speed, turn=self.largest.turn)
 
 
 def prepare(runs: Sequence[MotionRun], vehicle: Vehicle) -> Ground:
@@ -133,7 +137,7 @@ def _compare_all(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> 
 
 
 def _measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
-    speed = turn = wheel = 0.0
+    speed = turn = wheel = difference = 0.0
     for run in runs:
         series = run.commands or run.wheels
         if series is None:
@@ -147,6 +151,7 @@ def _measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
             around = np.abs(radius * (series.right - series.left) / track)
         speed, turn = max(speed, float(forward.max())), max(turn, float(around.max()))
         wheel = max(wheel, float(np.abs(series.left).max()), float(np.abs(series.right).max()))
+        difference = max(difference, float(np.abs(series.right - series.left).max()))
     places = np.concatenate([run.track.place[run.track.active, 0] for run in runs])
     tenths = np.quantile(places, np.linspace(0.0, 1.0, 11)) if places.size else np.zeros(11)
-    return Largest(speed, turn, wheel, max(run.duration_s for run in runs), tenths)
+    return Largest(speed, turn, wheel, max(difference, 1e-6), max(run.duration_s for run in runs), tenths)

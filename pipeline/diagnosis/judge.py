@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.diagnosis.polish import solve_step
+from pipeline.diagnosis.problem import number_units
 from pipeline.motion.effect import Search
 
 if TYPE_CHECKING:
@@ -29,6 +30,16 @@ LEAST_GAIN = 0.01
 LEAST_T = 2.5
 _FEWEST_WINDOWS = 6
 _FEWEST_ACTIVE = 2.5
+# In shorter stretches neighbours are not quite independent: more is asked of them.
+_SHORT_S = 3.0
+_SHORT_T = 3.5
+_FAINT_Z = 1.5
+_RARE_GAIN = 0.02
+_RARE_Z = 3.0
+_RARE_T = 1.5
+_PLAIN_Z = 6.0
+_LEAST_STRETCHES = 1.7
+_LAGS = 8
 
 
 @dataclass(frozen=True)
@@ -45,16 +56,23 @@ class Verdict:
 
     Attributes:
         gain: share of the other's held-out loss that it takes away.
+        z: the same against the noise that the better model leaves: for an effect that acts in two or three
+            stretches only, but there beyond doubt.
         t: largest of three block t values: of the loss difference, of the log ratio of losses, and of the
             loss taken away in proportion to how far predictions moved.
     """
 
     gain: float
     t: float
+    z: float
 
     def accepts(self, least_gain: float = LEAST_GAIN) -> bool:
         """Whether it is better beyond doubt."""
-        return self.gain >= least_gain and self.t >= LEAST_T
+        if self.gain < least_gain:
+            return False
+        common = self.t >= LEAST_T and self.z >= _FAINT_Z
+        rare = self.gain >= _RARE_GAIN and self.z >= _RARE_Z and self.t >= _RARE_T
+        return common or rare or (self.gain >= _RARE_GAIN and self.z >= _PLAIN_Z)
 
 
 def make_folds(problem: Problem) -> tuple[Fold, ...]:
@@ -102,7 +120,14 @@ def compare(problem: Problem, metric: Metric, before: Floats, after: Floats) -> 
     ratio = np.log(np.maximum(sums_old, 1e-9) / np.maximum(sums_new, 1e-9))
     moved = (((before - after) / metric.scale) ** 2).sum(axis=1)
     action = np.bincount(problem.unit, moved)[kept]
-    return Verdict(gain, max(_block_t(difference), _block_t(ratio), _ratio_t(difference, action)))
+    stretch = number_units(problem.run, problem.times, _SHORT_S)
+    short = _ratio_t(np.bincount(stretch, old - new), np.bincount(stretch, moved)) * LEAST_T / _SHORT_T
+    rare = _normal_t(
+        problem, after / metric.scale, np.bincount(stretch, old - new), np.bincount(stretch, moved)
+    )
+    return Verdict(
+        gain, max(_block_t(difference), _block_t(ratio), _ratio_t(difference, action), short), rare
+    )
 
 
 def _ratio_t(difference: Floats, action: Floats) -> float:
@@ -121,6 +146,22 @@ def _ratio_t(difference: Floats, action: Floats) -> float:
     rest = (difference - slope * action) / (1.0 - leverage)
     spread = float(np.sqrt(np.sum(rest**2)))
     return float(difference.sum()) / spread if spread > 0.0 else 0.0
+
+
+def _normal_t(problem: Problem, rest: Floats, difference: Floats, action: Floats) -> float:
+    """Loss taken away over its deviation if the better model's residuals were all the noise there is."""
+    total = float(action.sum())
+    if total <= 0.0 or total**2 / float(np.sum(action**2)) < _LEAST_STRETCHES:
+        return 0.0
+    noise = 0.0
+    for channel in problem.channels:
+        clipped = np.clip(rest[problem.live, channel], -3.0, 3.0)
+        power = float(np.mean(clipped**2))
+        spread = power
+        for lag in range(1, _LAGS):
+            spread += 2.0 * max(float(np.mean(clipped[lag:] * clipped[:-lag])), 0.0)
+        noise = max(noise, spread)
+    return float(difference.sum()) / (2.0 * float(np.sqrt(noise * total)))
 
 
 def _block_t(values: Floats) -> float:

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.ground import Ground
     from pipeline.motion.effect import Effect
 
+_LEAST_SHARE = 0.01
+
 Way = Literal["command", "measured", "wheels"]
 
 
@@ -51,11 +53,11 @@ def search_body(ground: Ground, source: Input, known: Sequence[Effect]) -> Searc
     """Search from an input to the body."""
     usable = [e for e in known if source is Input.COMMAND or e.place > Place.DRIVE]
     start = State((), ground.start_timing()).add(*usable)
-    arena, first = open_arena(
-        ground.pose_body(source), start, ground.list_candidates(source), ground.largest
-    )
+    arena, first = open_arena(ground.pose_body(source), start, ground.list_candidates(source), ground.largest)
     # Without encoders and gyro a late clock is a late drive; only an early one can be nothing else.
     arena.only_early_clock = source is Input.COMMAND and not ground.has_gyro and not ground.measured
+    if source is Input.MEASURED:
+        arena.least_delay = ground.sampling_s
     return Search(source.value, arena, first, search_effects(arena, first))
 
 
@@ -64,4 +66,6 @@ def search_wheels(ground: Ground, known: Sequence[Effect], body: Search) -> Sear
     usable = [e for e in known if e.place <= Place.DRIVE]
     start = State((), body.final.state.timing).add(*usable)
     arena, first = open_arena(ground.pose_wheels(), start, ground.list_drivetrain(), ground.largest)
+    arena.least_delay = ground.sampling_s
+    arena.least_share = _LEAST_SHARE
     return Search("wheels", arena, first, search_effects(arena, first))

@@ -24,6 +24,7 @@ _LEAST: Mapping[tuple[str, str], float] = {
     ("steering_lag", "tau"): 0.015,
     ("lateral_skid", "c"): 0.012,
 }
+_LATE = frozenset({"transport_delay", "clock_offset", "drive_lag", "steering_lag"})
 # How far from its neutral value a gain must be: less is a vehicle's data sheet, not an effect.
 _LEAST_GAIN: Mapping[str, tuple[tuple[str, ...], float]] = {
     "wheel_radius": (("k",), 0.004),
@@ -69,13 +70,21 @@ _ONE_SIGN: Mapping[str, str] = {
 }
 _SHARE_OF_TURNING = 0.1
 _LEAST_RAMP_S = 0.08
+_LEAST_DEADBAND = 0.02
 _REACHED = 0.99
 
 
-def is_nameable(effect: Effect, largest: Largest) -> bool:
-    """Whether an effect is large enough to be named and is not another one in disguise."""
+def is_nameable(effect: Effect, largest: Largest, least_delay: float = 0.0) -> bool:
+    """Whether an effect is large enough to be named and is not another one in disguise.
+
+    Args:
+        effect: with its values.
+        largest: what the run asked for.
+        least_delay: delays and lags below it are a matter of sampling [s].
+    """
     for (name, parameter), least in _LEAST.items():
-        if effect.id == name and abs(effect.values[parameter]) < least:
+        size = abs(effect.values[parameter]) if effect.id == name else math.inf
+        if size < least or (effect.id in _LATE and size < least_delay):
             return False
     if effect.id in _LEAST_GAIN:
         names, least = _LEAST_GAIN[effect.id]
@@ -83,11 +92,13 @@ def is_nameable(effect: Effect, largest: Largest) -> bool:
             return False
     if effect.id in _ONE_SIGN and effect.values[_ONE_SIGN[effect.id]] < 0.0:
         return False
+    if effect.id == "deadband":
+        return effect.values["d"] > _LEAST_DEADBAND * largest.speed
     if effect.id == "acceleration_limit":
         return effect.values["limit"] * _LEAST_RAMP_S < largest.wheel
     if effect.id == "turn_droop":
         # With its threshold at zero a droop is a wider track under another name.
-        return effect.values["threshold"] > _SHARE_OF_TURNING * 2.0 * largest.wheel
+        return _SHARE_OF_TURNING < effect.values["threshold"] / largest.difference < _REACHED
     limit = {
         "body_speed_limit": largest.speed,
         "body_turn_limit": largest.turn,
@@ -97,7 +108,7 @@ def is_nameable(effect: Effect, largest: Largest) -> bool:
         return False
     if effect.id == "turn_lag":
         fast, slow = effect.values["tau_mean"], effect.values["tau_diff"]
-        return max(fast, slow) > 0.015  # noqa: PLR2004 - less is rounding of stamps
+        return max(fast, slow) > max(0.02, least_delay)
     return True
 
 

@@ -60,9 +60,9 @@ class Problem(Protocol):
         """
 
 
-def number_units(run: Integers, times: Floats) -> Integers:
-    """Stretches of ten seconds, numbered through all runs."""
-    label = run * 1_000_000 + (times.mean(axis=1) // UNIT_S).astype(np.int64)
+def number_units(run: Integers, times: Floats, length: float = UNIT_S) -> Integers:
+    """Stretches of ten seconds, or of another length, numbered through all runs."""
+    label = run * 1_000_000 + (times.mean(axis=1) // length).astype(np.int64)
     return np.unique(label, return_inverse=True)[1].astype(np.int64)
 
 
@@ -131,9 +131,7 @@ class WheelProblem:
 
     def find_ideal(self) -> Floats:
         """See `Problem`."""
-        return np.concatenate(
-            [average_lags(c, c.predict_velocity((), _NO_DELAY)) for c in self.comparisons]
-        )
+        return np.concatenate([average_lags(c, c.predict_velocity((), _NO_DELAY)) for c in self.comparisons])
 
 
 def find_live(ideal: Floats) -> Flags:
@@ -171,5 +169,3 @@ def differentiate(problem: Problem, state: State, residual: Floats, slots: Seque
         step = slot.step if value + slot.step <= slot.bounds[1] else -slot.step
         columns[:, :, place] = (residual - problem.find_residuals(state.write(slot, value + step))) / step
     return columns
-
-

@@ -27,7 +27,8 @@ _LEAST_SHARE = 0.05
 
 @dataclass(frozen=True)
 class Largest:
-    """What relative starts are shares of: largest commanded speed, turn and wheel speed, and the duration.
+    """What relative starts are shares of: largest commanded speed, turn, wheel speed and difference of wheel
+    speeds, and the duration.
 
     Attributes:
         places: x [m] in the map below which the tenths of the run lie, shape (11,).
@@ -36,6 +37,7 @@ class Largest:
     speed: float
     turn: float
     wheel: float
+    difference: float
     duration: float
     places: Floats
 

@@ -50,7 +50,7 @@ def grow(arena: Arena, current: Contender) -> Contender:
 def _add(arena: Arena, current: Contender) -> Contender | None:
     for contender in arena.suggest(current, _TRIED):
         least = price_of(contender, current)
-        if contender.score < current.score and arena.judge(current, contender).accepts(least):
+        if contender.score < current.score and arena.prefers(current, contender, least):
             return contender
     return None
 
@@ -70,7 +70,7 @@ def prune(arena: Arena, current: Contender) -> Contender:
                 continue
             without = arena.enter(current.state.drop([name]))
             needed = price_of(current, without)
-            if not arena.judge(without, current).accepts(needed):
+            if not arena.prefers(without, current, needed):
                 smaller.append(without)
         if not smaller:
             return current
@@ -114,6 +114,6 @@ def _split(arena: Arena, current: Contender) -> Contender | None:
         without = arena.enter(current.state.drop([name]))
         for half in arena.suggest(without, 2, without=[name]):
             for rival in arena.suggest(half, 2, without=[name]):
-                if rival.score < current.score and arena.judge(current, rival).accepts():
+                if rival.score < current.score and arena.prefers(current, rival):
                     return rival
     return None
