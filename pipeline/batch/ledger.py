@@ -44,6 +44,7 @@ class Entry:
         has_report: whether the generation holds a report.
         seconds: time it took.
         peak_bytes: most memory its worker held.
+        fetched_bytes: bytes fetched from an object store for it.
         at: when it was worked on [s since 1970].
     """
 
@@ -59,6 +60,7 @@ class Entry:
     has_report: bool = False
     seconds: float = 0.0
     peak_bytes: int = 0
+    fetched_bytes: int = 0
     at: float = field(default=0.0)
 
     def fits(self, log: LogSighting, basis: str) -> bool:

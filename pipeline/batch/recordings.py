@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import glob
 import os
 import re
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.batch.errors import BatchError
+from pipeline.logs import RemotePath
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -74,6 +76,9 @@ def _expand_lists(targets: Iterable[str]) -> Iterator[str]:
 
 
 def _find_in(target: str) -> Iterator[Path]:
+    if "://" in target:
+        yield from _find_remote(RemotePath(target))
+        return
     path = Path(target).expanduser()
     if path.is_file():
         yield path.resolve()
@@ -121,6 +126,28 @@ def list_parts(folder: Path, names: Iterable[str], *, is_listed: bool) -> list[s
     return [name for name in names if pattern.fullmatch(name)]
 
 
+def _find_remote(target: RemotePath) -> Iterator[Path]:
+    """Recordings under a prefix, or the one at an address; objects are there whole or not at all."""
+    base, _, pattern = str(target).partition("*")
+    if not pattern and target.is_file():
+        yield target
+        return
+    top = RemotePath(base.rpartition("/")[0]) if _GLOB.search(str(target)) else target
+    if not top.is_dir():
+        raise BatchError(
+            "logs_not_found", "there is no such object or prefix", where=str(target), hint="Check the address"
+        )
+    objects = [found for found in top.find_objects() if not found.name.startswith(".")]
+    if top != target:
+        objects = [found for found in objects if fnmatch.fnmatchcase(str(found), str(target))]
+    listed = {found.parent for found in objects if found.name == LISTING}
+    for found in objects:
+        if found.suffix == SUFFIX:
+            folder = found.parent
+            is_part = bool(list_parts(folder, [found.name], is_listed=folder in listed))
+            yield folder if is_part else found
+
+
 def _parent_recording(log: Path) -> Path | None:
     folder = log.parent
     listed = (folder / LISTING).is_file()
@@ -129,6 +156,8 @@ def _parent_recording(log: Path) -> Path | None:
 
 def _is_growing(path: Path, settle_s: float) -> bool:
     """Whether a recorder or a copy is still writing it: no proper end, and changed a moment ago."""
+    if isinstance(path, RemotePath):
+        return False
     try:
         files = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
         touched = max((file.stat().st_mtime for file in files), default=0.0)

@@ -50,6 +50,8 @@ class Line:
         lossy: whether its results are there, but the log had losses.
         peak_bytes: most memory its worker ever held.
         rss_bytes: memory its worker held afterwards.
+        size_bytes: size of the log.
+        fetched_bytes: bytes fetched from an object store for it.
     """
 
     path: str
@@ -62,6 +64,8 @@ class Line:
     lossy: bool = False
     peak_bytes: int = 0
     rss_bytes: int = 0
+    size_bytes: int = 0
+    fetched_bytes: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,6 +213,8 @@ def _describe_entry(entry: Entry, state: str, report: Report | None = None) -> L
         hint=entry.hint,
         seconds=entry.seconds if report is not None else 0.0,
         lossy=entry.state == "lossy",
+        size_bytes=entry.log.size,
+        fetched_bytes=entry.fetched_bytes if report is not None else 0,
         peak_bytes=entry.peak_bytes if report is not None else 0,
         rss_bytes=report.rss_bytes if report is not None else 0,
     )

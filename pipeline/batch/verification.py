@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.core.errors import SlipError
-from pipeline.logs import hash_log
+from pipeline.logs import hash_log, to_location
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -80,7 +79,7 @@ def verify_results(store: Store, *, logs: bool, tell: Callable[[str], None]) -> 
 
 
 def _check_log(run: str, path: str, sha256: str) -> LogProblem | None:
-    if not Path(path).exists():
+    if not to_location(path).exists():
         return LogProblem(run=run, path=path, code="log_gone", what="the log is not there any more")
     try:
         content = hash_log(path)

@@ -105,9 +105,17 @@ def _analyze(task: Task, entry: Entry) -> tuple[Entry, tuple[str, ...]]:
         run=outcome.manifest.run,
         key=outcome.manifest.key,
         reason=_describe_losses(outcome),
+        fetched_bytes=_count_fetched(outcome),
         has_report=REPORT in outcome.manifest.files,
     )
     return done, outcome.computed
+
+
+def _count_fetched(outcome: Outcome) -> int:
+    from pipeline.job.work import stored_contexts  # noqa: PLC0415 - heavy
+
+    fetched = stored_contexts(outcome.manifest).get("extract", {}).get("fetched_bytes")
+    return fetched if isinstance(fetched, int) and "extract" in outcome.computed else 0
 
 
 def _describe_losses(outcome: Outcome) -> str:

@@ -127,6 +127,10 @@ def describe_outcome(outcome: Outcome) -> list[str]:
     for state, word in (("growing", "being written"), ("left", "not begun")):
         count = sum(line.state == state for line in outcome.lines)
         lines += [f"{word:<14}{count:>6}"] if count else []
+    fetched = sum(line.fetched_bytes for line in outcome.lines)
+    if fetched:
+        whole = sum(line.size_bytes for line in outcome.lines if line.fetched_bytes)
+        lines.append(f"fetched {fetched / 1e6:.1f} MB of {whole / 1e6:.1f} MB")
     if outcome.removed:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generations")
     for state, word in _EXPLAINED:

@@ -51,6 +51,7 @@ def describe_subject(path: Path, options: Options) -> Subject:
         JobError: the log has no pose, or neither command nor measured wheels.
     """
     index = open_log(path)
+    path = index.path
     configuration = load_configuration(
         path, given=options.config, fleet=options.fleet, overrides=options.overrides
     )

@@ -147,6 +147,7 @@ class Work:
                 name: {"rows": report.quarantined, "rules": dict(report.rules)}
                 for name, report in broken.items()
             },
+            "fetched_bytes": data.fetched_bytes or None,
             "losses": [describe_loss(loss, data.index.start_ns) for loss in data.losses],
         }
         return StageOutcome((*made.findings, *found, *notes), context)

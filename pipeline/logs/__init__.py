@@ -9,6 +9,7 @@ from pipeline.logs.definitions import bundled_types, definition_text, field_name
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.index import ChannelInfo, LogIndex, hash_log, open_log
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, read_topics
+from pipeline.logs.remote import RemotePath, to_location
 from pipeline.logs.transforms import TransformBuffer, TransformSeries, wanted_transforms
 from pipeline.logs.writer import LogWriter
 
@@ -21,6 +22,7 @@ __all__ = [
     "Loss",
     "Ragged",
     "RaggedStrings",
+    "RemotePath",
     "Strings",
     "TopicColumns",
     "TransformBuffer",
@@ -32,5 +34,6 @@ __all__ = [
     "hash_log",
     "open_log",
     "read_topics",
+    "to_location",
     "wanted_transforms",
 ]

@@ -6,15 +6,16 @@ import os
 import re
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.part import catalog_file
-from pipeline.logs.source import FileSource, hash_sources
+from pipeline.logs.remote import to_location
+from pipeline.logs.source import count_fetched, hash_sources, open_source
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from pipeline.logs.records import ChannelRecord, SchemaRecord
     from pipeline.logs.scan import Catalog
@@ -87,6 +88,7 @@ class LogIndex:
         losses: damage seen without reading the messages.
         notes: what is worth knowing and no loss.
         parts: the files.
+        fetched_bytes: bytes fetched from an object store to find this out.
     """
 
     path: Path
@@ -104,6 +106,7 @@ class LogIndex:
     losses: tuple[Loss, ...]
     notes: tuple[str, ...]
     parts: tuple[Part, ...] = field(repr=False)
+    fetched_bytes: int = 0
 
     @property
     def duration_s(self) -> float:
@@ -129,19 +132,21 @@ def open_log(path: str | os.PathLike[str]) -> LogIndex:
     """Find out what a recording holds.
 
     Args:
-        path: an MCAP file, or the folder of a recording split over several (with or without the
-            ``metadata.yaml`` of rosbag2).
+        path: an MCAP file or object (``s3://bucket/key``), or the folder of a recording split over several
+            (with or without the ``metadata.yaml`` of rosbag2).
 
     Raises:
         LogError: ``log_not_found``, ``log_empty``, ``not_mcap``, ``not_a_recording``, ``log_unreadable``.
     """
-    location = Path(path)
+    location = to_location(path)
     files, losses = find_parts(location)
     catalogs: list[tuple[Path, int, Catalog]] = []
+    fetched = 0
     for file in files:
-        with FileSource(file) as source:
+        with open_source(file) as source:
             catalogs.append((file, source.size, catalog_file(source, threads=os.cpu_count() or 1)))
-    return _merge(location, catalogs, losses)
+            fetched += count_fetched([source])
+    return replace(_merge(location, catalogs, losses), fetched_bytes=fetched)
 
 
 def hash_log(path: str | os.PathLike[str]) -> str:
@@ -150,9 +155,9 @@ def hash_log(path: str | os.PathLike[str]) -> str:
     Raises:
         LogError: as ``open_log``.
     """
-    files, _ = find_parts(Path(path))
+    files, _ = find_parts(to_location(path))
     with ExitStack() as stack:
-        return hash_sources([stack.enter_context(FileSource(file)) for file in files])
+        return hash_sources([stack.enter_context(open_source(file)) for file in files])
 
 
 def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:

@@ -17,7 +17,7 @@ from pipeline.logs.fields import STAMPS, derive_columns
 from pipeline.logs.index import LogIndex, open_log
 from pipeline.logs.loading import load_spans
 from pipeline.logs.payloads import gather_payloads
-from pipeline.logs.source import ByteSource, FileSource, hash_sources
+from pipeline.logs.source import ByteSource, count_fetched, hash_sources, open_source
 from pipeline.logs.spans import SpanKind
 
 if TYPE_CHECKING:
@@ -88,7 +88,8 @@ class LogData:
         topics: columns of every channel of the wanted topics that could be decoded.
         losses: everything that is known to be missing.
         notes: what is worth knowing and no loss.
-        sha256: of the recording's bytes (hex).
+        sha256: of the recording's bytes (hex); of an object, of its version and size.
+        fetched_bytes: bytes fetched from an object store.
     """
 
     index: LogIndex
@@ -96,6 +97,7 @@ class LogData:
     losses: tuple[Loss, ...]
     notes: tuple[str, ...]
     sha256: str
+    fetched_bytes: int = 0
 
     def of(self, topic: str) -> list[TopicColumns]:
         """Columns of every channel of a topic."""
@@ -127,7 +129,7 @@ def read_topics(
     notes = list(index.notes)
     jobs = _choose_channels(index, wanted, losses, notes)
     with ExitStack() as stack:
-        sources = [stack.enter_context(FileSource(part.path)) for part in index.parts]
+        sources = [stack.enter_context(open_source(part.path)) for part in index.parts]
         beside = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="hash"))
         digest = None if sha256 is not None else beside.submit(hash_sources, sources)
         unchecked = walked = 0
@@ -139,6 +141,7 @@ def read_topics(
                 for number, payloads in gathered.payloads.items():
                     jobs[number].buffer.add(payloads)
         found = digest.result() if digest is not None else (sha256 or "")
+        fetched = index.fetched_bytes + count_fetched(sources)
     if walked:
         notes.append(f"the message indexes of {walked} chunks are damaged; their records were walked")
     if unchecked:
@@ -148,7 +151,7 @@ def read_topics(
         columns, lost = _finish(job)
         losses.update(dict.fromkeys(lost))
         topics.append(columns)
-    return LogData(index, tuple(topics), tuple(losses), tuple(notes), found)
+    return LogData(index, tuple(topics), tuple(losses), tuple(notes), found, fetched)
 
 
 @dataclass(slots=True, eq=False)
@@ -265,8 +268,9 @@ def _finish(job: _Job) -> tuple[TopicColumns, list[Loss]]:
 def _header_time(leaves: Mapping[str, Column]) -> Ints | None:
     for prefix in STAMPS:
         seconds, nanoseconds = leaves.get(f"{prefix}sec"), leaves.get(f"{prefix}nanosec")
-        if isinstance(seconds, np.ndarray) and isinstance(nanoseconds, np.ndarray):
-            with np.errstate(invalid="ignore"):
-                stamp: Ints = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
+        if not isinstance(seconds, np.ndarray) or not isinstance(nanoseconds, np.ndarray):
+            continue
+        if np.isfinite(seconds).all() and np.isfinite(nanoseconds).all():
+            stamp: Ints = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
             return stamp
     return None

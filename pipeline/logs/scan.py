@@ -16,6 +16,7 @@ from pipeline.logs.spans import Span, SpanKind
 if TYPE_CHECKING:
     from pipeline.logs.source import ByteSource
 
+_FIRST_WINDOW: Final = 1 << 12
 _WINDOW: Final = 1 << 18
 _LOOSE_SPAN: Final = 1 << 22
 _KNOWN: Final = tuple(rec.LEAST_BODY)
@@ -55,13 +56,16 @@ class Window:
         self._source = source
         self._start = 0
         self._bytes = memoryview(b"")
+        # Gaps between chunks are small, and bytes from an object store are dear: reads grow as they go on.
+        self._next = _FIRST_WINDOW
 
     def view(self, offset: int, length: int) -> memoryview:
         """Bytes at ``offset``; fewer than ``length`` only at the end of the file."""
         inner = offset - self._start
         if inner < 0 or inner + length > len(self._bytes):
-            self._bytes = memoryview(self._source.read_at(offset, max(length, _WINDOW)))
+            self._bytes = memoryview(self._source.read_at(offset, max(length, self._next)))
             self._start, inner = offset, 0
+            self._next = min(2 * self._next, _WINDOW)
         return self._bytes[inner : inner + length]
 
 

@@ -1,4 +1,4 @@
-"""Where the bytes of a log come from: one small interface, and local files behind it."""
+"""Where the bytes of a log come from: one small interface, local files and object stores behind it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 from typing import TYPE_CHECKING, Final, Protocol
 
 from pipeline.logs.errors import LogError
+from pipeline.logs.remote import RemotePath, RemoteSource
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,6 +31,16 @@ class ByteSource(Protocol):
 
     def read_at(self, offset: int, length: int) -> bytes:
         """The bytes from ``offset``; fewer than ``length`` only at the end."""
+
+
+class OpenSource(ByteSource, Protocol):
+    """Bytes that are held open for the length of a block."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
 
 
 class FileSource:
@@ -109,10 +120,32 @@ class FileSource:
         self.close()
 
 
+def open_source(path: Path) -> OpenSource:
+    """Open a file or an object.
+
+    Raises:
+        LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``.
+    """
+    return RemoteSource(path) if isinstance(path, RemotePath) else FileSource(path)
+
+
+def count_fetched(sources: Sequence[ByteSource]) -> int:
+    """Bytes that were fetched from object stores."""
+    return sum(source.fetched for source in sources if isinstance(source, RemoteSource))
+
+
 def hash_sources(sources: Sequence[ByteSource]) -> str:
-    """SHA-256 (hex) of the bytes of the sources, one after the other."""
+    """SHA-256 (hex) of the bytes of the sources, one after the other.
+
+    An object is not fetched for it: its version and size, as its store tells them, stand for its bytes.
+    """
+    if len(sources) == 1 and isinstance(sources[0], RemoteSource):
+        return sources[0].version
     digest = hashlib.sha256()
     for source in sources:
+        if isinstance(source, RemoteSource):
+            digest.update(bytes.fromhex(source.version))
+            continue
         for offset in range(0, source.size, _HASH_BLOCK):
             digest.update(source.read_at(offset, _HASH_BLOCK))
     return digest.hexdigest()

@@ -7,7 +7,6 @@ size, modification time and inode did not.
 
 from __future__ import annotations
 
-import os
 import time
 from dataclasses import asdict, dataclass
 from stat import S_ISDIR
@@ -63,7 +62,7 @@ def see_log(path: Path) -> LogSighting:
     # A part may grow without its folder noticing.
     parts = [part.stat() for part in path.glob("*.mcap")] if S_ISDIR(status.st_mode) else [status]
     return LogSighting(
-        path=os.path.realpath(path),
+        path=str(path.resolve()),
         size=sum(part.st_size for part in parts),
         mtime_ns=max([status.st_mtime_ns, *(part.st_mtime_ns for part in parts)]),
         inode=status.st_ino,

@@ -104,7 +104,8 @@ class ClusterExecutor:
     @property
     def slots(self) -> int:
         """Threads of all workers, which may come and go."""
-        return max(1, sum(self._client.nthreads().values()))
+        threads: dict[str, int] = self._client.nthreads()
+        return max(1, sum(threads.values()))
 
     def submit(self, task: Task) -> Future[Report]:
         """Work on a task some time."""
