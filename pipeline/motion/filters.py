@@ -29,7 +29,7 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
 
     decay = float(np.exp(-step_s / tau))
     end = lfilter([1.0 - decay], [1.0, -decay], signal)
-    before = np.concatenate((signal[:1], end[:-1]))
+    before = np.concatenate((np.zeros(1, dtype=signal.dtype), end[:-1]))
     # The filter ran through the resets: what it carried over is taken back, and the state put in its place.
     # One reset after the other, in closed form: what is missing at each fades until the next.
     fade = step_s / tau

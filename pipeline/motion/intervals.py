@@ -23,7 +23,7 @@ _HUBER = 3.0
 _SHORTEST_BLOCK_S = 6.0
 _TAUS = 5.0
 _DELAY_STEP = 5e-3
-_RISEN = 2.0
+_RISEN = 1.92
 _SEED = 20240513
 
 
@@ -77,9 +77,9 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
     """Intervals of all numbers of a fit.
 
     Whole blocks are drawn with replacement and the fit is repeated through its derivatives. Blocks are
-    command steps; where those are short against the correlation of the residuals, several are joined, to at
-    least five integrated autocorrelation times and six seconds. The interval is symmetric, with Student's t for the
-    number of blocks.
+    command steps; where those are short against the correlation of the residuals, several are joined, to
+    at least five integrated autocorrelation times and six seconds. The interval is symmetric, with Student's
+    t for the number of blocks.
 
     Args:
         problem: the runs.
@@ -113,7 +113,7 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
         value = fitted.state.get(number)
         half = wide * float(errors[index])
         if needs_search(number):
-            half = _widen(problem, fitted, number, block)
+            half = _widen(problem, fitted, number)
         low, high = number.bounds
         margin = 1e-6 * (abs(low) + abs(high)) if np.isfinite(low + high) else 0.0
         items.append(
@@ -149,29 +149,30 @@ def _carry_delays(problem: Problem, fitted: Fitted, total: Floats, rows: Integer
     return carried
 
 
-def _widen(problem: Problem, fitted: Fitted, number: Free, block: Integers) -> float:
-    """Half-width for a number that is not smooth: where the blocks agree that the loss has risen."""
+def _widen(problem: Problem, fitted: Fitted, number: Free) -> float:
+    """Half-width for a number that is not smooth: where the loss has risen by what chance would allow.
+
+    The likelihood ratio, divided by how often a residual repeats itself.
+    """
     value, (low, high) = fitted.state.get(number), number.bounds
-    base = _sum_losses(problem, fitted, fitted.residuals, block)
+    base = _sum_losses(problem, fitted, fitted.residuals)
+    stride = float(np.median(np.diff(problem.times.mean(axis=1))))
+    repeats = max(integrate_correlation(problem, fitted) / max(stride, 1e-3), 1.0)
     ends = []
     for side in (-1.0, 1.0):
         width = number.step / 16.0
         while width < 64.0 * number.step:
             moved = fitted.state.set(number, float(np.clip(value + side * width, low, high)))
-            rise = _sum_losses(problem, fitted, problem.find_residuals(moved), block) - base
-            error = float(rise.std()) / np.sqrt(rise.size)
-            if rise.mean() > _RISEN * error > 0.0:
+            if _sum_losses(problem, fitted, problem.find_residuals(moved)) - base > _RISEN * repeats:
                 break
             width *= 1.5
         ends.append(width)
     return max(ends)
 
 
-def _sum_losses(problem: Problem, fitted: Fitted, residuals: Floats, block: Integers) -> Floats:
-    size = np.abs(fitted.weights.normalise(residuals, problem))
-    loss = np.where(size <= _HUBER, 0.5 * size**2, _HUBER * (size - 0.5 * _HUBER)).sum(axis=1)
-    sums = np.bincount(block[fitted.used], weights=loss[fitted.used], minlength=int(block.max()) + 1)
-    return sums.astype(np.float64)
+def _sum_losses(problem: Problem, fitted: Fitted, residuals: Floats) -> float:
+    size = np.abs(fitted.weights.normalise(residuals, problem))[fitted.used]
+    return float(np.where(size <= _HUBER, 0.5 * size**2, _HUBER * (size - 0.5 * _HUBER)).sum())
 
 
 def join_blocks(problem: Problem, fitted: Fitted) -> Integers:

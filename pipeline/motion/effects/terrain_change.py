@@ -2,8 +2,8 @@
 
     v0 = k_v * v0,  w0 = k_w * w0    where t >= at_s, or where x > at_x when at_x is given
 
-k_v, k_w are plain numbers, off one by 8 to 30 %; at_s [s] since the run's start. Both grounds need ten
-command steps with turning.
+k_v, k_w are plain numbers, off one by 8 to 30 %; at_s [s] since the run's start; at_x [m]. Both grounds
+need ten command steps with turning.
 
 Source: piecewise-constant slip; the deployments of Samson et al. 2024.
 """

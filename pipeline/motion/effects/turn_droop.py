@@ -2,8 +2,8 @@
 
     D = Omega_r - Omega_l:  D = kept + gain * (D - kept),  kept = clip(D, -threshold, threshold)
 
-The Warthog reaches 84 to 100 % of a wheel difference of the same sign, 4 to 80 % after a change of sign.
-Turn slowly and quickly, on the spot and while driving.
+threshold [rad/s]; gain is a plain number. The Warthog reaches 84 to 100 % of a wheel difference of the same
+sign, 4 to 80 % after a change of sign. Turn slowly and quickly, on the spot and while driving.
 
 Source: measured on the DRIVE recordings.
 """

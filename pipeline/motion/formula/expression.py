@@ -82,7 +82,7 @@ def parse_expression(text: str, known: Mapping[str, Unit], where: str) -> Expres
     """Parse a formula and work out its unit.
 
     Args:
-        text: arithmetic over ``known`` names with + - * / ** and the functions sin, cos, tan, asin, acos,
+        text: arithmetic over ``known`` names with + - * / ** (or ^), the functions sin, cos, tan, asin, acos,
             atan, atan2, tanh, exp, log, abs, sqrt, sign, min, max, hypot, and the constant pi.
         known: units of the names that may be used.
         where: file and line, for error messages.
@@ -93,7 +93,7 @@ def parse_expression(text: str, known: Mapping[str, Unit], where: str) -> Expres
     if len(text) > _LONGEST:
         raise _bad(where, f"the formula is longer than {_LONGEST} characters", "Split it into two effects.")
     try:
-        tree = ast.parse(text.strip(), mode="eval")
+        tree = ast.parse(text.strip().replace("^", "**"), mode="eval")
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         raise _bad(
             where, f"{text!r} is no formula", "Write arithmetic over signals, as k * sin(yaw)."
