@@ -1,0 +1,147 @@
+"""What the tests promise, on simulated runs that do not differ though their samples say so.
+
+Rejection rates are compared with binomial bounds of the number of repetitions: 2.6 standard errors, so that a
+correct test fails here once in two hundred seeds, and the seeds are fixed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from simulated_runs import RATE, simulate_runs
+
+from pipeline import statistics as ps
+
+SPREAD = 0.1
+
+
+def rejections_allowed(level: float, repetitions: int) -> tuple[float, float]:
+    error = math.sqrt(level * (1.0 - level) / repetitions)
+    return level - 2.6 * error, level + 2.6 * error
+
+
+def compare_once(runs: int, rng: np.random.Generator, *, seconds: float, memory: float, factor: float = 1.0):  # noqa: ANN201
+    sides = [
+        np.median(
+            simulate_runs(runs, seconds=seconds, memory=memory, spread=SPREAD, rng=rng, median=median), axis=1
+        )
+        for median in (1.0, factor)
+    ]
+    return ps.compare_runs(*sides)
+
+
+@pytest.mark.parametrize(("runs", "attainable"), [(3, 0.0), (4, 2 / 70), (5, 12 / 252)])
+def test_whole_runs_are_rejected_at_the_attainable_level(runs: int, attainable: float) -> None:
+    rng = np.random.default_rng(100 + runs)
+    repetitions = 800
+    found = [compare_once(runs, rng, seconds=30.0, memory=1.0) for _ in range(repetitions)]
+    rate = np.mean([one.test.p <= 0.05 for one in found])
+    low, high = rejections_allowed(attainable, repetitions)
+    assert low <= rate <= high
+    covered = np.mean([one.interval.low <= 0.0 <= one.interval.high for one in found])
+    assert 0.92 <= covered <= 0.985 if runs == 3 else 0.92 <= covered <= 0.975
+
+
+@pytest.mark.parametrize("runs", [3, 4, 6])
+def test_intervals_over_runs_hold_the_truth(runs: int) -> None:
+    rng = np.random.default_rng(10 + runs)
+    hits = []
+    for _ in range(600):
+        medians = np.median(simulate_runs(runs, seconds=30.0, memory=1.0, spread=SPREAD, rng=rng), axis=1)
+        found = ps.bound_typical(medians)
+        hits.append(found.low <= 1.0 <= found.high)
+    assert 0.92 <= np.mean(hits) <= 0.97
+
+
+@pytest.mark.parametrize(("memory", "seconds"), [(0.5, 200.0), (2.0, 300.0)])
+def test_blocks_of_single_runs_keep_the_level_that_plain_samples_break(memory: float, seconds: float) -> None:
+    rng = np.random.default_rng(round(10 * memory))
+    repetitions = 250
+    blocks, plain = [], []
+    for seed in range(repetitions):
+        sides = simulate_runs(2, seconds=seconds, memory=memory, spread=0.0, rng=rng)
+        ticks = np.arange(sides.shape[1])
+        cut = [ps.cut_blocks(side, ticks, np.zeros_like(ticks), step=2.0 * RATE) for side in sides]
+        test = ps.permute_studentized(cut[0].medians, cut[1].medians, draws=399, seed=seed)
+        blocks.append(test.p <= 0.05)
+        plain.append(ps.mann_whitney(*sides) <= 0.05)
+    assert np.mean(blocks) <= rejections_allowed(0.05, repetitions)[1]
+    assert np.mean(plain) > 0.5
+
+
+def test_the_interval_of_one_run_holds_its_own_median() -> None:
+    rng = np.random.default_rng(5)
+    hits = []
+    for _ in range(150):
+        (values,) = simulate_runs(1, seconds=300.0, memory=1.0, spread=0.0, rng=rng)
+        ticks = np.arange(values.size)
+        cut = ps.cut_blocks(values, ticks, np.zeros_like(ticks), step=2.0 * RATE)
+        found = ps.bootstrap_median(values, cut.numbers, draws=600)
+        hits.append(found.low <= 1.0 <= found.high)
+    assert 0.90 <= np.mean(hits) <= 0.985
+
+
+def test_a_family_of_equal_groups_gives_a_false_alarm_once_in_twenty() -> None:
+    rng = np.random.default_rng(6)
+    repetitions = 400
+    alarms = []
+    for seed in range(repetitions):
+        groups = [rng.normal(0.0, SPREAD, 4) for _ in range(3)]
+        alarms.append(ps.adjust_max_t(groups, seed=seed, draws=399).min() <= 0.05)
+    assert np.mean(alarms) <= rejections_allowed(0.05, repetitions)[1]
+
+
+def test_a_family_controls_the_pair_that_is_equal_while_a_third_differs() -> None:
+    rng = np.random.default_rng(7)
+    repetitions = 400
+    alarms, powers = [], []
+    for seed in range(repetitions):
+        groups = [rng.normal(level, SPREAD, 5) for level in (0.0, 0.0, 1.0)]
+        corrected = ps.adjust_max_t(groups, seed=seed, draws=399)
+        alarms.append(corrected[0, 1] <= 0.05)
+        powers.append(corrected[0, 2] <= 0.05)
+    assert np.mean(alarms) <= rejections_allowed(0.05, repetitions)[1]
+    assert np.mean(powers) > 0.95
+
+
+def test_power_grows_with_the_difference_and_the_runs() -> None:
+    rng = np.random.default_rng(8)
+    power = {
+        (runs, factor): np.mean(
+            [
+                compare_once(runs, rng, seconds=120.0, memory=1.0, factor=factor).test.p <= 0.05
+                for _ in range(150)
+            ]
+        )
+        for runs in (4, 6)
+        for factor in (1.2, 1.7)
+    }
+    assert power[4, 1.7] > 0.9
+    assert power[6, 1.2] > power[4, 1.2]
+
+
+def test_chance_makes_a_step_in_a_series_once_in_twenty() -> None:
+    rng = np.random.default_rng(9)
+    found = [bool(ps.find_changes(rng.normal(0.0, 1.0, 15), seed=seed)) for seed in range(300)]
+    assert np.mean(found) <= rejections_allowed(0.05, 300)[1]
+
+
+@pytest.mark.long
+def test_long_nulls_at_every_memory() -> None:
+    rng = np.random.default_rng(11)
+    repetitions = 1_000
+    for memory in (0.5, 1.0, 2.5):
+        rejected = []
+        for seed in range(repetitions):
+            sides = simulate_runs(2, seconds=600.0, memory=memory, spread=0.0, rng=rng)
+            ticks = np.arange(sides.shape[1])
+            cut = [ps.cut_blocks(side, ticks, np.zeros_like(ticks), step=2.0 * RATE) for side in sides]
+            test = ps.permute_studentized(cut[0].medians, cut[1].medians, draws=499, seed=seed)
+            rejected.append(test.p <= 0.05)
+        assert np.mean(rejected) <= rejections_allowed(0.05, repetitions)[1]
+    for runs, attainable in ((4, 2 / 70), (5, 12 / 252)):
+        found = [compare_once(runs, rng, seconds=120.0, memory=1.0).test.p <= 0.05 for _ in range(2_000)]
+        low, high = rejections_allowed(attainable, 2_000)
+        assert low <= np.mean(found) <= high
