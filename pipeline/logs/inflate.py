@@ -61,6 +61,34 @@ def check_size(stored: int, compression: str, size: int) -> None:
         raise InflateError(f"{stored} bytes cannot hold {size}")
 
 
+def inflate_into(stored: Buffer, compression: str, target: memoryview) -> None:
+    """Inflate the records of a chunk to where they shall stand.
+
+    Args:
+        stored: compressed bytes.
+        compression: ``""``, ``"zstd"`` or ``"lz4"``.
+        target: as many bytes as must come out.
+
+    Raises:
+        InflateError: as ``inflate``.
+    """
+    size = len(target)
+    check_size(len(stored), compression, size)
+    if compression != "zstd" or size == 0:
+        target[:] = inflate(stored, compression, size)
+        return
+    try:
+        said = zstandard.frame_content_size(stored)
+        if said != size:
+            raise InflateError(f"the zstd frame says {said} bytes, its chunk {size}")
+        with _zstd().stream_reader(stored) as reader:
+            found = reader.readinto(target)
+    except zstandard.ZstdError as error:
+        raise InflateError(str(error)) from None
+    if found != size:
+        raise InflateError(f"{found} bytes came out in place of {size}")
+
+
 def inflate_start(stored: Buffer, compression: str, size: int) -> Buffer:
     """As much of the first ``size`` bytes as undamaged stored bytes give; never raises for damage."""
     if compression == "":
@@ -111,15 +139,20 @@ def holds_own_checksum(stored: Buffer, compression: str) -> bool:
     return False
 
 
-def _inflate_zstd(stored: Buffer, size: int) -> bytes:
+def _zstd() -> zstandard.ZstdDecompressor:
+    """This thread's decompressor."""
     decompressor: zstandard.ZstdDecompressor | None = getattr(_per_thread, "zstd", None)
     if decompressor is None:
         decompressor = _per_thread.zstd = zstandard.ZstdDecompressor()
+    return decompressor
+
+
+def _inflate_zstd(stored: Buffer, size: int) -> bytes:
     try:
         said = zstandard.frame_content_size(stored)
         if said not in (-1, size):
             raise InflateError(f"the zstd frame says {said} bytes, its chunk {size}")
-        return decompressor.decompress(stored, max_output_size=size)
+        return _zstd().decompress(stored, max_output_size=size)
     except zstandard.ZstdError as error:
         raise InflateError(str(error)) from None
 

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Final, TypeAlias
 
+import numpy as np
+
 from pipeline.logs import records as rec
 from pipeline.logs.errors import Loss
 from pipeline.logs.inflate import (
@@ -18,16 +20,16 @@ from pipeline.logs.inflate import (
     checksum,
     holds_own_checksum,
     inflate,
+    inflate_into,
     inflate_prefix,
     inflate_start,
 )
 from pipeline.logs.messages import Messages, locate_messages
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from collections.abc import Set as AbstractSet
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from pipeline.logs.records import Buffer
@@ -167,9 +169,45 @@ def load_span(
     return Loaded(chunk, messages, losses, unchecked=head.crc == 0, index_damaged=index_damaged)
 
 
+def load_together(source: ByteSource, spans: Sequence[Span], size: int) -> Loaded | None:
+    """Read neighbouring chunks as one: their records end to end are records like those of one chunk.
+
+    Args:
+        source: the file.
+        spans: chunks that stand one behind the other.
+        size: bytes they inflate to, as the summary says.
+
+    Returns:
+        All their messages; None when anything at all is not in order, so that each is to be read alone.
+    """
+    start = spans[0].offset
+    blob = memoryview(
+        source.read_at(start, spans[-1].offset + spans[-1].length + spans[-1].index_length - start)
+    )
+    chunk = np.empty(size, dtype=np.uint8).data
+    joined: list[Entries] = []
+    place = 0
+    for span in spans:
+        part = blob[span.offset - start : span.offset - start + span.length + span.index_length]
+        try:
+            head, losses = _open_chunk(span, part)
+            entries = _read_entries(part[span.length :])
+            target = chunk[place : place + head.uncompressed_size]
+            inflate_into(part[head.body : head.body + head.compressed_size], head.compression, target)
+        except (_SpanError, InflateError, ValueError):
+            return None
+        if losses or entries is None or head.crc == 0 or checksum(target) != head.crc:
+            return None
+        shift = np.array([0, place], dtype=np.uint64)
+        joined += [(channel, entry + shift) for channel, entry in entries]
+        place += head.uncompressed_size
+    messages = locate_messages(chunk, joined)
+    return None if messages.walked or messages.damage or place != size else Loaded(chunk, messages)
+
+
 def _needed_size(span: Span, entries: list[Entries], wanted: AbstractSet[int]) -> int | None:
     """Bytes up to the end of the last wanted message, None when that is not certain."""
-    if span.channels != {number for number, _ in entries}:
+    if set(span.channels or ()) != {number for number, _ in entries}:
         return None
     last = max((int(e[:, 1].max()) for c, e in entries if c in wanted and e.size), default=-1)
     behind = [int(later.min()) for _, e in entries if (later := e[e[:, 1] > last, 1]).size]
