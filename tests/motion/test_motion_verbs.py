@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tomllib
+from typing import TYPE_CHECKING
+
+import pytest
+
+from pipeline.simulate import simulate_case
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def run_slip(*arguments: object, check: bool = True) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        [sys.executable, "-m", "pipeline", *map(str, arguments)], capture_output=True, text=True, check=False
+    )
+    assert not check or done.returncode == 0, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("verbs")
+    for seed in (1, 2):
+        simulate_case("husky_tile", out=made / f"tile{seed}.mcap", seed=seed, duration_s=90.0)
+    return made
+
+
+def test_the_catalogue_and_a_page_are_printed() -> None:
+    listed = run_slip("effects").stdout
+    assert "lateral_skid" in listed
+    page = run_slip("effects", "lateral_skid").stdout
+    assert "v_y += -c * v0 * w0" in page
+    assert "Source: " in page
+    wrong = run_slip("effects", "lateral_skit", check=False)
+    assert wrong.returncode == 1
+    assert "lateral_skid" in wrong.stderr
+    assert len(wrong.stderr.splitlines()) == 1
+    assert json.loads(run_slip("effects", "--json").stdout)["effects"][0]["id"]
+
+
+def test_a_model_is_made_grown_asked_about_another_run_and_exported(folder: Path) -> None:
+    model, out = folder / "husky.toml", folder / "results"
+    run_slip("model", "new", model, "--vehicle", "husky_a200")
+    on = ["--on", folder / "tile1.mcap", "--out", out, "--input", "measured"]
+    grown = json.loads(
+        run_slip("model", "add", model, "effective_track", "lateral_drift", *on, "--json").stdout
+    )
+    assert [rung["effects"] for rung in grown["ladder_before"]] == [[]]
+    assert grown["ladder"][1]["effects"] == ["effective_track"]
+    assert grown["ladder"][1]["t_mrmse_m"] < grown["ladder"][0]["t_mrmse_m"]
+    assert {"velocity_rms", "t_mrmse_m", "r_mrmse_rad"} <= set(grown["noise_floor"])
+    track = grown["parameters"]["effective_track.k"]
+    assert track["low"] < 1.8 < track["high"]
+    assert track["unit"] == "1"
+
+    written = tomllib.loads(model.read_text(encoding="utf-8"))
+    assert written["effect"][0]["k"]["value"] == pytest.approx(track["value"], rel=1e-4)
+    assert len(written["fit"]["runs"][0]["sha256"]) == 64
+
+    dropped = run_slip("model", "drop", model, "lateral_drift", *on)
+    assert "before" in dropped.stdout
+    assert "noise floor" in dropped.stdout
+
+    carried = json.loads(
+        run_slip("model", "fit", model, *on, "--predict", folder / "tile2.mcap", "--json").stdout
+    )
+    assert carried["carried_over"][0]["ratio"] < 1.1
+    assert carried["warnings"] == []
+
+    other = folder / "other.toml"
+    run_slip("model", "new", other, "--vehicle", "husky_a200", "--effects", "effective_track")
+    on_two = ["--on", folder / "tile2.mcap", "--out", out, "--input", "measured"]
+    compared = json.loads(run_slip("model", "compare", model, other, *on_two, "--json").stdout)
+    assert [row["model"] for row in compared["compared"]] == [str(model), str(other)]
+    assert compared["compared"][1]["warning"]
+
+    assert "wheel_separation_multiplier" in run_slip("model", "export", model, "--to", "ros2_control").stdout
+    assert "effective_track" in run_slip("model", "show", model).stdout
+
+
+def test_errors_are_one_line_with_the_line_of_the_file(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.toml"
+    bad.write_text(
+        '[vehicle]\npreset = "husky_a200"\n[[effect]]\nid = "effective_track"\nk = 99\n', encoding="utf-8"
+    )
+    done = run_slip("model", "show", bad, check=False)
+    assert done.returncode == 1
+    assert f"{bad}:5" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    missing = run_slip("model", "fit", bad.with_name("good.toml"), "--on", "nowhere", check=False)
+    assert missing.returncode == 1
+    exists = run_slip("model", "new", bad, "--vehicle", "husky_a200", check=False)
+    assert exists.returncode == 1
+    assert "--force" in exists.stderr
