@@ -56,6 +56,10 @@ class PayloadDecoder(Protocol):
     def rejected(self) -> list[Rejected]:
         """What could not be decoded."""
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is worth knowing of what was decoded."""
+
 
 class StructuredDecoder:
     """Decodes CDR and ROS 1 payloads through the type's tree.
@@ -65,15 +69,24 @@ class StructuredDecoder:
         paths: wanted leaf fields.
         encoding: ``"cdr"`` or ``"ros1"``.
         expected: how many messages the index promises.
+        exact: whether messages that are longer than the type are refused, because the type is a guess.
     """
 
-    def __init__(self, structure: Structure, paths: set[str], encoding: str, expected: int) -> None:
+    def __init__(
+        self, structure: Structure, paths: set[str], encoding: str, expected: int, *, exact: bool = False
+    ) -> None:
         self._plan = plan_fields(structure, paths)
         self._ros1 = encoding == "ros1"
-        self._decoder = Decoder(self._plan, {})
+        self._decoder = Decoder(self._plan, exact)
         self._parts = {path: ColumnParts(leaf, expected) for path, leaf in wanted_leaves(self._plan)}
         self._ids: list[Ints] = []
         self.rejected: list[Rejected] = []
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is worth knowing of what was decoded."""
+        longer = self._decoder.longer
+        return (f"{longer} messages hold more bytes than their type describes",) if longer else ()
 
     def decode(self, ids: Ints, block: Block) -> None:
         """Decode a block; ``ids`` are the numbers of its rows in the channel."""

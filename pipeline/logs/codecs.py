@@ -59,7 +59,15 @@ def decoder_for(info: ChannelInfo, schema: bytes, fields: tuple[str, ...] | None
     chosen = select_leaves(leaves, fields, where=place)
     chosen |= {path for path in _STAMP if path in leaves}
     return Recipe(
-        StructuredDecoder(structure, chosen, info.message_encoding, info.message_count), leaves, notes
+        StructuredDecoder(
+            structure,
+            chosen,
+            info.message_encoding,
+            info.message_count,
+            exact=bool(notes and structure.members),
+        ),
+        leaves,
+        notes,
     )
 
 

@@ -5,8 +5,8 @@ Only wanted fields are copied; the others are stepped over, their lengths checke
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Ints = NDArray[np.int64]
+
+
+_PADDING: Final = 3
+"""Serializers may pad a message to a multiple of four bytes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,11 +74,15 @@ class Decoder:
 
     Attributes:
         plan: the type and its wanted fields.
+        exact: whether a row that is longer than its type, but for padding, does not fit; always so in XCDR2.
         vocabularies: by field path; filled while decoding.
+        longer: rows met that are longer than their type.
     """
 
     plan: Plan
-    vocabularies: dict[str, Vocabulary]
+    exact: bool
+    vocabularies: dict[str, Vocabulary] = field(default_factory=dict)
+    longer: int = 0
 
     def decode(self, cursor: Cursor) -> tuple[Pieces, Ints]:
         """Decode all rows that fit.
@@ -89,13 +97,15 @@ class Decoder:
             pieces: Pieces = {}
             try:
                 self._read(self.plan, cursor, "", pieces)
-                if cursor.dialect.sized:
-                    cursor.reject(cursor.limit - cursor.place > 3)  # noqa: PLR2004 - padding to four bytes
+                longer = cursor.limit - cursor.place > _PADDING
+                if self.exact or cursor.dialect.sized:
+                    cursor.reject(longer)
             except MisfitError as misfit:
                 kept = np.flatnonzero(~np.isin(cursor.rows, misfit.rows))
                 cursor = cursor.select(kept)
                 cursor.place = 0
             else:
+                self.longer += int(longer.sum())
                 return pieces, cursor.rows
         return {}, cursor.rows
 

@@ -46,6 +46,7 @@ class ObjectDecoder:
         self._rows: dict[int, dict[str, list[Leaf]]] = {}
         self._several: set[str] = set()
         self.rejected: list[Rejected] = []
+        self.notes: tuple[str, ...] = ()
 
     def decode(self, ids: Ints, block: Block) -> None:
         """Decode a block; ``ids`` are the numbers of its rows in the channel."""

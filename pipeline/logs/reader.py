@@ -260,7 +260,7 @@ def _finish(job: _Job) -> tuple[TopicColumns, list[Loss]]:
         publish_time,
         header_time,
         fields,
-        job.recipe.notes,
+        (*job.recipe.notes, *job.recipe.decoder.notes),
     )
     return columns, losses
 

@@ -258,6 +258,21 @@ def test_an_empty_schema_falls_back_to_the_bundled_definition_and_says_so(tmp_pa
     assert "/odd" in data.losses[0].text
 
 
+def test_messages_longer_than_a_guessed_type_are_refused_and_than_their_own_noted(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    encoded = [payload + bytes(8) for payload in payloads(FLOAT, 2, {"data": np.array([1.0, 2.0])})]
+    channels: list[Channel] = [
+        ("/own", FLOAT, "ros2msg", text_of(FLOAT), "cdr", encoded),
+        ("/guessed", FLOAT, "ros2msg", b"", "cdr", encoded),
+    ]
+    write_channels(path, channels)
+    data = read_topics(path, [Wanted("/own"), Wanted("/guessed")])
+    assert data.of("/own")[0].fields["data"].tolist() == [1.0, 2.0]
+    assert "2 messages hold more bytes" in data.of("/own")[0].notes[0]
+    assert len(data.of("/guessed")[0]) == 0
+    assert [loss.kind for loss in data.losses] == ["undecodable"]
+
+
 def test_unchunked_logs_and_log_time_zero_are_read(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     truth = write_official(path, use_chunking=False)
