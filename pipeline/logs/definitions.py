@@ -37,6 +37,8 @@ FIELDS: Final[dict[str, str]] = {
     "nav_msgs/Odometry": f"{_HEADER}; string child_frame_id; geometry_msgs/PoseWithCovariance pose; "
     "geometry_msgs/TwistWithCovariance twist",
     "nav_msgs/Path": f"{_HEADER}; geometry_msgs/PoseStamped[] poses",
+    "rcl_interfaces/Log": "builtin_interfaces/Time stamp; uint8 level; string name; string msg; string file; "
+    "string function; uint32 line",
     "rosgraph_msgs/Clock": "builtin_interfaces/Time clock",
     "sensor_msgs/Imu": f"{_HEADER}; geometry_msgs/Quaternion orientation; "
     "float64[9] orientation_covariance; geometry_msgs/Vector3 angular_velocity; "
@@ -45,6 +47,7 @@ FIELDS: Final[dict[str, str]] = {
     "sensor_msgs/JointState": f"{_HEADER}; string[] name; float64[] position; float64[] velocity; "
     "float64[] effort",
     "std_msgs/Bool": "bool data",
+    "std_msgs/ColorRGBA": "float32 r; float32 g; float32 b; float32 a",
     "std_msgs/Empty": "",
     "std_msgs/Float32": "float32 data",
     "std_msgs/Float32MultiArray": "std_msgs/MultiArrayLayout layout; float32[] data",
@@ -58,6 +61,10 @@ FIELDS: Final[dict[str, str]] = {
     "std_msgs/String": "string data",
     "std_msgs/UInt8": "uint8 data",
     "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+    "visualization_msgs/Marker": f"{_HEADER}; string ns; int32 id; int32 type; int32 action; "
+    "geometry_msgs/Pose pose; geometry_msgs/Vector3 scale; std_msgs/ColorRGBA color; "
+    "builtin_interfaces/Duration lifetime; bool frame_locked; geometry_msgs/Point[] points; "
+    "std_msgs/ColorRGBA[] colors; string text; string mesh_resource; bool mesh_use_embedded_materials",
 }
 """Fields of every bundled type, by ``package/Name``."""
 

@@ -13,6 +13,9 @@ from pipeline.motion.forward import Timing
 from pipeline.motion.heading import HeadingSource
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.motion.effect import Effect
     from pipeline.motion.model import Model
     from pipeline.motion.recording import MotionRun
 
@@ -67,7 +70,26 @@ def predict(
     """
     comparison = Comparison(run, model.vehicle, source, heading=heading)
     timing = timing or Timing(comparison.usual_delay)
-    effects = model.effects
+    return predict_from(comparison, model.effects, timing, horizon_s=horizon_s, rate_hz=rate_hz)
+
+
+def predict_from(
+    comparison: Comparison,
+    effects: Sequence[Effect],
+    timing: Timing,
+    *,
+    horizon_s: float = 2.0,
+    rate_hz: float = 20.0,
+) -> Prediction:
+    """Predict a run that has been made ready already: much cheaper for the second model on.
+
+    Args:
+        comparison: the run and its input.
+        effects: of the model, with their values.
+        timing: delays of the recording.
+        horizon_s: length of a prediction.
+        rate_hz: grid of the result; the model itself runs at 200 Hz.
+    """
     velocity = comparison.predict_velocity(effects, timing)
     cells = comparison.cells
     every = max(round(1.0 / (rate_hz * cells.step_s)), 1)

@@ -1,0 +1,61 @@
+"""CSV: one file a table, with the units in the heads."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import polars as pl
+
+from pipeline.report.errors import ReportError
+from schemas import contract_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pipeline.report.exports.source import ExportSource
+
+
+def write_csv(source: ExportSource, folder: Path) -> list[Path]:
+    """Write every table of a run as `<table>.csv`.
+
+    A column whose contract gives it a unit carries it in its head, for example `v_x [m/s]`.
+
+    Args:
+        source: the run.
+        folder: made when it is not there.
+
+    Returns:
+        The files, sorted.
+
+    Raises:
+        ReportError: ``export_not_written``.
+    """
+    written = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for table in sorted(source.manifest.tables):
+            path = folder / f"{table}.csv"
+            part = path.with_name(f".{path.name}.part")
+            heads = {name: _name_column(table, name) for name in source.columns(table)}
+            with part.open("wb") as file:
+                pl.DataFrame(schema=list(heads.values())).write_csv(file)
+                for frame in source.batches(table):
+                    frame.write_csv(file, include_header=False)
+            part.replace(path)
+            written.append(path)
+    except OSError as error:
+        raise ReportError(
+            "export_not_written",
+            f"cannot be written: {error.strerror}",
+            where=str(folder),
+            hint="Choose another place with --out.",
+        ) from error
+    return written
+
+
+def _name_column(table: str, name: str) -> str:
+    contract = contract_of(table)
+    if name not in contract.schema.columns():
+        return name
+    unit = contract.metadata_of(name).get("unit", "")
+    return f"{name} [{unit}]" if unit and unit != "1" else name

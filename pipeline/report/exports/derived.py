@@ -1,0 +1,170 @@
+"""The derived MCAP: what was computed of a log, to be opened beside it.
+
+Message types are standard ROS 2 ones, which Foxglove, Lichtblick, PlotJuggler and RViz know; times are those
+of the original.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from pipeline.logs import LogWriter
+from pipeline.report.exports import topics
+from pipeline.report.exports.markers import write_findings, write_trail
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from pipeline.logs.normalize import Given
+    from pipeline.report.exports.source import ExportSource
+
+_BODY = "base_link"
+_TWIST = "geometry_msgs/msg/TwistStamped"
+_PATH_POSES = 5000
+_PREDICTIONS_HZ = 5.0
+
+
+def write_derived_log(source: ExportSource, path: Path) -> Path:
+    """Write velocities, slip, segments, findings and paths of a run as MCAP.
+
+    Args:
+        source: the run, and the model whose velocity and predictions are wanted.
+        path: the file; an existing one is replaced when the new one is whole.
+
+    Raises:
+        LogError: nothing can be written there.
+        MotionError: the model cannot be run on this log.
+    """
+    prediction = source.prediction
+    with LogWriter(path) as writer:
+        writer.metadata("slip", {"run": source.manifest.run, "key": source.manifest.key, **_name_log(source)})
+        for frame in source.batches("velocities"):
+            _write_twist(writer, source, topics.MEASURED, frame, "v")
+            _write_poses(writer, source, frame)
+            times = source.log_times(frame["stamp"].to_numpy())
+            writer.write_columns(
+                topics.SEGMENT, "std_msgs/msg/Int32", times, {"data": frame["segment"].to_numpy()}
+            )
+        _write_path(writer, source)
+        for frame in source.batches("slip"):
+            _write_slip(writer, source, frame)
+        if prediction is not None:
+            frame = pl.DataFrame(
+                {
+                    "stamp": source.start_ns + np.round(prediction.times * 1e9).astype(np.int64),
+                    **{f"v_{axis}": prediction.velocity[:, i] for i, axis in enumerate("xyw")},
+                }
+            )
+            _write_twist(writer, source, topics.MODEL, frame, "v")
+            _write_predictions(writer, source)
+        write_trail(writer, source)
+        write_findings(writer, source)
+    return path
+
+
+def _name_log(source: ExportSource) -> dict[str, str]:
+    log = source.manifest.details.get("log")
+    return (
+        {"log": str(log.get("path", "")), "sha256": str(log.get("sha256", ""))}
+        if isinstance(log, dict)
+        else {}
+    )
+
+
+def _write_twist(
+    writer: LogWriter, source: ExportSource, topic: str, frame: pl.DataFrame, prefix: str
+) -> None:
+    stamps = frame["stamp"].to_numpy()
+    fields: dict[str, Given] = {
+        "header.frame_id": _BODY,
+        "twist.linear.x": frame[f"{prefix}_x"].to_numpy(),
+        "twist.linear.y": frame[f"{prefix}_y"].to_numpy(),
+        "twist.angular.z": frame[f"{prefix}_w"].to_numpy(),
+    }
+    writer.write_columns(topic, _TWIST, source.log_times(stamps), fields, header_time=stamps)
+
+
+def _write_slip(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -> None:
+    for (name,), rows in frame.group_by("input", maintain_order=True):
+        _write_twist(writer, source, topics.name_ideal(str(name)), rows, "f")
+        _write_twist(writer, source, topics.name_slip(str(name)), rows, "g")
+        times = source.log_times(rows["stamp"].to_numpy())
+        modulus = {"data": rows["modulus"].to_numpy()}
+        writer.write_columns(topics.name_modulus(str(name)), "std_msgs/msg/Float64", times, modulus)
+
+
+def _write_poses(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -> None:
+    stamps = frame["stamp"].to_numpy()
+    fields: dict[str, Given] = {
+        "header.frame_id": source.frame_id,
+        "child_frame_id": _BODY,
+        **{f"pose.pose.position.{axis}": frame[axis].to_numpy() for axis in "xyz"},
+        **_turn(frame["yaw"].to_numpy(), "pose.pose.orientation."),
+        "twist.twist.linear.x": frame["v_x"].to_numpy(),
+        "twist.twist.linear.y": frame["v_y"].to_numpy(),
+        "twist.twist.angular.z": frame["v_w"].to_numpy(),
+    }
+    writer.write_columns(
+        topics.POSE, "nav_msgs/msg/Odometry", source.log_times(stamps), fields, header_time=stamps
+    )
+
+
+def _write_path(writer: LogWriter, source: ExportSource) -> None:
+    """The whole way driven as one message at its beginning, thinned to what a screen can show."""
+    if "velocities" not in source.manifest.tables:
+        return
+    every = max(source.manifest.tables["velocities"].rows // _PATH_POSES, 1)
+    kept = [
+        frame.gather_every(every) for frame in source.batches("velocities", ("stamp", "x", "y", "z", "yaw"))
+    ]
+    if not kept:
+        return
+    frame = pl.concat(kept)
+    stamps = frame["stamp"].to_numpy()
+    fields: dict[str, Given] = {
+        "header.frame_id": source.frame_id,
+        "poses[].header.frame_id": [[source.frame_id] * frame.height],
+        "poses[].header.stamp.sec": (stamps // 10**9)[None, :],
+        "poses[].header.stamp.nanosec": (stamps % 10**9)[None, :],
+        **{f"poses[].pose.position.{axis}": frame[axis].to_numpy()[None, :] for axis in "xyz"},
+        **{
+            key: part[None, :]
+            for key, part in _turn(frame["yaw"].to_numpy(), "poses[].pose.orientation.").items()
+        },
+    }
+    writer.write_columns(
+        topics.PATH, "nav_msgs/msg/Path", source.log_times(stamps[:1]), fields, header_time=stamps[:1]
+    )
+
+
+def _write_predictions(writer: LogWriter, source: ExportSource) -> None:
+    """Where the model would have gone, over two seconds from measured poses, a few a second."""
+    prediction = source.prediction
+    if prediction is None or prediction.start_times.size == 0:
+        return
+    slot = np.floor(prediction.start_times * _PREDICTIONS_HZ)
+    kept = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0.0)
+    stamps = source.start_ns + np.round(prediction.start_times[kept] * 1e9).astype(np.int64)
+    along = stamps[:, None] + np.round(prediction.horizon_times * 1e9).astype(np.int64)[None, :]
+    poses = prediction.poses[kept]
+    fields: dict[str, Given] = {
+        "header.frame_id": source.frame_id,
+        "poses[].header.frame_id": [[source.frame_id] * along.shape[1]] * along.shape[0],
+        "poses[].header.stamp.sec": along // 10**9,
+        "poses[].header.stamp.nanosec": along % 10**9,
+        "poses[].pose.position.x": poses[:, :, 0],
+        "poses[].pose.position.y": poses[:, :, 1],
+        **_turn(poses[:, :, 2], "poses[].pose.orientation."),
+    }
+    writer.write_columns(
+        topics.PREDICTED_PATH, "nav_msgs/msg/Path", source.log_times(stamps), fields, header_time=stamps
+    )
+
+
+def _turn(yaw: NDArray[np.float64], prefix: str) -> dict[str, NDArray[np.float64]]:
+    return {f"{prefix}z": np.sin(0.5 * yaw), f"{prefix}w": np.cos(0.5 * yaw)}

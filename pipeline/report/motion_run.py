@@ -1,0 +1,73 @@
+"""From a stored run to what models are fitted on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from pipeline.report.errors import ReportError
+
+if TYPE_CHECKING:
+    from pipeline.motion import Input, MotionRun
+    from pipeline.store import Manifest
+    from pipeline.vehicles import Vehicle
+
+TABLES = ("poses", "commands", "wheels", "imu", "slip")
+
+
+def load_motion_run(manifest: Manifest, vehicle: Vehicle) -> MotionRun:
+    """The tables of a run as arrays for models.
+
+    Raises:
+        MotionError: ``no_poses``.
+        ReportError: ``no_poses``, the run has no table of poses.
+    """
+    from pipeline.motion import load_run  # noqa: PLC0415 - heavy
+
+    if "poses" not in manifest.tables:
+        raise ReportError(
+            "no_poses",
+            "the run has no poses to compare a model with",
+            where=manifest.run,
+            hint="Check the pose topic with `slip inspect`.",
+        )
+    tables = {name: manifest.read(name) for name in TABLES if name in manifest.tables}
+    log = manifest.details.get("log")
+    sha256 = str(log.get("sha256", "")) if isinstance(log, dict) else ""
+    return load_run(tables, vehicle, name=manifest.run, sha256=sha256, hold_s=_hold_of(manifest))
+
+
+def load_vehicle(manifest: Manifest) -> Vehicle:
+    """The vehicle that a run was analyzed with.
+
+    Raises:
+        ReportError: ``no_vehicle``, the results do not say it.
+    """
+    from pipeline.vehicles import Vehicle  # noqa: PLC0415 - heavy
+
+    try:
+        return msgspec.convert(manifest.details.get("vehicle"), Vehicle, strict=False)
+    except msgspec.ValidationError as error:
+        raise ReportError(
+            "no_vehicle",
+            "the results do not say which vehicle the run is of",
+            where=manifest.run,
+            hint="Analyze the log again with --force.",
+        ) from error
+
+
+def choose_source(run: MotionRun, asked: str | None) -> Input:
+    """The input asked for; by default the command where there is one, else the measured wheels."""
+    from pipeline.motion import Input  # noqa: PLC0415 - heavy
+
+    if asked is not None:
+        return Input(asked)
+    return Input.COMMAND if run.commands is not None else Input.MEASURED
+
+
+def _hold_of(manifest: Manifest) -> float | None:
+    configuration = manifest.details.get("configuration")
+    command = configuration.get("command") if isinstance(configuration, dict) else None
+    hold = command.get("hold_s") if isinstance(command, dict) else None
+    return float(hold) if isinstance(hold, int | float) else None

@@ -1,0 +1,208 @@
+"""Exports: read back by the readers that others wrote, and by people's viewers' rules."""
+
+from __future__ import annotations
+
+import json
+import runpy
+import shutil
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.motion import Model, find_effect
+from pipeline.report import ReportError
+from pipeline.report.exports import (
+    ExportSource,
+    write_csv,
+    write_derived_log,
+    write_foxglove_layout,
+    write_plotjuggler_layout,
+)
+from pipeline.report.motion_run import load_vehicle
+from pipeline.simulate import simulate_case
+from pipeline.store import Store
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulate_case("husky_tile", out=tmp_path_factory.mktemp("log") / "run.mcap", duration_s=40.0)
+
+
+@pytest.fixture(scope="module")
+def results(log: Path) -> Path:
+    folder = log.parent / "results"
+    analyze_log(log, Options(out=folder, report=False))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def source(results: Path) -> ExportSource:
+    (manifest,) = Store(results).manifests()
+    model = Model(load_vehicle(manifest), (find_effect("effective_track")(k=1.7),))
+    return ExportSource(manifest, model)
+
+
+@pytest.fixture(scope="module")
+def derived(source: ExportSource, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_derived_log(source, tmp_path_factory.mktemp("derived") / "run_slip.mcap")
+
+
+def read_officially(path: Path) -> dict[str, list[tuple[int, object]]]:
+    found: dict[str, list[tuple[int, object]]] = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        for _, channel, message, decoded in reader.iter_decoded_messages():
+            found.setdefault(channel.topic, []).append((message.log_time, decoded))
+    return found
+
+
+def test_the_official_reader_finds_what_the_tables_hold(source: ExportSource, derived: Path) -> None:
+    found = read_officially(derived)
+
+    velocities = source.manifest.read("velocities")
+    measured = found["/slip/velocity/measured"]
+    assert [time for time, _ in measured] == velocities["stamp"].to_list()
+    assert [message.twist.angular.z for _, message in measured] == velocities["v_w"].to_list()  # type: ignore[attr-defined]
+    modulus = source.manifest.read("slip").filter(pl.col("input") == "measured")["modulus"]
+    assert [message.data for _, message in found["/slip/modulus_measured"]] == modulus.to_list()  # type: ignore[attr-defined]
+    assert {"/slip/velocity/model", "/slip/predicted_path", "/slip/trail", "/slip/segment"} <= set(found)
+
+
+def test_another_reader_finds_the_same(derived: Path) -> None:
+    official = read_officially(derived)
+    counts: dict[str, int] = {}
+    with AnyReader([derived]) as reader:
+        for connection, _, raw in reader.messages():
+            reader.deserialize(raw, connection.msgtype)
+            counts[connection.topic] = counts.get(connection.topic, 0) + 1
+    assert counts == {topic: len(messages) for topic, messages in official.items()}
+
+
+def test_the_derived_log_lies_within_the_times_of_the_original(log: Path, derived: Path) -> None:
+    with log.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    start, end = summary.statistics.message_start_time, summary.statistics.message_end_time
+    times = [time for messages in read_officially(derived).values() for time, _ in messages]
+    assert start - 1e8 <= min(times)
+    assert max(times) <= end + 1e8
+
+
+def test_predictions_begin_at_the_measured_pose_and_last_two_seconds(derived: Path) -> None:
+    found = read_officially(derived)
+    poses = found["/slip/pose"]
+    times = np.array([time for time, _ in poses])
+    for time, path in found["/slip/predicted_path"][5::20]:
+        first, last = path.poses[0], path.poses[-1]  # type: ignore[attr-defined]
+        pose = poses[int(np.argmin(np.abs(times - time)))][1].pose.pose.position  # type: ignore[attr-defined]
+        assert np.hypot(first.pose.position.x - pose.x, first.pose.position.y - pose.y) < 0.15
+        assert last.header.stamp.sec - first.header.stamp.sec == 2
+
+
+def test_a_finding_stands_where_it_happened(results: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "results"
+    shutil.copytree(results, copy)
+    (manifest,) = Store(copy).manifests()
+    frame = pl.DataFrame(
+        {
+            "stage": ["checks", "checks"],
+            "id": ["pose_jump", "not_moving"],
+            "severity": ["warning", "error"],
+            "text": ["the pose <b>jumps</b>", "wheels in the air"],
+            "where": ["/odom", ""],
+            "t_start": [12.0, None],
+            "t_end": [13.0, None],
+        },
+        schema_overrides={"t_start": pl.Float64, "t_end": pl.Float64},
+    )
+    frame.write_parquet(manifest.path("findings"))
+    found = read_officially(write_derived_log(ExportSource(manifest), tmp_path / "out.mcap"))
+
+    lines = [(message.name, message.level, message.msg) for _, message in found["/slip/findings"]]  # type: ignore[attr-defined]
+    assert lines == [("not_moving", 40, "wheels in the air"), ("pose_jump", 30, "the pose <b>jumps</b>")]
+    marker = found["/slip/finding_markers"][1][1]
+    place = manifest.read("velocities").filter(pl.col("t") >= 12.0).row(0, named=True)
+    assert marker.text == "pose_jump"  # type: ignore[attr-defined]
+    assert marker.pose.position.x == pytest.approx(place["x"])  # type: ignore[attr-defined]
+
+
+def test_a_recorder_with_a_clock_of_its_own_keeps_it(results: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "results"
+    shutil.copytree(results, copy)
+    (manifest,) = Store(copy).manifests()
+    late = 3_600_000_000_000
+    poses = manifest.read("poses").with_columns(pl.col("log_time") + late)
+    poses.write_parquet(manifest.path("poses"))
+    source = ExportSource(manifest)
+    assert source.shift_ns == pytest.approx(late, abs=2e8)
+    found = read_officially(write_derived_log(source, tmp_path / "out.mcap"))
+    time, message = found["/slip/velocity/measured"][0]
+    stamp = message.header.stamp  # type: ignore[attr-defined]
+    assert time - (stamp.sec * 10**9 + stamp.nanosec) == source.shift_ns
+
+
+def test_csv_holds_every_row_with_units_in_its_heads(source: ExportSource, tmp_path: Path) -> None:
+    written = write_csv(source, tmp_path / "csv")
+
+    assert {path.stem for path in written} == set(source.manifest.tables)
+    slip = pl.read_csv(tmp_path / "csv" / "slip.csv")
+    stored = source.manifest.read("slip")
+    assert slip["g_w [rad/s]"].to_list() == stored["g_w"].to_list()
+    assert slip["stamp [ns]"].to_list() == stored["stamp"].to_list()
+    assert (tmp_path / "csv" / "findings.csv").read_text().startswith("run,dataset,")
+
+
+def test_layouts_name_only_topics_of_the_derived_log(
+    source: ExportSource, derived: Path, tmp_path: Path
+) -> None:
+    topics = set(read_officially(derived))
+    layout = json.loads(write_foxglove_layout(source, tmp_path / "l.json").read_text())
+    plots = [panel for name, panel in layout["configById"].items() if name.startswith("Plot")]
+    drawn = {line["value"].split(".")[0] for plot in plots for line in plot["paths"]}
+    assert drawn <= topics
+    assert len(drawn) == 6
+    panels = json.dumps(layout["layout"])
+    assert all(name in panels for name in layout["configById"])
+    tree = ET.parse(write_plotjuggler_layout(source, tmp_path / "l.xml"))  # noqa: S314 - our own file
+    curves = [curve.get("name", "") for curve in tree.iter("curve")]
+    assert {"/".join(curve.split("/")[:-1]).split("/twist")[0] for curve in curves} == drawn
+
+
+def test_a_place_that_cannot_be_written_is_named(source: ExportSource, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ReportError, match="--out"):
+        write_csv(source, tmp_path / "file" / "csv")
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "words"),
+    [
+        ("where_it_turns.py", (), "median_modulus"),
+        ("fit_by_hand.py", ("effective_track",), "over 2 s"),
+    ],
+)
+def test_the_examples_run(
+    name: str,
+    more: tuple[str, ...],
+    words: str,
+    results: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (run,) = Store(results).runs()
+    arguments = [str(results), *((run, *more) if more else ())]
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    runpy.run_path(str(ROOT / "examples" / name))
+    assert words in capsys.readouterr().out
