@@ -51,6 +51,8 @@ def normalize_columns(
                 where=where,
                 hint=f"The type has: {', '.join(leaves)}",
             )
+    if rows == 0:
+        return {}
     wanted = dict(wanted_leaves(plan_fields(structure, set(fields))))
     columns: dict[str, Column] = {}
     for path, leaf in wanted.items():

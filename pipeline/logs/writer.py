@@ -140,6 +140,13 @@ class LogWriter:
                 where=topic,
                 hint="Give one a message",
             )
+        if log.size and min(log.min(), publish.min()) < 0:
+            raise LogError(
+                "bad_column",
+                "a log or publish time lies before 1970",
+                where=topic,
+                hint="Times are nanoseconds since 1970, zero or later",
+            )
         kind = self._type(type_name, definition)
         given = dict(fields)
         if header_time is not None:

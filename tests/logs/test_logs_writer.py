@@ -119,6 +119,25 @@ def test_what_cannot_be_written_is_said(tmp_path: Path, kind: str, fields: dict[
     assert open_log(tmp_path / "log.mcap").message_count == 0
 
 
+def test_a_topic_without_messages_is_there(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    nothing = np.empty(0, dtype=np.int64)
+    with LogWriter(path) as writer:
+        writer.write_columns("/joints", JOINTS, nothing, {"name": [], "velocity": []}, header_time=nothing)
+    index = open_log(path)
+    assert index.topics() == ("/joints",)
+    (columns,) = read_topics(index, [Wanted("/joints")]).of("/joints")
+    assert len(columns) == 0
+    assert isinstance(columns.fields["velocity"], Ragged)
+    assert isinstance(columns.fields["name"], RaggedStrings)
+
+
+def test_times_before_1970_are_refused(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "log.mcap") as writer, pytest.raises(LogError) as caught:
+        writer.write_columns("/x", FLOAT, np.array([-1]), {"data": 1.0})
+    assert caught.value.code == "bad_column"
+
+
 def test_every_bundled_type_can_be_written_empty(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     with LogWriter(path) as writer:
