@@ -147,7 +147,7 @@ def _find_scale(both: pl.DataFrame) -> tuple[float, float]:
     found = []
     for asked, got in (("f_x", "m_x"), ("f_w", "m_w")):
         live = means.filter(pl.col(asked).abs() > _SMALLEST)
-        slow = live.filter(pl.col(asked).abs() <= live[asked].abs().quantile(_SLOW_SHARE))
+        slow = live.filter(pl.col(asked).abs() <= pl.col(asked).abs().quantile(_SLOW_SHARE))
         ratio = slow.select((pl.col(got) / pl.col(asked)).median()).item()
         found.append(1.0 if ratio is None or ratio <= 0.0 else float(ratio))
     return found[0], found[1]

@@ -1,0 +1,216 @@
+"""Results of made-up runs, written as the job writes them, without logs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.store import Manifest, Store
+
+RATE = 20.0
+STEP_S = 6.0
+_INPUTS = pl.Enum(["command", "measured"])
+_SUBSETS = pl.Enum(["all", "transitory", "steady"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """A run to make up; slip on the measured wheels is half of that on the command."""
+
+    name: str
+    dataset: str = "warthog_gravel"
+    vehicle: str = "warthog"
+    terrain: str = "gravel"
+    median: float = 1.0
+    seconds: float = 60.0
+    mass_kg: float | None = 470.0
+    length: float = 1.0
+    sha256: str = ""
+    start_ns: int = 1_700_000_000_000_000_000
+    findings: Sequence[tuple[str, str, float | None]] = field(default=())
+    parameters: Sequence[tuple[str, str, float, str]] = field(default=())
+    still: bool = False
+
+
+def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
+    """Write a run's tables and publish them."""
+    rng = np.random.default_rng([seed, *run.name.encode()])
+    count = round(run.seconds * RATE)
+    t = np.arange(count) / RATE
+    step = (t / STEP_S).astype(np.int32)
+    rho = math.exp(-1.0 / RATE)
+    level = np.empty(count)
+    level[0] = rng.standard_normal()
+    noise = rng.standard_normal(count) * math.sqrt(1.0 - rho**2)
+    for i in range(1, count):
+        level[i] = rho * level[i - 1] + noise[i]
+    modulus = np.full(count, run.median) if run.still else run.median * np.exp(0.5 * level)
+    speed = rng.uniform(0.5, 2.0, step[-1] + 1)[step]
+    turn = rng.uniform(-1.0, 1.0, step[-1] + 1)[step]
+    parts = []
+    for name, share in (("command", 1.0), ("measured", 0.5)):
+        g = np.stack((0.8 * share * modulus, 0.6 * share * modulus), axis=1)
+        parts.append(
+            pl.DataFrame(
+                {
+                    "t": t,
+                    "stamp": run.start_ns + (t * 1e9).astype(np.int64),
+                    "segment": np.zeros(count, dtype=np.int32),
+                    "step": step,
+                    "transitory": (t % STEP_S) < 2.0,
+                    "f_x": speed,
+                    "f_y": np.zeros(count),
+                    "f_w": turn,
+                    "v_x": speed - g[:, 0],
+                    "v_y": -g[:, 1],
+                    "v_w": turn,
+                    "g_x": speed - (speed - g[:, 0]),
+                    "g_y": g[:, 1],
+                    "g_w": np.zeros(count),
+                    "modulus": share * modulus,
+                    "suspect": np.zeros(count, dtype=bool),
+                }
+            ).with_columns(pl.lit(name).cast(_INPUTS).alias("input"))
+        )
+    slip = pl.concat(parts)
+    tables = {
+        "slip": slip,
+        "windows": _cut_windows(slip),
+        "aggregates": _aggregate(slip, run),
+        "findings": _list_findings(run),
+        "poses": _integrate(t, speed, turn, run.start_ns),
+        "parameters": _list_parameters(run),
+    }
+    names = {"run": run.name, "dataset": run.dataset, "vehicle": run.vehicle, "terrain": run.terrain}
+    labels = [pl.lit(value).alias(name) for name, value in names.items()]
+    with store.open_generation(run.name, f"k{seed}") as generation:
+        for name, table in tables.items():
+            generation.write_table(name, table.with_columns(labels))
+        return generation.commit(
+            {
+                "log": {"sha256": run.sha256 or run.name},
+                "stages": {"extract": {"context": {"start_ns": run.start_ns}}},
+                "vehicle": {
+                    "id": run.vehicle,
+                    "mass_kg": run.mass_kg,
+                    "track_width_m": 1.08,
+                    "wheelbase_m": 0.914,
+                    "max_speed_mps": 5.0,
+                    "max_yaw_rate_radps": 4.0,
+                },
+                "terrain": run.terrain,
+                "dataset": run.dataset,
+            }
+        )
+
+
+def _cut_windows(slip: pl.DataFrame) -> pl.DataFrame:
+    return (
+        slip.with_columns((pl.col("t") / 2.0 + 1e-9).floor().alias("window"))
+        .group_by("input", "window", maintain_order=True)
+        .agg(
+            pl.col("t").min().alias("t_start"),
+            pl.col("t").max().alias("t_end"),
+            pl.col("segment", "step").first(),
+            pl.col("transitory").first(),
+            pl.col("suspect").any(),
+            pl.len().cast(pl.Int32).alias("samples"),
+            (pl.col("modulus") ** 2).mean().sqrt().alias("rms_modulus"),
+        )
+        .with_columns((math.sqrt(40.0) * pl.col("rms_modulus")).alias("window_norm"))
+        .drop("window")
+    )
+
+
+def _aggregate(slip: pl.DataFrame, run: Run) -> pl.DataFrame:
+    rows = []
+    for name in ("command", "measured"):
+        for subset in ("all", "transitory", "steady"):
+            own = slip.filter(pl.col("input") == name)
+            if subset != "all":
+                own = own.filter(pl.col("transitory") == (subset == "transitory"))
+            rows.append(
+                {
+                    "input": name,
+                    "subset": subset,
+                    "samples": own.height,
+                    "windows": own.height // 40,
+                    "median_modulus": own["modulus"].median(),
+                    "median_window_norm": math.sqrt(40.0) * float(own["modulus"].median()),  # type: ignore[arg-type]
+                    **dict.fromkeys(
+                        (
+                            "rms_x", "rms_y", "rms_w", "mean_square", "drivetrain_mean_square",
+                            "ground_mean_square", "cross_mean_square",
+                        ),
+                        0.1,
+                    ),
+                    "distance": 100.0,
+                    "duration": run.seconds,
+                    "height_rate": 0.0,
+                    "largest_kinetic_energy": None if run.mass_kg is None else 1000.0,
+                    "length_scale": run.length,
+                }
+            )  # fmt: skip
+    frame = pl.DataFrame(rows)
+    return frame.with_columns(pl.col("input").cast(_INPUTS), pl.col("subset").cast(_SUBSETS))
+
+
+def _list_findings(run: Run) -> pl.DataFrame:
+    rows = [
+        {
+            "stage": "slip", "id": name, "severity": severity, "text": name, "where": "", "t_start": None,
+            "t_end": None, "value": value, "count": None,
+        }
+        for name, severity, value in run.findings
+    ]  # fmt: skip
+    schema = {
+        "stage": pl.String, "id": pl.String, "severity": pl.Enum(["info", "warning", "error"]),
+        "text": pl.String, "where": pl.String, "t_start": pl.Float64, "t_end": pl.Float64,
+        "value": pl.Float64, "count": pl.Int64,
+    }  # fmt: skip
+    return pl.DataFrame(rows, schema=schema, orient="row")
+
+
+def _list_parameters(run: Run) -> pl.DataFrame:
+    rows = [
+        {"input": "measured", "effect": effect, "parameter": name, "value": value, "low": None, "high": None,
+         "unit": unit}
+        for effect, name, value, unit in run.parameters
+    ]  # fmt: skip
+    schema = {
+        "input": _INPUTS, "effect": pl.String, "parameter": pl.String, "value": pl.Float64, "low": pl.Float64,
+        "high": pl.Float64, "unit": pl.String,
+    }  # fmt: skip
+    return pl.DataFrame(rows, schema=schema, orient="row")
+
+
+def _integrate(t: np.ndarray, speed: np.ndarray, turn: np.ndarray, start_ns: int) -> pl.DataFrame:
+    """Poses of a vehicle that follows its ideal motion."""
+    yaw = np.concatenate(([0.0], np.cumsum(turn[:-1]) / RATE))
+    middle = yaw + turn / RATE / 2.0
+    stamp = start_ns + (t * 1e9).astype(np.int64)
+    zero = np.zeros_like(t)
+    return pl.DataFrame(
+        {
+            "t": t,
+            "stamp": stamp,
+            "log_time": stamp,
+            "segment": np.zeros(t.size, dtype=np.int32),
+            "x": np.concatenate(([0.0], np.cumsum((speed * np.cos(middle))[:-1]) / RATE)),
+            "y": np.concatenate(([0.0], np.cumsum((speed * np.sin(middle))[:-1]) / RATE)),
+            "z": zero,
+            "q_x": zero,
+            "q_y": zero,
+            "q_z": np.sin(yaw / 2.0),
+            "q_w": np.cos(yaw / 2.0),
+            "held": zero > 1.0,
+            "active": zero < 1.0,
+        }
+    )

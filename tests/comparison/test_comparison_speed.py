@@ -1,0 +1,44 @@
+"""100 runs of 12,000 rows: lazy, without a loop over rows."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+from comparison_store import Run, write_run
+
+from pipeline.store import Store
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.mark.long
+def test_a_hundred_runs_take_ten_seconds_and_a_gigabyte(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for i in range(100):
+        terrain = f"t{i % 8}"
+        write_run(
+            store,
+            Run(
+                name=f"r{i:03d}",
+                dataset=f"warthog_{terrain}",
+                terrain=terrain,
+                seconds=300.0,
+                median=1 + i % 8,
+            ),
+            seed=i,
+        )
+    program = "import sys; from pipeline.cli.app import main; main(sys.argv[1:])"
+    # The first start on a machine bundles the scripts of the page once.
+    subprocess.run([sys.executable, "-c", program, "map", str(tmp_path / "none"), "--quiet"], check=True)
+    start = time.perf_counter()
+    subprocess.run([sys.executable, "-c", program, "compare", str(tmp_path), "--quiet"], check=True)
+    took = time.perf_counter() - start
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
+    assert took < 10.0
+    assert peak < 1.0
