@@ -7,19 +7,19 @@ the generation that its note names. Losing a note costs a look at the log.
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.store import LogSighting  # noqa: TC001 - msgspec evaluates the annotations
+from pipeline.store import LOG_NOTES, LogSighting, StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.store import JSON, Store
+    from pipeline.store import JSON, Mirror, Store
 
-FOLDER = "batch/logs"
 STATES = ("done", "unchanged", "lossy", "failed", "quarantined")
 """What a log can come out as; each of them is counted."""
 
@@ -73,10 +73,12 @@ class Ledger:
 
     Args:
         store: the results.
+        mirror: where entries are published, if the results are on an object store.
     """
 
-    def __init__(self, store: Store) -> None:
-        self._notes = store.notes(FOLDER)
+    def __init__(self, store: Store, mirror: Mirror | None = None) -> None:
+        self._mirror = mirror
+        self._notes = store.notes(LOG_NOTES)
 
     def read_all(self) -> Mapping[str, Entry]:
         """Every entry by the path of its log."""
@@ -97,6 +99,10 @@ class Ledger:
         stamped = replace(entry, at=round(time.time(), 3))
         content: dict[str, JSON] = msgspec.to_builtins(stamped)
         self._notes.write(entry.log.path, content)
+        if self._mirror is not None:
+            # A lost entry costs a look at the log.
+            with suppress(StoreError):
+                self._mirror.push_note(entry.log.path)
 
 
 def _as_entry(content: Mapping[str, JSON]) -> Entry | None:

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 from pipeline.job.keys import hash_json
 
 if TYPE_CHECKING:
-    from pipeline.store import Store
+    from pipeline.store import Mirror, Store
 
 _NOTES = "batch/pooled"
 _NOTE = "all runs"
+POOLED = ("datasets.parquet", "quarantine_datasets.parquet", "index.html")
+"""Files over all runs."""
 _MOST_ROUNDS = 20
 
 
@@ -35,6 +37,16 @@ def refresh_pools(store: Store) -> bool:
             notes.write(_NOTE, {"runs": runs})
             return written
     return written
+
+
+def refresh_remote_pools(mirror: Mirror) -> None:
+    """As `refresh_pools`, for results on an object store, with the runs that other machines have added."""
+    mirror.pull_index()
+    mirror.pull_tables(("aggregates",), mirror.store.manifests())
+    mirror.store.notes(_NOTES).remove(_NOTE)
+    refresh_pools(mirror.store)
+    for name in POOLED:
+        mirror.push_file(name)
 
 
 def _hash_runs(store: Store) -> str:

@@ -44,6 +44,7 @@ class Request:
     Attributes:
         targets: logs, folders, globs and lists.
         options: what each log is analyzed with.
+        address: of the results, if they are on an object store; ``options.out`` is then their mirror.
         executor: ``local``, ``inline``, ``dask``, or the address of a scheduler.
         jobs: logs worked on at once.
         shard: the part of the logs that is this machine's.
@@ -56,6 +57,7 @@ class Request:
 
     targets: tuple[str, ...]
     options: Options
+    address: str | None = None
     executor: str = "local"
     jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
     shard: Shard | None = None

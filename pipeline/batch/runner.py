@@ -8,16 +8,16 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from pipeline.batch.ledger import FATAL_KILLS, Entry, Ledger
+from pipeline.batch.ledger import FATAL_KILLS, Entry
 from pipeline.batch.work import Report, Task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from pipeline.batch.executors import Blame, Executor
+    from pipeline.batch.ledger import Ledger
     from pipeline.batch.plan import Item
-    from pipeline.job import Options
-    from pipeline.store import Store
+    from pipeline.batch.request import Request
 
 STOPPING = ("disk_full", "read_only", "no_locks")
 """Errors that every other log would meet as well."""
@@ -43,8 +43,8 @@ def run_items(
     items: Sequence[Item],
     executor: Executor,
     *,
-    options: Options,
-    store: Store,
+    request: Request,
+    ledger: Ledger,
     tell: Callable[[Report, Item], None],
 ) -> Result:
     """Work on logs.
@@ -52,19 +52,19 @@ def run_items(
     Args:
         items: the logs, in the order to begin them.
         executor: the workers.
-        options: what each log is analyzed with.
-        store: the results.
+        request: what the user asked for.
+        ledger: where it is noted that a log has killed its worker.
         tell: told of each log that is finished.
     """
-    return _Run(executor, options, Ledger(store), tell).work_through(items)
+    return _Run(executor, request, ledger, tell).work_through(items)
 
 
 class _Run:
     def __init__(
-        self, executor: Executor, options: Options, ledger: Ledger, tell: Callable[[Report, Item], None]
+        self, executor: Executor, request: Request, ledger: Ledger, tell: Callable[[Report, Item], None]
     ) -> None:
         self._executor = executor
-        self._options = options
+        self._request = request
         self._ledger = ledger
         self._tell = tell
         self._queue: deque[Item] = deque()
@@ -92,13 +92,16 @@ class _Run:
             time.sleep(_BUSY_PAUSE_S)
         while self._queue and len(self._flying) < 2 * self._executor.slots:
             item = self._queue.popleft()
-            task = Task(
-                path=item.path,
-                log=item.log,
-                basis=item.basis,
-                options=replace(self._options, run=item.run),
-            )
-            self._flying[self._executor.submit(task)] = item
+            self._flying[self._executor.submit(self._make_task(item))] = item
+
+    def _make_task(self, item: Item) -> Task:
+        return Task(
+            path=item.path,
+            log=item.log,
+            basis=item.basis,
+            options=replace(self._request.options, run=item.run),
+            address=self._request.address,
+        )
 
     def _land(self, future: Future[Report], item: Item) -> None:
         report: Report | None
@@ -120,8 +123,7 @@ class _Run:
 
     def _judge(self, item: Item, error: BaseException) -> Report | None:
         """A report in the place of one that never came; None when the log gets another chance."""
-        task = Task(path=item.path, log=item.log, basis=item.basis, options=self._options)
-        blame = self._executor.blame(task, error)
+        blame = self._executor.blame(self._make_task(item), error)
         kills = self._kills.get(item.log.path, _kills_before(item)) + blame.kills
         self._kills[item.log.path] = kills
         if blame.kills and kills < FATAL_KILLS:

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 from pipeline.batch.executors import Settings, find_executor
-from pipeline.batch.ledger import STATES, Entry
+from pipeline.batch.ledger import STATES, Entry, Ledger
 from pipeline.batch.plan import Item, Plan, make_plan
-from pipeline.batch.pooling import refresh_pools
+from pipeline.batch.pooling import refresh_pools, refresh_remote_pools
 from pipeline.batch.pruning import prune_results
 from pipeline.batch.recordings import find_recordings
 from pipeline.batch.runner import Result, run_items
 from pipeline.batch.work import Report, work_on
 from pipeline.core.errors import SlipError
-from pipeline.store import Store
+from pipeline.store import Mirror, Store
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -114,14 +114,17 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
         StoreError: the results cannot be written at all.
     """
     started = time.monotonic()
+    mirror = None if request.address is None else Mirror(request.address, request.options.out)
     store = Store(request.options.out)
+    if mirror is not None:
+        mirror.pull_index()
     found = find_recordings(request.targets, settle_s=request.settle_s)
     store.check_writable()
     plan = make_plan(found.recordings, store, request)
     todo = _select(plan.todo, request.shard)
     watch.plan(len(todo), len(plan.settled), sum(item.log.size for item in todo))
-    result = _work_through(todo, request, store, watch, work)
-    problems, removed = _tidy_up(store, request)
+    result = _work_through(todo, request, Ledger(store, mirror), watch, work)
+    problems, removed = _tidy_up(store, mirror, request)
     growing = [Line(path=str(path), state="growing", reason="still being written") for path in found.growing]
     lines = [*_describe_plan(plan), *map(_describe_report, result.reports), *_describe_left(result), *growing]
     return Outcome(
@@ -132,15 +135,18 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
     )
 
 
-def _tidy_up(store: Store, request: Request) -> tuple[tuple[SlipError, ...], int]:
+def _tidy_up(store: Store, mirror: Mirror | None, request: Request) -> tuple[tuple[SlipError, ...], int]:
     """Pool the runs and remove old generations; what goes wrong there must not hide what came of the logs."""
     problems: list[SlipError] = []
     removed = 0
     try:
-        refresh_pools(store)
+        if mirror is None:
+            refresh_pools(store)
+        else:
+            refresh_remote_pools(mirror)
         if request.pruning is not None:
             pruned = prune_results(store, request.pruning)
-            removed = len(pruned.removed)
+            removed = len(pruned.removed) if mirror is None else mirror.prune(store.manifests())
             problems += [] if pruned.problem is None else [pruned.problem]
     except SlipError as error:
         problems.append(error)
@@ -160,7 +166,7 @@ def _number(run: str) -> int:
 
 
 def _work_through(
-    todo: Sequence[Item], request: Request, store: Store, watch: Watch, work: Callable[[Task], Report]
+    todo: Sequence[Item], request: Request, ledger: Ledger, watch: Watch, work: Callable[[Task], Report]
 ) -> Result:
     if not todo:
         return Result(reports=(), left=())
@@ -175,8 +181,8 @@ def _work_through(
         return run_items(
             todo,
             executor,
-            options=request.options,
-            store=store,
+            request=request,
+            ledger=ledger,
             tell=lambda report, item: watch.tell(_describe_report(report), item.log.size),
         )
     finally:

@@ -11,7 +11,7 @@ from pipeline.logs import hash_log, to_location
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pipeline.store import Problem, Store
+    from pipeline.store import Mirror, Problem, Store
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,15 +53,18 @@ class Verification:
         return not self.files and not self.logs
 
 
-def verify_results(store: Store, *, logs: bool, tell: Callable[[str], None]) -> Verification:
+def verify_results(
+    store: Store, *, logs: bool, tell: Callable[[str], None], mirror: Mirror | None = None
+) -> Verification:
     """Hash all files of the results again, and the logs if wanted.
 
     Args:
         store: the results.
         logs: whether to read the logs, which takes as long as the disk needs for them.
         tell: told the name of each run whose log is about to be read.
+        mirror: the mirror that the store is, if the results are on an object store.
     """
-    files = store.verify()
+    files = store.verify() if mirror is None else mirror.verify()
     manifests = store.survey().manifests
     found: list[LogProblem] = []
     for manifest in manifests if logs else ():

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.batch.ledger import Entry, Ledger
 from pipeline.core.errors import SlipError
-from pipeline.store import Store
+from pipeline.store import Mirror, Store
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -32,12 +32,14 @@ class Task:
         log: what its file looked like when the batch was planned.
         basis: hash of everything else the results depend on.
         options: what it is analyzed with, the name of its run among them.
+        address: of the results, if they are on an object store.
     """
 
     path: Path
     log: LogSighting
     basis: str
     options: Options
+    address: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +77,7 @@ def work_safely(work: Callable[[Task], Report], task: Task) -> Report:
 
 def work_on(task: Task) -> Report:
     """Analyze one log and note the outcome in the ledger; raises nothing that a log can cause."""
+    mirror = None if task.address is None else Mirror(task.address, task.options.out)
     store = Store(task.options.out)
     started = time.monotonic()
     entry = Entry(log=task.log, basis=task.basis, state="failed", run=task.options.run or "")
@@ -83,22 +86,26 @@ def work_on(task: Task) -> Report:
         with store.claim(entry.run) as is_ours:
             if not is_ours:
                 return Report(entry=entry, is_busy=True)
-            entry, computed = _analyze(task, entry)
+            entry, computed = _analyze(task, entry, mirror)
     except SlipError as error:
         where = f"{error.where}: " if error.where and error.where != str(task.path) else ""
         entry = replace(entry, code=error.code, reason=f"{where}{error.what}", hint=error.hint)
     except Exception as error:  # noqa: BLE001 - one log must not cost the others
         entry = _describe_surprise(entry, error)
     entry = replace(entry, seconds=round(time.monotonic() - started, 3), peak_bytes=_peak_bytes())
-    Ledger(store).write(entry)
+    Ledger(store, mirror).write(entry)
     return Report(entry=entry, computed=computed, rss_bytes=read_rss())
 
 
-def _analyze(task: Task, entry: Entry) -> tuple[Entry, tuple[str, ...]]:
+def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, tuple[str, ...]]:
     # Workers that find nothing to do need no table library.
     from pipeline.job.analyze import REPORT, analyze_log  # noqa: PLC0415
 
+    if mirror is not None:
+        mirror.pull_run(entry.run)
     outcome = analyze_log(task.path, task.options)
+    if mirror is not None:
+        mirror.push_run(outcome.manifest)
     done = replace(
         entry,
         state="lossy" if outcome.lossy else "done",

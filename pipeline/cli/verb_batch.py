@@ -12,6 +12,7 @@ from cyclopts.types import PositiveFloat, PositiveInt
 from pipeline.batch import Pruning, Request, measure_memory, parse_shard, parse_size
 from pipeline.cli.choices import Choices, build_options
 from pipeline.cli.output import CLEAN, FAILED, LOSSY, describe_error, print_error, print_json
+from pipeline.cli.results_place import open_results
 from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
@@ -79,10 +80,12 @@ def batch(  # noqa: D417 - the shared choices document themselves
         raise SlipError("no_logs", "no log is given", hint="Say which: slip batch LOGS, a folder or a glob")
     pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
     options = build_options(choices, report=reports, force=force)
+    place = open_results(choices.out)
     workers = jobs or os.cpu_count() or 1
     request = Request(
         targets=tuple(logs or ()),
-        options=replace(options, config=None, fleet=options.config),
+        options=replace(options, out=place.root, config=None, fleet=options.config),
+        address=place.address,
         executor=executor,
         jobs=workers,
         shard=None if shard is None else parse_shard(shard),

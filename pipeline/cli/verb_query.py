@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from pipeline.cli.output import CLEAN
+from pipeline.cli.results_place import open_results
 
 if TYPE_CHECKING:
     import polars as pl
@@ -44,10 +46,15 @@ def query(  # noqa: D417 - arguments document themselves
         to: how to print the answer.
         json: print one JSON object: columns and rows.
     """
-    from pipeline.store import Partition, Store  # noqa: PLC0415 - only for this verb
+    from pipeline.store import Partition  # noqa: PLC0415 - only for this verb
 
     partition = Partition(vehicle=vehicle, terrain=terrain, dataset=dataset, day=day)
-    answer = Store(out).query(sql, partition)
+    place = open_results(out)
+    store = place.open_store()
+    if place.mirror is not None:
+        words = re.findall(r"\w+", sql.lower())
+        place.mirror.pull_tables(words, filter(partition.holds, store.manifests()))
+    answer = store.query(sql, partition)
     _print(answer, "json" if json else to)
     return CLEAN
 

@@ -10,6 +10,7 @@ import msgspec
 from cyclopts import App, Parameter
 
 from pipeline.cli.output import CLEAN, FAILED, describe_error, print_json
+from pipeline.cli.results_place import open_results
 
 if TYPE_CHECKING:
     from pipeline.batch.status import Status
@@ -41,9 +42,8 @@ def status(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
     """
     from pipeline.batch.status import tell_status  # noqa: PLC0415 - only for this verb
-    from pipeline.store import Store  # noqa: PLC0415 - only for this verb
 
-    found = tell_status(Store(results or out))
+    found = tell_status(open_results(results or out).open_store())
     if json:
         print_json(_as_json(found))
     else:

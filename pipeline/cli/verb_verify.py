@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from pipeline.cli.output import CLEAN, FAILED, print_json, show_progress
+from pipeline.cli.results_place import open_results
 
 if TYPE_CHECKING:
     from pipeline.batch.verification import Verification
@@ -35,10 +36,10 @@ def verify(  # noqa: D417 - arguments document themselves
         quiet: print nothing.
     """
     from pipeline.batch.verification import verify_results  # noqa: PLC0415 - only for this verb
-    from pipeline.store import Store  # noqa: PLC0415 - only for this verb
 
+    place = open_results(results or out)
     with show_progress("verify", quiet=quiet or json) as tell:
-        found = verify_results(Store(results or out), logs=logs, tell=tell)
+        found = verify_results(place.open_store(), mirror=place.mirror, logs=logs, tell=tell)
     if json:
         print_json(_as_json(found))
     elif not quiet:

@@ -216,7 +216,7 @@ def update_datasets(store: Store) -> None:
     from pipeline.comparison import gather_runs, pool_runs  # noqa: PLC0415 - heavy
     from pipeline.job.material import find_material  # noqa: PLC0415 - heavy
 
-    material = find_material(store, ("dataset",), trusted_only=False)
+    material = find_material(store, ("dataset",), trusted_only=False, tables=("aggregates",))
     if not store.survey().manifests:
         return
     runs = list(material.manifests)

@@ -53,7 +53,9 @@ class Material:
         return scan_table(table, root=self.store.root, manifests=list(self.manifests.values()))
 
 
-def find_material(store: Store, by: Sequence[str], *, trusted_only: bool) -> Material:
+def find_material(
+    store: Store, by: Sequence[str], *, trusted_only: bool, tables: Sequence[str] = _TABLES
+) -> Material:
     """The current runs of the results, each recording once.
 
     Left out, with a note: damaged results, a log that another run holds too, tables of another contract
@@ -64,6 +66,7 @@ def find_material(store: Store, by: Sequence[str], *, trusted_only: bool) -> Mat
         store: the results.
         by: columns that make a group.
         trusted_only: whether findings of severity `error` leave a run out.
+        tables: tables that a run must have.
 
     Raises:
         ComparisonError: ``by`` names no column.
@@ -74,7 +77,7 @@ def find_material(store: Store, by: Sequence[str], *, trusted_only: bool) -> Mat
     holders: dict[str, str] = {}
     for manifest in survey.manifests:
         digest = _read_digest(manifest)
-        reason = _doubt(manifest)
+        reason = _doubt(manifest, tables)
         if digest in holders:
             reason = f"the same recording as {holders[digest]}"
         if reason:
@@ -123,9 +126,9 @@ def _leave_out_untrusted(material: Material) -> Material:
     return material
 
 
-def _doubt(manifest: Manifest) -> str:
+def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
     """Why a run's tables cannot be compared; empty when they can."""
-    for name in _TABLES:
+    for name in tables:
         entry = manifest.tables.get(name)
         if entry is None:
             return f"it has no table {name}; analyze it again"

@@ -9,19 +9,22 @@ from pipeline.store.errors import StoreError
 from pipeline.store.generation import STEPS, Generation
 from pipeline.store.identities import LogIdentities, LogSighting, see_log
 from pipeline.store.manifest import JSON, FileEntry, Manifest, TableEntry, TableReport
-from pipeline.store.notes import Notes
+from pipeline.store.mirror import Mirror
+from pipeline.store.notes import LOG_NOTES, Notes
 from pipeline.store.partitions import Partition
 from pipeline.store.results import Store, Survey
 from pipeline.store.verification import Problem
 
 __all__ = [
     "JSON",
+    "LOG_NOTES",
     "STEPS",
     "FileEntry",
     "Generation",
     "LogIdentities",
     "LogSighting",
     "Manifest",
+    "Mirror",
     "Notes",
     "Partition",
     "Problem",

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from pipeline.store.manifest import JSON
 
 
+LOG_NOTES = "batch/logs"
+"""Folder of the notes on logs, the only ones that several machines share."""
+
+
 class Notes:
     """Notes by name in one folder.
 

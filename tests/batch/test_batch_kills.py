@@ -55,7 +55,9 @@ def time_whole_batch(field: Path, out: Path) -> float:
     return time.monotonic() - started
 
 
-def kill_at_random(field: Path, out: Path, undisturbed: dict[str, bytes], *, rounds: int, longest_s: float) -> int:
+def kill_at_random(
+    field: Path, out: Path, undisturbed: dict[str, bytes], *, rounds: int, longest_s: float
+) -> int:
     chance = random.Random(rounds)  # noqa: S311 - moments, not secrets
     killed = 0
     for _ in range(rounds):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,12 +14,24 @@ pytest.importorskip("s3fs", reason="the extra s3 is not installed")
 pytest.importorskip("moto", reason="moto is not installed")
 
 import fsspec
+import numpy as np
 from moto.server import ThreadedMotoServer
 
+from pipeline.batch import Pruning
 from pipeline.batch.recordings import find_recordings
-from pipeline.logs import LogError, RemotePath, Wanted, hash_log, open_log, read_topics, to_location
-from pipeline.simulate import simulate_case
-from pipeline.store import Store
+from pipeline.batch.verification import verify_results
+from pipeline.logs import (
+    LogError,
+    LogWriter,
+    RemotePath,
+    Wanted,
+    hash_log,
+    open_log,
+    read_topics,
+    to_location,
+)
+from pipeline.store import Mirror, Partition, Store, StoreError
+from pipeline.store import mirror as mirror_room
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -41,10 +54,10 @@ def bucket(server: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[fsspec.Abst
     for name, value in {
         "AWS_ENDPOINT_URL": server,
         "AWS_ACCESS_KEY_ID": "a",
-        "AWS_SECRET_ACCESS_KEY": "b",  # noqa: S105 - of a server that lives for a test
+        "AWS_SECRET_ACCESS_KEY": "b",
         "AWS_DEFAULT_REGION": "us-east-1",
     }.items():
-        monkeypatch.setenv(name, value.replace("b", "b"))
+        monkeypatch.setenv(name, value)
     fsspec.get_filesystem_class("s3").clear_instance_cache()
     store = fsspec.filesystem("s3", listings_expiry_time=60)
     store.mkdir(BUCKET)
@@ -75,16 +88,13 @@ def test_a_log_is_read_as_if_it_were_here(bucket: fsspec.AbstractFileSystem, sea
 
 
 def test_only_the_chunks_that_matter_are_fetched(bucket: fsspec.AbstractFileSystem, tmp_path: Path) -> None:
-    from pipeline.logs import LogWriter
-
     path = tmp_path / "cameras.mcap"
-    import numpy as np
-
     stamps = np.arange(1000, dtype=np.int64) * 10**7 + 10**18
+    noise = np.random.default_rng(0)
     with LogWriter(path, chunk_size=1 << 16) as log:
         log.write_columns("/odom", "nav_msgs/msg/Odometry", stamps, {}, header_time=stamps)
-        noise = np.random.default_rng(0).bytes(3_000_000)
-        log.write_columns("/text", "std_msgs/msg/String", stamps[:30], {"data": [noise.hex()] * 30})
+        texts = [noise.bytes(50_000).hex() for _ in range(100)]
+        log.write_columns("/text", "std_msgs/msg/String", stamps[-100:] + 10**10, {"data": texts})
     upload(bucket, {"cameras.mcap": path})
     data = read_topics(f"{BUCKET}/cameras.mcap", [Wanted("/odom")])
     assert len(data.topics[0]) == 1000
@@ -136,12 +146,102 @@ def test_what_is_not_there_is_said(bucket: fsspec.AbstractFileSystem) -> None:
 
 
 def test_addresses_survive_what_happens_to_paths() -> None:
-    import pickle
-
     path = RemotePath("s3://bucket/folder/run.mcap")
     assert str(path) == os.fspath(path) == path.as_posix() == "s3://bucket/folder/run.mcap"
     assert str(path.parent / "x") == "s3://bucket/folder/x"
     assert to_location(Path("s3://bucket/folder/run.mcap")) == path
     assert pickle.loads(pickle.dumps(path)) == path  # noqa: S301 - our own
     assert (path.name, path.stem, path.parent.name) == ("run.mcap", "run", "folder")
-    assert not isinstance(to_location("/tmp/x"), RemotePath)
+    assert not isinstance(to_location("/data/x"), RemotePath)
+
+
+def list_published(store: fsspec.AbstractFileSystem, out: str) -> dict[str, bytes]:
+    """Every table and text that people read, by its path in the results."""
+    store.invalidate_cache()
+    start = len(out.removeprefix("s3://")) + 1
+    names = [name for name in store.find(out) if not name[start:].startswith("batch/")]
+    return {name[start:]: store.cat_file(name) for name in names}
+
+
+def test_results_in_a_bucket_are_those_of_a_folder(
+    bucket: fsspec.AbstractFileSystem, season: Path, tmp_path: Path
+) -> None:
+    out = f"{BUCKET}/results"
+    batch(season, tmp_path / "here")
+    first = batch(season, tmp_path / "mirror", address=out, executor="local")
+    assert counts(first) == {"done": 4}
+    assert first.problems == ()
+    published = list_published(bucket, out)
+    assert published == read_tables(tmp_path / "here")
+
+    # Another machine knows nothing but the bucket.
+    assert counts(batch(season, tmp_path / "elsewhere", address=out)) == {"unchanged": 4}
+    assert not list((tmp_path / "elsewhere").rglob("slip.parquet"))
+    mirror = Mirror(out, tmp_path / "elsewhere")
+    mirror.pull_index()
+    ice = Partition(terrain="ice")
+    mirror.pull_tables(["slip"], filter(ice.holds, mirror.store.manifests()))
+    assert mirror.store.query("SELECT DISTINCT run FROM slip", ice)["run"].to_list() == ["season/d"]
+    assert len(list((tmp_path / "elsewhere").rglob("slip.parquet"))) == 1
+    assert verify_results(mirror.store, mirror=mirror, logs=False, tell=print).is_clean
+
+    # A stage that changed reuses what another machine computed.
+    (season / "a.toml").write_text("[slip]\nlength_scale_m = 2.0\n")
+    again = batch(season, tmp_path / "elsewhere", address=out, pruning=Pruning(keep=0))
+    assert counts(again) == {"done": 1, "unchanged": 3}
+    assert again.removed == 1
+    batch(season, tmp_path / "here", pruning=Pruning(keep=0))
+    assert list_published(bucket, out) == read_tables(tmp_path / "here")
+
+    damaged = next(name for name in bucket.find(out) if name.endswith("velocities.parquet"))
+    bucket.pipe_file(damaged, b"x")
+    found = verify_results(mirror.store, mirror=mirror, logs=False, tell=print)
+    assert [problem.code for problem in found.files] == ["file_damaged"]
+
+
+class FailingStore:
+    """Takes so many objects and then no more."""
+
+    def __init__(self, objects: object, allowed: int) -> None:
+        self.objects = objects
+        self.left = allowed
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.objects, name)
+
+    def pipe_file(self, path: str, value: bytes) -> None:
+        self.left -= 1
+        if self.left < 0:
+            raise OSError("the network is gone")
+        self.objects.pipe_file(path, value)  # type: ignore[attr-defined]
+
+
+def test_a_run_is_published_whole_or_not_at_all(
+    bucket: fsspec.AbstractFileSystem, season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = f"{BUCKET}/results"
+    log = season / "a.mcap"
+    opened = mirror_room._open_objects
+    for allowed in (0, 1, 5):
+        with monkeypatch.context() as patch:
+            patch.setattr(mirror_room, "_open_objects", lambda url, n=allowed: FailingStore(opened(url), n))
+            outcome = batch(log, tmp_path / f"mirror{allowed}", address=out)
+        assert outcome.has_failed
+        assert outcome.lines[0].code in {"store_unreachable", ""}
+        mirror = Mirror(out, tmp_path / "reader")
+        mirror.pull_index()
+        assert mirror.verify() == ()
+    assert not batch(log, tmp_path / "last", address=out).has_failed
+    batch(log, tmp_path / "here")
+    assert list_published(bucket, out) == read_tables(tmp_path / "here")
+
+
+def test_a_bucket_that_is_not_there_is_said(
+    bucket: fsspec.AbstractFileSystem, season: Path, tmp_path: Path
+) -> None:
+    del bucket
+    with pytest.raises(StoreError) as caught:
+        Mirror("nothing://x/y", tmp_path)
+    assert caught.value.code == "no_object_store"
+    outcome = batch(season / "a.mcap", tmp_path / "mirror", address="s3://nowhere/results")
+    assert outcome.lines[0].code == "store_unreachable"
