@@ -1,0 +1,96 @@
+"""On a dask cluster: the same bytes, also when a worker is killed in the middle."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from batch_tools import HERE, batch, counts, read_tables
+from batch_works import work_poisoned, work_slowly
+
+from pipeline.batch import BatchError
+
+distributed = pytest.importorskip("distributed", reason="the extra dask is not installed")
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@pytest.fixture
+def scheduler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[str]:
+    """A scheduler with two worker processes over TCP, as somebody else may have started it."""
+    begun = tmp_path / "begun"
+    begun.mkdir()
+    monkeypatch.setenv("BEGUN", str(begun))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(HERE), str(HERE.parents[1]))))
+    monkeypatch.setenv("POLARS_MAX_THREADS", "1")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, protocol="tcp://", dashboard_address=None, silence_logs=50
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+def kill_first_worker(begun: Path, killed: list[int]) -> None:
+    """Kill the first worker that has begun with a log."""
+    deadline = time.monotonic() + 30.0
+    while not killed and time.monotonic() < deadline:
+        for marker in begun.iterdir():
+            killed.append(int(marker.name.rpartition("-")[2]))
+            os.kill(killed[0], signal.SIGKILL)
+            return
+        time.sleep(0.02)
+
+
+def test_a_worker_killed_in_the_middle_costs_nothing(scheduler: str, season: Path, tmp_path: Path) -> None:
+    batch(season, tmp_path / "here")
+    killed: list[int] = []
+    killer = threading.Thread(target=kill_first_worker, args=(tmp_path / "begun", killed))
+    killer.start()
+    outcome = batch(season, tmp_path / "cluster", work=work_slowly, executor=scheduler)
+    killer.join()
+    assert len(killed) == 1
+    begun = [marker.name.rpartition("-")[0] for marker in (tmp_path / "begun").iterdir()]
+    assert len(begun) > len(set(begun)), "the log of the killed worker was begun again"
+    assert counts(outcome) == {"done": 4}
+    assert read_tables(tmp_path / "cluster") == read_tables(tmp_path / "here")
+
+
+@pytest.mark.long
+def test_poison_on_a_cluster_of_our_own_is_named(
+    season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(HERE), str(HERE.parents[1]))))
+    for number, kind in enumerate(("raises", "hangs", "eats", "dies")):
+        (season / f"{kind}.mcap").write_bytes((season / "a.mcap").read_bytes() + bytes(number + 1))
+    outcome = batch(
+        season,
+        tmp_path / "out",
+        work=work_poisoned,
+        executor="dask",
+        timeout_s=8.0,
+        memory_bytes=900_000_000,
+    )
+    found = {Path(line.path).stem: (line.state, line.code) for line in outcome.lines}
+    assert {name: found[name] for name in ("raises", "hangs", "eats", "dies")} == {
+        "raises": ("failed", "unexpected_error"),
+        "hangs": ("quarantined", "timed_out"),
+        "eats": ("quarantined", "out_of_memory"),
+        "dies": ("quarantined", "worker_died"),
+    }
+    assert counts(outcome)["done"] == 4
+
+
+def test_a_scheduler_that_does_not_answer_is_said(
+    season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.batch.executors.cluster._CONNECT_S", 0.5)
+    with pytest.raises(BatchError) as caught:
+        batch(season, tmp_path / "out", executor="tcp://127.0.0.1:9")
+    assert caught.value.code == "cluster_not_reached"
+    with pytest.raises(BatchError, match="no executor is called 'slurm'"):
+        batch(season, tmp_path / "out", executor="slurm")
