@@ -11,7 +11,8 @@ class LogError(SlipError):
     """A log, topic or field that cannot be served.
 
     Codes: ``log_not_found``, ``log_empty``, ``not_mcap``, ``not_a_recording``, ``log_unreadable``,
-    ``topic_not_found``, ``field_not_found``, ``frame_not_found``, ``unknown_type``, ``bad_column``.
+    ``topic_not_found``, ``field_not_found``, ``frame_not_found``, ``unknown_type``, ``bad_column``,
+    ``unsupported_encoding``, ``no_object_store``.
     """
 
 

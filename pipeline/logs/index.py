@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -12,8 +11,10 @@ from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.part import catalog_file
 from pipeline.logs.remote import to_location
 from pipeline.logs.source import count_fetched, hash_sources, open_source
+from pipeline.logs.workers import usable_threads
 
 if TYPE_CHECKING:
+    import os
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
@@ -144,7 +145,7 @@ def open_log(path: str | os.PathLike[str]) -> LogIndex:
     fetched = 0
     for file in files:
         with open_source(file) as source:
-            catalogs.append((file, source.size, catalog_file(source, threads=os.cpu_count() or 1)))
+            catalogs.append((file, source.size, catalog_file(source, threads=usable_threads())))
             fetched += count_fetched([source])
     return replace(_merge(location, catalogs, losses), fetched_bytes=fetched)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -19,8 +18,10 @@ from pipeline.logs.loading import load_spans
 from pipeline.logs.payloads import gather_payloads
 from pipeline.logs.source import ByteSource, count_fetched, hash_sources, open_source
 from pipeline.logs.spans import SpanKind
+from pipeline.logs.workers import usable_threads
 
 if TYPE_CHECKING:
+    import os
     from collections.abc import Iterable, Iterator, Mapping
 
     from numpy.typing import NDArray
@@ -116,7 +117,7 @@ def read_topics(
     Args:
         path: the recording, or what ``open_log`` said of it.
         wanted: topics and fields.
-        threads: chunks inflated at once; as many as the machine has cores by default.
+        threads: chunks inflated at once; by default as many as this process may use.
         sha256: the recording's hash when it is known; otherwise it is computed beside the reading.
 
     Raises:
@@ -124,7 +125,7 @@ def read_topics(
             not supported is a loss, not an error: the others are read.
     """
     index = path if isinstance(path, LogIndex) else open_log(path)
-    workers = threads or os.cpu_count() or 1
+    workers = threads or usable_threads()
     losses: dict[Loss, None] = dict.fromkeys(index.losses)
     notes = list(index.notes)
     jobs = _choose_channels(index, wanted, losses, notes)
