@@ -5,10 +5,11 @@ from __future__ import annotations
 import struct
 import zlib
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from mcap.writer import CompressionType, IndexType
 from mcap_files import (
     WITHOUT_INDEX,
     Truth,
@@ -154,6 +155,30 @@ def test_a_log_without_summary_is_whole(tmp_path: Path) -> None:
     assert not data.losses
     assert data.index.message_count == len(truth)
     assert any("rebuilt" in note for note in data.notes)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"index_types": IndexType.CHUNK},
+        {"index_types": IndexType.MESSAGE},
+        {"repeat_schemas": False},
+        {"repeat_channels": False},
+        {"use_statistics": False},
+        {"use_summary_offsets": False},
+        {"enable_data_crcs": True},
+        {"compression": CompressionType.LZ4},
+        {"compression": CompressionType.NONE, "chunk_size": 1},
+    ],
+    ids=str,
+)
+def test_no_choice_of_the_recorder_loses_anything(tmp_path: Path, options: dict[str, Any]) -> None:
+    path = tmp_path / "log.mcap"
+    truth = write_official(path, **options)
+    data, found = read_small(path)
+    assert found == truth
+    assert not data.losses
+    assert data.index.message_count == len(truth)
 
 
 def test_a_wrong_summary_without_checksum_is_found_out(tmp_path: Path) -> None:
