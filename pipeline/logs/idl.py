@@ -19,7 +19,7 @@ from pipeline.logs.schema import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-_SEPARATOR: Final = re.compile(r"^={3,}[ \t]*$", re.MULTILINE)
+_SEPARATOR: Final = re.compile(r"^={3,}[ \t\r]*$", re.MULTILINE)
 _COMMENT: Final = re.compile(r"//[^\n]*|/\*.*?\*/|^\s*#[^\n]*|^IDL:[^\n]*", re.MULTILINE | re.DOTALL)
 _TOKEN: Final = re.compile(r'"(?:[^"\\]|\\.)*"|\'(?:[^\'\\]|\\.)*\'|::|[A-Za-z_][\w]*|[\d.]+[\w.+-]*|\S')
 _NUMBERS: Final = {

@@ -34,7 +34,7 @@ MAX_DEPTH: Final = 64
 
 _ALIASES: Final = {"byte": "uint8", "char": "uint8", "octet": "uint8", "boolean": "bool"}
 _ALIASES_ROS1: Final = {"byte": "int8", "char": "uint8"}
-_SEPARATOR: Final = re.compile(r"^={3,}[ \t]*$", re.MULTILINE)
+_SEPARATOR: Final = re.compile(r"^={3,}[ \t\r]*$", re.MULTILINE)
 _FIELD: Final = re.compile(
     r"^(?P<type>[A-Za-z][\w/]*)(?P<text_bound><=\d+)?(?P<array>\[(?P<bound><=)?(?P<count>\d*)\])?"
     r"\s+(?P<name>[A-Za-z]\w*)(?P<rest>.*)$"
