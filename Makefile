@@ -8,13 +8,13 @@ BIN    := $(VENV)/bin
 OUT    ?= results
 
 # Values reach the shell through its environment, so that a path may hold spaces and quotes.
-export LOG OUT VEHICLE ARGS
+export LOG LOGS OUT VEHICLE ARGS
 
 # Exit code 3 means done, but the log had losses: they are on the screen, and make has not failed.
 FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: help setup analyze inspect test test-long check format samples bench bench-analyze bench-reader browser lock clean
+.PHONY: help setup analyze batch inspect test test-long check format samples bench bench-analyze bench-batch bench-reader browser lock clean
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -23,6 +23,10 @@ analyze: $(VENV)/.ready ## LOG=run.mcap: slip tables, a summary, a report [VEHIC
 	@[ -n "$$LOG" ] || { echo "Say which log: make analyze LOG=run.mcap" >&2; exit 2; }
 	@if [ -n "$$VEHICLE" ]; then $(BIN)/slip analyze "$$LOG" --out "$$OUT" --vehicle "$$VEHICLE" $$ARGS; \
 	else $(BIN)/slip analyze "$$LOG" --out "$$OUT" $$ARGS; fi $(FORGIVE_LOSSES)
+
+batch: $(VENV)/.ready ## LOGS=dir: bring the results up to date with a season of logs [OUT=results, ARGS=]
+	@[ -n "$$LOGS" ] || { echo "Say which logs: make batch LOGS=dir" >&2; exit 2; }
+	@$(BIN)/slip batch "$$LOGS" --out "$$OUT" $$ARGS $(FORGIVE_LOSSES)
 
 inspect: $(VENV)/.ready ## LOG=run.mcap: topics, rates, gaps, clocks, damage
 	@[ -n "$$LOG" ] || { echo "Say which log: make inspect LOG=run.mcap" >&2; exit 2; }
@@ -48,10 +52,13 @@ samples: $(VENV)/.ready ## make the logs in data_samples again
 	@for case in husky_tile warthog_ice ackermann_gravel; do \
 		$(BIN)/slip simulate $$case --out data_samples/$$case.mcap || exit 1; done
 
-bench: bench-reader bench-analyze ## all benchmarks
+bench: bench-reader bench-analyze bench-batch ## all benchmarks
 
 bench-analyze: $(VENV)/.ready-dev ## a whole analysis of a 10-minute log
 	$(BIN)/python tests/bench/analyze.py
+
+bench-batch: $(VENV)/.ready-dev ## batches of 10, 100 and 1,000 logs, on one and two processes
+	$(BIN)/python tests/bench/batch.py
 
 bench-reader: $(VENV)/.ready-dev ## reading a 1 GB log: ours, its peers, and the bound
 	$(BIN)/python tests/bench/reader.py
@@ -63,7 +70,7 @@ lock: $(VENV)/.ready-dev ## pin the dependencies of pyproject.toml again
 	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
 		--no-emit-index-url --no-header --no-annotate --extra build --output-file requirements.txt
 	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
-		--no-emit-index-url --no-header --no-annotate --extra build --extra dev --extra sim \
+		--no-emit-index-url --no-header --no-annotate --extra build --extra dask --extra dev --extra s3 --extra sim \
 		--constraint requirements.txt --output-file requirements-dev.txt
 
 clean: ## remove the environment and caches; results stay
