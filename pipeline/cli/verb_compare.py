@@ -56,12 +56,8 @@ def compare(  # noqa: D417 - arguments document themselves
         json: print one JSON object in place of the tables.
         quiet: print nothing.
     """
-    from pipeline.job.compare import (  # noqa: PLC0415 - heavy
-        Question,
-        compare_results,
-        describe_answer,
-        write_answer,
-    )
+    from pipeline.job.compare import Question, compare_results  # noqa: PLC0415 - heavy
+    from pipeline.job.compare_files import describe_answer, write_answer  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     store = Store(out or results)
@@ -76,30 +72,28 @@ def compare(  # noqa: D417 - arguments document themselves
 
 
 def _describe(answer: Answer, written: Mapping[str, Path]) -> str:
-    datasets = answer.datasets.filter(answer.datasets["input"] == answer.input)
+    datasets = answer.datasets.filter(answer.datasets["input"] == answer.input).select(
+        "dataset", "runs", "median_window_norm"
+    )
+    rated = answer.intervals.join(datasets, on="dataset").sort("value")
     label = "as published" if answer.quantity == "published_norm" else "median modulus"
     lines = [
         f"slip on {answer.input.replace('measured', 'measured wheels')}, {label} [m/s]",
         "",
         f"{'dataset':<{_NAME}}{'runs':>5}{'median':>9}   {'95 % interval':<16}{'window norm':>12}",
     ]
-    lines += [
-        _describe_dataset(row, answer.quantity)
-        for row in datasets.sort(answer.quantity).iter_rows(named=True)
-    ]
+    lines += [_describe_dataset(row) for row in rated.iter_rows(named=True)]
     lines += ["", *_describe_pairs(list(answer.comparisons.sort("p_adjusted", "p").iter_rows(named=True)))]
     lines += ["", *(f"! {note}" for note in answer.notes), f"page    {written['comparison.html']}"]
     return "\n".join(lines)
 
 
-def _describe_dataset(row: Mapping[str, object], quantity: str) -> str:
+def _describe_dataset(row: Mapping[str, object]) -> str:
     low, high = row["low"], row["high"]
     ends = f"{low:.3g} to {high:.3g}" if isinstance(low, float) and isinstance(high, float) else "-"
-    if quantity != "median_modulus":
-        ends = "-"
     only = " (this run)" if row["interval"] == "this run only" and ends != "-" else ""
     return (
-        f"{str(row['dataset'])[: _NAME - 1]:<{_NAME}}{row['runs']:>5}{_number(row[quantity]):>9}   "
+        f"{str(row['dataset'])[: _NAME - 1]:<{_NAME}}{row['runs']:>5}{_number(row['value']):>9}   "
         f"{ends:<16}{_number(row['median_window_norm']):>12}{only}"
     )
 

@@ -36,6 +36,7 @@ RUNS = "runs"
 BLOCKS = "blocks"
 _FEW_GROUPS = 6
 _FEWER_DRAWS = 1_999
+_MANY_PAIRS = 200
 ABOUT_BLOCKS = "this run against that run, not the terrain"
 
 
@@ -139,10 +140,11 @@ def _compare_runs(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> 
     compared = [compare_runs(groups[i].medians, groups[j].medians) for i, j in pairs]
     by_max_t = len(groups) <= MOST_GROUPS
     own = [found.test.p for found in compared]
+    draws = DRAWS if len(groups) <= _FEW_GROUPS or not by_max_t else _FEWER_DRAWS
     if by_max_t and pairs:
         positive = all(np.all(group.medians > 0.0) for group in groups)
         units = [np.log(group.medians) if positive else group.medians for group in groups]
-        matrix = adjust_max_t(units, draws=DRAWS if len(groups) <= _FEW_GROUPS else _FEWER_DRAWS)
+        matrix = adjust_max_t(units, draws=draws)
         adjusted = [max(float(matrix[i, j]), p) for (i, j), p in zip(pairs, own, strict=True)]
     else:
         adjusted = adjust_holm(own).tolist()
@@ -150,7 +152,7 @@ def _compare_runs(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> 
     correction = _name_correction("max-T" if by_max_t else "Holm", len(pairs))
     found_pairs = []
     for (i, j), found, p in zip(pairs, compared, adjusted, strict=True):
-        smallest = min(found.test.smallest_p * factor, 1.0)
+        smallest = min(max(found.test.smallest_p, 1.0 / (draws + 1)) * factor, 1.0)
         kind = "exact" if found.test.exact else "random"
         found_pairs.append(
             Pair(
@@ -171,7 +173,8 @@ def _compare_runs(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> 
 def _compare_blocks(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> list[Pair]:
     needed = {i for pair in pairs for i in pair}
     blocks = {i: cut_run(groups[i].runs[0]) for i in needed}
-    compared = [compare_blocks(blocks[i].medians, blocks[j].medians) for i, j in pairs]
+    draws = DRAWS if len(pairs) <= _MANY_PAIRS else _FEWER_DRAWS
+    compared = [compare_blocks(blocks[i].medians, blocks[j].medians, draws=draws) for i, j in pairs]
     adjusted = adjust_holm([found.test.p for found in compared]).tolist()
     correction = _name_correction("Holm", len(pairs))
     return [
@@ -184,7 +187,7 @@ def _compare_blocks(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -
             unit=BLOCKS,
             method=f"permutation of {blocks[i].medians.size} and {blocks[j].medians.size} blocks{correction}",
             p_uncorrected=_ask_published(groups[i], groups[j]),
-            note=_note_blocks(groups[i], groups[j], min(found.test.smallest_p * len(pairs), 1.0)),
+            note=_note_blocks(groups[i], groups[j], found.test.smallest_p, len(pairs)),
         )
         for (i, j), found, p in zip(pairs, compared, adjusted, strict=True)
     ]
@@ -208,10 +211,12 @@ def _note_runs(a: Group, b: Group, smallest: float, family: int) -> str:
     return "; ".join(notes)
 
 
-def _note_blocks(a: Group, b: Group, smallest: float) -> str:
+def _note_blocks(a: Group, b: Group, smallest: float, pairs: int) -> str:
     notes = [ABOUT_BLOCKS, *_note_scatter(a.runs[0].values, b.runs[0].values)]
     if smallest > LEVEL:
         notes.append("cannot be significant: too short for enough independent blocks")
+    elif smallest * pairs > LEVEL:
+        notes.append(f"cannot be significant among {pairs} pairs; compare fewer")
     return "; ".join(notes)
 
 

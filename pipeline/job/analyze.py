@@ -217,7 +217,7 @@ def update_datasets(store: Store) -> None:
     from pipeline.job.material import find_material  # noqa: PLC0415 - heavy
 
     material = find_material(store, ("dataset",), trusted_only=False, tables=("aggregates",))
-    if not store.survey().manifests:
+    if not material.manifests and not material.notes:
         return
     runs = list(material.manifests)
     aggregates = material.scan("aggregates").filter(pl.col("run").is_in(runs)).collect()

@@ -18,17 +18,17 @@ from pipeline.comparison import (
     pool_runs,
 )
 from pipeline.comparison.boxes import spread_windows
-from pipeline.comparison.tables import tabulate_pairs, write_csv, write_latex
+from pipeline.comparison.datasets import OVER_RUNS, THIS_RUN
+from pipeline.comparison.tables import tabulate_pairs
 from pipeline.job.errors import JobError
 from pipeline.job.material import Material, find_material, keep_runs
-from pipeline.job.samples import follow_published_runs, read_moduli
+from pipeline.job.samples import follow_published_runs, read_moduli, read_norms
+from pipeline.statistics import bound_typical
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-    from pathlib import Path
 
     from pipeline.comparison import Pair, Samples
-    from pipeline.job.options import FigureFormat
     from pipeline.statistics import Interval
     from pipeline.store import Store
 
@@ -69,6 +69,7 @@ class Answer:
         runs: one row a run and input with all its numbers.
         input: what u is in the comparisons.
         quantity: what was compared.
+        intervals: ``dataset``, ``value``, ``low``, ``high``, ``interval`` of what was compared.
         windows: box plot numbers of the window norms, as of `spread_windows`.
         notes: what must be known: runs left out, pairs that cannot be told apart.
     """
@@ -78,6 +79,7 @@ class Answer:
     runs: pl.DataFrame
     input: str
     quantity: str
+    intervals: pl.DataFrame
     windows: pl.DataFrame
     notes: tuple[str, ...]
 
@@ -101,10 +103,11 @@ def compare_results(store: Store, question: Question) -> Answer:
         )
     chosen = question.input or _choose_input(runs)
     runs = add_measures(runs, measure_difficulty(_scan_slip(material), _describe_vehicles(material, runs)))
-    samples = read_moduli(material, chosen)
     quantity = "median_modulus"
     if question.as_published:
         chosen, quantity = "command", "published_norm"
+    moduli = samples = read_moduli(material, chosen)
+    if question.as_published:
         samples, runs, told = follow_published_runs(material, runs)
         notes += told
     missing = sorted(set(material.manifests) - set(samples))
@@ -112,73 +115,21 @@ def compare_results(store: Store, question: Question) -> Answer:
         notes.append(f"{', '.join(missing)} not compared: no {quantity.replace('_', ' ')} on {chosen}")
     groups = _group(material, samples)
     pairs = compare_groups(groups)
-    datasets = pool_runs(runs, question.by, within=_bound_single(groups, samples, chosen, quantity))
+    single = _find_single(material)
+    datasets = pool_runs(
+        runs,
+        question.by,
+        within=_bound_single(moduli, single, chosen),
+        norms_within=_bound_single(read_norms(material, chosen), single, chosen),
+    )
     comparisons = tabulate_pairs(
         pairs, by=question.by, input_name=chosen, quantity=quantity, keys=_keys(material)
     )
     windows = _tabulate_windows(samples, chosen) if question.as_published else material.scan("windows")
     boxes = spread_windows(windows, material.labels.select("run", "group"))
     all_notes = (*material.notes, *notes, *_sum_up(pairs, groups))
-    return Answer(datasets, comparisons, runs, chosen, quantity, boxes, all_notes)
-
-
-def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = None) -> dict[str, Path]:
-    """Write `datasets.parquet`, `comparisons.parquet`, CSV and LaTeX tables and `comparison.html`.
-
-    Args:
-        store: the results.
-        answer: as of `compare_results`.
-        figures: also write the two figures to `figures/` in this format.
-
-    Returns:
-        The files by name.
-    """
-    from pipeline.report.comparison import list_pictures, render_comparison  # noqa: PLC0415 - heavy
-
-    store.write_results_table("datasets", answer.datasets)
-    store.write_results_table("comparisons", answer.comparisons)
-    written = {}
-    for name, frame in (("datasets", answer.datasets), ("comparisons", answer.comparisons)):
-        written[f"{name}.csv"] = store.write_results_text(f"{name}.csv", write_csv(frame))
-        shown = frame.filter(pl.col("input") == answer.input)
-        written[f"{name}.tex"] = store.write_results_text(f"{name}.tex", write_latex(name, shown))
-    page = render_comparison(
-        datasets=answer.datasets,
-        comparisons=answer.comparisons,
-        runs=answer.runs,
-        input_name=answer.input,
-        quantity=answer.quantity,
-        notes=answer.notes,
-        windows=answer.windows,
-    )
-    written["comparison.html"] = store.write_results_text("comparison.html", page)
-    if figures:
-        from pipeline.report.gallery import write_pictures  # noqa: PLC0415 - heavy
-
-        pictures = list_pictures(
-            answer.datasets.filter(pl.col("input") == answer.input),
-            answer.runs,
-            answer.windows,
-            input_name=answer.input,
-            quantity=answer.quantity,
-        )
-        written |= {path.name: path for path in write_pictures(pictures, store.root / "figures", figures)}
-    return written
-
-
-def describe_answer(answer: Answer) -> dict[str, object]:
-    """The JSON object of `slip compare`."""
-    return {
-        "input": answer.input,
-        "quantity": answer.quantity,
-        "datasets": _list_rows(answer.datasets.filter(pl.col("input") == answer.input)),
-        "pairs": _list_rows(answer.comparisons.drop("run", "dataset", "vehicle", "terrain")),
-        "notes": list(answer.notes),
-    }
-
-
-def _list_rows(frame: pl.DataFrame) -> list[dict[str, object]]:
-    return frame.with_columns(pl.col(pl.Enum).cast(pl.String)).to_dicts()
+    intervals = _list_intervals(groups, datasets, chosen, quantity)
+    return Answer(datasets, comparisons, runs, chosen, quantity, intervals, boxes, all_notes)
 
 
 def _gather(material: Material) -> pl.DataFrame:
@@ -225,14 +176,38 @@ def _group(material: Material, samples: Mapping[str, Samples]) -> list[Group]:
     return [Group(name, tuple(runs)) for name, runs in members.items()]
 
 
+def _find_single(material: Material) -> list[str]:
+    """Runs that are alone in their dataset."""
+    alone = material.labels.filter(pl.len().over("group") == 1)
+    return alone["run"].to_list()
+
+
 def _bound_single(
-    groups: Sequence[Group], samples: Mapping[str, Samples], chosen: str, quantity: str
+    samples: Mapping[str, Samples], single: Sequence[str], chosen: str
 ) -> dict[tuple[str, str], Interval]:
     """Intervals of runs that are alone in their dataset."""
-    if quantity != "median_modulus":
-        return {}
-    alone = {id(group.runs[0]) for group in groups if len(group.runs) == 1}
-    return {(run, chosen): bound_run(own) for run, own in samples.items() if id(own) in alone}
+    return {(run, chosen): bound_run(samples[run]) for run in single if run in samples}
+
+
+def _list_intervals(
+    groups: Sequence[Group], datasets: pl.DataFrame, chosen: str, quantity: str
+) -> pl.DataFrame:
+    """Value and interval of what was compared, one row a dataset."""
+    own = datasets.filter(pl.col("input") == chosen)
+    if quantity == "median_modulus":
+        return own.select("dataset", pl.col(quantity).alias("value"), "low", "high", "interval")
+    rows = []
+    for group in groups:
+        several = len(group.runs) > 1
+        found = bound_typical(group.medians) if several else bound_run(group.runs[0])
+        says = OVER_RUNS if several else THIS_RUN
+        rows.append((group.name, float(np.median(group.medians)), found.low, found.high, says))
+    kinds = {
+        "dataset": pl.String,
+        **dict.fromkeys(("value", "low", "high"), pl.Float64),
+        "interval": pl.String,
+    }
+    return pl.DataFrame(rows, schema=kinds, orient="row")
 
 
 def _keys(material: Material) -> dict[str, str]:

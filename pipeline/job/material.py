@@ -72,7 +72,7 @@ def find_material(
         ComparisonError: ``by`` names no column.
     """
     survey = store.survey()
-    notes = [f"left out: {error}" for error in survey.errors]
+    notes = [f"left out, damaged: {error}" for error in survey.errors]
     kept: dict[str, Manifest] = {}
     holders: dict[str, str] = {}
     for manifest in survey.manifests:
@@ -81,7 +81,7 @@ def find_material(
         if digest in holders:
             reason = f"the same recording as {holders[digest]}"
         if reason:
-            notes.append(f"{manifest.run} is left out: {reason}")
+            notes.append(f"left out, {reason}: {manifest.run}")
             continue
         holders[digest] = manifest.run
         kept[manifest.run] = manifest
@@ -106,7 +106,7 @@ def _leave_out(material: Material, which: pl.Expr, reason: str) -> Material:
     if not gone:
         return material
     kept = {run: manifest for run, manifest in material.manifests.items() if run not in set(gone)}
-    note = f"{', '.join(gone)} left out: {reason}"
+    note = f"left out, {reason}: {', '.join(gone)}"
     return Material(material.labels.filter(~which), kept, material.store, (*material.notes, note))
 
 

@@ -38,6 +38,28 @@ def read_moduli(material: Material, input_name: str) -> dict[str, Samples]:
     return {str(run): _take_samples(part) for (run,), part in parts.items() if part.height >= _FEWEST}
 
 
+def read_norms(material: Material, input_name: str) -> dict[str, Samples]:
+    """2 s window norms of every run on one input, suspect windows left out.
+
+    Args:
+        material: the runs.
+        input_name: `command` or `measured`.
+    """
+    frame = (
+        material.scan("windows")
+        .filter(
+            pl.col("input") == input_name,
+            ~pl.col("suspect"),
+            pl.col("window_norm").is_finite(),
+            pl.col("run").is_in(list(material.manifests)),
+        )
+        .select("run", "t_start", "segment", "step", "window_norm")
+        .collect()
+    )
+    parts = frame.partition_by("run", as_dict=True, maintain_order=True)
+    return {str(run): _take_windows(part) for (run,), part in parts.items() if part.height >= _FEWEST}
+
+
 def follow_published_runs(
     material: Material, runs: pl.DataFrame
 ) -> tuple[dict[str, Samples], pl.DataFrame, list[str]]:

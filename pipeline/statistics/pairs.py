@@ -12,7 +12,7 @@ from pipeline.statistics.arrays import Floats, Integers, check_values
 from pipeline.statistics.correlation import TIMES_PER_BLOCK, integrated_time, number_blocks
 from pipeline.statistics.effect_sizes import cliffs_delta, shift_between
 from pipeline.statistics.intervals import Interval, bound_shift
-from pipeline.statistics.permutation import PermutationTest, permute_means, permute_studentized
+from pipeline.statistics.permutation import DRAWS, PermutationTest, permute_means, permute_studentized
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -79,16 +79,17 @@ def compare_runs(a: ArrayLike, b: ArrayLike, *, level: float = 0.95) -> Comparis
     )
 
 
-def compare_blocks(a: ArrayLike, b: ArrayLike, *, level: float = 0.95) -> Comparison:
+def compare_blocks(a: ArrayLike, b: ArrayLike, *, level: float = 0.95, draws: int = DRAWS) -> Comparison:
     """Compare one run with one other by the medians of their blocks: this run against that, not the terrain.
 
-    The test permutes blocks with Welch's t of the medians themselves, so that it and the interval of the shift
-    speak of the same difference.
+    The test permutes blocks with Welch's t of the medians themselves, so that it and the interval of the
+    shift speak of the same difference.
 
     Args:
         a: one median a block, shape (n,).
         b: the same of the other run, shape (m,).
         level: of the interval.
+        draws: how many random labellings, where not all are counted.
 
     Raises:
         StatisticsError: a side is empty or holds a value that is not finite.
@@ -99,7 +100,7 @@ def compare_blocks(a: ArrayLike, b: ArrayLike, *, level: float = 0.95) -> Compar
         shift=shift_between(first, second),
         interval=None if few else bound_shift(first, second, level=level),
         delta=cliffs_delta(first, second),
-        test=permute_means(first, second) if few else permute_studentized(first, second),
+        test=permute_means(first, second) if few else permute_studentized(first, second, draws=draws),
     )
 
 

@@ -158,8 +158,11 @@ def _aggregate(slip: pl.DataFrame, run: Run) -> pl.DataFrame:
                     "length_scale": run.length,
                 }
             )  # fmt: skip
-    frame = pl.DataFrame(rows)
-    return frame.with_columns(pl.col("input").cast(_INPUTS), pl.col("subset").cast(_SUBSETS))
+    return pl.DataFrame(rows).with_columns(
+        pl.col("input").cast(_INPUTS),
+        pl.col("subset").cast(_SUBSETS),
+        pl.col("largest_kinetic_energy").cast(pl.Float64),
+    )
 
 
 def _list_findings(run: Run) -> pl.DataFrame:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
 from pipeline.cli.app import main
-from pipeline.comparison import ComparisonError
-from pipeline.job.compare import Answer, Question, compare_results, describe_answer, write_answer
+from pipeline.comparison import ComparisonError, Group, Samples, compare_groups
+from pipeline.job.compare import Answer, Question, compare_results
+from pipeline.job.compare_files import describe_answer, write_answer
 from pipeline.job.errors import JobError
 from pipeline.store import Store
 from schemas.contract import list_contracts
@@ -100,10 +102,10 @@ def test_grave_findings_copies_and_other_scales_are_left_out_and_said(store: Sto
     write_run(store, Run(name="somewhere", terrain="unknown", dataset="warthog_unknown"))
     answer = ask(store)
     told = "\n".join(answer.notes)
-    assert "air left out: finding not_moving" in told
+    assert "left out, finding not_moving: air" in told
     assert "same recording" in told
-    assert "scaled left out: its length scale" in told
-    assert "somewhere left out" in told
+    assert "left out, its length scale" in told
+    assert "not pooled: somewhere" in told
     command = answer.datasets.filter(pl.col("input") == "command")
     assert command["runs"].to_list() == [4, 4]
 
@@ -196,3 +198,22 @@ def test_the_same_question_gets_the_same_bytes(store: Store) -> None:
     first = {name: path.read_bytes() for name, path in write_answer(store, ask(store)).items()}
     second = {name: path.read_bytes() for name, path in write_answer(store, ask(store)).items()}
     assert first == second
+
+
+def test_more_groups_than_closed_testing_takes_are_corrected_after_holm(store: Store) -> None:
+    fill(store, {f"terrain{i}": 1.0 for i in range(9)}, runs=2)
+    (row, *_) = ask(store).comparisons.iter_rows(named=True)
+    assert "Holm over 36 pairs" in row["method"]
+    assert row["note"] == "cannot be significant with 2 runs a side; 7 a side would do"
+
+
+def test_many_single_runs_say_that_they_are_too_many() -> None:
+    rng = np.random.default_rng(1)
+    ticks = np.arange(1200)
+    groups = [
+        Group(f"r{i}", (Samples(rng.uniform(0.5, 1.5, 1200), ticks, np.zeros_like(ticks), 40.0),))
+        for i in range(21)
+    ]
+    pairs = compare_groups(groups)
+    assert len(pairs) == 210
+    assert all("cannot be significant among 210 pairs" in pair.note for pair in pairs)

@@ -50,17 +50,17 @@ def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: 
 
     Args:
         runs: ``group``, ``run`` and the column ``value``, one row a run.
-        datasets: table `datasets` of one input, with ``low``, ``high``, ``interval``.
+        datasets: ``dataset``, ``value``, ``low``, ``high``, ``interval``.
         value: column with the medians.
         title: of the axis, with its unit.
     """
-    order = datasets.sort(value)["dataset"].to_list()
+    order = datasets.sort("value")["dataset"].to_list()
     points = runs.filter(pl.col(value).is_not_null()).select("group", "run", pl.col(value).alias("value"))
     highest = points["value"].max()
     end = 1.6 * float(highest) if isinstance(highest, float) else 1.0
     spans = datasets.select(
         pl.col("dataset").alias("group"),
-        pl.col(value).alias("value"),
+        "value",
         pl.col("low").clip(0.0, end),
         pl.col("high").clip(0.0, end),
         pl.when(pl.col("interval") == "over runs")

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 _LEVEL = 0.05
+_ABOUT_PAIRS = (
+    "Whole runs are permuted where a side has several, blocks where each side is one run; p corrected over "
+    "all pairs of the same unit"
+)
 _SHOWN = (
     "transitory_median_modulus", "steady_median_modulus", "median_window_norm", "published_norm",
     "drivetrain_mean_square", "ground_mean_square", "cross_mean_square", "height_rate",
@@ -28,6 +32,7 @@ def render_comparison(
     datasets: pl.DataFrame,
     comparisons: pl.DataFrame,
     runs: pl.DataFrame,
+    intervals: pl.DataFrame,
     windows: pl.DataFrame,
     input_name: str,
     quantity: str,
@@ -39,13 +44,14 @@ def render_comparison(
         datasets: table `datasets`.
         comparisons: table `comparisons`.
         runs: one row a run and input.
+        intervals: ``dataset``, ``value``, ``low``, ``high``, ``interval`` of what was compared.
         windows: as of `spread_windows`.
         input_name: what u was in the comparisons.
         quantity: what was compared, a column of `datasets`.
         notes: what must be known.
     """
     shown = datasets.filter(pl.col("input") == input_name)
-    pictures = list_pictures(shown, runs, windows, input_name=input_name, quantity=quantity)
+    pictures = list_pictures(runs, intervals, windows, input_name=input_name, quantity=quantity)
     told = "".join(f"<li>{escape(begin_large(note))}.</li>" for note in notes)
     keys = "".join(
         f"<li><b>{escape(row['dataset'])}</b> {escape(row['keys'])}</li>"
@@ -74,40 +80,37 @@ def render_comparison(
 
 
 def list_pictures(
-    shown: pl.DataFrame, runs: pl.DataFrame, windows: pl.DataFrame, *, input_name: str, quantity: str
+    runs: pl.DataFrame, intervals: pl.DataFrame, windows: pl.DataFrame, *, input_name: str, quantity: str
 ) -> list[Picture]:
     """The published figure and the honest one.
 
     Args:
-        shown: table `datasets` of one input.
         runs: one row a run and input.
+        intervals: ``dataset``, ``value``, ``low``, ``high``, ``interval`` of what was compared.
         windows: as of `spread_windows`.
         input_name: what u was.
         quantity: column of the run medians.
     """
     boxes = windows.filter(pl.col("input") == input_name)
     own = runs.filter(pl.col("input") == input_name)
+    published = quantity == "published_norm"
     pictures = []
     if not boxes.is_empty():
-        told = ", ".join(f"{row['group']} {row['median']:.3g}" for row in boxes.iter_rows(named=True))
-        words = "of the published chain" if quantity == "published_norm" else INPUT_WORDS[input_name]
+        words = "of the published chain" if published else INPUT_WORDS[input_name]
         drawing = draw_boxes(boxes, input_name, title=f"2 s window norm {words} [m/s]")
+        told = ", ".join(f"{row['group']} {row['median']:.3g}" for row in boxes.iter_rows(named=True))
         pictures.append(
             Picture("window_norms_by_dataset", "The published figure", drawing, f"Medians in m/s: {told}.")
         )
-    rated = shown.filter(pl.col(quantity).is_not_null())
+    rated = intervals.filter(pl.col("value").is_not_null()).sort("value")
     if not rated.is_empty():
-        if quantity == "published_norm":
-            title = "window norm of the published chain [m/s]"
-            rated = rated.with_columns(
-                pl.lit(None, pl.Float64).alias("low"), pl.lit(None, pl.Float64).alias("high")
-            )
-        else:
-            title = f"median slip modulus {INPUT_WORDS[input_name]} [m/s]"
-        told = ", ".join(
-            f"{row['dataset']} {row[quantity]:.3g}" for row in rated.sort(quantity).iter_rows(named=True)
+        title = (
+            "window norm of the published chain [m/s]"
+            if published
+            else f"median slip modulus {INPUT_WORDS[input_name]} [m/s]"
         )
         drawing = draw_runs(own, rated, value=quantity, title=title)
+        told = ", ".join(f"{row['dataset']} {row['value']:.3g}" for row in rated.iter_rows(named=True))
         pictures.append(Picture("run_medians_by_dataset", "The honest figure", drawing, f"In m/s: {told}."))
     return pictures
 
@@ -139,8 +142,8 @@ def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> str:
             escape(row["dataset"]),
             str(row["runs"]),
             f"{row['samples']:,}",
-            say_distance(row["distance"]),
-            say_duration(row["duration"]),
+            say_distance(row["distance"]).replace(" ", "\u00a0"),
+            say_duration(row["duration"]).replace(" ", "\u00a0"),
             say_number(row["median_modulus"]),
             _say_ends(row) + (" <small>this run</small>" if row["interval"] == "this run only" else ""),
             *(say_number(row[name]) for name in _SHOWN),
@@ -168,13 +171,12 @@ def _tabulate_pairs(comparisons: pl.DataFrame) -> str:
             _say_p(row["p"]),
             _say_p(row["smallest_p"]),
             _say_pair(row),
-            "whole runs" if row["unit_of_analysis"] == "runs" else "blocks: run against run",
+            "runs" if row["unit_of_analysis"] == "runs" else "run\u00a0against\u00a0run",
             f"<small>{_say_p(row['p_uncorrected'])}</small>",
         ]
         for row in comparisons.sort("p_adjusted", "p").iter_rows(named=True)
     ]
-    methods = "; ".join(sorted(set(comparisons["method"].to_list())))[:400]
-    return build_table(head, rows, caption=f"Pairs: {methods}", numeric=(1, 2, 4, 5, 6, 9))
+    return build_table(head, rows, caption=_ABOUT_PAIRS, numeric=(1, 2, 4, 5, 6, 9))
 
 
 def _say_pair(row: Mapping[str, object]) -> str:
@@ -197,4 +199,4 @@ def _say_ends(row: Mapping[str, object]) -> str:
     low, high = row["low"], row["high"]
     if not isinstance(low, float) or not isinstance(high, float):
         return "\u2013"
-    return f"{say_number(low)} to {say_number(high)}"
+    return f"{say_number(low)}\u00a0to\u00a0{say_number(high)}"

@@ -62,7 +62,7 @@ def render_map(
             "missing",
             "Not on the map",
             lead="<p>Mass, speed or terrain could not be found; these rows wait for somebody who knows.</p>",
-            rest=f"<ul>{''.join(f'<li>{_cite(row)}</li>' for row in left.iter_rows(named=True))}</ul>",
+            rest=f"<ul>{''.join(_list_row(row) for row in left.iter_rows(named=True))}</ul>",
         ),
         Chapter("provenance", "Runs counted", rest=f"<ul>{runs}</ul>" if runs else "<p>None.</p>"),
     ]
@@ -100,13 +100,13 @@ def _tabulate_own(own: pl.DataFrame) -> str:
 def _tabulate_literature(deployments: pl.DataFrame, points: pl.DataFrame) -> str:
     head = [
         "deployment", "mass <small>kg</small>", "known", "speed <small>m/s</small>", "known",
-        "kinetic energy <small>J</small>", "complexity", "risk", "remarks",
+        "kinetic energy <small>J</small>", "complexity", "risk", "publication", "remarks",
     ]  # fmt: skip
     joined = points.select("key", "complexity", "zone").join(deployments, on="key").sort("year", "key")
     signs = {"upper": "\u2264\u202f", "lower": "\u2265\u202f", "uncertain": "~\u202f"}
     rows = [
         [
-            _cite(row),
+            escape(row["key"]),
             say_number(row["mass_kg"]),
             escape(row["mass_status"]),
             say_number(row["speed_mps"]),
@@ -114,6 +114,7 @@ def _tabulate_literature(deployments: pl.DataFrame, points: pl.DataFrame) -> str
             signs.get(row["kinetic_energy_bound"], "") + say_number(row["kinetic_energy_j"]),
             say_number(row["complexity"], digits=2),
             row["zone"],
+            f"<small>{_cite(row)}</small>",
             escape(row["remarks"] or ""),
         ]
         for row in joined.iter_rows(named=True)
@@ -123,6 +124,9 @@ def _tabulate_literature(deployments: pl.DataFrame, points: pl.DataFrame) -> str
     )
 
 
+def _list_row(row: Mapping[str, object]) -> str:
+    return f"<li>{escape(row['key'])} <small>{_cite(row)}</small></li>"
+
+
 def _cite(row: Mapping[str, object]) -> str:
-    about = ", ".join(escape(row[name]) for name in ("title", "venue") if row[name])
-    return f"{escape(row['key'])} <small>{about}</small>"
+    return ", ".join(escape(row[name]) for name in ("title", "venue") if row[name])

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
     from pipeline.comparison.trend import Alert, Series
 
-_FEWEST_POINTS = 2
+_FEWEST_POINTS = 3
+_LATER = ("finding ", "suspect share", "warnings")
 
 
 def render_trend(
@@ -29,7 +30,7 @@ def render_trend(
     """The whole page as HTML.
 
     Args:
-        series: as of `follow_quantities`; those with one run only are left out.
+        series: as of `follow_quantities`; those with fewer than three runs are left out.
         alerts: as of `raise_alerts`.
         notes: what must be known.
         keys: run/generation of every run.
@@ -45,6 +46,7 @@ def render_trend(
     groups = list(dict.fromkeys(one.group for one in series))
     for number, group in enumerate(groups):
         own = [one for one in series if one.group == group and one.points.height >= _FEWEST_POINTS]
+        own.sort(key=lambda one: (not one.steps, one.quantity.startswith(_LATER), one.quantity))
         pictures = [_picture(one, f"trend_{number}_{place}") for place, one in enumerate(own)]
         if pictures:
             chapters.append(Chapter(f"group-{number}", group, pictures=pictures))
@@ -65,7 +67,12 @@ def _draw_series(series: Series, name: str) -> Drawing:
     points = series.points.with_row_index("order").with_columns(pl.col("order").cast(pl.Float64))
     levels = _tabulate_levels(series)
     axis = alt.Axis(title=None, format=",~r", tickCount=4, minExtent=44)
-    along = alt.X("order:Q", axis=alt.Axis(title="runs in the order of their dates", format="d", grid=False))
+    about = f"runs in the order of their dates, {points['day'][0]} to {points['day'][-1]}"
+    along = alt.X(
+        "order:Q",
+        axis=alt.Axis(title=about, labels=False, grid=False),
+        scale=alt.Scale(domain=[-0.5, points.height - 0.5], nice=False, zero=False),
+    )
     dots = (
         alt.Chart(alt.NamedData(f"{name}_points"))
         .mark_point(size=46, filled=True, color=theme.SLIP, opacity=0.9)
