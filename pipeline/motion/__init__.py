@@ -89,6 +89,7 @@ __all__ = [
     "load_run",
     "predict",
     "predict_ackermann",
+    "predict_at",
     "predict_differential",
     "predict_from",
     "read_model",

@@ -32,6 +32,8 @@ def errors_as_json(errors: Errors) -> dict[str, object]:
         "r_mrmse_rad": _round(errors.r_mrmse_rad),
         "published_t_mean_m": _round(errors.t_mean_m),
         "published_r_mean_rad": _round(errors.r_mean_rad),
+        "t_median_m": _round(errors.t_median_m),
+        "r_median_rad": _round(errors.r_median_rad),
         "windows": errors.windows,
     }
 

@@ -122,3 +122,33 @@ def predict_from(
         poses=poses,
         horizon_times=since,
     )
+
+
+def predict_at(
+    model: Model, run: MotionRun, source: Input, at: Floats, *, timing: Timing | None = None
+) -> Floats:
+    """Body velocities of a model at given times, to set measured ones against: slip relative to the model.
+
+    Args:
+        model: with its values.
+        run: whose commands or wheels are followed.
+        source: what the model is fed with.
+        at: stamps of poses [s], shape (n,).
+        timing: delays of the recording; by default those that the gyro shows.
+
+    Returns:
+        (v_x [m/s], v_y [m/s], v_w [rad/s]) as the localization would report them, NaN in holes of the
+        recording, shape (n, 3).
+
+    Raises:
+        MotionError: the run lacks the input.
+    """
+    comparison = Comparison(run, model.vehicle, source)
+    timing = timing or Timing(comparison.usual_delay)
+    velocity = comparison.predict_velocity(model.effects, timing)
+    cells = comparison.cells
+    moment = at - timing.pose_delay_s
+    columns = [np.interp(moment, cells.times, values) for values in (velocity.x, velocity.y, velocity.w)]
+    found = np.column_stack(columns)
+    found[cells.find_span(moment) < 0] = np.nan
+    return found

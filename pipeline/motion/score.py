@@ -38,6 +38,7 @@ class Errors:
         t_mrmse_m: root mean square position error over windows and steps of a 2 s horizon [m].
         r_mrmse_rad: the same of the wrapped yaw [rad].
         t_mean_m, r_mean_rad: the published variant: mean of the per-step error norms.
+        t_median_m, r_median_rad: median of the same: what most predictions are like.
         windows: how many windows were scored.
     """
 
@@ -47,6 +48,8 @@ class Errors:
     r_mrmse_rad: float
     t_mean_m: float
     r_mean_rad: float
+    t_median_m: float
+    r_median_rad: float
     windows: int
 
     def ratios(self, other: Errors) -> tuple[float, float, float, float, float]:
@@ -209,14 +212,17 @@ def measure_errors(residuals: Floats, position: Floats, yaw: Floats) -> Errors:
     position, yaw = position[np.isfinite(position)], yaw[np.isfinite(yaw)]
     rms = np.sqrt(np.mean(residuals**2, axis=0))
     spread = 1.4826 * np.median(np.abs(residuals), axis=0)
-    empty = position.size == 0
+    none = np.full(1, np.nan)
+    position, yaw = (position, yaw) if position.size else (none, none)
     return Errors(
         velocity_rms=_triple(rms),
         velocity_spread=_triple(spread),
-        t_mrmse_m=float("nan") if empty else float(np.sqrt(np.mean(position**2))),
-        r_mrmse_rad=float("nan") if empty else float(np.sqrt(np.mean(yaw**2))),
-        t_mean_m=float("nan") if empty else float(position.mean()),
-        r_mean_rad=float("nan") if empty else float(yaw.mean()),
+        t_mrmse_m=float(np.sqrt(np.mean(position**2))),
+        r_mrmse_rad=float(np.sqrt(np.mean(yaw**2))),
+        t_mean_m=float(position.mean()),
+        r_mean_rad=float(yaw.mean()),
+        t_median_m=float(np.median(position)),
+        r_median_rad=float(np.median(yaw)),
         windows=int(residuals.shape[0]),
     )
 

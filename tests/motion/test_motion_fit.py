@@ -20,6 +20,7 @@ from pipeline.motion import (
     fit_model,
     hold_out,
     predict,
+    predict_at,
     score,
 )
 from pipeline.motion.score import GAP_S, assign_folds, list_training
@@ -196,6 +197,21 @@ def test_predictions_begin_at_measured_poses_and_follow_the_true_motion() -> Non
     ideal = predict(model.ideal, run, Input.COMMAND, timing=Timing())
     turned = np.abs(ideal.poses[:, -1, 2] - made.poses[:, -1, 2])
     assert turned.max() > 0.3
+
+
+def test_slip_against_the_true_model_is_noise_where_slip_against_the_ideal_is_not() -> None:
+    run = simulate({"effective_track": 1.8, "drive_lag": 0.3}, duration_s=60.0, disturbance=Disturbance())
+    true = Model(HUSKY, (find_effect("effective_track")(k=1.8), find_effect("drive_lag")(tau=0.3)))
+    at = 0.5 * (run.track.times[2:] + run.track.times[:-2])
+    turned = (run.track.heading[2:] - run.track.heading[:-2]) / (run.track.times[2:] - run.track.times[:-2])
+    slips = [
+        np.nanstd(predict_at(model, run, Input.COMMAND, at, timing=Timing())[:, 2] - turned)
+        for model in (true, true.ideal)
+    ]
+    assert slips[0] < 0.03
+    assert slips[1] > 0.1
+    outside = predict_at(true, run, Input.COMMAND, np.array([-5.0, 1e6]), timing=Timing())
+    assert np.isnan(outside).all()
 
 
 @pytest.mark.long
