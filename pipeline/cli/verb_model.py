@@ -292,6 +292,7 @@ def _as_json(
         ladder_as_json,
         parameters_as_json,
     )
+    from pipeline.motion.score import measure_by_terrain  # noqa: PLC0415
 
     problem, fitted = new_one.problem, new_one.fitted
     return {
@@ -304,6 +305,10 @@ def _as_json(
         "by_run": {
             name: errors_as_json(errors)
             for name, errors in zip(problem.names, new_one.whole.held_out.by_run, strict=True)
+        },
+        "by_terrain": {
+            terrain: errors_as_json(errors)
+            for terrain, errors in measure_by_terrain(problem, new_one.whole.held_out).items()
         },
         "noise_floor": errors_as_json(new_one.floor),
         "parameters": parameters_as_json(fitted.model, new_one.estimates),

@@ -36,7 +36,7 @@ from pipeline.motion.ladder import Ladder, Rung, climb
 from pipeline.motion.model import Model
 from pipeline.motion.model_file import ModelFile, read_model
 from pipeline.motion.model_text import write_model
-from pipeline.motion.predict import Prediction, predict, predict_from
+from pipeline.motion.predict import Prediction, predict, predict_at, predict_from
 from pipeline.motion.problem import Free, Problem, State
 from pipeline.motion.recording import MotionRun, load_run
 from pipeline.motion.score import Errors, HeldOut, hold_out, score

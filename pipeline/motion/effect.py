@@ -175,6 +175,14 @@ class Effect(ABC):
         """
         return self._copy(self.values, self.fixed | {self.parameter(name).name for name in names})
 
+    def loosen(self, *names: str) -> Self:
+        """The same effect with parameters that a fit may change again.
+
+        Raises:
+            MotionError: ``unknown_parameter``.
+        """
+        return self._copy(self.values, self.fixed - {self.parameter(name).name for name in names})
+
     def _copy(self, values: Mapping[str, float], fixed: Iterable[str]) -> Self:
         return type(self)(fixed=fixed, **values)
 

@@ -207,6 +207,19 @@ def summarize(
     )
 
 
+def measure_by_terrain(problem: Problem, held_out: HeldOut) -> dict[str, Errors]:
+    """Errors of the runs of each terrain together: of each dataset, a model having one vehicle."""
+    found = {}
+    terrains = [comparison.run.terrain for comparison in problem.comparisons]
+    for terrain in dict.fromkeys(terrains):
+        runs = [run for run, name in enumerate(terrains) if name == terrain]
+        rows = np.isin(problem.run_of, runs) & np.isfinite(held_out.residuals).all(axis=1)
+        position = np.concatenate([held_out.position[run] for run in runs])
+        yaw = np.concatenate([held_out.yaw[run] for run in runs])
+        found[terrain] = measure_errors(held_out.residuals[rows], position, yaw)
+    return found
+
+
 def measure_errors(residuals: Floats, position: Floats, yaw: Floats) -> Errors:
     """Errors of residuals (n, 3) and of prediction errors (m,); NaN where nothing was predicted."""
     position, yaw = position[np.isfinite(position)], yaw[np.isfinite(yaw)]

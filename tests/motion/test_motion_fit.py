@@ -23,7 +23,7 @@ from pipeline.motion import (
     predict_at,
     score,
 )
-from pipeline.motion.score import GAP_S, assign_folds, list_training
+from pipeline.motion.score import GAP_S, assign_folds, list_training, measure_by_terrain
 from pipeline.simulate import Disturbance, Imu, PoseSensor
 
 HUSKY = vehicle_of("husky_a200")
@@ -82,6 +82,8 @@ def test_runs_share_a_parameter_or_have_their_own() -> None:
     held_out = hold_out(problem, fitted)
     assert len(held_out.by_run) == 2
     assert held_out.pooled.windows == sum(errors.windows for errors in held_out.by_run)
+    by_terrain = measure_by_terrain(problem, held_out)
+    assert by_terrain == {"simulated": held_out.pooled}
 
 
 def test_nothing_crosses_a_jump_of_the_pose() -> None:
