@@ -68,6 +68,7 @@ class _Run:
         self._ledger = ledger
         self._tell = tell
         self._queue: deque[Item] = deque()
+        self._suspects: deque[Item] = deque()
         self._flying: dict[Future[Report], Item] = {}
         self._kills: dict[str, int] = {}
         self._reports: list[Report] = []
@@ -76,23 +77,28 @@ class _Run:
 
     def work_through(self, items: Sequence[Item]) -> Result:
         self._queue.extend(items)
-        while self._flying or (self._queue and not self._is_stopped):
+        while self._flying or ((self._queue or self._suspects) and not self._is_stopped):
             self._fill()
             landed, _ = wait(self._flying, timeout=_LOOK_PERIOD_S, return_when=FIRST_COMPLETED)
             for future in landed:
                 self._land(future, self._flying.pop(future))
-        return Result(reports=tuple(self._reports), left=tuple(self._queue))
+        return Result(reports=tuple(self._reports), left=(*self._queue, *self._suspects))
 
     def _fill(self) -> None:
-        """Give the workers something to do; two tasks each, so that none waits for us."""
+        """Give the workers something to do."""
         if self._is_stopped:
             return
         if not self._flying and time.monotonic() < self._busy_until:
             # Nothing is left but what another batch is working on.
             time.sleep(_BUSY_PAUSE_S)
-        while self._queue and len(self._flying) < 2 * self._executor.slots:
+        while self._queue and len(self._flying) < self._executor.depth:
             item = self._queue.popleft()
-            self._flying[self._executor.submit(self._make_task(item))] = item
+            self._submit(item)
+        if self._suspects and not self._queue and not self._flying:
+            self._submit(self._suspects.popleft())
+
+    def _submit(self, item: Item) -> None:
+        self._flying[self._executor.submit(self._make_task(item))] = item
 
     def _make_task(self, item: Item) -> Task:
         return Task(
@@ -110,7 +116,7 @@ class _Run:
         except (Exception, CancelledError) as error:  # noqa: BLE001 - whatever a worker can die of
             report = self._judge(item, error)
         if report is None:
-            self._queue.append(item)
+            (self._suspects if self._executor.spreads_blame else self._queue).append(item)
             return
         if report.is_busy:
             self._busy_until = time.monotonic() + _BUSY_PAUSE_S

@@ -7,6 +7,7 @@ import random
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections import Counter
 from contextlib import suppress
@@ -125,7 +126,7 @@ def test_a_batch_killed_with_all_its_workers_at_a_step_goes_on(
         "batch(Path(sys.argv[1]), Path(sys.argv[2]), work=work_killing_the_batch, executor='local')"
     )
     process = subprocess.Popen(
-        ["python", "-c", code, season, tmp_path / "out"],
+        [sys.executable, "-c", code, season, tmp_path / "out"],
         start_new_session=True,
         env=os.environ | {"DIE_AT": step, "PYTHONPATH": os.pathsep.join((str(HERE), str(HERE.parents[1])))},
     )

@@ -58,8 +58,12 @@ class Executor(Protocol):
     """Workers."""
 
     @property
-    def slots(self) -> int:
-        """Tasks that are worked on at once; the runner keeps twice as many here."""
+    def depth(self) -> int:
+        """Tasks that it likes to have at once, waiting ones included."""
+
+    @property
+    def spreads_blame(self) -> bool:
+        """Whether a worker that dies may make innocent tasks look guilty; suspects are then tried alone."""
 
     def submit(self, task: Task) -> Future[Report]:
         """Work on a task some time."""

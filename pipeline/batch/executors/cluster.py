@@ -1,8 +1,8 @@
 """A dask cluster: of this machine (``dask``), or one that is there (``tcp://scheduler:8786``).
 
 The scheduler gives the tasks of a lost worker to another one. A worker ends itself when its log takes too
-long or too much memory, so a log that does so costs its worker; the nanny starts another, and the scheduler
-refuses the log when it has cost as many workers as it allows.
+long or too much memory, so a log that does so costs its worker, and the nanny starts another. The scheduler
+suspects every task that the worker had; suspects are tried again alone, where there is no doubt.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, cast
 from pipeline.batch.errors import BatchError
 from pipeline.batch.executors import Blame, Settings
 from pipeline.batch.executors.local import THREAD_VARIABLES
-from pipeline.batch.ledger import FATAL_KILLS
 from pipeline.batch.work import Report, Task, read_rss, work_safely
 from pipeline.store import Store
 
@@ -70,7 +69,7 @@ def _start_cluster(settings: Settings) -> Client:
         os.environ.setdefault(variable, "1")
     # The guard judges memory; dask's own limit would pause workers before it.
     plain = {
-        "distributed.scheduler.allowed-failures": FATAL_KILLS - 1,
+        "distributed.scheduler.allowed-failures": 0,
         "distributed.worker.memory.pause": False,
         "distributed.worker.memory.spill": False,
         "distributed.worker.memory.target": False,
@@ -102,7 +101,12 @@ class ClusterExecutor:
         )
 
     @property
-    def slots(self) -> int:
+    def spreads_blame(self) -> bool:
+        """Tasks that wait for a worker are blamed for its death, too."""
+        return True
+
+    @property
+    def depth(self) -> int:
         """Threads of all workers, which may come and go."""
         threads: dict[str, int] = self._client.nthreads()
         return max(1, sum(threads.values()))
@@ -120,7 +124,7 @@ class ClusterExecutor:
             death = notes.read(task.log.path) or {}
             notes.remove(task.log.path)
             reason = str(death.get("reason", "its workers died"))
-            return Blame(str(death.get("code", "worker_died")), reason, FATAL_KILLS)
+            return Blame(str(death.get("code", "worker_died")), reason, 1)
         return Blame("bad_result", f"it gave no result: {type(error).__name__}: {error}", 0)
 
     def close(self) -> None:

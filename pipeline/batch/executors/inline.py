@@ -33,9 +33,14 @@ class InlineExecutor:
         self._work = settings.work
 
     @property
-    def slots(self) -> int:
+    def depth(self) -> int:
         """One."""
         return 1
+
+    @property
+    def spreads_blame(self) -> bool:
+        """Nobody is left to blame."""
+        return False
 
     def submit(self, task: Task) -> Future[Report]:
         """Work on a task now."""

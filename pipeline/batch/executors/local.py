@@ -57,9 +57,14 @@ class LocalExecutor:
         self._watchdog.start()
 
     @property
-    def slots(self) -> int:
-        """Processes."""
-        return self._settings.jobs
+    def depth(self) -> int:
+        """Two for each process, so that none waits for us."""
+        return 2 * self._settings.jobs
+
+    @property
+    def spreads_blame(self) -> bool:
+        """A process has one task."""
+        return False
 
     def submit(self, task: Task) -> Future[Report]:
         """Work on a task some time."""
