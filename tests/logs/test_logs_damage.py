@@ -321,7 +321,7 @@ def test_absurd_lengths_are_refused_before_memory_is_asked_for(tmp_path: Path) -
     assert end > start
 
 
-def test_records_of_the_helper_are_the_official_ones(tmp_path: Path) -> None:
+def test_the_records_counted_here_are_the_official_ones(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     write_small(path)
     content = path.read_bytes()
