@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.diagnosis.judge import LEAST_GAIN, Verdict, compare, hold_out, make_folds
-from pipeline.diagnosis.metric import Metric, make_metric, saturate
+from pipeline.diagnosis.metric import Metric, make_metric, measure_spread, saturate
 from pipeline.diagnosis.plausibility import is_nameable
 from pipeline.diagnosis.polish import Fitted, polish
 from pipeline.diagnosis.screen import propose
@@ -29,6 +29,9 @@ EffectClass = type[Effect]
 # A number more must buy something: between models that predict alike the simpler one is named.
 _PRICE_OF_A_NUMBER = 0.004
 _PRICE = {"terrain_change": 0.05}
+_FIRST_STEPS = 4
+_WORTH = 1.15
+_FLOOR = 1.1
 
 
 @dataclass(frozen=True)
@@ -82,10 +85,21 @@ class Arena:
     only_early_clock: bool = False
     least_delay: float = 0.0
     least_share: float = 0.0
+    _dropped: dict[tuple[str, ...], Contender] = field(default_factory=dict)
+    _suggested: dict[tuple[object, ...], list[Contender]] = field(default_factory=dict)
 
     def enter(self, state: State) -> Contender:
         """Fit a state and hold it out."""
-        fitted = polish(self.problem, self.metric, state)
+        return self._present(polish(self.problem, self.metric, state))
+
+    def drop(self, current: Contender, names: Iterable[str]) -> Contender:
+        """A model without some of its effects, fitted anew."""
+        state = current.state.drop(names)
+        if state.ids not in self._dropped:
+            self._dropped[state.ids] = self.enter(state)
+        return self._dropped[state.ids]
+
+    def _present(self, fitted: Fitted) -> Contender:
         held = hold_out(fitted, self.metric, self.folds)
         price = 1.0 + sum(
             _PRICE.get(effect.id, 0.0)
@@ -113,15 +127,33 @@ class Arena:
     def adapt(self, contender: Contender) -> Contender:
         """Take the metric from a model's own residuals, and fit it anew."""
         self.metric = make_metric(contender.fitted.residual, self.noise, self.problem)
+        self._dropped.clear()
+        self._suggested.clear()
         return self.enter(contender.state)
 
     def suggest(self, base: Contender, count: int, without: Iterable[str] = ()) -> list[Contender]:
         """The best few models with one effect more, fitted, by score."""
-        barred = set(without)
+        barred = frozenset(without)
+        key = (base.ids, count, barred)
+        if key in self._suggested:
+            return self._suggested[key]
         candidates = [c for c in self.candidates if c.id not in barred]
         proposals = propose(self.problem, self.metric, base.fitted, candidates, self.largest)[:count]
-        entered = [self.enter(proposal.state) for proposal in proposals]
-        return sorted((c for c in entered if self.is_sound(c)), key=lambda c: c.score)
+        # A few steps tell which of them are worth fitting to the end.
+        tried = [polish(self.problem, self.metric, p.state, _FIRST_STEPS) for p in proposals]
+        best = min((fitted.loss for fitted in tried), default=0.0)
+        entered = [
+            self.enter(fitted.state) if fitted.loss < _WORTH * best else self._present(fitted)
+            for fitted in tried
+        ]
+        ranked = sorted((c for c in entered if self.is_sound(c)), key=lambda c: c.score)
+        self._suggested[key] = ranked
+        return ranked
+
+    def has_room(self, contender: Contender) -> bool:
+        """Whether a model leaves more than a saturated fit does in any channel."""
+        own = measure_spread(contender.fitted.residual, self.problem)[:, self.problem.channels]
+        return bool((own > _FLOOR * self.noise[:, self.problem.channels]).any())
 
     def is_sound(self, contender: Contender) -> bool:
         """Whether every effect is large enough to be named, and no degenerate form of another."""

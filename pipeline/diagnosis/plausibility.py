@@ -70,6 +70,8 @@ _ONE_SIGN: Mapping[str, str] = {
 }
 _SHARE_OF_TURNING = 0.1
 _LEAST_RAMP_S = 0.08
+_APART = 0.08
+_LEAST_APART_S = 0.02
 _LEAST_DEADBAND = 0.02
 _REACHED = 0.99
 
@@ -108,7 +110,9 @@ def is_nameable(effect: Effect, largest: Largest, least_delay: float = 0.0) -> b
         return False
     if effect.id == "turn_lag":
         fast, slow = effect.values["tau_mean"], effect.values["tau_diff"]
-        return max(fast, slow) > max(0.02, least_delay)
+        # With equal time constants it is a drive lag.
+        apart = abs(fast - slow) > max(_APART * max(fast, slow), least_delay, _LEAST_APART_S)
+        return apart and max(fast, slow) > max(_LEAST_APART_S, least_delay)
     return True
 
 

@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 _ITERATIONS = 20
 _ENOUGH = 2e-5
 _GRID_ROUNDS = 4
+_STIFFEST = 30.0
 
 
 @dataclass(frozen=True)
@@ -84,15 +85,19 @@ def _descend(problem: Problem, metric: Metric, state: State, iterations: int) ->
         if not free:
             break
         step, _ = solve_step(jacobian[:, :, free], residual, metric, damping)
+        # What the step promises, were the model linear: where that is nothing, the fit is done.
+        promised = metric.loss(residual - jacobian[:, :, free] @ step)
+        if (loss - promised) / max(loss, 1e-12) < 0.5 * _ENOUGH:
+            break
         trial = state
         for place, change in zip(free, step.tolist(), strict=True):
             trial = trial.write(slots[place], trial.read(slots[place]) + change)
         after = problem.find_residuals(trial)
         reached = metric.loss(after)
         if reached > loss:
-            if damping > 1e3:  # noqa: PLR2004 - no step is small enough
+            if damping > _STIFFEST:
                 break
-            damping *= 8.0
+            damping = max(damping * 20.0, 1e-2)
             continue
         fall = (loss - reached) / max(loss, 1e-12)
         state, residual, loss = trial, after, reached

@@ -93,7 +93,9 @@ def list_trials(
     for values in list_starts(candidate, largest):
         start = candidate(**values)
         direct = tuple(
-            p.name for p in start.parameters if p.search is Search.DIRECT and math.isfinite(p.neutral)
+            p.name
+            for p in start.parameters
+            if p.search is Search.DIRECT and math.isfinite(p.neutral) and p.name not in start.fixed
         )
         state = fitted.state.add(start)
         if not direct:

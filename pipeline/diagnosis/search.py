@@ -68,7 +68,7 @@ def prune(arena: Arena, current: Contender) -> Contender:
         for name in current.ids:
             if name in arena.kept:
                 continue
-            without = arena.enter(current.state.drop([name]))
+            without = arena.drop(current, [name])
             needed = price_of(current, without)
             if not arena.prefers(without, current, needed):
                 smaller.append(without)
@@ -85,7 +85,7 @@ def _swap(arena: Arena, current: Contender) -> Contender | None:
     """One effect for another: better, or as good with fewer in the end."""
     best: Contender | None = None
     for name in _free(arena, current):
-        without = arena.enter(current.state.drop([name]))
+        without = arena.drop(current, [name])
         for rival in arena.suggest(without, _SWAPPED, without=[name]):
             if rival.score < (1.0 - _BETTER) * current.score:
                 if best is None or rival.score < best.score:
@@ -101,7 +101,7 @@ def _swap(arena: Arena, current: Contender) -> Contender | None:
 def _join(arena: Arena, current: Contender) -> Contender | None:
     """One effect in the place of two."""
     for pair in combinations(_free(arena, current), 2):
-        without = arena.enter(current.state.drop(pair))
+        without = arena.drop(current, pair)
         for rival in arena.suggest(without, _SWAPPED, without=pair):
             if rival.score < (1.0 + LEAST_GAIN) * current.score:
                 return rival
@@ -109,9 +109,11 @@ def _join(arena: Arena, current: Contender) -> Contender | None:
 
 
 def _split(arena: Arena, current: Contender) -> Contender | None:
-    """Two effects in the place of one."""
+    """Two effects in the place of one, where the model leaves room for them."""
+    if not arena.has_room(current):
+        return None
     for name in _free(arena, current):
-        without = arena.enter(current.state.drop([name]))
+        without = arena.drop(current, [name])
         for half in arena.suggest(without, 2, without=[name]):
             for rival in arena.suggest(half, 2, without=[name]):
                 if rival.score < current.score and arena.prefers(current, rival):

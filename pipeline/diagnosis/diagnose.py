@@ -1,0 +1,151 @@
+"""The whole diagnosis: clocks, excitation, search, what is left, and the ladder of what was named."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.diagnosis import conclude
+from pipeline.diagnosis.diagnosis import Diagnosis, RunDiagnosis
+from pipeline.diagnosis.errors import DiagnosisError
+from pipeline.diagnosis.excitation import find_unobservable
+from pipeline.diagnosis.ground import prepare
+from pipeline.diagnosis.naming import Search, search_body, search_wheels
+from pipeline.diagnosis.naming_rules import Clocks, read_clocks
+from pipeline.diagnosis.subject import FATAL, correct_vehicle, load_recording
+from pipeline.diagnosis.undecided import find_undecided
+from pipeline.diagnosis.unexplained import (
+    Explainable,
+    boost_residuals,
+    describe_windows,
+    find_places,
+    search_formula,
+)
+from pipeline.motion import Input
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.diagnosis.excitation import Unobservable
+    from pipeline.diagnosis.ground import Ground
+    from pipeline.diagnosis.subject import Recording
+    from pipeline.diagnosis.undecided import Undecided
+    from pipeline.motion import Effect, Model
+    from pipeline.vehicles import Vehicle
+
+
+@dataclass(frozen=True)
+class Explored:
+    """A way with all that was found on it.
+
+    Attributes:
+        search: the search, its final model with formula terms where they serve better.
+        undecided: rivals of what was named.
+        unobservable: what this way could not tell.
+        explainable: what can still be predicted; None where it was not asked.
+    """
+
+    search: Search
+    undecided: tuple[Undecided, ...]
+    unobservable: tuple[Unobservable, ...]
+    explainable: Explainable | None
+
+
+def diagnose_runs(
+    recordings: Sequence[Recording],
+    vehicle: Vehicle,
+    *,
+    inputs: Sequence[str] = ("command", "measured"),
+    model: Model | None = None,
+) -> Diagnosis:
+    """Say which physical effects are missing from the model of one run, or of several of one vehicle jointly.
+
+    Args:
+        recordings: the runs' tables.
+        vehicle: their vehicle.
+        inputs: `command`, `measured` or both; with both, the command leads and the wheels serve to tell the
+            drivetrain from the ground.
+        model: what is known already; what is missing beyond it is said. The ideal model when None.
+
+    Returns:
+        One diagnosis a run; runs that were judged together share their effects.
+
+    Raises:
+        DiagnosisError: ``too_short`` or ``no_input``.
+    """
+    fatal = [f for recording in recordings for f in recording.list_findings() if f["id"] in FATAL]
+    leading = "command" if "command" in inputs else "measured"
+    if fatal:
+        return Diagnosis(tuple(conclude.refuse(recording, leading, recordings) for recording in recordings))
+    vehicle = correct_vehicle(recordings, vehicle)
+    ground = prepare([load_recording(recording, vehicle) for recording in recordings], vehicle)
+    known = () if model is None else model.effects
+    if not ground.compare(Input(leading)):
+        other = "measured" if leading == "command" else "command"
+        if other not in inputs or not ground.compare(Input(other)):
+            raise DiagnosisError(
+                "no_input",
+                f"there is no {'command' if leading == 'command' else 'measured wheel'} to diagnose from",
+                where=", ".join(run.name for run in ground.runs),
+                hint=f"Try --input {other}.",
+            )
+        leading = other
+    ways, clocks = _explore(ground, leading, known)
+    return _conclude(recordings, ground, leading, ways, clocks)
+
+
+def _explore(ground: Ground, leading: str, known: Sequence[Effect]) -> tuple[list[Explored], Clocks]:
+    """All ways that the recording opens: the ground alone and the drivetrain alone, or both at once."""
+    if leading == "measured" or ground.measured:
+        body = _explore_body(ground, Input.MEASURED, known)
+        ways = [body]
+        if leading == "command":
+            ways.append(_explore_wheels(ground, known, body.search))
+    else:
+        body = _explore_body(ground, Input.COMMAND, known)
+        ways = [body]
+    return ways, read_clocks(ground, body.search)
+
+
+def _explore_body(ground: Ground, source: Input, known: Sequence[Effect]) -> Explored:
+    found = search_body(ground, source, known)
+    comparisons = ground.compare(source)
+    places = np.concatenate([find_places(comparison) for comparison in comparisons])
+    final = search_formula(found.arena, found.start, found.final, places)
+    features, _ = describe_windows(comparisons)
+    explainable = boost_residuals(found.arena, final, features)
+    found = replace(found, final=final)
+    return Explored(
+        found,
+        tuple(find_undecided(found.arena, final)),
+        tuple(find_unobservable(found.arena, final)),
+        explainable,
+    )
+
+
+def _explore_wheels(ground: Ground, known: Sequence[Effect], body: Search) -> Explored:
+    found = search_wheels(ground, known, body)
+    return Explored(
+        found,
+        tuple(find_undecided(found.arena, found.final)),
+        tuple(find_unobservable(found.arena, found.final)),
+        None,
+    )
+
+
+def _conclude(
+    recordings: Sequence[Recording],
+    ground: Ground,
+    leading: str,
+    ways: Sequence[Explored],
+    clocks: Clocks,
+) -> Diagnosis:
+    common: RunDiagnosis = conclude.summarize(ground, Input(leading), ways, clocks)
+    return Diagnosis(
+        tuple(
+            conclude.of_run(common, recording, number, ground)
+            for number, recording in enumerate(recordings)
+        )
+    )

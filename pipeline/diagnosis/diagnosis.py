@@ -1,0 +1,261 @@
+"""What a diagnosis says of a run, as values, as JSON and as tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from pipeline.diagnosis.where import tabulate_regions
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from pipeline.diagnosis.excitation import Unobservable
+    from pipeline.diagnosis.undecided import Undecided
+    from pipeline.diagnosis.where import Region
+    from pipeline.motion import ModelFile
+
+Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
+
+_DIGITS = 6
+
+
+@dataclass(frozen=True)
+class Value:
+    """A number with its 95 % interval; NaN where there is none."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Named:
+    """An effect that is missing from the model.
+
+    Attributes:
+        id: the simplest of its class.
+        parameters: its numbers.
+        gain: relative rise of the held-out loss when it alone is dropped.
+        equivalent_to: other names of the same thing.
+        confused_with: what it looks like at first order.
+        corrected: whether it is a timing error that was corrected before anything else was judged.
+        way: on which way it was found: `command`, `measured` or `wheels`.
+        selected: share of resampled recordings in which it is still worth its place.
+        tentative: far more structure stays in its channel than it explains.
+        implausible: what no vehicle does, in words; None where it is plausible.
+    """
+
+    id: str
+    parameters: Mapping[str, Value]
+    gain: float
+    equivalent_to: tuple[str, ...]
+    confused_with: tuple[str, ...]
+    corrected: bool
+    way: str
+    selected: float
+    tentative: bool = False
+    implausible: str | None = None
+
+    def to_json(self) -> dict[str, Json]:
+        """The promised keys, and more."""
+        return {
+            "id": self.id,
+            "parameters": {
+                name: {"value": _clean(v.value), "low": _clean(v.low), "high": _clean(v.high), "unit": v.unit}
+                for name, v in self.parameters.items()
+            },
+            "gain": _clean(self.gain),
+            "equivalent_to": list(self.equivalent_to),
+            "confused_with": list(self.confused_with),
+            "corrected": self.corrected,
+            "found_on": self.way,
+            "selection_frequency": _clean(self.selected),
+            "tentative": self.tentative,
+            "implausible": self.implausible,
+        }
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """Structure that no catalogued effect takes.
+
+    Attributes:
+        share: of the held-out loss of the named model that a function of the recorded signals takes away.
+        channel: x, y or w.
+        channels: every channel with structure.
+        where: in words.
+        formula: a formula effect as text of a model file; None where none was found.
+        partial: what the structure depends on most: name, and mean error by value.
+        way: on which way it was found.
+    """
+
+    share: float
+    channel: str
+    channels: tuple[str, ...]
+    where: str
+    formula: str | None
+    partial: Mapping[str, Json]
+    way: str
+
+    def to_json(self) -> dict[str, Json]:
+        """The promised keys, and more."""
+        return {
+            "share": _clean(self.share),
+            "channel": self.channel,
+            "channels": list(self.channels),
+            "where": self.where,
+            "formula": self.formula,
+            "partial_dependence": self.partial,
+            "found_on": self.way,
+        }
+
+
+@dataclass(frozen=True)
+class RunDiagnosis:
+    """What is missing from the model of one run, or of several runs of one vehicle together.
+
+    Attributes:
+        run: its name.
+        input: what the model is fed with: `command` or `measured`.
+        joint: names of all runs that were judged together.
+        effects: what is missing.
+        undecided: explanations that are as good as each other.
+        unobservable: what this log could not tell.
+        unexplained: structure without a name; None without.
+        findings: what the stages and the diagnosis noticed.
+        ladder: rungs with their held-out errors.
+        noise_floor: the errors that no model could remove.
+        explained_share: of the removable error; NaN without room.
+        regions: every region with its part of the ideal model's error.
+        where: the few that carry most of it.
+        timing: delays, and whose heading was used.
+        by_way: ladders of the drivetrain and of the ground apart, where there are encoders.
+        consistency: whether the ways agree.
+        disturbance: rms of motion that is no function of anything recorded, x, y, w.
+        proposal: model file with what was named, fitted; None where nothing could be judged.
+    """
+
+    run: str
+    input: str
+    joint: tuple[str, ...] = ()
+    effects: tuple[Named, ...] = ()
+    undecided: tuple[Undecided, ...] = ()
+    unobservable: tuple[Unobservable, ...] = ()
+    unexplained: Unexplained | None = None
+    findings: tuple[Mapping[str, Json], ...] = ()
+    ladder: tuple[Mapping[str, Json], ...] = ()
+    noise_floor: Mapping[str, Json] = field(default_factory=dict)
+    explained_share: float = math.nan
+    regions: tuple[Region, ...] = ()
+    where: tuple[Region, ...] = ()
+    timing: Mapping[str, Json] = field(default_factory=dict)
+    by_way: Mapping[str, Json] = field(default_factory=dict)
+    consistency: Mapping[str, Json] = field(default_factory=dict)
+    disturbance: Mapping[str, Json] = field(default_factory=dict)
+    proposal: ModelFile | None = None
+
+    def to_json(self) -> dict[str, Json]:
+        """The promised keys of `slip diagnose --json` for one run, and more."""
+        return {
+            "run": self.run,
+            "input": self.input,
+            "joint_with": [name for name in self.joint if name != self.run],
+            "effects": [effect.to_json() for effect in self.effects],
+            "undecided": [
+                {"candidates": list(item.candidates), "separate_by": item.separate_by}
+                for item in self.undecided
+            ],
+            "unobservable": [item.id for item in self.unobservable],
+            "unobservable_why": {
+                item.id: {"reason": item.reason, "manoeuvre": item.manoeuvre} for item in self.unobservable
+            },
+            "unexplained": None if self.unexplained is None else self.unexplained.to_json(),
+            "findings": list(self.findings),
+            "ladder": list(self.ladder),
+            "noise_floor": dict(self.noise_floor),
+            "explained_share": _clean(self.explained_share),
+            "where": [
+                {
+                    "channel": region.channel,
+                    "kind": region.kind,
+                    "region": region.text,
+                    "share": _clean(region.share),
+                    "time_share": _clean(region.time_share),
+                    "rms": _clean(region.rms),
+                    "text": region.sentence,
+                }
+                for region in self.where
+            ],
+            "timing": dict(self.timing),
+            "by_way": dict(self.by_way),
+            "consistency": dict(self.consistency),
+            "disturbance": dict(self.disturbance),
+        }
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The diagnosis of one run, or of several of one vehicle together."""
+
+    runs: tuple[RunDiagnosis, ...]
+
+    def to_json(self) -> list[dict[str, Json]]:
+        """One object a run."""
+        return [run.to_json() for run in self.runs]
+
+    def tabulate_ladder(self, run: str) -> pl.DataFrame:
+        """Rungs of one run as table `ladder` (without the run's own columns)."""
+        import polars as pl  # noqa: PLC0415 - heavy
+
+        rows = []
+        for item in self.runs:
+            if item.run == run:
+                rows += list(_ladder_rows(item))
+        schema = {
+            "input": pl.String, "rung": pl.Int32, "added": pl.String, "effects": pl.String,
+            "rms_x": pl.Float64, "rms_y": pl.Float64, "rms_w": pl.Float64,
+            "t_mrmse": pl.Float64, "r_mrmse": pl.Float64, "explained_share": pl.Float64,
+            "kind": pl.String,
+        }  # fmt: skip
+        return pl.DataFrame(rows, schema=schema, orient="row")
+
+    def tabulate_where(self, run: str) -> pl.DataFrame:
+        """All regions of one run with their part of the ideal model's error."""
+        return tabulate_regions([region for item in self.runs if item.run == run for region in item.regions])
+
+
+def _ladder_rows(item: RunDiagnosis) -> list[dict[str, Json]]:
+    rows: list[dict[str, Json]] = []
+    before: set[str] = set()
+    rungs = [("rung", rung) for rung in item.ladder]
+    if item.noise_floor:
+        rungs.append(("floor", item.noise_floor))
+    for number, (kind, rung) in enumerate(rungs):
+        names = [str(name) for name in rung.get("effects", [])]  # type: ignore[union-attr]
+        x, y, w = rung["velocity_rms"]  # type: ignore[misc]
+        rows.append(
+            {
+                "input": item.input,
+                "rung": number,
+                "added": ", ".join(name for name in names if name not in before),
+                "effects": ", ".join(names),
+                "rms_x": x,
+                "rms_y": y,
+                "rms_w": w,
+                "t_mrmse": rung["t_mrmse_m"],
+                "r_mrmse": rung["r_mrmse_rad"],
+                "explained_share": rung.get("explained_share"),
+                "kind": kind,
+            }
+        )
+        before |= set(names)
+    return rows
+
+
+def _clean(value: float) -> float | None:
+    """A number for JSON: six digits, null where there is none."""
+    return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None

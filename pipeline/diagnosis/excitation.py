@@ -1,0 +1,130 @@
+"""What a log can tell at all: effects of a usual size that would leave no trace in it, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.motion.effect import Effect, Excitation
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.diagnosis.arena import Arena, Contender
+    from pipeline.diagnosis.screen import Largest
+
+Floats = NDArray[np.float64]
+EffectClass = type[Effect]
+
+_STANDARD_ERRORS = 4.0
+
+MANOEUVRES: Mapping[Excitation, str] = {
+    Excitation.DRIVING: "drive for a few minutes",
+    Excitation.TURNING: "turn both ways, on the spot and while driving",
+    Excitation.SPEED_SPREAD: "drive at several speeds, forward and backward",
+    Excitation.BOTH_SIGNS: "drive forward and backward, straight and in curves of both signs",
+    Excitation.CHANGES: "change speed and turning in steps, every few seconds",
+    Excitation.SLOPE: "drive on a slope in several directions",
+    Excitation.LARGE: "ask for the largest speeds and turns",
+    Excitation.SMALL: "ask for very small speeds, and for very small turns while driving",
+    Excitation.LONG: "drive for ten minutes, the same manoeuvres at the start and at the end",
+    Excitation.STEERING: "steer to both sides at several speeds",
+}
+
+
+@dataclass(frozen=True)
+class Unobservable:
+    """An effect of which this log could not tell.
+
+    Attributes:
+        id: of the effect.
+        reason: the run does not excite it, or it looks like what was named.
+        manoeuvre: what would show it.
+    """
+
+    id: str
+    reason: Literal["no excitation", "collinear with what was named"]
+    manoeuvre: str
+
+
+def find_unobservable(arena: Arena, final: Contender) -> list[Unobservable]:
+    """Candidates of which a usual size would move the prediction by less than four standard errors."""
+    found = []
+    for candidate in arena.candidates:
+        if final.state.find(candidate.id) is not None:
+            continue
+        column = _shift(arena, final, candidate)
+        alone, beside = _evidence(arena, final, column)
+        if beside >= _STANDARD_ERRORS:
+            continue
+        reason: Literal["no excitation", "collinear with what was named"] = (
+            "no excitation" if alone < _STANDARD_ERRORS else "collinear with what was named"
+        )
+        found.append(Unobservable(candidate.id, reason, suggest_manoeuvre(candidate)))
+    return found
+
+
+def suggest_manoeuvre(*effects: EffectClass) -> str:
+    """What to drive so that effects show themselves."""
+    needs: list[Excitation] = []
+    for effect in effects:
+        needs += [need for need in effect.needs if need not in needs]
+    return "; ".join(MANOEUVRES[need] for need in needs[:3])
+
+
+def make_usual(candidate: EffectClass, largest: Largest) -> Effect:
+    """The effect at a usual size; limits and thresholds as shares of what the run asked for."""
+    relative = {"speed": 0.7 * largest.speed, "turn": 0.7 * largest.turn, "wheel": 0.7 * largest.wheel}
+    values = {}
+    for parameter in candidate.parameters:
+        if parameter.name == "at_x":
+            continue
+        value = parameter.typical
+        if parameter.relative_to == "duration":
+            value = 0.5 * largest.duration
+        elif parameter.relative_to:
+            value = relative[parameter.relative_to]
+        values[parameter.name] = value
+    if candidate.id == "acceleration_limit":
+        values["limit"] = largest.wheel
+    elif candidate.id == "turn_droop":
+        values["threshold"] = 0.4 * largest.difference
+    elif candidate.id == "deadband":
+        values["d"] *= min(largest.speed, 1.0)
+    return candidate(**values)
+
+
+def _shift(arena: Arena, final: Contender, candidate: EffectClass) -> Floats:
+    changed = arena.problem.find_residuals(final.state.add(make_usual(candidate, arena.largest)))
+    shift: Floats = final.fitted.residual - changed
+    return shift
+
+
+def _evidence(arena: Arena, final: Contender, shift: Floats) -> tuple[float, float]:
+    """How many standard errors the shift is, alone and beside the model's own numbers."""
+    fitted, metric = final.fitted, arena.metric
+    factor = metric.weights(fitted.residual)
+    column = shift * factor
+    beside = column
+    if fitted.slots:
+        rows = (fitted.jacobian * factor[:, :, None]).reshape(-1, len(fitted.slots))
+        solution = np.linalg.lstsq(rows, column.reshape(-1), rcond=1e-8)[0]
+        beside = (column.reshape(-1) - rows @ solution).reshape(column.shape)
+    rest = metric.weigh(fitted.residual)
+    noise = _inflation(rest, arena)
+    return tuple(float(np.sqrt(np.sum(c**2) / noise)) for c in (column, beside))  # type: ignore[return-value]
+
+
+def _inflation(rest: Floats, arena: Arena) -> float:
+    """Variance of weighted residuals times the number of neighbours that repeat them."""
+    largest = 0.0
+    for channel in arena.problem.channels:
+        values = np.clip(rest[arena.problem.live, channel], -3.0, 3.0)
+        total = float(np.mean(values**2))
+        for lag in range(1, 8):
+            total += 2.0 * max(float(np.mean(values[lag:] * values[:-lag])), 0.0)
+        largest = max(largest, total)
+    return max(largest, 1e-12)

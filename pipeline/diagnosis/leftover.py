@@ -1,0 +1,138 @@
+"""What is left when everything with a name is taken: structure, in words and as a formula; or a disturbance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.diagnosis.diagnosis import Unexplained
+from pipeline.diagnosis.library import join_formula
+from pipeline.diagnosis.unexplained import collect_terms, describe_windows, is_explainable
+from pipeline.diagnosis.where import CHANNELS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.diagnosis.diagnose import Explored
+    from pipeline.diagnosis.diagnosis import Json, Named
+    from pipeline.diagnosis.ground import Ground
+    from pipeline.diagnosis.problem import BodyProblem
+
+Floats = NDArray[np.float64]
+
+_BINS = 8
+_PART = 0.3
+_OF_NOISE = 1.15
+
+
+def describe(ground: Ground, ways: Sequence[Explored]) -> Unexplained | None:
+    """Structure that no effect takes on the way to the body; None where there is none."""
+    del ground
+    body = ways[0]
+    arena, final = body.search.arena, body.search.final
+    terms = collect_terms(final)
+    if terms:
+        without = arena.drop(final, [term.id for term in terms])
+        pushed = (without.fitted.residual - final.fitted.residual) / arena.metric.scale
+        sizes = np.sqrt((pushed**2).mean(axis=0))
+        share = 1.0 - arena.metric.loss(final.held) / arena.metric.loss(without.held)
+        formula = write_formula(join_formula(terms))
+        signal = pushed * arena.metric.scale
+    elif body.explainable is not None and is_explainable(body.explainable):
+        sizes = np.where(body.explainable.shares > 0.0, body.explainable.sizes, 0.0)
+        channel = int(np.argmax(sizes))
+        share, formula = float(body.explainable.shares[channel]), None
+        signal = body.explainable.predicted * arena.metric.scale
+    else:
+        return None
+    channel = int(np.argmax(sizes))
+    name, table = _depend(body, signal[:, channel])
+    every = tuple(CHANNELS[i] for i in np.argsort(-sizes) if sizes[i] > _PART * sizes[channel])
+    unit = "rad/s" if channel == 2 else "m/s"  # noqa: PLR2004 - the third channel
+    low, high = min(table, key=lambda row: row[1]), max(table, key=lambda row: row[1])
+    where = (
+        f"the {CHANNELS[channel]} error depends on {name}: {high[1]:+.3g} {unit} near {high[0]:.3g}, "
+        f"{low[1]:+.3g} {unit} near {low[0]:.3g}"
+    )
+    partial: Mapping[str, Json] = {
+        "of": name,
+        "unit": unit,
+        "table": [{"at": round(at, 6), "mean_error": round(mean, 6)} for at, mean in table],
+    }
+    return Unexplained(share, CHANNELS[channel], every, where, formula, partial, body.search.way)
+
+
+def write_formula(joined: Mapping[str, object]) -> str:
+    """A formula effect as text of a model file."""
+    lines = ["[[effect]]", f'id = "{joined["id"]}"']
+    lines += [f'{key} = "{joined[key]}"' for key in ("v_x", "v_y", "v_w") if key in joined]
+    parameters = joined["parameters"]
+    for name, entry in parameters.items() if isinstance(parameters, dict) else ():
+        low, high = entry["bounds"]
+        neutral = f", neutral = {entry['value']:g}" if entry["fixed"] or low > 0.0 else ""
+        fixed = ", fixed = true" if entry["fixed"] else ""
+        lines.append(
+            f'{name} = {{value = {entry["value"]:g}, unit = "{entry["unit"]}", '
+            f"bounds = [{low:g}, {high:g}]{neutral}{fixed}}}"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def mark_tentative(
+    named: tuple[Named, ...], ways: Sequence[Explored], unexplained: Unexplained | None
+) -> tuple[Named, ...]:
+    """Names that explain far less than what stays unexplained in their channel."""
+    if unexplained is None:
+        return named
+    body = ways[0]
+    arena, final = body.search.arena, body.search.final
+    terms = [term.id for term in collect_terms(final)]
+    rest = arena.drop(final, terms) if terms else final
+    channel = CHANNELS.index(unexplained.channel)
+    stays = unexplained.share * float(((rest.held / arena.metric.scale) ** 2)[:, channel].mean())
+    marked = []
+    for effect in named:
+        tentative = False
+        if effect.id in final.ids:
+            without = arena.drop(final, [effect.id])
+            fall = ((without.held / arena.metric.scale) ** 2).mean(axis=0)
+            fall -= ((final.held / arena.metric.scale) ** 2).mean(axis=0)
+            tentative = int(np.argmax(fall)) == channel and float(fall[channel]) < 0.5 * stays
+        marked.append(replace(effect, tentative=tentative))
+    return tuple(marked)
+
+
+def describe_disturbance(body: Explored, unexplained: Unexplained | None) -> dict[str, Json]:
+    """What is left and cannot be predicted from anything recorded: rms of x, y, w."""
+    final = body.search.final
+    rms = np.sqrt((final.held**2).mean(axis=0))
+    text = (
+        "what is left is not a function of anything recorded: disturbance and localization noise"
+        if unexplained is None
+        else "beside the structure, what is left is disturbance and localization noise"
+    )
+    return {"rms": [round(float(value), 6) for value in rms], "text": text}
+
+
+def _depend(body: Explored, signal: Floats) -> tuple[str, list[tuple[float, float]]]:
+    """The recorded signal that a push depends on most, and its mean by value."""
+    problem = body.search.arena.problem
+    comparisons = problem.comparisons  # type: ignore[attr-defined]
+    features, names = describe_windows(comparisons)
+    best, name, table = -1.0, names[0], [(0.0, 0.0)]
+    for column, label in zip(features.T, names, strict=True):
+        edges = np.unique(np.quantile(column, np.linspace(0.0, 1.0, _BINS + 1)))
+        if edges.size < 3:  # noqa: PLR2004 - it does not vary
+            continue
+        place = np.clip(np.searchsorted(edges, column, side="right") - 1, 0, edges.size - 2)
+        count = np.bincount(place, minlength=edges.size - 1)
+        mean = np.bincount(place, signal, minlength=edges.size - 1) / np.maximum(count, 1)
+        ratio = float(np.sum(count * (mean - signal.mean()) ** 2)) / max(float(np.sum(signal**2)), 1e-18)
+        if ratio > best:
+            middle = np.bincount(place, column, minlength=edges.size - 1) / np.maximum(count, 1)
+            best, name = ratio, label
+            table = [(float(a), float(b)) for a, b, c in zip(middle, mean, count, strict=True) if c]
+    return name, table

@@ -1,0 +1,99 @@
+"""From what a search found to what is named: classes that cannot be told apart, and clocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.diagnosis.timing import LEAST_DELAY
+from pipeline.motion.catalogue import find_effect
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.diagnosis.ground import Ground
+    from pipeline.diagnosis.naming import Search
+    from pipeline.motion.effect import Effect
+
+_SKEWED_CLOCK = 0.03
+_HELD_SHARE = 0.2
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """What the delays of a run come to.
+
+    Attributes:
+        effects: `clock_offset` and `heading_skew`, as far as they are certain.
+        timing: of every run, in JSON's words.
+    """
+
+    effects: tuple[Effect, ...]
+    timing: tuple[Mapping[str, float | str | None], ...]
+
+
+def read_clocks(ground: Ground, body: Search) -> Clocks:
+    """Name clocks: with a gyro the delays of heading and position are known apart."""
+    state = body.final.state
+    extra = state.find("clock_offset")
+    more = extra.values["d"] if extra is not None else 0.0
+    rows, positions, certain = [], [], []
+    for timing, yaw in zip(state.timing, ground.yaw_delays, strict=True):
+        late = timing.pose_delay_s + more
+        positions.append(late)
+        certain.append(yaw is not None and yaw.is_certain)
+        rows.append(
+            {
+                "heading": "gyro" if yaw is not None else "pose",
+                "pose_delay_s": round(late, 4),
+                "yaw_delay_s": None if yaw is None else round(yaw.seconds, 4),
+                "wheel_delay_s": round(timing.wheel_delay_s, 4) if body.way == "measured" else None,
+            }
+        )
+    found: list[Effect] = []
+    late = float(np.mean(positions))
+    skewed = extra is not None and ground.has_gyro
+    if skewed:
+        found.append(find_effect("heading_skew")(d=min(max(-more, -0.6), 0.6)))
+    least = max(LEAST_DELAY, _SKEWED_CLOCK if skewed else 0.0, _held_delay(ground))
+    known = extra is not None if not ground.has_gyro else all(certain)
+    if known and abs(late) >= least:
+        found.append(find_effect("clock_offset")(d=min(max(late, -1.0), 1.0)))
+    return Clocks(tuple(found), tuple(rows))
+
+
+def _held_delay(ground: Ground) -> float:
+    """Half the time that a held pose may be old: no clock offset can be named below it."""
+    delay = 0.0
+    for run in ground.runs:
+        fresh = float(np.median(np.diff(run.track.times)))
+        raw = float(np.median(np.diff(run.streams))) if run.streams.size > 1 else fresh
+        if fresh > (1.0 + _HELD_SHARE) * raw and fresh > 0.06:  # noqa: PLR2004 - slower than usual poses
+            delay = max(delay, 0.5 * fresh)
+    return delay
+
+
+def join_classes(effects: Sequence[Effect]) -> list[Effect]:
+    """Effects with both parts of a lever arm put under its name."""
+    by_id = {effect.id: effect for effect in effects}
+    along, across = by_id.get("icr_offset"), by_id.get("icr_lateral")
+    if along is None or across is None:
+        return list(effects)
+    arm = find_effect("lever_arm")(l_x=-along.values["x_icr"], l_y=-across.values["y_icr"])
+    kept = [effect for effect in effects if effect.id not in {"icr_offset", "icr_lateral"}]
+    return [*kept, arm]
+
+
+def list_equivalents(effect: Effect, ground: Ground) -> tuple[str, ...]:
+    """Other names of the same thing, as far as this recording goes."""
+    if effect.id in {"transport_delay", "clock_offset"}:
+        alone = not ground.measured and not ground.has_gyro
+        if not alone or (effect.id == "clock_offset" and effect.values["d"] < 0.0):
+            return ()
+    if effect.id in {"drive_lag", "body_inertia"}:
+        both = ground.largest.speed > 0.05 and ground.largest.turn > 0.05  # noqa: PLR2004 - standing still
+        if both or ground.measured:
+            return ()
+    return effect.equivalent_to

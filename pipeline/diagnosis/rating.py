@@ -1,0 +1,51 @@
+"""The ladder of what was named, with intervals and the noise floor, on data that no fit has seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from pipeline.motion import HeadingSource, Input, Model, Problem, Timing
+from pipeline.motion.workshop import Judgement, judge_model
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.diagnosis.ground import Ground
+    from pipeline.motion.effect import Effect
+
+_RATE_HZ = 50.0
+
+
+@dataclass(frozen=True)
+class Rating:
+    """A model judged on runs.
+
+    Attributes:
+        judgement: ladder, estimates and floor.
+        names: how effects of the model are called in the diagnosis, where that differs.
+    """
+
+    judgement: Judgement
+
+
+def rate_effects(
+    ground: Ground, source: Input, effects: Sequence[Effect], timing: Sequence[Timing]
+) -> Rating:
+    """Judge a model of these effects.
+
+    Args:
+        ground: the runs.
+        source: the input.
+        effects: with their values to start from.
+        timing: delays of each run that are no effect.
+    """
+    ids = {effect.id for effect in effects}
+    # A skew of the reported heading shows against the reported heading only.
+    heading = HeadingSource.POSE if "heading_skew" in ids else HeadingSource.AUTO
+    if "clock_offset" in ids:
+        timing = [replace(one, pose_delay_s=0.0) for one in timing]
+    problem = Problem(
+        ground.runs, ground.vehicle, source, heading=heading, timing=timing, rate_hz=_RATE_HZ
+    )
+    return Rating(judge_model(problem, Model(ground.vehicle, tuple(effects))))

@@ -1,0 +1,72 @@
+"""Explanations that are as good as the one chosen, as far as this log goes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.diagnosis.excitation import suggest_manoeuvre
+
+if TYPE_CHECKING:
+    from pipeline.diagnosis.arena import Arena, Contender
+    from pipeline.motion.effect import Effect
+
+_LOOKED_AT = 8
+_AS_GOOD = 0.01
+# Effects that hold the key as a special case explain whatever it explains.
+_HOLDS: dict[str, frozenset[str]] = {
+    "drive_lag": frozenset({"turn_lag"}),
+    "effective_track": frozenset({"turn_droop", "terrain_change"}),
+    "wheel_radius": frozenset({"terrain_change"}),
+    "time_drift": frozenset({"terrain_change"}),
+}
+
+
+@dataclass(frozen=True)
+class Undecided:
+    """Effects of which one acts, this log cannot tell which.
+
+    Attributes:
+        candidates: ids, the chosen one first.
+        separate_by: what to drive to tell them apart.
+    """
+
+    candidates: tuple[str, ...]
+    separate_by: str
+
+
+def find_undecided(arena: Arena, final: Contender) -> list[Undecided]:
+    """For every effect that was named, the others that would do in its place."""
+    found = []
+    for effect in final.state.effects:
+        if effect.id in arena.kept:
+            continue
+        without = arena.drop(final, [effect.id])
+        rivals = [
+            rival
+            for rival in arena.suggest(without, _LOOKED_AT, without=[effect.id])
+            if _is_as_good(arena, final, rival)
+        ]
+        names = [name for rival in rivals for name in rival.ids if name not in final.ids]
+        simple = [name for name in names if not _is_larger(arena, name, effect)]
+        if simple:
+            classes = [type(effect), *(c for c in arena.candidates if c.id in names)]
+            found.append(Undecided((effect.id, *names), suggest_manoeuvre(*classes)))
+    return found
+
+
+def _is_as_good(arena: Arena, final: Contender, rival: Contender) -> bool:
+    if arena.metric.loss(rival.held) < (1.0 + _AS_GOOD) * arena.metric.loss(final.held):
+        return True
+    return not arena.judge(rival, final).accepts()
+
+
+def _is_larger(arena: Arena, name: str, effect: Effect) -> bool:
+    """Whether an effect fits as well only because it has more numbers, or holds the other as a special case."""
+    if name in _HOLDS.get(effect.id, frozenset()):
+        return True
+    rival = next(c for c in arena.candidates if c.id == name)
+    numbers = sum(bool(np.isfinite(value)) for value in effect.values.values())
+    return len([p for p in rival.parameters if p.name != "at_x"]) > numbers

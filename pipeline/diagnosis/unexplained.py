@@ -1,0 +1,205 @@
+"""Structure that no effect of the catalogue takes: how much, in which channel, where, and as which formula."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.diagnosis.judge import GAP_S
+from pipeline.diagnosis.library import is_term, list_terms, list_waves
+from pipeline.diagnosis.search import prune
+from pipeline.motion.formula.formula_effect import FormulaEffect
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.diagnosis.arena import Arena, Contender
+    from pipeline.motion.comparison import Comparison
+
+Floats = NDArray[np.float64]
+
+_MOST_TERMS = 3
+_TRIED = 4
+_LEAST_GAIN = 0.02
+_LEAST_T = 3.0
+_LEAST_Z = 3.0
+_BETTER = 0.02
+_EXPLAINABLE = 0.1
+_LAGS_S = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
+_TREES = 60
+_FOLDS = 4
+_STRETCH_S = 20.0
+
+
+@dataclass(frozen=True)
+class Explainable:
+    """What gradient boosting still predicts of a model's residuals on stretches it has not seen.
+
+    Attributes:
+        shares: share of the variance of x, y, w that it explains, shape (3,).
+        sizes: rms that it explains, in units of the metric, shape (3,).
+        predicted: what it predicts, shape (n, 3).
+    """
+
+    shares: Floats
+    sizes: Floats
+    predicted: Floats
+
+
+def search_formula(arena: Arena, start: Contender, final: Contender, places: Floats) -> Contender:
+    """Try formulas where the catalogue has nothing, or where it only imitates one.
+
+    Args:
+        arena: where the catalogue's effects were judged.
+        start: the model that the search began with.
+        final: the best model of them.
+        places: x, y [m] in the map at every window, shape (n, 2).
+
+    Returns:
+        The model with up to three terms, and without effects that only stood for them.
+    """
+    waves = (*list_waves(arena, final, places), *list_waves(arena, start, places, "_first"))
+    terms = (*list_terms(), *waves)
+    wide = replace(arena, candidates=(*arena.candidates, *terms), _dropped={}, _suggested={})
+    narrow = {effect.id for effect in arena.candidates}
+    current = final
+    for _ in range(_MOST_TERMS + 1):
+        if sum(is_term(name) for name in current.ids) >= _MOST_TERMS:
+            return current
+        moved = _replace(wide, current, narrow) or _add(wide, current, narrow)
+        if moved is None:
+            return current
+        current = prune(wide, wide.enter(moved.state))
+    return current
+
+
+def _add(arena: Arena, current: Contender, narrow: set[str]) -> Contender | None:
+    for rival in arena.suggest(current, _TRIED, without=narrow):
+        verdict = arena.judge(current, rival)
+        if verdict.gain >= _LEAST_GAIN and verdict.t >= _LEAST_T and verdict.z >= _LEAST_Z:
+            return rival
+    return None
+
+
+def _replace(arena: Arena, current: Contender, narrow: set[str]) -> Contender | None:
+    """A term in the place of one effect or two that only imitate it."""
+    free = [name for name in current.ids if name not in arena.kept and not is_term(name)]
+    for names in (*((name,) for name in free), *combinations(free, 2)):
+        without = arena.drop(current, names)
+        for rival in arena.suggest(without, _TRIED, without={*narrow, *names}):
+            bonus = _BETTER if len(names) == 1 else 0.0
+            if rival.score < (1.0 - bonus) * current.score:
+                return rival
+    return None
+
+
+def collect_terms(contender: Contender) -> list[FormulaEffect]:
+    """The terms of a model."""
+    return [cast("FormulaEffect", e) for e in contender.state.effects if is_term(e.id)]
+
+
+def boost_residuals(arena: Arena, final: Contender, features: Floats) -> Explainable:
+    """Predict a model's residuals from all that was recorded, stretch by stretch unseen.
+
+    Args:
+        arena: where the model was judged.
+        final: the model.
+        features: what was recorded, at every window, shape (n, f).
+    """
+    from sklearn.ensemble import HistGradientBoostingRegressor  # noqa: PLC0415 - heavy
+
+    problem = arena.problem
+    rest = np.clip(arena.metric.weigh(final.held), -6.0, 6.0)
+    middle = problem.times.mean(axis=1)
+    stretch = np.unique(
+        problem.run * 1_000_000 + (middle // _STRETCH_S).astype(np.int64), return_inverse=True
+    )[1]
+    predicted = np.zeros(rest.shape)
+    for fold in range(_FOLDS):
+        test = stretch % _FOLDS == fold
+        train = ~test & ~_is_near(problem.run, problem.times, test)
+        if not test.any() or train.sum() < 50:  # noqa: PLR2004 - too few to learn from
+            continue
+        for channel in problem.channels:
+            model = HistGradientBoostingRegressor(
+                max_iter=_TREES, learning_rate=0.1, max_leaf_nodes=10, min_samples_leaf=25,
+                l2_regularization=5.0, early_stopping=False, random_state=0,
+            )  # fmt: skip
+            model.fit(features[train], rest[train, channel])
+            predicted[test, channel] = model.predict(features[test])
+    live = problem.live
+    before = (rest[live] ** 2).mean(axis=0)
+    after = ((rest - predicted)[live] ** 2).mean(axis=0)
+    shares = 1.0 - after / np.maximum(before, 1e-12)
+    return Explainable(shares, np.sqrt(np.maximum(before - after, 0.0)), predicted)
+
+
+def is_explainable(explainable: Explainable) -> bool:
+    """Whether enough of any channel is predictable to be called structure."""
+    return bool((explainable.shares > _EXPLAINABLE).any())
+
+
+def _is_near(run: NDArray[np.int64], times: Floats, test: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    near = np.zeros(test.size, dtype=bool)
+    for number in np.unique(run).tolist():
+        rows = run == number
+        starts, ends = np.sort(times[rows & test, 0]), np.sort(times[rows & test, 1])
+        later = np.searchsorted(starts, times[rows, 1] + GAP_S)
+        earlier = np.searchsorted(ends, times[rows, 0] - GAP_S)
+        near[rows] = later > earlier
+    return near
+
+
+def describe_windows(comparisons: Sequence[Comparison]) -> tuple[Floats, tuple[str, ...]]:
+    """Everything recorded, at the middle of every window.
+
+    Returns:
+        Features of shape (n, f), and their names.
+    """
+    parts = [_describe(comparison) for comparison in comparisons]
+    return np.concatenate([part[0] for part in parts]), parts[0][1]
+
+
+def _describe(comparison: Comparison) -> tuple[Floats, tuple[str, ...]]:
+    from pipeline.motion.forward import Timing  # noqa: PLC0415 - only here
+
+    around, cells = comparison.surroundings, comparison.cells
+    velocity = comparison.predict_velocity((), Timing())
+    at = comparison.windows.times.mean(axis=1)
+    columns: dict[str, Floats] = {}
+    for late in _LAGS_S:
+        columns[f"v_x {late:g} s ago"] = np.interp(at - late, around.times, velocity.x)
+        columns[f"v_w {late:g} s ago"] = np.interp(at - late, around.times, velocity.w)
+    yaw = np.interp(at, around.times, around.attitude[:, 2])
+    columns |= {"sin yaw": np.sin(yaw), "cos yaw": np.cos(yaw)}
+    columns |= {"sin 2 yaw": np.sin(2.0 * yaw), "cos 2 yaw": np.cos(2.0 * yaw)}
+    for place, name in enumerate(("roll", "pitch")):
+        columns[name] = np.interp(at, around.times, around.attitude[:, place])
+    columns |= {"x": find_places(comparison)[:, 0], "y": find_places(comparison)[:, 1]}
+    vehicle = around.vehicle
+    half = 0.5 * around.track_m * velocity.w if vehicle.kind == "differential" else 0.0 * velocity.w
+    for name, rim in (("left", velocity.x - half), ("right", velocity.x + half)):
+        angle = np.cumsum(rim) * cells.step_s / vehicle.wheel_radius_m
+        for word, wave in (("sin", np.sin(angle)), ("cos", np.cos(angle))):
+            columns[f"{word} {name} wheel"] = _average(rim * wave, at, comparison)
+    columns["time"] = at
+    return np.column_stack(list(columns.values())), tuple(columns)
+
+
+def _average(signal: Floats, at: Floats, comparison: Comparison) -> Floats:
+    cells = comparison.cells
+    total = np.asarray(cells.sum_up(signal), dtype=np.float64)
+    edges = np.arange(total.size)
+    ends = [np.interp(cells.locate_edges(at + half), edges, total) for half in (-0.25, 0.25)]
+    return (ends[1] - ends[0]) / 0.5
+
+
+def find_places(comparison: Comparison) -> Floats:
+    """Where the vehicle was at the middle of every window: x, y in the map [m], shape (n, 2)."""
+    at = comparison.windows.times.mean(axis=1)
+    track = comparison.run.track
+    return np.column_stack([np.interp(at, track.times, column) for column in track.place.T])

@@ -1,0 +1,172 @@
+"""Where a model fails: by region of the command space, transitory or steady, by time and by place, in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from pipeline.diagnosis.problem import Problem
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+CHANNELS = ("x", "y", "w")
+_WORDS = {"x": "forward error", "y": "sideways error", "w": "yaw error"}
+_TRANSITORY_S = 2.0
+_LEAST_SHARE = 0.2
+_EXCESS = 1.3
+_SHOWN = 3
+_STANDING = 0.03
+_CHANGE = 0.05
+
+
+@dataclass(frozen=True)
+class Region:
+    """A region with its part of the error.
+
+    Attributes:
+        channel: x, y or w.
+        kind: `command`, `phase`, `time` or `place`.
+        text: the region in words.
+        share: of the channel's squared error.
+        time_share: of the windows.
+        rms: error in the region [m/s or rad/s].
+    """
+
+    channel: str
+    kind: str
+    text: str
+    share: float
+    time_share: float
+    rms: float
+
+    @property
+    def sentence(self) -> str:
+        """In words: where, and how much of the error in how much of the time."""
+        return (
+            f"{self.text}: {self.share:.0%} of the {_WORDS[self.channel]} in {self.time_share:.0%} of the time"
+        )
+
+
+def map_errors(problem: Problem, residual: Floats, places: Floats) -> list[Region]:
+    """Every region of every kind with its part of each channel's error.
+
+    Args:
+        problem: whose windows they are.
+        residual: of a model, shape (n, 3).
+        places: x, y [m] in the map at every window, shape (n, 2).
+    """
+    regions = []
+    for kind, text, rows in _list_regions(problem, places):
+        if not rows.any():
+            continue
+        for channel, name in enumerate(CHANNELS):
+            square = np.minimum(residual[:, channel] ** 2, 36.0 * np.median(residual[:, channel] ** 2) + 1.0)
+            total = float(square.sum())
+            if total <= 0.0:
+                continue
+            share = float(square[rows].sum()) / total
+            rms = float(np.sqrt(square[rows].mean()))
+            regions.append(Region(name, kind, text, share, float(rows.mean()), rms))
+    return regions
+
+
+def pick_regions(regions: list[Region], residual: Floats, noise: Floats) -> list[Region]:
+    """The few regions that carry most of the excess error.
+
+    Args:
+        regions: all of them.
+        residual: of the model, shape (n, 3).
+        noise: spread that a saturated fit leaves: channels at it have no excess, shape (n, 3).
+    """
+    excess = np.sqrt((residual**2).mean(axis=0)) > 1.2 * np.median(noise, axis=0)
+    picked = []
+    for channel, name in enumerate(CHANNELS):
+        if not excess[channel]:
+            continue
+        worth = [
+            region
+            for region in regions
+            if region.channel == name
+            and region.share >= _LEAST_SHARE
+            and region.share > _EXCESS * region.time_share
+        ]
+        worth.sort(key=lambda region: region.time_share - region.share)
+        kinds: set[str] = set()
+        for region in worth:
+            if region.kind not in kinds:
+                kinds.add(region.kind)
+                picked.append(region)
+    picked.sort(key=lambda region: region.time_share - region.share)
+    return picked[: 2 * _SHOWN]
+
+
+def _list_regions(problem: Problem, places: Floats) -> list[tuple[str, str, Flags]]:
+    lags = problem.find_ideal()
+    speed, turn = lags[:, 0, 0], lags[:, 0, 1]
+    found = _cut_commands(speed, turn)
+    changed = np.abs(lags - lags[:, :1, :]).max(axis=1) > _CHANGE * np.abs(lags).max(axis=(0, 1))
+    transitory = changed.any(axis=1)
+    found.append(("phase", f"within {_TRANSITORY_S:g} s of a change of command", transitory))
+    found.append(("phase", "in steady driving", ~transitory & problem.live))
+    middle = problem.times.mean(axis=1)
+    edges = np.linspace(float(middle.min()), float(middle.max()) + 1e-6, 6)
+    for low, high in zip(edges[:-1], edges[1:], strict=True):
+        found.append(("time", f"from {low:.0f} to {high:.0f} s", (middle >= low) & (middle < high)))
+    for axis, name in ((0, "x"), (1, "y")):
+        cut = float(np.median(places[:, axis]))
+        found.append(("place", f"where {name} > {cut:.1f} m in the map", places[:, axis] > cut))
+        found.append(("place", f"where {name} <= {cut:.1f} m in the map", places[:, axis] <= cut))
+    return found
+
+
+def _cut_commands(speed: Floats, turn: Floats) -> list[tuple[str, str, Flags]]:
+    """Regions of the command space: by the sign and size of turning and of speed, and both together."""
+    fast, sharp = float(np.abs(speed).max()), float(np.abs(turn).max())
+    found: list[tuple[str, str, Flags]] = []
+    signs = ((1.0, "left", "forward"), (-1.0, "right", "backward"))
+    for sign, side, way in signs:
+        for share in (0.25, 0.5):
+            if sharp > _STANDING:
+                text = f"turning {side} faster than {share * sharp:.2g} rad/s"
+                found.append(("command", text, sign * turn > share * sharp))
+            if fast > _STANDING:
+                text = f"driving {way} faster than {share * fast:.2g} m/s"
+                found.append(("command", text, sign * speed > share * fast))
+    for share in (0.25, 0.5):
+        text = f"turning faster than {share * sharp:.2g} rad/s"
+        found.append(("command", text, np.abs(turn) > share * max(sharp, _STANDING)))
+        text = f"driving faster than {share * fast:.2g} m/s"
+        found.append(("command", text, np.abs(speed) > share * max(fast, _STANDING)))
+        curve = (np.abs(turn) > share * max(sharp, _STANDING)) & (np.abs(speed) > share * max(fast, _STANDING))
+        text = f"in curves tighter than {share * sharp:.2g} rad/s at more than {share * fast:.2g} m/s"
+        found.append(("command", text, curve))
+    slow = (np.abs(speed) < 0.15 * max(fast, _STANDING)) & (np.abs(turn) > 0.25 * max(sharp, _STANDING))
+    found.append(("command", "turning on the spot", slow))
+    straight = (np.abs(turn) < 0.1 * max(sharp, _STANDING)) & (np.abs(speed) > 0.25 * max(fast, _STANDING))
+    found.append(("command", "driving straight", straight))
+    return found
+
+
+def tabulate_regions(regions: list[Region]) -> pl.DataFrame:
+    """Regions as a table."""
+    import polars as pl  # noqa: PLC0415 - heavy
+
+    return pl.DataFrame(
+        [vars(region) for region in regions],
+        schema={
+            "channel": pl.String,
+            "kind": pl.String,
+            "text": pl.String,
+            "share": pl.Float64,
+            "time_share": pl.Float64,
+            "rms": pl.Float64,
+        },
+        orient="row",
+    )
