@@ -23,6 +23,7 @@ _DOING = {
     "velocity": "differentiating poses",
     "slip": "computing slip",
     "aggregate": "aggregating",
+    "diagnosis": "looking for missing effects",
     "report": "drawing the report",
 }
 

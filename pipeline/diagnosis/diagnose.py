@@ -145,7 +145,6 @@ def _conclude(
     common: RunDiagnosis = conclude.summarize(ground, Input(leading), ways, clocks)
     return Diagnosis(
         tuple(
-            conclude.of_run(common, recording, number, ground)
-            for number, recording in enumerate(recordings)
+            conclude.of_run(common, recording, number, ground) for number, recording in enumerate(recordings)
         )
     )

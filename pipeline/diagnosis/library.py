@@ -169,9 +169,7 @@ def _make_wave(channel: str, factor: str, axis: str, wave: float) -> Term:
         starts=(wave,),
         step=1e-3,
     )
-    return Term(
-        f"{PREFIX}{channel[-1]}_{factor}_along_{axis}", channel, text, (*parameters, number)
-    )
+    return Term(f"{PREFIX}{channel[-1]}_{factor}_along_{axis}", channel, text, (*parameters, number))
 
 
 def is_term(name: str) -> bool:

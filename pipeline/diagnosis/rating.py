@@ -45,7 +45,5 @@ def rate_effects(
     heading = HeadingSource.POSE if "heading_skew" in ids else HeadingSource.AUTO
     if "clock_offset" in ids:
         timing = [replace(one, pose_delay_s=0.0) for one in timing]
-    problem = Problem(
-        ground.runs, ground.vehicle, source, heading=heading, timing=timing, rate_hz=_RATE_HZ
-    )
+    problem = Problem(ground.runs, ground.vehicle, source, heading=heading, timing=timing, rate_hz=_RATE_HZ)
     return Rating(judge_model(problem, Model(ground.vehicle, tuple(effects))))

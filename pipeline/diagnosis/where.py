@@ -49,9 +49,7 @@ class Region:
     @property
     def sentence(self) -> str:
         """In words: where, and how much of the error in how much of the time."""
-        return (
-            f"{self.text}: {self.share:.0%} of the {_WORDS[self.channel]} in {self.time_share:.0%} of the time"
-        )
+        return f"{self.text}: {self.share:.0%} of the {_WORDS[self.channel]} in {self.time_share:.0%} of the time"
 
 
 def map_errors(problem: Problem, residual: Floats, places: Floats) -> list[Region]:
@@ -144,7 +142,9 @@ def _cut_commands(speed: Floats, turn: Floats) -> list[tuple[str, str, Flags]]:
         found.append(("command", text, np.abs(turn) > share * max(sharp, _STANDING)))
         text = f"driving faster than {share * fast:.2g} m/s"
         found.append(("command", text, np.abs(speed) > share * max(fast, _STANDING)))
-        curve = (np.abs(turn) > share * max(sharp, _STANDING)) & (np.abs(speed) > share * max(fast, _STANDING))
+        curve = (np.abs(turn) > share * max(sharp, _STANDING)) & (
+            np.abs(speed) > share * max(fast, _STANDING)
+        )
         text = f"in curves tighter than {share * sharp:.2g} rad/s at more than {share * fast:.2g} m/s"
         found.append(("command", text, curve))
     slow = (np.abs(speed) < 0.15 * max(fast, _STANDING)) & (np.abs(turn) > 0.25 * max(sharp, _STANDING))

@@ -1,0 +1,172 @@
+"""`slip diagnose`: which physical effects are missing from the model of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+
+from pipeline.cli.choices import Choices, build_options
+from pipeline.cli.output import describe_error, exit_code, print_error, print_json, show_progress
+from pipeline.core.errors import SlipError
+
+if TYPE_CHECKING:
+    from pipeline.diagnosis import Diagnosis, Recording
+    from pipeline.job.options import Options
+    from pipeline.motion import ModelFile
+    from pipeline.store import Manifest
+    from pipeline.vehicles import Vehicle
+
+
+def register(app: App) -> None:
+    """Add the verb."""
+    app.command(diagnose)
+
+
+def diagnose(  # noqa: D417 - the shared choices document themselves
+    logs: Annotated[list[str], Parameter(help="logs, or runs of the results folder", negative=())],
+    /,
+    *,
+    choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
+    model: Annotated[
+        Path | None, Parameter(help="what is known already: say what is missing beyond it")
+    ] = None,
+    apply: Annotated[Path | None, Parameter(help="write the proposed model to this file")] = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Name what is missing from the model, from one run or from several of one vehicle jointly.
+
+    Args:
+        json: print one JSON object instead of the summary.
+        quiet: print no progress and no summary.
+    """
+    options = build_options(choices)
+    known = _read_model(model)
+    gathered, errors, lossy = _gather(logs, options, quiet=quiet or json)
+    diagnoses: list[Diagnosis] = []
+    for vehicle, recordings in gathered.values():
+        try:
+            diagnoses.append(_judge(recordings, vehicle, options, known, quiet=quiet or json))
+        except SlipError as error:
+            print_error(error)
+            errors.append(describe_error(recordings[0].path, error))
+    runs = [run for diagnosis in diagnoses for run in diagnosis.runs]
+    if apply is not None:
+        _apply([run.proposal for run in runs], apply, quiet=quiet or json)
+    if json:
+        print_json({"runs": [run.to_json() for run in runs], "errors": errors})
+    elif not quiet:
+        from pipeline.diagnosis.words import describe_run  # noqa: PLC0415 - only for people
+
+        for run in runs:
+            print(describe_run(run))
+    return exit_code(errors, lossy=lossy)
+
+
+def _read_model(path: Path | None) -> ModelFile | None:
+    if path is None:
+        return None
+    from pipeline.motion import read_model  # noqa: PLC0415 - heavy
+
+    return read_model(path)
+
+
+def _gather(
+    logs: list[str], options: Options, *, quiet: bool
+) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], bool]:
+    """Recordings by vehicle; an error costs one log."""
+    gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
+    errors: list[dict[str, str]] = []
+    lossy = False
+    for log in logs:
+        try:
+            manifest, losses = _find(log, options, quiet=quiet)
+            vehicle, recording = _read(manifest)
+        except SlipError as error:
+            print_error(error)
+            errors.append(describe_error(log, error))
+            continue
+        lossy |= losses
+        gathered.setdefault(repr(vehicle), (vehicle, []))[1].append(recording)
+    return gathered, errors, lossy
+
+
+def _find(log: str, options: Options, *, quiet: bool) -> tuple[Manifest, bool]:
+    """A log is taken through the stages first; a stored run is read."""
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    if not Path(log).exists() and not Path(log).suffix:
+        from pipeline.job.lookup import find_run  # noqa: PLC0415 - heavy
+
+        return find_run(log, Store(options.out)), False
+    from pipeline.job.analyze import analyze_log  # noqa: PLC0415 - heavy
+
+    with show_progress(Path(log).name, quiet=quiet) as progress:
+        outcome = analyze_log(Path(log), options, progress)
+    return outcome.manifest, outcome.lossy
+
+
+def _read(manifest: Manifest) -> tuple[Vehicle, Recording]:
+    import msgspec  # noqa: PLC0415
+
+    from pipeline.diagnosis import Recording  # noqa: PLC0415 - heavy
+    from pipeline.vehicles import Vehicle  # noqa: PLC0415
+
+    vehicle = msgspec.convert(manifest.details["vehicle"], Vehicle)
+    tables = {
+        table: manifest.read(table)
+        for table in ("poses", "commands", "wheels", "imu", "slip", "findings")
+        if table in manifest.tables
+    }
+    log = manifest.details.get("log")
+    known = log if isinstance(log, dict) else {}
+    configuration = manifest.details.get("configuration")
+    command = configuration.get("command") if isinstance(configuration, dict) else None
+    hold = command.get("hold_s") if isinstance(command, dict) else None
+    recording = Recording(
+        manifest.run,
+        tables,
+        sha256=str(known.get("sha256", "")),
+        path=str(known.get("path", "")),
+        hold_s=float(hold) if isinstance(hold, int | float) else None,
+    )
+    return vehicle, recording
+
+
+def _judge(
+    recordings: list[Recording],
+    vehicle: Vehicle,
+    options: Options,
+    known: ModelFile | None,
+    *,
+    quiet: bool,
+) -> Diagnosis:
+    from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy
+
+    name = recordings[0].name if len(recordings) == 1 else f"{len(recordings)} runs"
+    with show_progress(name, quiet=quiet) as progress:
+        progress("diagnosis")
+        return diagnose_runs(
+            recordings,
+            vehicle if known is None else known.model.vehicle,
+            inputs=options.inputs,
+            model=None if known is None else known.model,
+        )
+
+
+def _apply(proposals: list[ModelFile | None], path: Path, *, quiet: bool) -> None:
+    from pipeline.motion import write_model  # noqa: PLC0415 - heavy
+
+    proposal = next((found for found in proposals if found is not None), None)
+    if proposal is None:
+        raise SlipError(
+            "nothing_to_apply",
+            "no model can be proposed: nothing could be judged",
+            where=str(path),
+            hint="See the findings.",
+        )
+    write_model(proposal, path)
+    if not quiet:
+        print(f"{path}: {', '.join(proposal.model.ids) or 'the ideal model'}")

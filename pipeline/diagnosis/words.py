@@ -1,0 +1,133 @@
+"""A diagnosis as lines of text: how bad, where, what is missing, what now."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, cast
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.diagnosis.diagnosis import Json, Named, RunDiagnosis, Value
+
+_LABEL = 10
+_WHERE_SHOWN = 3
+_UNOBSERVABLE_SHOWN = 8
+_WAYS = {"command": "from the command", "measured": "from the measured wheels"}
+
+
+def describe_run(diagnosis: RunDiagnosis) -> str:
+    """The diagnosis of one run for a tired person."""
+    lines = [_row("run", f"{diagnosis.run}    {_WAYS[diagnosis.input]}")]
+    if not diagnosis.ladder:
+        lines += [_row("" if i else "findings", str(f["text"])) for i, f in enumerate(_grave(diagnosis))]
+        lines.append(_row("missing", "no effect is named: a fit to this run would mean nothing"))
+        return "\n".join(lines) + "\n"
+    first, last = diagnosis.ladder[0], diagnosis.ladder[-1]
+    lines.append(
+        _row(
+            "error",
+            f"of the ideal model over 2 s     {_number(first, 't_mrmse_m')} m   "
+            f"{_number(first, 'r_mrmse_rad')} rad",
+        )
+    )
+    for number, region in enumerate(diagnosis.where[:_WHERE_SHOWN]):
+        lines.append(_row("" if number else "where", region.sentence))
+    lines += _describe_missing(diagnosis)
+    if math.isfinite(diagnosis.explained_share) and len(diagnosis.ladder) > 1:
+        floor = diagnosis.noise_floor
+        lines.append(
+            _row(
+                "",
+                f"explained {max(min(diagnosis.explained_share, 1.0), 0.0):.0%} of what can be explained; "
+                f"now {_number(last, 't_mrmse_m')} m, floor {_number(floor, 't_mrmse_m')} m",
+            )
+        )
+    lines += _describe_unobservable(diagnosis)
+    lines += [_row("" if i else "findings", str(f["text"])) for i, f in enumerate(_grave(diagnosis))]
+    names = [effect.id for effect in diagnosis.effects]
+    if names:
+        lines.append(_row("next", f"slip diagnose {diagnosis.run} --apply model.toml"))
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
+    rows: list[str] = []
+    falls = _list_falls(diagnosis)
+    for effect in diagnosis.effects:
+        notes = []
+        if effect.equivalent_to:
+            notes.append(f"= {', '.join(effect.equivalent_to)}")
+        if effect.corrected:
+            notes.append("timing, corrected")
+        if effect.tentative:
+            notes.append("tentative")
+        note = f"  ({'; '.join(notes)})" if notes else ""
+        rows.append(f"{effect.id:<20}{_values(effect):<34}{falls.get(effect.id, '')}{note}")
+    for item in diagnosis.undecided:
+        rows.append(f"{'undecided':<20}{' or '.join(item.candidates)}: {item.separate_by}")
+    if diagnosis.unexplained is not None:
+        left = diagnosis.unexplained
+        rows.append(f"{'unexplained':<20}{left.share:.0%} of what is left: {left.where}")
+        if left.formula is not None:
+            rows += [f"{'':<20}{line}" for line in left.formula.splitlines() if line.startswith("v_")]
+    if not rows:
+        rows.append("nothing: the model is as good as the localization lets us see")
+    return [_row("" if number else "missing", text) for number, text in enumerate(rows)]
+
+
+def _values(effect: Named) -> str:
+    return ", ".join(_value(name, value) for name, value in effect.parameters.items())
+
+
+def _value(name: str, value: Value) -> str:
+    unit = "" if value.unit == "1" else f" {value.unit}"
+    text = f"{name} = {value.value:.3g}{unit}"
+    if math.isfinite(value.low):
+        text += f" [{value.low:.3g}, {value.high:.3g}]"
+    return text
+
+
+def _list_falls(diagnosis: RunDiagnosis) -> dict[str, str]:
+    """How the error fell on the rung of each effect."""
+    falls: dict[str, str] = {}
+    for before, after in zip(diagnosis.ladder[:-1], diagnosis.ladder[1:], strict=True):
+        old = set(cast("Sequence[str]", before["effects"]))
+        text = (
+            f"{_number(before, 't_mrmse_m')} -> {_number(after, 't_mrmse_m')} m   "
+            f"{_number(before, 'r_mrmse_rad')} -> {_number(after, 'r_mrmse_rad')} rad"
+        )
+        for name in cast("Sequence[str]", after["effects"]):
+            if name not in old:
+                falls[name] = text
+    return falls
+
+
+def _describe_unobservable(diagnosis: RunDiagnosis) -> list[str]:
+    hidden = [item.id for item in diagnosis.unobservable]
+    if not hidden:
+        return []
+    shown = ", ".join(hidden[:_UNOBSERVABLE_SHOWN])
+    more = f" and {len(hidden) - _UNOBSERVABLE_SHOWN} more" if len(hidden) > _UNOBSERVABLE_SHOWN else ""
+    manoeuvres: list[str] = []
+    for item in diagnosis.unobservable:
+        for part in item.manoeuvre.split("; "):
+            if part not in manoeuvres:
+                manoeuvres.append(part)
+    return [
+        _row("cannot", f"tell of {shown}{more} from this log"),
+        _row("", f"to see them: {'; '.join(manoeuvres[:3])}"),
+    ]
+
+
+def _grave(diagnosis: RunDiagnosis) -> list[Mapping[str, Json]]:
+    return [finding for finding in diagnosis.findings if finding.get("severity") != "info"][:4]
+
+
+def _number(content: Mapping[str, Json], key: str) -> str:
+    value = content.get(key)
+    return f"{value:.3g}" if isinstance(value, int | float) else "-"
+
+
+def _row(label: str, text: str) -> str:
+    return f"{label:<{_LABEL}}{text}"
