@@ -18,7 +18,7 @@ from pipeline.logs.loading import load_spans
 from pipeline.logs.payloads import gather_payloads
 from pipeline.logs.source import ByteSource, count_fetched, hash_sources, open_source
 from pipeline.logs.spans import SpanKind
-from pipeline.logs.workers import usable_threads
+from pipeline.logs.workers import map_in_order, usable_threads
 
 if TYPE_CHECKING:
     import os
@@ -148,8 +148,7 @@ def read_topics(
     if unchecked:
         notes.append(f"{unchecked} chunks carry no checksum: damage inside them cannot be seen")
     topics: list[TopicColumns] = []
-    for job in jobs.values():
-        columns, lost = _finish(job)
+    for columns, lost in map_in_order(_finish, jobs.values(), workers):
         losses.update(dict.fromkeys(lost))
         topics.append(columns)
     return LogData(index, tuple(topics), tuple(losses), tuple(notes), found, fetched)
