@@ -110,6 +110,8 @@ def compare_results(store: Store, question: Question) -> Answer:
     if question.as_published:
         samples, runs, told = follow_published_runs(material, runs)
         notes += told
+    elif chosen == "command":
+        notes += _doubt_commands(material)
     missing = sorted(set(material.manifests) - set(samples))
     if missing:
         notes.append(f"{', '.join(missing)} not compared: no {quantity.replace('_', ' ')} on {chosen}")
@@ -157,6 +159,19 @@ def _agree_on_scale(material: Material, runs: pl.DataFrame) -> tuple[Material, p
 def _choose_input(runs: pl.DataFrame) -> str:
     on_command = runs.filter(pl.col("input") == "command")["run"].n_unique()
     return "command" if on_command == runs["run"].n_unique() else "measured"
+
+
+def _doubt_commands(material: Material) -> list[str]:
+    """Runs whose recorded command is known to be scaled wrongly: their slip on it is no slip."""
+    found = material.scan("findings").filter(
+        pl.col("id") == "command_scale", pl.col("run").is_in(list(material.manifests))
+    )
+    runs = found.select("run").unique().sort("run").collect()["run"].to_list()
+    if not runs:
+        return []
+    return [
+        f"read with care, the recorded command is scaled wrongly (use --input measured): {', '.join(runs)}"
+    ]
 
 
 def _scan_slip(material: Material) -> pl.LazyFrame:

@@ -140,6 +140,15 @@ def test_a_damaged_run_costs_itself_only(store: Store) -> None:
     assert answer.comparisons.height == 1
 
 
+def test_a_command_that_is_scaled_wrongly_is_said(store: Store) -> None:
+    fill(store, {"asphalt": 0.5}, runs=1)
+    write_run(
+        store, Run(name="snow", dataset="snow", terrain="s", findings=[("command_scale", "warning", 1.8)])
+    )
+    assert any("scaled wrongly" in note and "snow" in note for note in ask(store).notes)
+    assert not any("scaled wrongly" in note for note in ask(store, input="measured").notes)
+
+
 def test_groups_may_be_any_labels(store: Store) -> None:
     fill(store, TERRAINS, runs=2)
     assert ask(store, by=("vehicle",)).datasets["dataset"].unique().to_list() == ["warthog"]
@@ -217,3 +226,14 @@ def test_many_single_runs_say_that_they_are_too_many() -> None:
     pairs = compare_groups(groups)
     assert len(pairs) == 210
     assert all("cannot be significant among 210 pairs" in pair.note for pair in pairs)
+
+
+def test_runs_without_wheels_have_no_published_number_and_that_is_said(store: Store) -> None:
+    for terrain in ("ice", "sand"):
+        manifest = write_run(store, Run(name=terrain, dataset=f"d_{terrain}", terrain=terrain))
+        path = manifest.path("slip")
+        pl.read_parquet(path).filter(pl.col("input") == "command").write_parquet(path)
+    answer = ask(store, as_published=True)
+    assert any("ice, sand not compared: no published norm" in note for note in answer.notes)
+    assert answer.comparisons.is_empty()
+    assert "comparison.html" in write_answer(store, answer)
