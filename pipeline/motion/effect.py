@@ -192,9 +192,10 @@ class Effect(ABC):
             low, high = parameter.bounds
             neutral = value == parameter.neutral or (math.isnan(value) and math.isnan(parameter.neutral))
             if not neutral and not low <= value <= high:
+                unit = "" if parameter.unit == "1" else f" {parameter.unit}"
                 raise MotionError(
                     "out_of_bounds",
-                    f"{name} = {value:g} {parameter.unit} is outside of {low:g} to {high:g}",
+                    f"{name} = {value:g}{unit} is outside of {low:g} to {high:g}",
                     where=f"{self.id}.{name}",
                     hint="Give a value inside the bounds.",
                 )

@@ -89,7 +89,9 @@ class State:
         return self.model.effect(free.effect).values[free.name]
 
     def set(self, free: Free, value: float) -> State:
-        """The state with another value of a free number."""
+        """The state with another value of a free number, brought inside its bounds."""
+        # A step that ends on a bound may miss it by a rounding error.
+        value = min(max(value, free.bounds[0]), free.bounds[1])
         if not free.effect:
             timing = list(self.timing)
             timing[free.run or 0] = replace(timing[free.run or 0], **{free.name: value})

@@ -54,25 +54,25 @@ FAST = (TRACK, INERTIA, "turn_lag", "wheel_speed_limit")
 GRAVEL = (TRACK, INERTIA, "lateral_skid")
 ICE = (INERTIA, "acceleration_limit", TRACK)
 _TILE = "husky_wheels-deflated_tile_2023_12_12_16h16"
-# What was reached, rounded up by 4 %: five numbers, relative to the ideal model on the clocks as recorded.
+# What was reached, and 8 % of margin: five numbers, relative to the ideal model on the clocks as recorded.
 CASES = (
-    Case(_TILE, M, TILE, (0.88, 0.23, 0.06, 0.29, 0.05)),
-    Case(_TILE, C, (*TILE, "turn_lag", "transport_delay"), (0.69, 0.26, 0.14, 0.36, 0.13)),
-    Case("husky_snow_boreal", M, SNOW, (0.79, 0.76, 0.17, 0.39, 0.16)),
-    Case("husky_snow_boreal", C, (*SNOW, "body_turn_limit", "turn_lag"), (0.90, 0.76, 0.06, 0.41, 0.13)),
-    Case("husky_wheels_wetgrass", M, (TRACK, "icr_offset"), (1.05, 1.02, 0.15, 0.88, 0.10)),
-    Case("husky_wheels_wetgrass", C, WET, (1.02, 1.02, 0.10, 0.77, 0.07)),
-    Case("warthog_wheels_asphalt_2024_8_7_11h30s30", M, (TRACK, INERTIA), (0.88, 0.53, 0.21, 0.44, 0.12)),
-    Case("warthog_wheels_asphalt_2024_8_7_11h30s30", C, FAST, (0.67, 0.54, 0.18, 0.34, 0.15)),
-    Case("warthog_wheels_asphalt", M, (TRACK, INERTIA), (0.83, 0.38, 0.14, 0.50, 0.11)),
-    Case("warthog_wheels_asphalt", C, FAST, (0.76, 0.38, 0.18, 0.39, 0.16)),
-    Case("warthog_gravel_1", M, GRAVEL, (0.51, 0.26, 0.12, 0.21, 0.14)),
-    Case("warthog_gravel_1", C, (*GRAVEL, "turn_lag", "body_turn_limit"), (0.40, 0.32, 0.11, 0.26, 0.23)),
-    Case("warthog_wheels_gravel_2024_8_6_11h37s32", M, GRAVEL, (0.78, 0.44, 0.14, 0.34, 0.12)),
+    Case(_TILE, M, TILE, (0.91, 0.24, 0.07, 0.30, 0.05)),
+    Case(_TILE, C, (*TILE, "turn_lag", "transport_delay"), (0.72, 0.27, 0.15, 0.37, 0.14)),
+    Case("husky_snow_boreal", M, SNOW, (0.83, 0.80, 0.19, 0.43, 0.19)),
+    Case("husky_snow_boreal", C, (*SNOW, "body_turn_limit", "turn_lag"), (0.94, 0.80, 0.06, 0.45, 0.14)),
+    Case("husky_wheels_wetgrass", M, (TRACK, "icr_offset"), (1.09, 1.06, 0.15, 0.93, 0.10)),
+    Case("husky_wheels_wetgrass", C, WET, (1.06, 1.06, 0.10, 0.82, 0.07)),
+    Case("warthog_wheels_asphalt_2024_8_7_11h30s30", M, (TRACK, INERTIA), (0.95, 0.58, 0.21, 0.52, 0.13)),
+    Case("warthog_wheels_asphalt_2024_8_7_11h30s30", C, FAST, (0.71, 0.59, 0.19, 0.39, 0.16)),
+    Case("warthog_wheels_asphalt", M, (TRACK, INERTIA), (0.87, 0.46, 0.15, 0.54, 0.12)),
+    Case("warthog_wheels_asphalt", C, FAST, (0.77, 0.46, 0.20, 0.43, 0.18)),
+    Case("warthog_gravel_1", M, GRAVEL, (0.53, 0.26, 0.14, 0.23, 0.16)),
+    Case("warthog_gravel_1", C, (*GRAVEL, "turn_lag", "body_turn_limit"), (0.41, 0.33, 0.12, 0.27, 0.25)),
+    Case("warthog_wheels_gravel_2024_8_6_11h37s32", M, GRAVEL, (0.84, 0.53, 0.15, 0.45, 0.13)),
     Case(
-        "warthog_wheels_gravel_2024_8_6_11h37s32", C, (*FAST, "lateral_skid"), (0.60, 0.44, 0.16, 0.29, 0.15)
+        "warthog_wheels_gravel_2024_8_6_11h37s32", C, (*FAST, "lateral_skid"), (0.63, 0.54, 0.16, 0.40, 0.17)
     ),
-    Case("warthog_wheels_sand_2024_9_25_14h32s32", M, (TRACK, INERTIA), (0.79, 0.50, 0.14, 0.42, 0.13)),
+    Case("warthog_wheels_sand_2024_9_25_14h32s32", M, (TRACK, INERTIA), (0.81, 0.50, 0.14, 0.43, 0.13)),
     Case(
         "warthog_wheels_sand_2024_9_25_14h32s32",
         C,
@@ -80,10 +80,10 @@ CASES = (
         (0.61, 0.51, 0.13, 0.37, 0.18),
     ),
     Case(
-        "warthog_wheels_ice_2024_7_30_16h30s21", M, (INERTIA, "wheel_radius"), (0.52, 0.58, 0.35, 0.37, 0.31)
+        "warthog_wheels_ice_2024_7_30_16h30s21", M, (INERTIA, "wheel_radius"), (0.54, 0.62, 0.35, 0.39, 0.31)
     ),
-    Case("warthog_wheels_ice_2024_7_30_16h30s21", C, ICE, (0.50, 0.67, 0.28, 0.33, 0.26)),
-    Case("warthog_wheels_grass_2024_7_29_14h46s15", M, (TRACK, INERTIA), (0.91, 0.80, 0.09, 0.57, 0.07)),
+    Case("warthog_wheels_ice_2024_7_30_16h30s21", C, ICE, (0.50, 0.74, 0.28, 0.35, 0.27)),
+    Case("warthog_wheels_grass_2024_7_29_14h46s15", M, (TRACK, INERTIA), (0.94, 0.83, 0.10, 0.57, 0.08)),
     Case(
         "warthog_wheels_grass_2024_8_8_16h19s23",
         C,
