@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pipeline.report import theme
-from pipeline.report.bundle import load_bundle
 from pipeline.report.errors import ReportError
-from pipeline.report.page import assemble_page
+from pipeline.report.page import assemble_page, load_scripts
 from pipeline.report.specs import build_spec, fill_spec, share_rows
 from pipeline.report.words import encode_json, escape
 
@@ -72,7 +70,7 @@ def render_gallery(title: str, facts: Sequence[str], chapters: Sequence[Chapter]
         "rows": share_rows(picture.drawing for picture in pictures),
         "dark": dict(theme.DARK_TWINS),
     }
-    scripts = [load_bundle(), files("pipeline.report").joinpath("page.js").read_text(encoding="utf-8")]
+    scripts = load_scripts()
     line = "".join(f"<li>{escape(fact)}</li>" for fact in facts)
     head = f'<header><h1>{escape(title)}</h1><ul class="line">{line}</ul></header>'
     main = "\n".join(_render_chapter(chapter) for chapter in chapters)

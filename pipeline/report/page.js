@@ -2,111 +2,19 @@
 // Draws the figures and links them: a stretch of time marked in one is shown in all.
 (() => {
   const page = JSON.parse(document.getElementById("page-data").textContent);
-  const dark = matchMedia("(prefers-color-scheme: dark)");
-  const RIGHT = 16;
-  const NARROW = 480;
-  const views = new Map();
   let spans = [];
   let points = [];
   let zoom = null;
 
-  const unpack = (columns) => {
-    const names = Object.keys(columns);
-    const read = names.map((name) => {
-      const column = columns[name];
-      return Array.isArray(column) ? column : column.codes.map((code) => column.levels[code]);
-    });
-    const count = names.length ? read[0].length : 0;
-    const rows = new Array(count);
-    for (let i = 0; i < count; i += 1) {
-      const row = {};
-      for (let k = 0; k < names.length; k += 1) row[names[k]] = read[k][i];
-      rows[i] = row;
-    }
-    return rows;
-  };
-
-  const swap = (value, twins) => {
-    if (typeof value === "string") return twins[value] ?? value;
-    if (Array.isArray(value)) return value.map((entry) => swap(entry, twins));
-    if (value === null || typeof value !== "object") return value;
-    return Object.fromEntries(Object.entries(value).map(([key, entry]) => [key, swap(entry, twins)]));
-  };
-
-  const widen = ([low, high], span) => [(low + high - span) / 2, (low + high + span) / 2];
-
-  const setDomains = (spec, domains) => {
-    for (const layer of spec.layer ?? [])
-      for (const axis of ["x", "y"]) {
-        const scale = layer.encoding?.[axis]?.scale;
-        if (scale?.domain && domains[axis]) scale.domain = domains[axis];
-      }
-  };
-
-  const fit = (spec, width) => {
-    const equal = spec.usermeta?.equal;
-    if (equal) {
-      const wide = equal.x[1] - equal.x[0];
-      const tall = equal.y[1] - equal.y[0];
-      const height = Math.min(Math.max((width * tall) / wide, equal.lowest), equal.highest);
-      const scale = Math.max(wide / width, tall / height);
-      spec.height = Math.round(height);
-      setDomains(spec, { x: widen(equal.x, scale * width), y: widen(equal.y, scale * height) });
-    }
-    for (const part of spec.vconcat ?? [spec]) {
-      part.width = Math.floor(width);
-      if (zoom && spec.usermeta?.brush === "time") setDomains(part, { x: zoom });
-    }
-  };
-
-  const namesIn = (value, found) => {
-    if (Array.isArray(value)) value.forEach((entry) => namesIn(entry, found));
-    else if (value && typeof value === "object") {
-      if (value.data && typeof value.data.name === "string") found.add(value.data.name);
-      Object.values(value).forEach((entry) => namesIn(entry, found));
-    }
-    return found;
-  };
-
   const fillsView = (span) => zoom !== null && span.t_start <= zoom[0] && span.t_end >= zoom[1];
 
-  const rowsOf = (name) => {
+  const ownRows = (name) => {
     if (name === "marked_spans") return spans.filter((span) => !fillsView(span)).map((span) => ({ ...span }));
     if (name === "marked_points") return points.map((point) => ({ ...point }));
-    return unpack(page.rows[name]);
+    return null;
   };
 
-  const embed = async (place, width) => {
-    const id = place.dataset.figure;
-    const spec = swap(page.figures[id], dark.matches ? page.dark : {});
-    fit(spec, width);
-    if (place.clientWidth < NARROW) spec.config.legend.columns = 1;
-    spec.padding = { left: 2, right: RIGHT - 4, top: 4, bottom: 4 };
-    const names = namesIn(spec, new Set());
-    spec.datasets = Object.fromEntries([...names].map((name) => [name, rowsOf(name)]));
-    views.get(id)?.finalize();
-    const result = await vegaEmbed(place, spec, {
-      actions: false,
-      ast: true,
-      mode: "vega-lite",
-      renderer: "svg",
-      tooltip: { theme: dark.matches ? "dark" : "light" },
-    });
-    views.set(id, { view: result.view, names, meta: spec.usermeta ?? {}, finalize: () => result.finalize() });
-    return result.view;
-  };
-
-  const draw = async (place) => {
-    const room = place.clientWidth;
-    let width = room - (page.figures[place.dataset.figure].usermeta?.gutter ?? 50) - RIGHT;
-    await embed(place, width);
-    const excess = place.querySelector("svg").width.baseVal.value - room;
-    if (excess > 1 || excess < -30) {
-      width -= excess;
-      await embed(place, width);
-    }
-    place.classList.add("drawn");
-  };
+  const { dark, draw, rowsOf, unpack, views } = slipPlots(page, { own: ownRows, zoomOf: () => zoom });
 
   const drawAll = async (selector = ".plot[data-figure]") => {
     for (const place of document.querySelectorAll(selector)) await draw(place);

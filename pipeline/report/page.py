@@ -42,7 +42,7 @@ def render_report(report: RunReport) -> str:
         "rows": share_rows(drawing for _, drawing in drawings),
         "dark": dict(theme.DARK_TWINS),
     }
-    scripts = [load_bundle(), _read_own("page.js")] if drawings else []
+    scripts = load_scripts() if drawings else []
     body = _render_header(page) + _render_sections(page)
     return assemble_page(escape(report.text("run") or "run"), body, encode_json(data), scripts)
 
@@ -86,6 +86,11 @@ def _render_sections(page: Page) -> str:
                 f'<h2 id="{section.id}-title">{section.title}</h2>\n{content}</section>'
             )
     return f"<main>{chr(10).join(shown)}</main>"
+
+
+def load_scripts() -> list[str]:
+    """What a page with figures runs: Vega, what draws, what links."""
+    return [load_bundle(), _read_own("plots.js"), _read_own("page.js")]
 
 
 def assemble_page(title: str, body: str, data: str, scripts: list[str]) -> str:

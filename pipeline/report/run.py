@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import polars as pl
 
+    from pipeline.report.motion_view import MotionView
+
 INPUTS = ("command", "measured")
 INPUT_WORDS = {"command": "on command", "measured": "on measured wheels"}
 
@@ -20,10 +22,14 @@ class RunReport:
     Attributes:
         summary: the JSON object of one run of ``slip analyze --json``.
         tables: tables by contract name (`commands`, `slip`, `windows`, ...); any may be missing or empty.
+        diagnosis: the JSON object of one run of ``slip diagnose --json``; empty where there is none.
+        motion: a model of the run; None where there is none.
     """
 
     summary: Mapping[str, object]
     tables: Mapping[str, pl.DataFrame] = field(default_factory=dict)
+    diagnosis: Mapping[str, object] = field(default_factory=dict)
+    motion: MotionView | None = None
 
     def table(self, name: str) -> pl.DataFrame | None:
         """A table that has rows, or None."""

@@ -9,7 +9,7 @@ import polars as pl
 from pipeline.report import theme
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from pipeline.report.figures import Drawing
 
@@ -44,6 +44,11 @@ def share_rows(drawings: Iterable[Drawing]) -> dict[str, Columns]:
     frames: dict[str, pl.DataFrame] = {}
     for drawing in drawings:
         frames.update(drawing.rows)
+    return pack_rows(frames)
+
+
+def pack_rows(frames: Mapping[str, pl.DataFrame]) -> dict[str, Columns]:
+    """Rows by name as columns, as `share_rows` gives them."""
     return {name: _pack_columns(frame) for name, frame in sorted(frames.items())}
 
 

@@ -22,8 +22,9 @@ SERIES_WORDS = {
     "velocity": "measured",
     "command": "ideal on command",
     "measured": "ideal on measured wheels",
+    "model": "model",
 }
-SERIES_COLOURS = {"velocity": theme.MEASURED, **theme.INPUT_COLOURS}
+SERIES_COLOURS = {"velocity": theme.MEASURED, **theme.INPUT_COLOURS, "model": theme.MODEL}
 
 MARKED_SPANS = "marked_spans"
 MARKED_POINTS = "marked_points"
@@ -77,6 +78,24 @@ def series_colour(names: list[str], words: dict[str, str]) -> alt.Color:
     label = " : ".join(f"datum.value === '{name}' ? '{words[name]}'" for name in names)
     scale = alt.Scale(domain=names, range=[SERIES_COLOURS[name] for name in names])
     legend = alt.Legend(title=None, labelExpr=f"{label} : datum.value", symbolType="stroke", symbolSize=220)
+    return alt.Color("series:N", scale=scale, legend=legend)
+
+
+def before_and_after(input_name: str) -> alt.Color:
+    """The colours of the ideal model on an input and of the model, with a legend."""
+    scale = alt.Scale(
+        domain=["ideal", "model"], range=[theme.INPUT_COLOURS.get(input_name, theme.QUIET), theme.MODEL]
+    )
+    words = INPUT_WORDS.get(input_name, "")
+    label = f"datum.value === 'ideal' ? 'ideal {words}' : 'model'"
+    legend = alt.Legend(
+        title=None,
+        labelExpr=label,
+        symbolType="stroke",
+        symbolSize=220,
+        symbolOpacity=1,
+        symbolStrokeWidth=2.5,
+    )
     return alt.Color("series:N", scale=scale, legend=legend)
 
 

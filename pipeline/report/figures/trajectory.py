@@ -69,19 +69,39 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
     meta = parts.brush_over_plane("x", "y") | {
         "equal": {"x": extent[0], "y": extent[1], "lowest": _LOWEST, "highest": _HIGHEST}
     }
-    chart = alt.layer(path, marked, dots, spots, *words).properties(
-        width=_WIDTH, height=height, usermeta=meta
-    )
+    predicted = [
+        alt.Chart(alt.NamedData("arcs"))
+        .mark_line(color=theme.MODEL, strokeWidth=1.6, opacity=0.9, order=False)
+        .encode(x="x:Q", y="y:Q")
+    ]
+    chart = alt.layer(
+        path, marked, dots, *(predicted if scene.report.motion else []), spots, *words
+    ).properties(width=_WIDTH, height=height, usermeta=meta)
     first, last = (
         frame.head(1).with_columns(place=pl.lit("start")),
         frame.tail(1).with_columns(place=pl.lit("end")),
     )
     steps = break_lines(frame.select("x", "y", "piece"), "x", "y")
-    rows = {"track": frame, "path": steps, "track_ends": pl.concat([first, last])} | parts.marked_rows()
-    note = parts.tell_thinning(track, kept="the highest slip of every bin")
-    return Drawing(
-        chart, rows, f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile. {note}".strip()
+    rows = (
+        list_arcs(scene)
+        | {"track": frame, "path": steps, "track_ends": pl.concat([first, last])}
+        | parts.marked_rows()
     )
+    note = parts.tell_thinning(track, kept="the highest slip of every bin")
+    arcs = " Lines: where the model goes in two seconds from measured poses." if scene.report.motion else ""
+    return Drawing(
+        chart, rows, f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile.{arcs} {note}".strip()
+    )
+
+
+def list_arcs(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Predicted paths as one broken line: ``t x y``; empty without a model."""
+    motion = scene.report.motion
+    if motion is None:
+        return {}
+    east, north = scene.origin
+    moved = motion.arcs.with_columns(pl.col("x") - east, pl.col("y") - north)
+    return {"arcs": break_lines(moved, "x", "y")}
 
 
 def fit_equal_aspect(

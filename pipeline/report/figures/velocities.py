@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import altair as alt
+import polars as pl
 
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
 from pipeline.report.scales import find_range
-from pipeline.report.scene import COMPONENTS
+from pipeline.report.scene import COMPONENTS, LINE_BINS
+from pipeline.report.thinning import break_lines, drop_flat_rows, thin_series
 
 if TYPE_CHECKING:
     from pipeline.report.figures.figure import Picture
@@ -29,7 +31,7 @@ def draw_velocities(scene: Scene) -> Drawing | None:
     if not there:
         return None
     chart = alt.vconcat(*(_draw_panel(scene, component, line) for component, line in there.items()))
-    rows = {f"velocity_{component}": line.frame for component, line in there.items()}
+    rows = {f"velocity_{component}": line.frame for component, line in there.items()} | model_rows(scene)
     note = parts.tell_thinning(*there.values(), kept="first, last, lowest and highest of every bin")
     return Drawing(
         chart.properties(usermeta=parts.brush_over_time()),
@@ -42,16 +44,32 @@ def _draw_panel(scene: Scene, component: str, lines: Thinned) -> Picture:
     shown = find_range(lines.frame, lines.usual)
     title = parts.title_panel(*_QUANTITIES[component], shown)
     last = component == COMPONENTS[-1]
-    line = (
-        alt.Chart(alt.NamedData(f"velocity_{component}"))
+    series = [*scene.slip, "velocity", *(["model"] if scene.report.motion else [])]
+    names = [f"velocity_{component}", *([f"model_{component}"] if scene.report.motion else [])]
+    drawn = [
+        alt.Chart(alt.NamedData(name))
         .mark_line(clip=True, order=False)
         .encode(
             x=parts.time_axis(scene) if last else parts.time_axis(scene, title=None),
             y=parts.value_axis(shown),
-            color=parts.series_colour([*scene.slip, "velocity"], parts.SERIES_WORDS),
+            color=parts.series_colour(series, parts.SERIES_WORDS),
         )
-    )
-    return alt.layer(*parts.shade_spans(), line).properties(width=parts.WIDTH, height=118, title=title)
+        for name in names
+    ]
+    return alt.layer(*parts.shade_spans(), *drawn).properties(width=parts.WIDTH, height=118, title=title)
+
+
+def model_rows(scene: Scene) -> dict[str, pl.DataFrame]:
+    """The model's velocity by component, thinned: ``t value series``; empty without a model."""
+    motion = scene.report.motion
+    if motion is None:
+        return {}
+    rows = {}
+    for component in COMPONENTS:
+        line = motion.velocity.select("t", "piece", value=pl.col(f"v_{component}"))
+        thinned = thin_series(drop_flat_rows(line, "value"), "value", bins=LINE_BINS)
+        rows[f"model_{component}"] = break_lines(thinned, "value").with_columns(series=pl.lit("model"))
+    return rows
 
 
 def describe_velocities(scene: Scene) -> str:
@@ -60,6 +78,7 @@ def describe_velocities(scene: Scene) -> str:
     return (
         "Forward velocity, sideways velocity and yaw rate over time in three panels: measured"
         + "".join(f", {word}" for word in words)
+        + (", model" if scene.report.motion else "")
         + ". The distance between a line and the measured one is the slip in that direction."
     )
 

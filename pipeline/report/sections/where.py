@@ -19,7 +19,7 @@ _WORTH_TELLING = 1.15
 _SMALLEST_SHARE = 0.15
 _UPPER_QUANTILE = 0.7
 _SLOW = 0.05
-_VERBS = {"command": ("Asked to turn", "Asked to drive"), "measured": ("Turning", "Driving")}
+VERBS = {"command": ("Asked to turn", "Asked to drive"), "measured": ("Turning", "Driving")}
 
 
 def render_where(page: Page) -> str:
@@ -27,7 +27,7 @@ def render_where(page: Page) -> str:
     figures = page.render_figures(Section.WHERE)
     if not figures:
         return ""
-    regions = find_regions(page.scene.sound_slip.get(page.report.main_input), _VERBS[page.report.main_input])
+    regions = find_regions(page.scene.sound_slip.get(page.report.main_input), VERBS[page.report.main_input])
     told = ""
     if regions:
         words = INPUT_WORDS[page.report.main_input]

@@ -1,0 +1,80 @@
+"""How far two-second predictions end from where the vehicle was, over time: the ideal model and the model."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import altair as alt
+import polars as pl
+
+from pipeline.report.figures import parts
+from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.scales import find_range, usual_ends
+from pipeline.report.scene import LINE_BINS
+from pipeline.report.thinning import break_lines, thin_series
+
+if TYPE_CHECKING:
+    from pipeline.report.scene import Scene
+
+
+def draw_reach(scene: Scene) -> Drawing | None:
+    """Two lines over time; None without a model."""
+    motion = scene.report.motion
+    if motion is None or motion.reach.is_empty():
+        return None
+    rows = list_reach(scene)
+    ends = usual_ends(motion.reach["ideal"], exact=False)
+    shown = find_range(rows["reach"], (ends[0], ends[1]))
+    line = (
+        alt.Chart(alt.NamedData("reach"))
+        .mark_line(clip=True, order=False)
+        .encode(
+            x=parts.time_axis(scene),
+            y=parts.value_axis(shown),
+            color=parts.before_and_after(motion.input),
+        )
+    )
+    chart = alt.layer(*parts.shade_spans(), line).properties(
+        width=parts.WIDTH,
+        height=130,
+        title=parts.title_panel("error of a 2 s prediction", "m", shown),
+        usermeta=parts.brush_over_time(),
+    )
+    return Drawing(chart, rows | parts.span_rows(scene))
+
+
+def list_reach(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Rows ``t value series``, thinned to peaks; empty without a model."""
+    motion = scene.report.motion
+    if motion is None:
+        return {}
+    lines = []
+    for name in ("ideal", "model"):
+        line = motion.reach.select("t", "piece", value=pl.col(name))
+        thinned = thin_series(line, "value", bins=LINE_BINS)
+        lines.append(break_lines(thinned, "value").with_columns(series=pl.lit(name)))
+    return {"reach": pl.concat(lines)}
+
+
+def describe_reach(scene: Scene) -> str:
+    """Medians and the worst moment of the model."""
+    motion = scene.report.motion
+    if motion is None or motion.reach.is_empty():
+        return "There is no model to draw."
+    row = motion.reach.row(motion.reach["model"].arg_max() or 0, named=True)
+    medians = [float(motion.reach[name].median() or 0.0) for name in ("ideal", "model")]  # type: ignore[arg-type]
+    return (
+        f"Error of two-second predictions over time: median {medians[0]:.3f} m for the ideal model, "
+        f"{medians[1]:.3f} m for the model, which is worst, {row['model']:.2f} m, at {row['t']:.0f} s."
+    )
+
+
+FIGURE = Figure(
+    id="reach",
+    title="Predictions over two seconds",
+    section=Section.WHY,
+    order=5,
+    width=Width.FULL,
+    draw=draw_reach,
+    describe=describe_reach,
+)

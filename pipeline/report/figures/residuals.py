@@ -1,0 +1,158 @@
+"""Residuals against the signal that explains them, before and after the model's effects."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import altair as alt
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from pipeline.report import theme
+from pipeline.report.figures import parts
+from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.motion_view import COMPONENTS, SIGNALS
+
+if TYPE_CHECKING:
+    from pipeline.report.figures.figure import Picture
+    from pipeline.report.motion_view import MotionView
+    from pipeline.report.scene import Scene
+
+Floats = NDArray[np.float64]
+
+QUANTITIES = {"x": ("forward", "m/s"), "y": ("sideways", "m/s"), "w": ("yaw rate", "rad/s")}
+
+_BINS = 18
+_FEWEST = 12
+_QUARTILES = (0.25, 0.5, 0.75)
+
+
+def draw_residuals(scene: Scene) -> Drawing | None:
+    """A panel a channel: median and quartiles of the residual over its signal; None without a model."""
+    motion = scene.report.motion
+    if motion is None or motion.residuals.is_empty():
+        return None
+    rows = list_residuals(scene)
+    panels = [_draw_panel(motion, component, rows[f"residual_{component}"]) for component in COMPONENTS]
+    chart = alt.vconcat(*panels).resolve_scale(x="independent", y="independent")
+    note = (
+        "Lines: medians; bands: the middle half. A line along zero leaves nothing to explain by that signal."
+    )
+    return Drawing(chart.properties(usermeta={"gutter": parts.GUTTER}), rows, note)
+
+
+def list_residuals(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Rows ``value low middle high series`` of every channel, in bins of equal counts."""
+    motion = scene.report.motion
+    if motion is None:
+        return {}
+    return {f"residual_{component}": _bin_residuals(motion, component) for component in COMPONENTS}
+
+
+def choose_signal(motion: MotionView, component: str) -> str:
+    """The signal whose bins explain most of the ideal model's residual in a channel."""
+    residual = motion.residuals[f"ideal_{component}"].to_numpy()
+    shares = {name: _explain(motion.residuals[name].to_numpy(), residual) for name in SIGNALS}
+    return max(shares, key=lambda name: shares[name])
+
+
+def _explain(signal: Floats, residual: Floats) -> float:
+    """Share of the spread of a residual that goes when each bin's median is taken off."""
+    edges = _find_edges(signal)
+    if edges.size == 0:
+        return 0.0
+    number = np.searchsorted(edges, signal, side="right")
+    rest = residual.copy()
+    for each in np.unique(number):
+        rest[number == each] -= np.median(residual[number == each])
+    before = float(np.abs(residual).mean())
+    return 1.0 - float(np.abs(rest).mean()) / before if before > 0.0 else 0.0
+
+
+def _find_edges(signal: Floats) -> Floats:
+    """Inner edges of bins of equal width, lone extremes in the outer ones; none for a constant."""
+    low, high = np.quantile(signal, (0.005, 0.995)).tolist()
+    if not high - low > 1e-9:  # noqa: PLR2004 - no width at all
+        return np.zeros(0)
+    edges: Floats = np.linspace(low, high, _BINS + 1)[1:-1]
+    return edges
+
+
+def _bin_residuals(motion: MotionView, component: str) -> pl.DataFrame:
+    signal = motion.residuals[choose_signal(motion, component)].to_numpy()
+    number = np.searchsorted(_find_edges(signal), signal, side="right")
+    rows = []
+    for series in ("ideal", "model"):
+        residual = motion.residuals[f"{series}_{component}"].to_numpy()
+        for each in np.unique(number):
+            inside = number == each
+            if inside.sum() < _FEWEST:
+                continue
+            low, middle, high = np.quantile(residual[inside], _QUARTILES).tolist()
+            rows.append(
+                {
+                    "value": float(np.median(signal[inside])),
+                    "low": low,
+                    "middle": middle,
+                    "high": high,
+                    "series": series,
+                }
+            )
+    schema = {**dict.fromkeys(("value", "low", "middle", "high"), pl.Float64), "series": pl.String}
+    return pl.DataFrame(rows, schema=schema)
+
+
+def _draw_panel(motion: MotionView, component: str, rows: pl.DataFrame) -> Picture:
+    what, unit = QUANTITIES[component]
+    signal, signal_unit = SIGNALS[choose_signal(motion, component)]
+    before = rows.filter(pl.col("series") == "ideal")
+    size = max(abs(float(before["low"].min() or 0.0)), abs(float(before["high"].max() or 0.0)), 1e-3)  # type: ignore[arg-type]
+    x = alt.X("value:Q", axis=alt.Axis(title=f"{signal} [{signal_unit}]", format=",~r", tickCount=6))
+    y = alt.Y(
+        "middle:Q",
+        scale=alt.Scale(domain=[-1.1 * size, 1.1 * size], nice=False),
+        axis=alt.Axis(title=None, tickCount=3, format=",~r", minExtent=parts.GUTTER - 10),
+    )
+    colour = parts.before_and_after(motion.input)
+    base = alt.Chart(alt.NamedData(f"residual_{component}"))
+    band = base.mark_area(opacity=0.16, clip=True).encode(x=x, y=alt.Y("low:Q"), y2="high:Q", color=colour)
+    line = base.mark_line(clip=True, strokeWidth=2, point={"size": 18}).encode(x=x, y=y, color=colour)
+    zero = (
+        alt.Chart(alt.NamedData(f"residual_{component}"))
+        .mark_rule(color=theme.QUIET, strokeWidth=0.8)
+        .encode(y=alt.datum(0.0))
+    )
+    return alt.layer(zero, band, line).properties(
+        width=480, height=96, title=alt.Title(f"{what} residual [{unit}]")
+    )
+
+
+def describe_residuals(scene: Scene) -> str:
+    """Which signal explains which channel, and the spread before and after."""
+    motion = scene.report.motion
+    if motion is None or motion.residuals.is_empty():
+        return "There is no model to draw."
+    told = []
+    for component in COMPONENTS:
+        what, unit = QUANTITIES[component]
+        sizes = [
+            float(np.sqrt(np.mean(motion.residuals[f"{series}_{component}"].to_numpy() ** 2)))
+            for series in ("ideal", "model")
+        ]
+        signal = SIGNALS[choose_signal(motion, component)][0]
+        told.append(
+            f"{what} over {signal}, root mean square {sizes[0]:.3f} before, {sizes[1]:.3f} {unit} after"
+        )
+    return "Residuals against the signal that explains most of them: " + "; ".join(told) + "."
+
+
+FIGURE = Figure(
+    id="residuals",
+    title="What is left, against the signal that explains it",
+    section=Section.WHY,
+    order=1,
+    width=Width.HALF,
+    draw=draw_residuals,
+    describe=describe_residuals,
+)

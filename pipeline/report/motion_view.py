@@ -1,0 +1,210 @@
+"""What a model says of a run beside the ideal one, as rows that figures draw.
+
+The report and the workbench draw from the same rows. Making a run ready takes a second; asking about another
+model takes hundredths.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from pipeline.motion import Timing, fit_model, predict_from
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.motion import Fitted, Problem, State
+    from pipeline.motion.comparison import Reach
+
+Floats = NDArray[np.float64]
+
+COMPONENTS = ("x", "y", "w")
+SIGNALS = {
+    "f_x": ("ideal speed", "m/s"),
+    "f_w": ("ideal yaw rate", "rad/s"),
+    "f_x_f_w": ("ideal speed times ideal yaw rate", "m/s²"),
+    "a_x": ("change of ideal speed", "m/s²"),
+    "a_w": ("change of ideal yaw rate", "rad/s²"),
+    "roll": ("roll", "rad"),
+    "pitch": ("pitch", "rad"),
+}
+
+_ARC_EVERY_S = 4.0
+_ARC_RATE_HZ = 10.0
+_RATE_HZ = 20.0
+_BROKEN_S = 5.0
+
+
+@dataclass(frozen=True)
+class MotionView:
+    """A model on a run.
+
+    Attributes:
+        input: what the model is fed with, `command` or `measured`.
+        effects: ids of its effects.
+        ladder: rungs as in the JSON of `slip diagnose`, from the ideal model up.
+        floor: the noise floor under the same keys; None where it is not known.
+        residuals: one row a window of half a second: ``t`` [s], residuals ``ideal_x`` .. ``model_w``
+            [m/s, rad/s], and the signals of `SIGNALS`.
+        velocity: the model's velocity: ``t piece v_x v_y v_w``.
+        reach: one row a prediction of two seconds: ``t piece ideal model`` [m], ``ideal_yaw model_yaw``
+            [rad].
+        arcs: predicted paths, one every few seconds: ``t piece x y`` in the map.
+    """
+
+    input: str
+    effects: tuple[str, ...]
+    ladder: Sequence[Mapping[str, object]]
+    floor: Mapping[str, object] | None
+    residuals: pl.DataFrame
+    velocity: pl.DataFrame
+    reach: pl.DataFrame
+    arcs: pl.DataFrame
+
+
+class MotionStage:
+    """A run made ready to be shown under many models.
+
+    Args:
+        problem: the runs; the first one is shown.
+        places: measured ``t x y`` of that run in the map, where predicted paths begin; None leaves them as
+            they come out of the plane of motion.
+    """
+
+    def __init__(self, problem: Problem, places: pl.DataFrame | None = None) -> None:
+        self.problem = problem
+        self._places = places
+        self._comparison = problem.comparisons[0]
+
+    @cached_property
+    def ideal(self) -> Fitted:
+        """The ideal model with the recording's delays."""
+        from pipeline.motion import Model  # noqa: PLC0415 - only here
+
+        return fit_model(self.problem, Model(self.problem.vehicle))
+
+    @cached_property
+    def _ideal_reach(self) -> Reach:
+        return self._comparison.find_reach((), self.ideal.state.timing[0])
+
+    @cached_property
+    def _signals(self) -> dict[str, Floats]:
+        comparison = self._comparison
+        cells, around = comparison.cells, comparison.surroundings
+        velocity = comparison.predict_velocity((), Timing())
+        times, span = comparison.windows.times - comparison.usual_delay, comparison.windows.span_s
+        edges = cells.locate_edges(times.ravel())
+        index = np.arange(cells.times.size + 1, dtype=np.float64)
+        middle = times.mean(axis=1)
+
+        def average(signal: Floats) -> Floats:
+            sums = np.interp(edges, index, cells.sum_up(signal)).reshape(times.shape)
+            return np.asarray((sums[:, 1] - sums[:, 0]) / span, dtype=np.float64)
+
+        def slope(signal: Floats) -> Floats:
+            ends = np.interp(times.ravel(), cells.times, signal).reshape(times.shape)
+            return np.asarray((ends[:, 1] - ends[:, 0]) / span, dtype=np.float64)
+
+        return {
+            "f_x": average(velocity.x),
+            "f_w": average(velocity.w),
+            "f_x_f_w": average(velocity.x * velocity.w),
+            "a_x": slope(velocity.x),
+            "a_w": slope(velocity.w),
+            "roll": np.interp(middle, around.times, around.attitude[:, 0]),
+            "pitch": np.interp(middle, around.times, around.attitude[:, 1]),
+        }
+
+    def view(
+        self, state: State, ladder: Sequence[Mapping[str, object]], floor: Mapping[str, object] | None
+    ) -> MotionView:
+        """Rows of one model.
+
+        Args:
+            state: the model with its values and the recording's delays.
+            ladder: its rungs as JSON.
+            floor: the noise floor as JSON.
+        """
+        comparison = self._comparison
+        rows = self.problem.run_of == 0
+        ideal, model = self.ideal.residuals[rows], self.problem.find_run_residuals(state, 0)
+        effects, timing = state.effects_of(0), state.timing[0]
+        residuals = pl.DataFrame(
+            {
+                "t": comparison.windows.times.mean(axis=1),
+                **{f"ideal_{name}": ideal[:, i] for i, name in enumerate(COMPONENTS)},
+                **{f"model_{name}": model[:, i] for i, name in enumerate(COMPONENTS)},
+                **self._signals,
+            }
+        )
+        return MotionView(
+            input=self.problem.source.value,
+            effects=state.model.ids,
+            ladder=ladder,
+            floor=floor,
+            residuals=residuals,
+            velocity=self._draw_velocity(state),
+            reach=self._gather_reach(comparison.find_reach(effects, timing)),
+            arcs=self._draw_arcs(state),
+        )
+
+    def _draw_velocity(self, state: State) -> pl.DataFrame:
+        cells = self._comparison.cells
+        velocity = self._comparison.predict_velocity(state.effects_of(0), state.timing[0])
+        every = max(round(1.0 / (_RATE_HZ * cells.step_s)), 1)
+        kept = slice(every // 2, None, every)
+        columns = {f"v_{name}": getattr(velocity, name)[kept] for name in COMPONENTS}
+        return pl.DataFrame(
+            {
+                "t": cells.times[kept] + state.timing[0].pose_delay_s,
+                "piece": cells.span[kept].astype(np.int32),
+                **columns,
+            }
+        )
+
+    def _gather_reach(self, reach: Reach) -> pl.DataFrame:
+        horizons, ideal = self._comparison.horizons, self._ideal_reach
+        count = np.maximum(np.bincount(horizons.number), 1)
+
+        def size(errors: Floats) -> Floats:
+            return np.asarray(np.sqrt(np.bincount(horizons.number, errors**2) / count), dtype=np.float64)
+
+        first = np.unique(horizons.number, return_index=True)[1]
+        times = horizons.times[first, 0]
+        present = np.unique(horizons.number)
+        broken = np.diff(times, prepend=times[:1]) > _BROKEN_S
+        return pl.DataFrame(
+            {
+                "t": times,
+                "piece": np.cumsum(broken).astype(np.int32),
+                "ideal": size(ideal.position)[present],
+                "model": size(reach.position)[present],
+                "ideal_yaw": size(ideal.yaw)[present],
+                "model_yaw": size(reach.yaw)[present],
+            }
+        )
+
+    def _draw_arcs(self, state: State) -> pl.DataFrame:
+        made = predict_from(self._comparison, state.effects_of(0), state.timing[0], rate_hz=_ARC_RATE_HZ)
+        slot = np.floor(made.start_times / _ARC_EVERY_S)
+        kept = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0.0)
+        x, y = made.poses[kept, :, 0], made.poses[kept, :, 1]
+        if self._places is not None and kept.size:
+            known = self._places["t"].to_numpy()
+            at = [np.interp(made.start_times[kept], known, self._places[name].to_numpy()) for name in "xy"]
+            x, y = x + (at[0] - x[:, 0])[:, None], y + (at[1] - y[:, 0])[:, None]
+        steps = made.horizon_times.size
+        return pl.DataFrame(
+            {
+                "t": (made.start_times[kept][:, None] + made.horizon_times).ravel(),
+                "piece": np.repeat(np.arange(kept.size, dtype=np.int32), steps),
+                "x": x.ravel(),
+                "y": y.ravel(),
+            }
+        )

@@ -1,0 +1,115 @@
+"use strict";
+// Draws figures out of specifications and shared rows, fitted to the room there is; the report and the workbench
+// use it. `page` holds figures, rows and dark twins of colours; `own(name)` gives rows that are not among them.
+const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false } = {}) => {
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  const RIGHT = 16;
+  const NARROW = 480;
+  const views = new Map();
+
+  const unpack = (columns) => {
+    const names = Object.keys(columns);
+    const read = names.map((name) => {
+      const column = columns[name];
+      return Array.isArray(column) ? column : column.codes.map((code) => column.levels[code]);
+    });
+    const count = names.length ? read[0].length : 0;
+    const rows = new Array(count);
+    for (let i = 0; i < count; i += 1) {
+      const row = {};
+      for (let k = 0; k < names.length; k += 1) row[names[k]] = read[k][i];
+      rows[i] = row;
+    }
+    return rows;
+  };
+
+  const swap = (value, twins) => {
+    if (typeof value === "string") return twins[value] ?? value;
+    if (Array.isArray(value)) return value.map((entry) => swap(entry, twins));
+    if (value === null || typeof value !== "object") return value;
+    return Object.fromEntries(Object.entries(value).map(([key, entry]) => [key, swap(entry, twins)]));
+  };
+
+  const widen = ([low, high], span) => [(low + high - span) / 2, (low + high + span) / 2];
+
+  const setDomains = (spec, domains) => {
+    for (const layer of spec.layer ?? [])
+      for (const axis of ["x", "y"]) {
+        const scale = layer.encoding?.[axis]?.scale;
+        if (scale?.domain && domains[axis]) scale.domain = domains[axis];
+      }
+  };
+
+  const fit = (spec, width) => {
+    const equal = spec.usermeta?.equal;
+    if (equal) {
+      const wide = equal.x[1] - equal.x[0];
+      const tall = equal.y[1] - equal.y[0];
+      const height = Math.min(Math.max((width * tall) / wide, equal.lowest), equal.highest);
+      const scale = Math.max(wide / width, tall / height);
+      spec.height = Math.round(height);
+      setDomains(spec, { x: widen(equal.x, scale * width), y: widen(equal.y, scale * height) });
+    }
+    for (const part of spec.vconcat ?? [spec]) {
+      part.width = Math.floor(width);
+      const zoom = zoomOf();
+      if (zoom && spec.usermeta?.brush === "time") setDomains(part, { x: zoom });
+    }
+  };
+
+  const namesIn = (value, found) => {
+    if (Array.isArray(value)) value.forEach((entry) => namesIn(entry, found));
+    else if (value && typeof value === "object") {
+      if (value.data && typeof value.data.name === "string") found.add(value.data.name);
+      Object.values(value).forEach((entry) => namesIn(entry, found));
+    }
+    return found;
+  };
+
+  const rowsOf = (name) => own(name) ?? unpack(page.rows[name]);
+
+  const embed = async (place, width) => {
+    const id = place.dataset.figure;
+    const spec = swap(page.figures[id], dark.matches ? page.dark : {});
+    fit(spec, width);
+    if (place.clientWidth < NARROW) spec.config.legend.columns = 1;
+    spec.padding = { left: 2, right: RIGHT - 4, top: 4, bottom: 4 };
+    const names = namesIn(spec, new Set());
+    spec.datasets = Object.fromEntries([...names].map((name) => [name, rowsOf(name)]));
+    views.get(id)?.finalize();
+    const result = await vegaEmbed(place, spec, {
+      actions: false,
+      ast: true,
+      mode: "vega-lite",
+      renderer: "svg",
+      tooltip: { theme: dark.matches ? "dark" : "light", disableDefaultStyle: strict },
+      defaultStyle: !strict,
+    });
+    views.set(id, { view: result.view, names, meta: spec.usermeta ?? {}, finalize: () => result.finalize() });
+    return result.view;
+  };
+
+  const draw = async (place) => {
+    const room = place.clientWidth;
+    let width = room - (page.figures[place.dataset.figure].usermeta?.gutter ?? 50) - RIGHT;
+    await embed(place, width);
+    const excess = place.querySelector("svg").width.baseVal.value - room;
+    if (excess > 1 || excess < -30) {
+      width -= excess;
+      await embed(place, width);
+    }
+    place.classList.add("drawn");
+  };
+
+  // Puts new rows into what is drawn; axes whose ends are fixed stay where they are.
+  const feed = (rows) => {
+    Object.assign(page.rows, rows);
+    for (const { view, names } of views.values()) {
+      const changed = Object.keys(rows).filter((name) => names.has(name));
+      for (const name of changed) view.data(name, unpack(rows[name]));
+      if (changed.length) view.runAsync();
+    }
+  };
+
+  return { dark, draw, feed, rowsOf, unpack, views };
+};

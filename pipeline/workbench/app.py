@@ -1,0 +1,177 @@
+"""The web side: routes, and errors as JSON."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from typing import TYPE_CHECKING
+from urllib.parse import quote
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
+
+from pipeline.core.errors import SlipError
+from pipeline.job.analyze import REPORT
+from pipeline.report.bundle import load_bundle
+from pipeline.vehicles import list_presets
+from pipeline.workbench.errors import WorkbenchError
+from pipeline.workbench.guard import LOOPBACK, Guard
+from pipeline.workbench.hall import Hall
+from pipeline.workbench.requests import read_ask
+from pipeline.workbench.runs import find_run, list_runs
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+    from pathlib import Path
+
+    from starlette.requests import Request
+    from starlette.types import ASGIApp
+
+    Answer = Callable[[Request], Awaitable[Response]]
+
+MOST_BYTES = 16_000_000_000
+
+_PAGES = {
+    "/": ("pipeline.workbench", "page.html", "text/html"),
+    "/page.css": ("pipeline.workbench", "page.css", "text/css"),
+    "/page.js": ("pipeline.workbench", "page.js", "text/javascript"),
+    "/pane.js": ("pipeline.workbench", "pane.js", "text/javascript"),
+    "/parts.js": ("pipeline.workbench", "parts.js", "text/javascript"),
+    "/plots.js": ("pipeline.report", "plots.js", "text/javascript"),
+}
+# The report's own policy stands inside it: it may run what it brought, and reach nothing.
+_REPORT_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
+    "sandbox allow-scripts"
+)
+_NOT_FOUND = ("no_such_run", "no_such_desk", "no_such_job")
+
+
+class Web:
+    """What each address answers.
+
+    Args:
+        hall: what is asked.
+    """
+
+    def __init__(self, hall: Hall) -> None:
+        self._hall = hall
+
+    def routes(self) -> list[Route]:
+        """All addresses."""
+        return [
+            *(Route(path, _serve_own(*where)) for path, where in _PAGES.items()),
+            Route("/vega.js", self.bundle),
+            Route("/model.toml", self.download),
+            Route("/report", self.report),
+            Route("/api/runs", self.runs),
+            Route("/api/jobs", self.jobs),
+            Route("/api/desk", self.desk, methods=["POST"]),
+            Route("/api/figures", self.figures, methods=["POST"]),
+            Route("/api/rows", self.rows, methods=["POST"]),
+            Route("/api/save", self.save, methods=["POST"]),
+            Route("/api/upload", self.upload, methods=["POST"]),
+            Route("/api/retry", self.retry, methods=["POST"]),
+            Route("/api/dismiss", self.dismiss, methods=["POST"]),
+        ]
+
+    async def runs(self, _: Request) -> Response:
+        """Runs, jobs and known vehicles."""
+        hall = self._hall
+        listed = await run_in_threadpool(list_runs, hall.store)
+        presets = [{"id": preset.id, "name": preset.name} for preset in list_presets()]
+        more = {"jobs": hall.jobs.show(), "vehicles": presets, "results": str(hall.results)}
+        return JSONResponse({**listed, **more})
+
+    async def jobs(self, _: Request) -> Response:
+        """Logs on their way to runs."""
+        return JSONResponse({"jobs": self._hall.jobs.show()})
+
+    async def desk(self, request: Request) -> Response:
+        """A change to a desk, and what it looks like then."""
+        return JSONResponse(await run_in_threadpool(self._hall.answer, await read_ask(request)))
+
+    async def figures(self, request: Request) -> Response:
+        """All figures of a desk."""
+        return JSONResponse(await run_in_threadpool(self._hall.draw, await read_ask(request)))
+
+    async def rows(self, request: Request) -> Response:
+        """Rows of the figures of a desk."""
+        return JSONResponse(await run_in_threadpool(self._hall.redraw, await read_ask(request)))
+
+    async def save(self, request: Request) -> Response:
+        """Write the model file of a desk."""
+        ask = await read_ask(request)
+        path = await run_in_threadpool(self._hall.save_model, ask.run, ask.slot)
+        return JSONResponse({"path": str(path)})
+
+    async def download(self, request: Request) -> Response:
+        """The model file of a desk."""
+        run, slot = request.query_params.get("run", ""), request.query_params.get("slot", "a")
+        text = await run_in_threadpool(self._hall.format_model, run, slot)
+        name = quote(f"{run.rpartition('/')[2]}.toml", safe="")
+        disposition = f"attachment; filename*=UTF-8''{name}"
+        return PlainTextResponse(text, headers={"content-disposition": disposition})
+
+    async def report(self, request: Request) -> Response:
+        """The stored report of a run, shut off from this page."""
+        run = request.query_params.get("run", "")
+        manifest = await run_in_threadpool(find_run, self._hall.store, run)
+        headers = {"content-security-policy": _REPORT_POLICY}
+        return FileResponse(manifest.path(REPORT), media_type="text/html", headers=headers)
+
+    async def bundle(self, _: Request) -> Response:
+        """The JavaScript that draws."""
+        script = await run_in_threadpool(load_bundle)
+        # It changes only with the installed version: a reload must not fetch megabytes again.
+        headers = {"cache-control": "private, max-age=3600"}
+        return Response(script, media_type="text/javascript", headers=headers)
+
+    async def upload(self, request: Request) -> Response:
+        """Take a log in, and begin to analyze it."""
+        length = request.headers.get("content-length", "")
+        if not length.isdecimal():
+            raise WorkbenchError("no_length", "the size of the log is not known", hint="Drop it again.")
+        name = request.query_params.get("name", "")
+        job = await self._hall.jobs.take(name, int(length), request.stream())
+        return JSONResponse({"job": job.show()})
+
+    async def retry(self, request: Request) -> Response:
+        """Analyze a log again, now that its vehicle is known."""
+        query = request.query_params
+        job = self._hall.jobs.retry(query.get("id", ""), query.get("vehicle", ""))
+        return JSONResponse({"job": job.show()})
+
+    async def dismiss(self, request: Request) -> Response:
+        """Forget a job that has ended."""
+        self._hall.jobs.dismiss(request.query_params.get("id", ""))
+        return JSONResponse({"jobs": self._hall.jobs.show()})
+
+
+def build_app(results: Path, *, hosts: tuple[str, ...] = LOOPBACK, most_bytes: int = MOST_BYTES) -> ASGIApp:
+    """The workbench as an ASGI application.
+
+    Args:
+        results: the results folder; need not exist yet.
+        hosts: names under which it may be addressed, without a port.
+        most_bytes: the largest log that is taken in.
+    """
+    web = Web(Hall(results, most_bytes))
+    return Guard(Starlette(routes=web.routes(), exception_handlers={SlipError: _tell_error}), hosts)
+
+
+def _serve_own(package: str, name: str, kind: str) -> Answer:
+    content = files(package).joinpath(name).read_text(encoding="utf-8")
+
+    async def serve(_: Request) -> Response:
+        return Response(content, media_type=kind)
+
+    return serve
+
+
+async def _tell_error(_: Request, error: Exception) -> Response:
+    if not isinstance(error, SlipError):
+        raise error
+    told = {"code": error.code, "message": error.what, "where": error.where, "hint": error.hint}
+    return JSONResponse({"error": told}, status_code=404 if error.code in _NOT_FOUND else 422)

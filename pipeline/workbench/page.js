@@ -1,0 +1,192 @@
+// Runs, dropped logs, one pane or two; what is open stands in the address, so that a reload brings it back.
+import { Pane } from "./pane.js";
+import { get, h, post, say, sayDuration, toast, upload } from "./parts.js";
+
+const find = (id) => document.getElementById(id);
+const panes = { a: null, b: null };
+let listed = { runs: [], jobs: [], vehicles: [] };
+let aimed = "a";
+
+const address = () => new URLSearchParams(location.hash.slice(1));
+
+const remember = () => {
+  const kept = new URLSearchParams();
+  for (const [slot, pane] of Object.entries(panes)) if (pane?.run) kept.set(slot, pane.run);
+  history.replaceState(null, "", `#${kept}`);
+  showRuns();
+  find("shelf").dataset.current = panes.a?.run ?? "";
+};
+
+// Runs -------------------------------------------------------------------------------------------------------
+
+const ORDERS = {
+  slip: (a, b) => (b.median_modulus ?? -1) - (a.median_modulus ?? -1),
+  name: (a, b) => a.run.localeCompare(b.run),
+  length: (a, b) => (b.duration_s ?? 0) - (a.duration_s ?? 0),
+};
+
+const showRuns = () => {
+  const words = find("search").value.toLowerCase().split(/\s+/).filter(Boolean);
+  const text = (run) => [run.run, run.vehicle, run.terrain, run.dataset].join(" ").toLowerCase();
+  const shown = listed.runs.filter((run) => words.every((word) => text(run).includes(word)));
+  shown.sort(ORDERS[find("sort").value]);
+  const open = new Set([panes.a?.run, panes.b?.run]);
+  find("count").textContent = listed.runs.length ? `${shown.length} of ${listed.runs.length}` : "none yet";
+  find("runs").replaceChildren(...shown.map((run) => h("li", {},
+    h("button", { type: "button", class: "run", "aria-current": open.has(run.run) ? "true" : null, onclick: () => open_(run.run) },
+      h("b", {}, run.run),
+      h("span", {}, [run.terrain, sayDuration(run.duration_s), run.median_modulus === null || run.median_modulus === undefined ? "" : `${say(run.median_modulus)} m/s`].filter(Boolean).join(" · ")),
+      run.losses.length > 0 && h("i", { class: "lossy", title: "the log had losses" }, "losses")))));
+  find("bench").classList.toggle("empty", !listed.runs.length);
+  if (!listed.runs.length) find("panes").replaceChildren(h("div", { class: "blank" }, h("h2", {}, "No runs yet"), h("p", {}, "Drop an MCAP anywhere on this page: it is analyzed here, and nothing leaves this machine.")));
+};
+
+const open_ = async (run) => {
+  const slot = panes.b && aimed === "b" ? "b" : "a";
+  if (matchMedia("(max-width: 860px)").matches) find("shelf").open = false;
+  await panes[slot].open(run);
+};
+
+const load = async () => {
+  listed = await get("/api/runs");
+  find("results").textContent = listed.results;
+  showRuns();
+  showJobs(listed.jobs);
+};
+
+// Panes ------------------------------------------------------------------------------------------------------
+
+const arrange = (two) => {
+  find("compare").checked = two;
+  panes.a ??= new Pane("a", remember);
+  panes.b = two ? (panes.b ?? new Pane("b", remember)) : null;
+  find("bench").classList.toggle("single", !two);
+  if (!listed.runs.length) return;
+  find("panes").replaceChildren(...Object.values(panes).filter(Boolean).map((pane) => pane.root));
+  for (const pane of Object.values(panes)) pane?.root.addEventListener("pointerdown", () => (aimed = pane.slot));
+};
+
+find("compare").addEventListener("change", async (event) => {
+  arrange(event.target.checked);
+  if (panes.b) {
+    aimed = "b";
+    await panes.a.draw();
+    await panes.b.open(panes.a.run);
+  } else {
+    aimed = "a";
+    remember();
+    await panes.a.draw();
+  }
+});
+
+// Dropped logs -----------------------------------------------------------------------------------------------
+
+const showJobs = (jobs) => {
+  find("jobs").replaceChildren(...jobs.map((job) => h("li", { class: `job${job.error ? " failed" : ""}`, data: { job: job.id } },
+    h("b", {}, job.name),
+    !job.done && h("span", {}, `${job.words}, ${Math.round(job.seconds)} s`),
+    !job.done && h("i", { class: "progress", bar: job.total && job.stage === "upload" ? (job.received / job.total) / job.steps : job.step / job.steps }),
+    job.error && h("p", {}, job.error.message),
+    job.error && askVehicle(job),
+    job.run && h("button", { type: "button", onclick: () => open_(job.run) }, job.lossy ? "Open (log had losses)" : "Open"),
+    job.done && h("button", { type: "button", class: "drop", "aria-label": "dismiss", onclick: async () => showJobs((await post(`/api/dismiss?id=${encodeURIComponent(job.id)}`, {})).jobs) }, "×"))));
+};
+
+const askVehicle = (job) => {
+  if (!job.error.code.includes("vehicle")) return null;
+  const chosen = h("select", { "aria-label": "vehicle of this log" }, h("option", { value: "" }, "choose the vehicle …"),
+    listed.vehicles.map((vehicle) => h("option", { value: vehicle.id }, vehicle.name)));
+  chosen.addEventListener("change", async () => {
+    await post(`/api/retry?id=${encodeURIComponent(job.id)}&vehicle=${encodeURIComponent(chosen.value)}`, {});
+    watch();
+  });
+  return chosen;
+};
+
+let watching = false;
+const watch = async () => {
+  if (watching) return;
+  watching = true;
+  try {
+    for (;;) {
+      const { jobs } = await get("/api/jobs");
+      showJobs(jobs);
+      if (jobs.every((job) => job.done)) {
+        const fresh = jobs.find((job) => job.run && !listed.runs.some((run) => run.run === job.run));
+        await load();
+        arrange(find("compare").checked);
+        if (fresh) await open_(fresh.run);
+        return;
+      }
+      await new Promise((done) => setTimeout(done, 400));
+    }
+  } catch (error) {
+    toast(error.message);
+  } finally {
+    watching = false;
+  }
+};
+
+const take = async (files) => {
+  for (const file of files) {
+    const line = h("li", { class: "job" }, h("b", {}, file.name), h("span", {}, "taking the log in"), h("i", { class: "progress", bar: 0 }));
+    find("jobs").prepend(line);
+    try {
+      await upload(file, (share) => line.querySelector(".progress").style.setProperty("--share", share / 7));
+    } catch (error) {
+      toast(error.message);
+      line.remove();
+      continue;
+    }
+    await watch();
+  }
+};
+
+find("file").addEventListener("change", (event) => take([...event.target.files]));
+for (const kind of ["dragover", "drop"])
+  addEventListener(kind, (event) => {
+    event.preventDefault();
+    document.body.classList.toggle("dropping", kind === "dragover");
+    if (kind === "drop") take([...event.dataTransfer.files]);
+  });
+addEventListener("dragleave", (event) => event.relatedTarget === null && document.body.classList.remove("dropping"));
+
+// Beginning --------------------------------------------------------------------------------------------------
+
+find("search").addEventListener("input", showRuns);
+find("sort").addEventListener("change", showRuns);
+addEventListener("keydown", (event) => {
+  if ((event.ctrlKey || event.metaKey) && event.key === "z" && !/INPUT|SELECT|TEXTAREA/.test(document.activeElement.tagName)) {
+    event.preventDefault();
+    panes[panes.b ? aimed : "a"]?.act(event.shiftKey ? "redo" : "undo");
+  }
+});
+let timer = 0;
+let width = document.documentElement.clientWidth;
+const again = () => {
+  clearTimeout(timer);
+  timer = setTimeout(() => Object.values(panes).forEach((pane) => pane?.plots && pane.paint()), 200);
+};
+addEventListener("resize", () => {
+  if (document.documentElement.clientWidth === width) return;
+  width = document.documentElement.clientWidth;
+  again();
+});
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", again);
+
+const begin = async () => {
+  try {
+    const kept = address();
+    if (matchMedia("(max-width: 860px)").matches) find("shelf").open = false;
+    await load();
+    arrange(kept.has("b"));
+    const known = (run) => run && listed.runs.some((entry) => entry.run === run);
+    if (listed.jobs.some((job) => !job.done)) watch();
+    const first = known(kept.get("a")) ? kept.get("a") : [...listed.runs].sort(ORDERS.slip)[0]?.run;
+    if (first) await panes.a.open(first);
+    if (panes.b && first) await panes.b.open(known(kept.get("b")) ? kept.get("b") : first);
+  } catch (error) {
+    toast(error.message);
+  }
+};
+begin();

@@ -1,0 +1,70 @@
+"""Starting the server."""
+
+from __future__ import annotations
+
+import socket
+from typing import TYPE_CHECKING
+
+from pipeline.report.bundle import warm_bundle
+from pipeline.workbench.app import build_app
+from pipeline.workbench.errors import WorkbenchError
+from pipeline.workbench.guard import LOOPBACK
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+def serve(results: Path, *, host: str, port: int, tell: Callable[[str], None]) -> None:
+    """Serve the workbench until it is interrupted.
+
+    Args:
+        results: the results folder.
+        host: address to listen on; anything but the loopback opens it to the network.
+        port: 0 takes any that is free.
+        tell: told the address once it listens.
+
+    Raises:
+        WorkbenchError: ``port_taken``, nothing can listen there.
+    """
+    import uvicorn  # noqa: PLC0415 - heavy
+
+    listener = _listen(host, port)
+    hosts = LOOPBACK if host in LOOPBACK or host == "::1" else (*LOOPBACK, host.lower(), *_own_names(host))
+    app = build_app(results, hosts=hosts)
+    warm_bundle()
+    shown = f"[{host}]" if ":" in host else host
+    tell(f"http://{shown}:{listener.getsockname()[1]}/")
+    configuration = uvicorn.Config(
+        app, log_level="warning", server_header=False, access_log=False, timeout_graceful_shutdown=2
+    )
+    uvicorn.Server(configuration).run(sockets=[listener])
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+    except OSError as error:
+        listener.close()
+        raise WorkbenchError(
+            "port_taken",
+            f"nothing can listen there: {error.strerror}",
+            where=f"{host}:{port}",
+            hint="Give another --port, or 0 for any that is free.",
+        ) from error
+    return listener
+
+
+def _own_names(host: str) -> tuple[str, ...]:
+    """Names of this machine, where it listens on all addresses."""
+    if host not in {"0.0.0.0", "::"}:  # noqa: S104 - compared, not bound
+        return ()
+    name = socket.gethostname().lower()
+    try:
+        addresses = {str(info[4][0]) for info in socket.getaddrinfo(name, None)}
+    except OSError:
+        addresses = set()
+    return (name, f"{name}.local", *(f"[{each}]" if ":" in each else each for each in sorted(addresses)))
