@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import random
 import shutil
@@ -10,8 +11,8 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import polars as pl
 import pytest
@@ -19,6 +20,9 @@ from batch_tools import HERE, batch, counts, read_tables, start_slip
 from batch_works import work_dying_at_steps
 
 from pipeline.store import STEPS, Store
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 FEW_ROUNDS, MANY_ROUNDS = 20, 200
 
@@ -28,7 +32,7 @@ def field(originals: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Logs that take long enough to be killed at."""
     folder = tmp_path_factory.mktemp("kills") / "season"
     shutil.copytree(originals, folder)
-    for number in range(8):
+    for number in range(3):
         # Bytes behind the end make a content of its own; the log then has losses, which is a state as well.
         (folder / f"e{number}.mcap").write_bytes((folder / "a.mcap").read_bytes() + bytes(number + 1))
     return folder
@@ -52,24 +56,25 @@ def assert_whole(out: Path, undisturbed: dict[str, bytes]) -> None:
     assert store.scan("slip").select(pl.len()).collect().item() >= 0
 
 
-def time_whole_batch(field: Path, out: Path) -> float:
-    started = time.monotonic()
-    start_slip("batch", field, "--out", out, "--jobs", "2", "--settle", "0", "--quiet").communicate()
-    return time.monotonic() - started
-
-
 def kill_at_random(
-    field: Path, out: Path, undisturbed: dict[str, bytes], *, rounds: int, longest_s: float
+    field: Path,
+    out: Path,
+    undisturbed: dict[str, bytes],
+    start: Callable[[], Callable[[], None]],
+    *,
+    rounds: int,
+    longest_s: float,
 ) -> Counter[int]:
-    """Rounds by how many runs were published when the batch was killed."""
+    """Rounds by how many runs were published when the batch was killed.
+
+    ``start`` begins a batch and gives what kills it.
+    """
     chance = random.Random(rounds)  # noqa: S311 - moments, not secrets
     seen: Counter[int] = Counter()
     for _ in range(rounds):
-        process = start_slip("batch", field, "--out", out, "--jobs", "2", "--settle", "0", "--quiet")
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(chance.uniform(0.2, longest_s))
-        os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
+        kill = start()
+        time.sleep(chance.uniform(0.0, longest_s))
+        kill()
         assert_whole(out, undisturbed)
         seen[len(Store(out).runs())] += 1
         if len(Store(out).runs()) == len(list(field.glob("*.mcap"))):
@@ -78,20 +83,66 @@ def kill_at_random(
     return seen
 
 
-@pytest.mark.parametrize("rounds", [FEW_ROUNDS, pytest.param(MANY_ROUNDS, marks=pytest.mark.long)])
-def test_killed_at_random_moments(
-    field: Path, tmp_path: Path, undisturbed: dict[str, bytes], rounds: int
-) -> None:
-    out = tmp_path / "out"
-    # A few rounds at the beginning of a batch are for every day, many over all of it for the long tests.
-    longest_s = time_whole_batch(field, tmp_path / "timed") if rounds == MANY_ROUNDS else 1.6
-    seen = kill_at_random(field, out, undisturbed, rounds=rounds, longest_s=longest_s)
-    assert seen.total() == rounds
-    assert len(seen) > 1, "some batches were killed while they published"
+def assert_finished(field: Path, out: Path, undisturbed: dict[str, bytes]) -> None:
     batch(field, out)
     assert read_tables(out) == undisturbed
     # Killed behind its last step a run is done: only the link `latest`, a convenience, may have been left.
     assert all(path.is_symlink() for path in out.glob("runs/*/*/.tmp-*"))
+
+
+@pytest.mark.parametrize("rounds", [FEW_ROUNDS, pytest.param(MANY_ROUNDS, marks=pytest.mark.long)])
+def test_killed_at_random_moments(
+    field: Path, tmp_path: Path, undisturbed: dict[str, bytes], rounds: int
+) -> None:
+    # A server that has loaded everything forks the batches: no round is spent on starting a program.
+    server = multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload(["batch_tools", "pipeline.job.analyze", "pipeline.batch.catalogue"])
+    # The first one waits for the server.
+    for name in ("warm", "timed"):
+        started = time.monotonic()
+        whole = server.Process(target=batch, args=(field, tmp_path / name))
+        whole.start()
+        whole.join()
+        longest_s = time.monotonic() - started
+    out = tmp_path / "out"
+
+    def start() -> Callable[[], None]:
+        process = server.Process(target=batch, args=(field, out))
+        process.start()
+
+        def kill() -> None:
+            process.kill()
+            process.join()
+
+        return kill
+
+    seen = kill_at_random(field, out, undisturbed, start, rounds=rounds, longest_s=longest_s)
+    assert len(seen) > 2, "batches were killed while they published"
+    assert_finished(field, out, undisturbed)
+
+
+@pytest.mark.long
+def test_whole_commands_killed_with_their_workers_at_random_moments(
+    field: Path, tmp_path: Path, undisturbed: dict[str, bytes]
+) -> None:
+    command = ("batch", field, "--jobs", "2", "--settle", "0", "--quiet", "--out")
+    started = time.monotonic()
+    start_slip(*command, tmp_path / "timed").communicate()
+    longest_s = time.monotonic() - started
+    out = tmp_path / "out"
+
+    def start() -> Callable[[], None]:
+        process = start_slip(*command, out)
+
+        def kill() -> None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+
+        return kill
+
+    seen = kill_at_random(field, out, undisturbed, start, rounds=2 * FEW_ROUNDS, longest_s=longest_s)
+    assert len(seen) > 1, "batches were killed while they published"
+    assert_finished(field, out, undisturbed)
 
 
 def name_logs_after_steps(originals: Path, folder: Path) -> None:
