@@ -26,9 +26,9 @@ FIGURES = (
     "ladder",
     "trajectory",
     "residuals",
-    "autocorrelation",
     "reach",
     "velocities",
+    "autocorrelation",
     "step_response",
     "command_space",
 )

@@ -51,7 +51,7 @@ export class Pane {
       await this.draw();
       this.changed();
       if (this.state.trial) this.follow();
-      else if (!this.state.desk.effects.length) this.tryAll();
+      else this.tryAll();
     } else {
       this.hero.replaceChildren(h("p", { class: "lead" }, "This run cannot be fitted."));
       this.model.replaceChildren();
@@ -103,7 +103,7 @@ export class Pane {
         h("p", { class: "big" }, h("span", { class: "value" }, "–"), h("small", {}, ` ${unit}`)),
         h("p", { class: "what" }, name, " ", h("b", { class: "fall" })));
     this.hero.dataset.run = desk.run + desk.input;
-    this.hero.replaceChildren(
+    const parts = [
       h("div", { class: "title" }, h("h2", {}, desk.run), h("p", { class: "facts" }, facts.join(" · ")), choice),
       this.warn(run),
       h("div", { class: "numbers" }, number("t", "m", "position after 2 s"), number("r", "rad", "heading after 2 s")),
@@ -118,7 +118,9 @@ export class Pane {
         h("button", { type: "button", class: "save", onclick: () => this.save() }, "Save model"),
         h("a", { class: "download button", href: `/model.toml?${new URLSearchParams({ run: desk.run, slot: this.slot })}` }, "Download"),
         run.report && h("a", { class: "report button", href: `/report?${new URLSearchParams({ run: desk.run })}`, target: "_blank", rel: "noopener" }, "Report"),
-        h("span", { class: "said", role: "status" })));
+        h("span", { class: "said", role: "status" })),
+    ];
+    this.hero.replaceChildren(...parts.filter(Boolean));
   }
 
   warn(run) {
@@ -145,7 +147,7 @@ export class Pane {
     track.style.setProperty("--floor", floor ? floor.t / most : 0);
     track.style.setProperty("--ideal", ideal.t / most);
     track.setAttribute("aria-label", `error ${say(errors.t)} m of ${say(ideal.t)} m for the ideal model`);
-    this.hero.querySelector(".floor-said").textContent = floor ? `floor ${say(floor.t)} m` : "";
+    this.hero.querySelector(".floor-said").textContent = floor ? `floor at most ${say(floor.t)} m` : "";
     this.hero.querySelector(".ideal-said").textContent =
       `ideal model ${say(ideal.t)} m${byHand ? " · values set by hand, not fitted" : ""}`;
   }
@@ -155,7 +157,7 @@ export class Pane {
       this.buildHero();
       this.show();
       await this.draw();
-      if (!this.state.desk.effects.length) this.tryAll();
+      this.tryAll();
     }
   }
 
@@ -269,7 +271,7 @@ export class Pane {
     const fall = entry.to.t / entry.from.t - 1;
     const turn = entry.to.r / entry.from.r - 1;
     return h("li", { class: first ? "first" : "", data: { effect: entry.id }, bar: Math.min(Math.max(1 - entry.ratio, 0), 1) },
-      h("div", {}, h("b", {}, entry.id), h("span", { class: "quiet" }, `${say(entry.from.t)} → ${say(entry.to.t)} m (${sayShare(fall)}), heading ${sayShare(turn)}`)),
+      h("div", {}, h("b", {}, entry.id), h("span", { class: "quiet" }, `${say(entry.from.t)} → ${say(entry.to.t)} m, ${sayShare(fall)}`), h("span", { class: "quiet" }, `heading ${sayShare(turn)}`)),
       h("button", { type: "button", class: "add", "aria-label": `add ${entry.id}`, title: entry.about, onclick: () => this.add(entry.id) }, "Add"));
   }
 
