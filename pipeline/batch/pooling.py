@@ -11,9 +11,11 @@ if TYPE_CHECKING:
 
 _NOTES = "batch/pooled"
 _NOTE = "all runs"
-POOLED = ("datasets.parquet", "quarantine_datasets.parquet", "index.html")
+POOLED = ("datasets.parquet", "index.html")
 """Files over all runs."""
 _MOST_ROUNDS = 20
+_VERSION = 1
+"""Raised by whoever changes how the pools are made."""
 
 
 def refresh_pools(store: Store) -> bool:
@@ -29,7 +31,8 @@ def refresh_pools(store: Store) -> bool:
     written = False
     for _ in range(_MOST_ROUNDS):
         runs = _hash_runs(store)
-        if (notes.read(_NOTE) or {}).get("runs") == runs and (store.root / "index.html").exists():
+        are_there = all((store.root / name).exists() for name in POOLED)
+        if are_there and (notes.read(_NOTE) or {}).get("runs") == runs:
             return written
         _write_pools(store)
         written = True
@@ -45,14 +48,17 @@ def refresh_remote_pools(mirror: Mirror) -> None:
     mirror.pull_tables(("aggregates",), mirror.store.manifests())
     mirror.store.notes(_NOTES).remove(_NOTE)
     refresh_pools(mirror.store)
-    for name in POOLED:
+    for name in (*POOLED, "quarantine_datasets.parquet"):
         mirror.push_file(name)
 
 
 def _hash_runs(store: Store) -> str:
-    return hash_json(
-        [[manifest.run, manifest.key, manifest.folder.name] for manifest in store.survey().manifests]
-    )
+    """What the pools depend on: the runs there are, and what is made of them."""
+    # The contracts bring a table library along, which help and usage errors do without.
+    from schemas import contract_of  # noqa: PLC0415
+
+    runs = [[manifest.run, manifest.key, manifest.folder.name] for manifest in store.survey().manifests]
+    return hash_json([_VERSION, contract_of("datasets").version, runs])
 
 
 def _write_pools(store: Store) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.batch.ledger import Entry, Ledger
 from pipeline.batch.pruning import measure_results
+from pipeline.logs import RemotePath, to_location
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -22,7 +23,8 @@ class Status:
 
     Attributes:
         runs: runs with results.
-        entries: what became of each log in batches, sorted by path.
+        entries: what became of each log in batches, sorted by path; without those that gave no results and
+            are gone.
         counts: logs by state: done, lossy, failed, quarantined, copy.
         bytes: size of the results, old generations included.
         old_generations: generations that are not current.
@@ -42,7 +44,8 @@ class Status:
 def tell_status(store: Store) -> Status:
     """Look at the results and at what batches have noted."""
     survey = store.survey()
-    entries = tuple(sorted(Ledger(store).read_all().values(), key=lambda entry: entry.log.path))
+    known = (entry for entry in Ledger(store).read_all().values() if _still_matters(entry))
+    entries = tuple(sorted(known, key=lambda entry: entry.log.path))
     states = [entry.state for entry in entries]
     return Status(
         runs=len(survey.manifests),
@@ -53,3 +56,8 @@ def tell_status(store: Store) -> Status:
         errors=survey.errors,
         last=max((entry.at for entry in entries), default=None),
     )
+
+
+def _still_matters(entry: Entry) -> bool:
+    log = to_location(entry.log.path)
+    return entry.state in {"done", "lossy"} or isinstance(log, RemotePath) or log.exists()

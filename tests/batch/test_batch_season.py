@@ -60,6 +60,9 @@ def test_a_season_with_good_and_bad_logs(season: Path, tmp_path: Path) -> None:
     status = tell_status(Store(out))
     assert status.counts == {"done": 4, "lossy": 1, "failed": 1, "quarantined": 0, "copy": 1}
     assert status.runs == 5
+    (season / "text.mcap").rename(tmp_path / "text.mcap")
+    assert tell_status(Store(out)).counts["failed"] == 0
+    (tmp_path / "text.mcap").rename(season / "text.mcap")
     assert verify_results(Store(out), logs=True, tell=print).is_clean
 
 
