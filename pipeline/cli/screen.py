@@ -19,6 +19,7 @@ def describe_run(summary: Summary, *, unchanged: bool) -> str:
         *_describe_slip(summary),
         *_describe_topics(summary),
         *_describe_findings(summary),
+        *_describe_diagnosis(summary),
         *_describe_end(summary, unchanged=unchanged),
     ]
     return "\n".join(line.rstrip() for line in lines) + "\n"
@@ -110,12 +111,26 @@ def _describe_findings(summary: Summary) -> list[str]:
     return lines
 
 
+def _describe_diagnosis(summary: Summary) -> list[str]:
+    """What is missing from the model; its findings stand among the run's own."""
+    lines = cast("Sequence[Sequence[str]]", _part(summary, "diagnosis").get("lines") or [])
+    described: list[str] = []
+    label = ""
+    for name, text in lines:
+        label = name or label
+        if label not in {"findings", "next"}:
+            described.append(_row(name, text))
+    return described
+
+
 def _describe_end(summary: Summary, *, unchanged: bool) -> list[str]:
     lines = []
     if unchanged:
         lines.append(
             _row("unchanged", "log and configuration are as before: nothing was computed (--force does)")
         )
+    if _part(summary, "diagnosis").get("effects"):
+        lines.append(_row("next", f"slip diagnose {summary['run']} --apply model.toml"))
     report = summary.get("report")
     if isinstance(report, str):
         lines.append(_row("report", _relative(report)))

@@ -26,7 +26,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     /,
     *,
     choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
-    diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis", show=False)] = True,
+    diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis")] = True,
     report: Annotated[bool, Parameter(negative="--no-report")] = True,
     figures: FigureFormat | None = None,
     force: bool = False,
@@ -36,14 +36,14 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     """Analyze logs: slip per time step into tables, a one-screen summary and a report.
 
     Args:
+        diagnosis: name what is missing from the model.
         report: write report.html.
         figures: also write the figures in this format, for papers.
         force: compute again what is already there.
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
-    del diagnosis  # No effect is named yet: asking for none changes nothing.
-    options = build_options(choices, report=report, figures=figures, force=force)
+    options = build_options(choices, report=report, diagnosis=diagnosis, figures=figures, force=force)
     outcomes, errors = _analyze_all(logs, options, quiet=quiet or json)
     if json:
         print_json({"runs": [dict(outcome.summary) for outcome in outcomes], "errors": errors})

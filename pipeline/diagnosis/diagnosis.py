@@ -216,10 +216,10 @@ class Diagnosis:
             if item.run == run:
                 rows += list(_ladder_rows(item))
         schema = {
-            "input": pl.String, "rung": pl.Int32, "added": pl.String, "effects": pl.String,
+            "input": pl.Enum(["command", "measured"]), "rung": pl.Int32, "added": pl.String, "effects": pl.String,
             "rms_x": pl.Float64, "rms_y": pl.Float64, "rms_w": pl.Float64,
             "t_mrmse": pl.Float64, "r_mrmse": pl.Float64, "explained_share": pl.Float64,
-            "kind": pl.String,
+            "kind": pl.Enum(["rung", "floor"]),
         }  # fmt: skip
         return pl.DataFrame(rows, schema=schema, orient="row")
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, cast
 
 import msgspec
 
+from pipeline.job.diagnosis import diagnose_work, has_diagnosis, key_diagnosis
 from pipeline.job.keys import hash_json, key_stages
 from pipeline.job.options import STAGES
 from pipeline.job.subject import Subject, describe_subject, name_run
@@ -84,7 +85,7 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
         work.run_stages()
         log = _describe_log(subject, sha256, work)
         if options.through == STAGES[-1]:
-            _write_outputs(work, log, options, progress)
+            _write_outputs(work, log, options, progress, diagnose_work(work))
         manifest = generation.commit(_details(work, log, sha256))
     return Outcome(_read_summary(manifest, options), manifest, tuple(work.computed))
 
@@ -119,7 +120,8 @@ def _is_done(manifest: Manifest, keys: Mapping[str, str], options: Options) -> b
     has_report = REPORT in files or not options.report
     figures = options.figures
     has_figures = figures is None or any(name.endswith(f".{figures}") for name in files)
-    return SUMMARY in files and has_report and has_figures
+    diagnosed = not options.diagnosis or has_diagnosis(manifest, key_diagnosis(keys))
+    return SUMMARY in files and has_report and has_figures and diagnosed
 
 
 def _describe_log(subject: Subject, sha256: str, work: Work) -> dict[str, JSON]:
@@ -135,9 +137,16 @@ def _describe_log(subject: Subject, sha256: str, work: Work) -> dict[str, JSON]:
     }
 
 
-def _write_outputs(work: Work, log: Mapping[str, JSON], options: Options, progress: Progress) -> None:
+def _write_outputs(
+    work: Work,
+    log: Mapping[str, JSON],
+    options: Options,
+    progress: Progress,
+    diagnosis: Mapping[str, JSON] | None,
+) -> None:
     """Summary, report and figures of a finished run."""
     summary = summarize_run(work, log)
+    summary["diagnosis"] = diagnosis
     summary["report"] = REPORT if options.report else None
     summary["provenance"] = {
         "versions": versions(),
@@ -151,7 +160,7 @@ def _write_outputs(work: Work, log: Mapping[str, JSON], options: Options, progre
 
         progress("report")
         tables = {name: generation.read_table(name) for name in generation.table_names}
-        report = RunReport(summary, tables)
+        report = RunReport(summary, tables, diagnosis or {})
         if options.report:
             generation.write_text(REPORT, render_report(report))
         if options.figures:

@@ -26,6 +26,7 @@ class Options:
         overrides: configuration values from the command line, nested like the file.
         inputs: which inputs to compute slip for.
         report: whether to write `report.html`.
+        diagnosis: whether to name what is missing from the model.
         figures: format of figures for papers (`svg`, `pdf`, `png`); None for none.
         force: compute again what is already there.
         through: last stage to run.
@@ -38,6 +39,7 @@ class Options:
     overrides: Mapping[str, object] = field(default_factory=dict)
     inputs: tuple[str, ...] = INPUTS
     report: bool = True
+    diagnosis: bool = False
     figures: FigureFormat | None = None
     force: bool = False
     through: str = "aggregate"
