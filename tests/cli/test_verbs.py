@@ -68,7 +68,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_log_that_cannot_be_analyzed_gets_one_line(
     field: Path, tmp_path: Path, name: str, words: list[str]
 ) -> None:
-    done = slip("analyze", field / name, "--out", tmp_path / "out", "--quiet")
+    done = slip("analyze", field / name, "--out", tmp_path / "out", "--quiet", "--no-diagnosis")
 
     assert done.returncode == 1
     assert done.stdout == ""
@@ -82,7 +82,9 @@ def test_a_log_that_cannot_be_analyzed_gets_one_line(
 
 
 def test_a_truncated_log_is_analyzed_up_to_the_cut(field: Path, tmp_path: Path) -> None:
-    done = slip("analyze", field / "truncated.mcap", "--out", tmp_path, "--json", "--no-report")
+    done = slip(
+        "analyze", field / "truncated.mcap", "--out", tmp_path, "--json", "--no-report", "--no-diagnosis"
+    )
 
     assert done.returncode == 3
     log = json.loads(done.stdout)["runs"][0]["log"]
@@ -92,7 +94,9 @@ def test_a_truncated_log_is_analyzed_up_to_the_cut(field: Path, tmp_path: Path) 
 
 
 def test_json_is_all_that_stdout_holds_and_has_the_promised_keys(field: Path, tmp_path: Path) -> None:
-    done = slip("analyze", field / "good.mcap", field / "missing.mcap", "--out", tmp_path, "--json")
+    done = slip(
+        "analyze", field / "good.mcap", field / "missing.mcap", "--out", tmp_path, "--json", "--no-diagnosis"
+    )
 
     assert done.returncode == 1, "one of two failed"
     content = json.loads(done.stdout)
@@ -113,7 +117,8 @@ def test_json_is_all_that_stdout_holds_and_has_the_promised_keys(field: Path, tm
 
 
 def test_the_summary_fits_a_screen_and_says_what_was_used(field: Path, tmp_path: Path) -> None:
-    done = slip("analyze", field / "good.mcap", "--out", tmp_path)
+    asked = ("analyze", field / "good.mcap", "--out", tmp_path, "--no-diagnosis")
+    done = slip(*asked)
 
     assert done.returncode == 0
     assert len(done.stdout.splitlines()) < 24
@@ -127,7 +132,7 @@ def test_the_summary_fits_a_screen_and_says_what_was_used(field: Path, tmp_path:
     ):
         assert word in done.stdout
     assert "differentiating poses" in done.stderr
-    again = slip("analyze", field / "good.mcap", "--out", tmp_path)
+    again = slip(*asked)
     assert "nothing was computed" in again.stdout
     assert "differentiating" not in again.stderr
 
@@ -172,9 +177,11 @@ def test_a_wrong_configuration_names_file_and_key(field: Path, tmp_path: Path) -
 
 
 def test_explain_says_where_numbers_come_from(field: Path, tmp_path: Path) -> None:
-    run = json.loads(slip("analyze", field / "good.mcap", "--out", tmp_path, "--json", "--no-report").stdout)[
-        "runs"
-    ][0]
+    run = json.loads(
+        slip(
+            "analyze", field / "good.mcap", "--out", tmp_path, "--json", "--no-report", "--no-diagnosis"
+        ).stdout
+    )["runs"][0]
     done = slip("explain", "good", "slip.g_w", "--out", tmp_path)
 
     assert done.returncode == 0
