@@ -14,7 +14,8 @@ export LOG LOGS OUT VEHICLE ARGS
 FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: help setup analyze batch inspect test test-long check format samples bench bench-analyze bench-batch bench-reader browser lock clean
+.PHONY: help analyze batch bench bench-analyze bench-batch bench-reader browser check clean compare format inspect lock samples \
+	serve test test-long
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -27,6 +28,9 @@ analyze: $(VENV)/.ready ## LOG=run.mcap: slip tables, a summary, a report [VEHIC
 batch: $(VENV)/.ready ## LOGS=dir: bring the results up to date with a season of logs [OUT=results, ARGS=]
 	@[ -n "$$LOGS" ] || { echo "Say which logs: make batch LOGS=dir" >&2; exit 2; }
 	@$(BIN)/slip batch "$$LOGS" --out "$$OUT" $$ARGS $(FORGIVE_LOSSES)
+
+compare: $(VENV)/.ready ## deployments in OUT side by side: medians, tests, figure [ARGS=]
+	@$(BIN)/slip compare "$$OUT" $$ARGS
 
 inspect: $(VENV)/.ready ## LOG=run.mcap: topics, rates, gaps, clocks, damage
 	@[ -n "$$LOG" ] || { echo "Say which log: make inspect LOG=run.mcap" >&2; exit 2; }
