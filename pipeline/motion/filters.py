@@ -9,6 +9,9 @@ import numpy as np
 if TYPE_CHECKING:
     from pipeline.motion.signals import Floats, Integers, Resets, Signal
 
+_FORGOTTEN = 40.0
+"""Time constants after which a state is forgotten to the last bit."""
+
 
 def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start: Signal) -> Signal:
     """First-order lag tau dy/dt = u - y of a real or complex signal.
@@ -33,18 +36,23 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
     # The filter ran through the resets: what it carried over is taken back, and the state put in its place.
     # One reset after the other, in closed form: what is missing at each fades until the next.
     fade = step_s / tau
-    before = before + _fading(signal[resets.first] - before[resets.first], resets.first, resets, fade)
     known = np.where(np.isfinite(start), start, signal[resets.at])
-    if resets.at is not resets.first or np.isfinite(start).any():
-        before = before + _fading(known - before[resets.at], resets.at, resets, fade)
+    if np.array_equal(resets.at, resets.first):
+        _add_fading(before, known - before[resets.at], resets.at, resets, fade)
+    else:
+        _add_fading(before, signal[resets.first] - before[resets.first], resets.first, resets, fade)
+        _add_fading(before, known - before[resets.at], resets.at, resets, fade)
     lagged: Signal = signal + (before - signal) * (tau / step_s * (1.0 - decay))
     return lagged
 
 
-def _fading(missing: Signal, at: Integers, resets: Resets, fade: float) -> Signal:
-    since = np.arange(resets.number.size) - at[resets.number]
-    left: Signal = missing[resets.number] * (np.exp(-np.maximum(since, 0) * fade) * (since >= 0))
-    return left
+def _add_fading(state: Signal, missing: Signal, at: Integers, resets: Resets, fade: float) -> None:
+    """Add what is missing at each reset to the state; it fades until the next reset comes."""
+    ends = np.append(resets.first[1:], state.size)
+    count = np.clip(ends - at, 0, int(_FORGOTTEN / fade) + 1)
+    since = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+    table = np.exp(-fade * np.arange(int(count.max(initial=1))))
+    state[np.repeat(at, count) + since] += np.repeat(missing, count) * table[since]
 
 
 def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, start: Floats) -> Floats:
