@@ -7,6 +7,7 @@ the keys decide what has to be computed.
 from __future__ import annotations
 
 import hashlib
+from dataclasses import fields
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,10 @@ if TYPE_CHECKING:
     from pipeline.job import Options
 
 
+_WITHOUT_INFLUENCE = ("out", "run", "config", "fleet", "report", "figures", "force")
+"""Options that the tables do not depend on, or whose content is hashed by itself."""
+
+
 class BasisHasher:
     """Hashes the basis of many logs, reading each configuration file once.
 
@@ -30,8 +35,9 @@ class BasisHasher:
 
     def __init__(self, options: Options) -> None:
         self._options = options
-        asked = [list(options.inputs), options.overrides, options.through]
-        self._shared = hash_json([asked, _describe_program()])
+        asked = {each.name: getattr(options, each.name) for each in fields(options)}
+        asked = {name: value for name, value in asked.items() if name not in _WITHOUT_INFLUENCE}
+        self._shared = hash_json([msgspec.to_builtins(asked, enc_hook=str), _describe_program()])
         self._contents: dict[Path, str] = {}
 
     def hash_basis(self, log: Path) -> str:
