@@ -205,7 +205,7 @@ def _describe_plan(plan: Plan) -> list[Line]:
 def _describe_report(report: Report) -> Line:
     entry = report.entry
     is_fine = entry.state in {"done", "lossy"}
-    state = "unchanged" if is_fine and not report.computed else entry.state
+    state = "unchanged" if is_fine and not report.is_new else entry.state
     return _describe_entry(entry, state, report)
 
 

@@ -48,13 +48,13 @@ class Report:
 
     Attributes:
         entry: what the ledger says of the log now.
-        computed: stages that were computed; none when nothing had changed.
+        is_new: whether a generation was published; not where nothing had changed.
         is_busy: whether another batch is working on the same run: nothing was done.
         rss_bytes: memory of the worker afterwards.
     """
 
     entry: Entry
-    computed: tuple[str, ...] = ()
+    is_new: bool = False
     is_busy: bool = False
     rss_bytes: int = 0
 
@@ -81,12 +81,12 @@ def work_on(task: Task) -> Report:
     store = Store(task.options.out)
     started = time.monotonic()
     entry = Entry(log=task.log, basis=task.basis, state="failed", run=task.options.run or "")
-    computed: tuple[str, ...] = ()
+    is_new = False
     try:
         with store.claim(entry.run) as is_ours:
             if not is_ours:
                 return Report(entry=entry, is_busy=True)
-            entry, computed = _analyze(task, entry, mirror)
+            entry, is_new = _analyze(task, entry, mirror)
     except SlipError as error:
         where = f"{error.where}: " if error.where and error.where != str(task.path) else ""
         entry = replace(entry, code=error.code, reason=f"{where}{error.what}", hint=error.hint)
@@ -94,15 +94,16 @@ def work_on(task: Task) -> Report:
         entry = _describe_surprise(entry, error)
     entry = replace(entry, seconds=round(time.monotonic() - started, 3), peak_bytes=_peak_bytes())
     Ledger(store, mirror).write(entry)
-    return Report(entry=entry, computed=computed, rss_bytes=read_rss())
+    return Report(entry=entry, is_new=is_new, rss_bytes=read_rss())
 
 
-def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, tuple[str, ...]]:
+def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bool]:
     # Workers that find nothing to do need no table library.
     from pipeline.job.analyze import REPORT, analyze_log  # noqa: PLC0415
 
     if mirror is not None:
         mirror.pull_run(entry.run)
+    before = Store(task.options.out).manifest(entry.run) if entry.run else None
     outcome = analyze_log(task.path, task.options)
     if mirror is not None:
         mirror.push_run(outcome.manifest)
@@ -115,7 +116,7 @@ def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, tu
         fetched_bytes=_count_fetched(outcome),
         has_report=REPORT in outcome.manifest.files,
     )
-    return done, outcome.computed
+    return done, before is None or before.folder != outcome.manifest.folder
 
 
 def _count_fetched(outcome: Outcome) -> int:

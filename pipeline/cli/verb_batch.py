@@ -45,6 +45,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
     executor: str = "local",
     shard: str | None = None,
     reports: Annotated[bool, Parameter(negative=())] = False,
+    diagnosis: Annotated[bool, Parameter(negative=())] = False,
     force: Annotated[bool, Parameter(negative=())] = False,
     retry_quarantined: Annotated[bool, Parameter(negative=())] = False,
     timeout: PositiveFloat = 3600.0,
@@ -63,6 +64,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
         executor: local; dask for a cluster on this machine; or a scheduler's address, tcp://host:8786.
         shard: i/n, the i-th of n machines that share the logs.
         reports: write report.html for every log.
+        diagnosis: name what is missing from the model for every log, which takes longer.
         force: compute again what is already there.
         retry_quarantined: try logs again that killed their workers.
         timeout: longest time for one log [s].
@@ -79,7 +81,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
     if not logs and not prune:
         raise SlipError("no_logs", "no log is given", hint="Say which: slip batch LOGS, a folder or a glob")
     pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
-    options = build_options(choices, report=reports, force=force)
+    options = build_options(choices, report=reports, diagnosis=diagnosis, force=force)
     place = open_results(choices.out)
     workers = jobs or os.cpu_count() or 1
     request = Request(

@@ -236,7 +236,7 @@ def test_reports_are_made_on_demand(season: Path, tmp_path: Path) -> None:
     log = season / "a.mcap"
     batch(log, out)
     assert not list(out.rglob("report.html"))
-    batch(log, out, report=True)
+    assert counts(batch(log, out, report=True)) == {"done": 1}
     assert list(out.rglob("report.html"))
     assert 'href="runs/season/a/' in (out / "index.html").read_text()
     assert "report.html" in (out / "index.html").read_text()
