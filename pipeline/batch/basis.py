@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.job.keys import TABLES, VERSIONS, hash_json
+from pipeline.job import diagnosis
+from pipeline.job.keys import VERSIONS, hash_json
 from pipeline.vehicles import list_configuration_files, list_presets
 
 if TYPE_CHECKING:
@@ -59,11 +60,10 @@ class BasisHasher:
 @cache
 def _describe_program() -> object:
     # The contracts bring a table library along, which a batch needs anyway.
-    from schemas import contract_of  # noqa: PLC0415
+    from schemas import list_contracts  # noqa: PLC0415
 
-    tables = sorted({table for names in TABLES.values() for table in names} | {"findings"})
     return [
-        dict(VERSIONS),
-        {table: contract_of(table).version for table in tables},
+        {**VERSIONS, diagnosis.STAGE: diagnosis.VERSION},
+        {contract.name: contract.version for contract in list_contracts()},
         [msgspec.to_builtins(vehicle) for vehicle in list_presets()],
     ]
