@@ -17,13 +17,16 @@ class Aggregates(Table):
     """One row an input and subset of the samples."""
 
     NAME: ClassVar[str] = "aggregates"
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})
     subset = dy.Enum(SUBSETS, metadata={"description": "all samples, or only transitory or steady ones"})
     samples = dy.Int64(min=0, metadata={"description": "time steps counted"})
     windows = dy.Int64(min=0, metadata={"description": "2 s windows counted"})
     median_modulus = fields.number("m/s", "median slip modulus", nullable=True)
+    median_residual_modulus = fields.number(
+        "m/s", "median modulus of what is left of the model given with --model", nullable=True
+    )
     median_window_norm = fields.number("m/s", "median 2 s window norm", nullable=True)
     rms_x = fields.number("m/s", "root mean square of g_x", nullable=True)
     rms_y = fields.number("m/s", "root mean square of g_y", nullable=True)

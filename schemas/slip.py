@@ -17,7 +17,7 @@ class Slip(Table):
     """One row a time step and input: g = f(u) - v."""
 
     NAME: ClassVar[str] = "slip"
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})
     t = fields.seconds()
@@ -40,6 +40,10 @@ class Slip(Table):
         metadata={"unit": "m/s", "frame": "base_link", "description": "norm of (g_x, g_y, L g_w)"},
     )
 
+    m_x = fields.body("m/s", "velocity forward of the model given with --model", nullable=True)
+    m_y = fields.body("m/s", "velocity to the left of that model", nullable=True)
+    m_w = fields.body("rad/s", "yaw rate of that model", nullable=True)
+    residual_modulus = fields.body("m/s", "norm of (m_x - v_x, m_y - v_y, L (m_w - v_w))", nullable=True)
     suspect = fields.flag("in a stretch with a rotated heading or a frozen position; left out of medians")
 
     @dy.rule()

@@ -47,6 +47,7 @@ def build_options(
     report: bool = False,
     diagnosis: bool = False,
     figures: FigureFormat | None = None,
+    model: Path | None = None,
     force: bool = False,
     through: str = "aggregate",
 ) -> Options:
@@ -59,6 +60,7 @@ def build_options(
         report=report,
         diagnosis=diagnosis,
         figures=figures,
+        model=model,
         force=force,
         through=through,
     )

@@ -79,6 +79,12 @@ def _describe_slip(summary: Summary) -> list[str]:
         f"steady {_number(lead, 'steady_median_modulus')} m/s"
     )
     lines.append(_row("", "      ".join(detail)))
+    left = [name for name in shown if _part(by_input, name).get("median_residual_modulus") is not None]
+    if left:
+        medians = "    ".join(
+            f"{_number(_part(by_input, name), 'median_residual_modulus')} m/s {words[name]}" for name in left
+        )
+        lines.append(_row("relative to the model", f"median {medians}"))
     return lines
 
 

@@ -29,6 +29,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis")] = True,
     report: Annotated[bool, Parameter(negative="--no-report")] = True,
     figures: FigureFormat | None = None,
+    model: Path | None = None,
     force: bool = False,
     json: bool = False,
     quiet: bool = False,
@@ -38,12 +39,15 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     Args:
         diagnosis: name what is missing from the model.
         report: write report.html.
+        model: a model file to compute slip relative to as well.
         figures: also write the figures in this format, for papers.
         force: compute again what is already there.
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
-    options = build_options(choices, report=report, diagnosis=diagnosis, figures=figures, force=force)
+    options = build_options(
+        choices, report=report, diagnosis=diagnosis, figures=figures, force=force, model=model
+    )
     outcomes, errors = _analyze_all(logs, options, quiet=quiet or json)
     if json:
         print_json({"runs": [dict(outcome.summary) for outcome in outcomes], "errors": errors})

@@ -14,6 +14,7 @@ import msgspec
 from pipeline.job.diagnosis import diagnose_work, has_diagnosis, key_diagnosis
 from pipeline.job.keys import hash_json, key_stages
 from pipeline.job.options import STAGES
+from pipeline.job.relative import hash_model
 from pipeline.job.subject import Subject, describe_subject, name_run
 from pipeline.job.summary import summarize_run
 from pipeline.job.work import Progress, Work, read_subject, stored_contexts, stored_keys
@@ -71,7 +72,7 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
     subject = describe_subject(path, options)
     sha256, data = _identify(path, subject, store, progress)
     run = options.run or name_run(path, sha256, store)
-    keys = key_stages(run, sha256, subject, options.inputs)
+    keys = key_stages(run, sha256, subject, options.inputs, hash_model(options.model))
     current = store.manifest(run)
     if current is not None and not options.force and _is_done(current, keys, options):
         return Outcome(_read_summary(current, options), current, ())

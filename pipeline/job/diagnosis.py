@@ -84,7 +84,7 @@ def _diagnose(work: Work) -> dict[str, JSON]:
     ladder = diagnosis.tabulate_ladder(work.run)
     if not ladder.is_empty():
         work.write("ladder", ladder)
-    return {**diagnosis.to_json()[0], "lines": _list_lines(diagnosis)}  # type: ignore[dict-item]
+    return {**diagnosis.to_json()[0], "lines": _list_lines(diagnosis)}
 
 
 def _list_lines(diagnosis: Diagnosis) -> list[list[str]]:

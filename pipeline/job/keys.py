@@ -29,8 +29,10 @@ TABLES: Mapping[str, tuple[str, ...]] = {
 _DIGITS = 16
 
 
-def key_stages(run: str, sha256: str, subject: Subject, inputs: tuple[str, ...]) -> dict[str, str]:
-    """Key of every stage of a run, in order."""
+def key_stages(
+    run: str, sha256: str, subject: Subject, inputs: tuple[str, ...], model: str | None = None
+) -> dict[str, str]:
+    """Key of every stage of a run, in order; ``model`` is the hash of the model that slip is set against."""
     # The contracts bring a table library along, which help and usage errors do without.
     from schemas import contract_of  # noqa: PLC0415
 
@@ -46,7 +48,7 @@ def key_stages(run: str, sha256: str, subject: Subject, inputs: tuple[str, ...])
             "limits": pose_limits,
         },
         "velocity": plain["velocity"],
-        "slip": {"slip": plain["slip"], "inputs": inputs},
+        "slip": {"slip": plain["slip"], "inputs": inputs, "model": model},
         "aggregate": {},
     }
     keys: dict[str, str] = {}

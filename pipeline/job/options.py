@@ -25,6 +25,7 @@ class Options:
         run: name of the run; None finds one by the log's folder, name and content.
         overrides: configuration values from the command line, nested like the file.
         inputs: which inputs to compute slip for.
+        model: model file to compute slip relative to as well.
         report: whether to write `report.html`.
         diagnosis: whether to name what is missing from the model.
         figures: format of figures for papers (`svg`, `pdf`, `png`); None for none.
@@ -38,6 +39,7 @@ class Options:
     run: str | None = None
     overrides: Mapping[str, object] = field(default_factory=dict)
     inputs: tuple[str, ...] = INPUTS
+    model: Path | None = None
     report: bool = True
     diagnosis: bool = False
     figures: FigureFormat | None = None

@@ -72,6 +72,7 @@ def _describe_input(aggregates: pl.DataFrame, name: str) -> dict[str, JSON]:
         "windows": int(whole["windows"] or 0),
         "median_modulus": _rounded(whole["median_modulus"]),
         "median_window_norm": _rounded(whole["median_window_norm"]),
+        "median_residual_modulus": _rounded(whole["median_residual_modulus"]),
         "rms": [_rounded(whole[f"rms_{axis}"]) for axis in "xyw"],
         "transitory_median_modulus": _rounded(rows["transitory"]["median_modulus"]),
         "steady_median_modulus": _rounded(rows["steady"]["median_modulus"]),

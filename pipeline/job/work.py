@@ -13,6 +13,7 @@ import polars as pl
 
 from pipeline.job.keys import TABLES
 from pipeline.job.options import STAGES
+from pipeline.job.relative import add_model
 from pipeline.logs import LogData, Loss, read_topics
 from pipeline.stages import aggregate, checks, slip, velocity
 from pipeline.stages.extract import extract_tables, list_wanted
@@ -180,12 +181,28 @@ class Work:
             inputs=self.options.inputs,
             where=str(subject.path),
         )
-        self.write("slip", made.slip)
+        table = self._set_against_model(made.slip)
+        self.write("slip", table)
         self.write("windows", made.windows)
         command = subject.sources.command
         body = command is not None and command.form in {DriveForm.BODY, DriveForm.BODY_SIGNALS}
         samples = checks.gather_samples(velocities, made.slip, body_commanded=body)
         return StageOutcome((*made.findings, *checks.run_checks(samples, subject.vehicle)))
+
+    def _set_against_model(self, table: pl.DataFrame) -> pl.DataFrame:
+        """Table `slip` with the velocity of the model that was given, as it is without one."""
+        path, configuration = self.options.model, self.subject.configuration
+        if path is None:
+            return table
+        read = {name: self._read(name) for name in ("poses", "commands", "wheels", "imu")}
+        return add_model(
+            table,
+            {name: frame for name, frame in read.items() if not frame.is_empty()},
+            path,
+            self.subject.vehicle,
+            length=configuration.slip.length_scale_m,
+            hold_s=configuration.command.hold_s,
+        )
 
     def _aggregate(self) -> StageOutcome:
         made = aggregate.aggregate_run(

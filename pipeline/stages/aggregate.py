@@ -57,7 +57,8 @@ def aggregate_run(
         pl.col(column).cast(kind) for column, kind in schema.items()
     )
     numbers = (
-        "median_modulus", "median_window_norm", "rms_x", "rms_y", "rms_w", "mean_square",
+        "median_modulus",
+        "median_residual_modulus", "median_window_norm", "rms_x", "rms_y", "rms_w", "mean_square",
         "drivetrain_mean_square", "ground_mean_square", "cross_mean_square",
         "distance", "duration", "height_rate", "largest_kinetic_energy",
     )  # fmt: skip
@@ -82,6 +83,7 @@ def _describe_slip(slip: pl.DataFrame, windows: pl.DataFrame) -> dict[str, float
         "samples": slip.height,
         "windows": windows.height,
         "median_modulus": _number(slip["modulus"].median()),
+        "median_residual_modulus": _number(slip["residual_modulus"].median()),
         "median_window_norm": _number(windows["window_norm"].median()),
         "rms_x": root("g_x"),
         "rms_y": root("g_y"),

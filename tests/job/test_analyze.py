@@ -10,6 +10,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+from pipeline.core.errors import SlipError
 from pipeline.job.analyze import Outcome, analyze_log, update_datasets
 from pipeline.job.options import Options
 from pipeline.simulate import simulate_case
@@ -198,3 +199,47 @@ def test_the_log_is_opened_read_only(log: Path, out: Path) -> None:
     analyze(log, out)
 
     assert (log.read_bytes(), log.stat().st_mtime_ns) == before
+
+
+def write_wide_track(path: Path, track: float) -> Path:
+    path.write_text(
+        'format = 1\n[vehicle]\npreset = "husky_a200"\n\n[[effect]]\nid = "effective_track"\n'
+        f'k = {{ value = {track}, unit = "1" }}\n'
+    )
+    return path
+
+
+def test_slip_can_be_told_relative_to_a_model(out: Path, tmp_path: Path) -> None:
+    log = simulate_case(
+        "ideal_husky", {"effective_track": {"k": 1.8}}, out=tmp_path / "w.mcap", duration_s=60.0
+    )
+    right = analyze(log, out, model=write_wide_track(tmp_path / "right.toml", 1.8))
+    table = right.manifest.read("slip")
+    by_input = right.summary["by_input"]
+
+    for name in ("command", "measured"):
+        assert by_input[name]["median_residual_modulus"] < 0.5 * by_input[name]["median_modulus"]
+    turning = table.filter(pl.col("f_w").abs() > 0.5).filter(~pl.col("transitory"))
+    assert (turning["m_w"] / turning["f_w"]).median() == pytest.approx(1 / 1.8, rel=0.02)
+
+    assert analyze(log, out, model=tmp_path / "right.toml").computed == ()
+    wrong = analyze(log, out, model=write_wide_track(tmp_path / "wrong.toml", 0.7))
+    assert wrong.computed == ("slip", "aggregate")
+    assert wrong.summary["by_input"]["command"]["median_modulus"] == by_input["command"]["median_modulus"]
+    assert (
+        wrong.summary["by_input"]["command"]["median_residual_modulus"]
+        > by_input["command"]["median_modulus"]
+    )
+    without = analyze(log, out)
+    assert without.summary["by_input"]["command"]["median_residual_modulus"] is None
+    assert without.manifest.read("slip")["m_x"].null_count() == table.height
+
+
+def test_a_model_that_is_missing_or_of_another_kind_is_refused(log: Path, out: Path, tmp_path: Path) -> None:
+    with pytest.raises(SlipError, match="cannot be read"):
+        analyze(log, out, model=tmp_path / "none.toml")
+    car = tmp_path / "car.toml"
+    car.write_text('format = 1\n[vehicle]\npreset = "ackermann_car"\n')
+    with pytest.raises(SlipError, match="kind 'ackermann'"):
+        analyze(log, out, model=car)
+    assert Store(out).runs() == ()

@@ -1,0 +1,94 @@
+"""Slip relative to a model: how far the motion was from what a fitted model predicts."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from pipeline.core.errors import SlipError
+from pipeline.job.errors import JobError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from pipeline.vehicles import Vehicle
+
+COLUMNS = ("m_x", "m_y", "m_w", "residual_modulus")
+
+
+def hash_model(path: Path | None) -> str | None:
+    """Hash of a model file's bytes; None without one.
+
+    Raises:
+        JobError: the file cannot be read.
+    """
+    if path is None:
+        return None
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise JobError(
+            "model_not_found",
+            f"the model file cannot be read: {error.strerror}",
+            where=str(path),
+            hint="Check the path; `slip model new` makes one.",
+        ) from None
+
+
+def add_model(
+    slip: pl.DataFrame,
+    tables: Mapping[str, pl.DataFrame],
+    path: Path,
+    vehicle: Vehicle,
+    *,
+    length: float,
+    hold_s: float | None,
+) -> pl.DataFrame:
+    """Table `slip` with the velocity of a model and the modulus of what is left of it.
+
+    Args:
+        slip: table `slip`, its columns for a model empty.
+        tables: `poses`, `commands`, `wheels`, `imu`, as far as the log has them.
+        path: the model file.
+        vehicle: of the run; the model must be of its kind.
+        length: length scale L [m] of the modulus.
+        hold_s: how long a command counts.
+
+    Raises:
+        MotionError: the model file is wrong.
+        JobError: the model is of another kind of vehicle.
+    """
+    from pipeline.motion import Input, load_run, read_model  # noqa: PLC0415 - heavy
+    from pipeline.motion.predict import predict_at  # noqa: PLC0415 - heavy
+
+    model = read_model(path).model
+    if model.vehicle.kind != vehicle.kind:
+        raise JobError(
+            "wrong_model",
+            f"the model is of a vehicle of kind {model.vehicle.kind!r}, the run's is {vehicle.kind!r}",
+            where=str(path),
+            hint="Give a model of this vehicle.",
+        )
+    run = load_run({**tables, "slip": slip}, model.vehicle, name=str(path), hold_s=hold_s)
+    parts = []
+    for name in slip["input"].unique(maintain_order=True):
+        part = slip.filter(pl.col("input") == name)
+        try:
+            predicted = predict_at(model, run, Input(name), part["t"].to_numpy())
+        except SlipError:
+            # Encoders that are dead, for example: there is an input, but no model can follow it.
+            parts.append(part)
+            continue
+        left = (predicted - part.select("v_x", "v_y", "v_w").to_numpy()) * np.array([1.0, 1.0, length])
+        columns = [*predicted.T, np.sqrt(np.sum(left**2, axis=1))]
+        parts.append(
+            part.with_columns(
+                pl.Series(column, values).fill_nan(None)
+                for column, values in zip(COLUMNS, columns, strict=True)
+            )
+        )
+    return pl.concat(parts)
