@@ -157,11 +157,13 @@ def _write_outputs(
     generation = work.generation
     if options.report or options.figures:
         # Drawing is most of the start-up time; who wants neither does not pay for it.
-        from pipeline.report import RunReport, render_report  # noqa: PLC0415
+        from pipeline.report import RunReport, render_report, view_diagnosis  # noqa: PLC0415
 
         progress("report")
         tables = {name: generation.read_table(name) for name in generation.table_names}
-        report = RunReport(summary, tables, diagnosis or {})
+        hold_s = work.subject.configuration.command.hold_s
+        motion = view_diagnosis(tables, work.subject.vehicle, diagnosis or {}, hold_s=hold_s)
+        report = RunReport(summary, tables, diagnosis or {}, motion)
         if options.report:
             generation.write_text(REPORT, render_report(report))
         if options.figures:

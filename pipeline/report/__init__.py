@@ -5,9 +5,18 @@ the page is a function from the report to HTML. Numbers come from the tables and
 """
 
 from pipeline.report.bundle import warm_bundle
+from pipeline.report.diagnosed import view_diagnosis
 from pipeline.report.errors import ReportError
 from pipeline.report.export import FORMATS, write_figures
 from pipeline.report.page import render_report
 from pipeline.report.run import RunReport
 
-__all__ = ["FORMATS", "ReportError", "RunReport", "render_report", "warm_bundle", "write_figures"]
+__all__ = [
+    "FORMATS",
+    "ReportError",
+    "RunReport",
+    "render_report",
+    "view_diagnosis",
+    "warm_bundle",
+    "write_figures",
+]

@@ -138,8 +138,8 @@ class Hall:
         return changes[ask.action]()
 
     def _begin_trial(self, file: DeskFile, stand: Stand, desk: Desk) -> Desk:
-        self._trials.forget_stopped()
-        self._trials.begin(stand, switch_off(file.parse(desk.step.model).model, desk.step.off))
+        model = switch_off(file.parse(desk.step.model).model, desk.step.off)
+        self._trials.begin(stand, model, f"{file.slot} {file.run}")
         return desk
 
     def _preview(self, file: DeskFile, stand: Stand, desk: Desk, ask: Ask) -> dict[str, object]:

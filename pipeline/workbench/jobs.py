@@ -128,8 +128,10 @@ class Jobs:
         """
         self._check_room(name, total)
         folder = self._results.resolve() / FOLDER / "uploads" / secrets.token_hex(4)
-        folder.mkdir(parents=True)
-        job = Job(folder.name, name, folder / clean_name(name), total)
+        # A run is called after its log's folder and name.
+        place = folder / "dropped"
+        place.mkdir(parents=True)
+        job = Job(folder.name, name, place / clean_name(name), total)
         self._jobs[job.id] = job
         while len(self._jobs) > _MOST_JOBS:
             self._jobs.pop(next(iter(self._jobs)))

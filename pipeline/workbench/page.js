@@ -104,6 +104,7 @@ const askVehicle = (job) => {
 };
 
 let watching = false;
+const opened = new Set();
 const watch = async () => {
   if (watching) return;
   watching = true;
@@ -112,7 +113,8 @@ const watch = async () => {
       const { jobs } = await get("/api/jobs");
       showJobs(jobs);
       if (jobs.every((job) => job.done)) {
-        const fresh = jobs.find((job) => job.run && !listed.runs.some((run) => run.run === job.run));
+        const fresh = jobs.find((job) => job.run && !opened.has(job.id));
+        jobs.forEach((job) => opened.add(job.id));
         await load();
         arrange(find("compare").checked);
         if (fresh) await open_(fresh.run);
@@ -181,6 +183,7 @@ const begin = async () => {
     await load();
     arrange(kept.has("b"));
     const known = (run) => run && listed.runs.some((entry) => entry.run === run);
+    for (const job of listed.jobs) if (job.done) opened.add(job.id);
     if (listed.jobs.some((job) => !job.done)) watch();
     const first = known(kept.get("a")) ? kept.get("a") : [...listed.runs].sort(ORDERS.slip)[0]?.run;
     if (first) await panes.a.open(first);

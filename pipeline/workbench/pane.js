@@ -2,6 +2,7 @@
 import { h, post, runTo, say, sayDuration, sayShare, toast } from "./parts.js";
 
 const WAIT_MS = 60;
+const REST_MS = 350;
 const HEADROOM = 1.05;
 
 export class Pane {
@@ -136,7 +137,7 @@ export class Pane {
       runTo(place.querySelector(".value"), errors[key]);
       const fall = ideal[key] ? errors[key] / ideal[key] - 1 : 0;
       const last = before && before[key] ? errors[key] / before[key] - 1 : 0;
-      const told = Math.abs(fall) < 0.005 ? "as the ideal model" : `${sayShare(fall)} against the ideal model`;
+      const told = Math.abs(fall) < 0.005 ? "as ideal" : `${sayShare(fall)} vs ideal`;
       place.querySelector(".fall").textContent = Math.abs(last) < 0.005 || Math.abs(last - fall) < 0.005 ? told : `${told}, ${sayShare(last)} now`;
       place.classList.toggle("fallen", fall < -0.005);
       place.classList.toggle("risen", fall > 0.005);
@@ -212,7 +213,11 @@ export class Pane {
       shown.textContent = `${say(Number(input.value), 4)} ${unit === "1" ? "" : unit}`;
       this.preview(effect.id, name, Number(input.value));
     });
-    input.addEventListener("change", () => this.act("set", { effect: effect.id, parameter: name, value: Number(input.value) }));
+    // Keys change the value many times in a row: only where it comes to rest is a step.
+    input.addEventListener("change", () => {
+      clearTimeout(this.rest);
+      this.rest = setTimeout(() => this.act("set", { effect: effect.id, parameter: name, value: Number(input.value) }), REST_MS);
+    });
     const span = low === null ? "" : `95 %: ${say(low, 4)} to ${say(high, 4)}`;
     return h("div", { class: "slider" },
       h("label", {}, h("span", {}, name), shown),
@@ -279,7 +284,7 @@ export class Pane {
     if (!diagnosis) return h("p", { class: "quiet" }, "Not diagnosed yet: ", h("code", {}, `slip diagnose ${this.run}`));
     const effects = (diagnosis.effects ?? []).filter((entry) => !there.has(entry.id));
     const told = effects.map((entry) => h("li", { class: "first", data: { effect: entry.id }, bar: 1 },
-      h("div", {}, h("b", {}, entry.id), h("span", { class: "quiet" }, `named by the diagnosis${Number.isFinite(entry.gain) ? `, worth ${sayShare(entry.gain)} of the loss` : ""}${(entry.equivalent_to ?? []).length ? `; same as ${entry.equivalent_to.join(", ")}` : ""}`)),
+      h("div", {}, h("b", {}, entry.id), h("span", { class: "quiet" }, `named by the diagnosis${Number.isFinite(entry.gain) ? `: without it the loss is ${say(entry.gain + 1)} times as high` : ""}${(entry.equivalent_to ?? []).length ? `; same as ${entry.equivalent_to.join(", ")}` : ""}`)),
       h("button", { type: "button", class: "add", "aria-label": `add ${entry.id}, named by the diagnosis`, onclick: () => this.add(entry.id) }, "Add")));
     const undecided = (diagnosis.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. ${entry.separate_by ?? ""}`));
     const rest = diagnosis.unexplained ? [h("p", { class: "quiet" }, `Not explained yet: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}`)] : [];
@@ -311,6 +316,10 @@ export class Pane {
         const state = await post("/api/desk", { run, slot: this.slot, input: this.state.desk.input, action: "open" });
         if (this.run !== run || turn !== this.turn) return;
         this.state.trial = state.trial;
+        if (!state.trial) {
+          this.tryAll();
+          return;
+        }
         this.model.querySelector(".next")?.replaceWith(this.proposals());
       } catch (error) {
         toast(error.message);

@@ -7,6 +7,8 @@ import threading
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from pipeline.motion import MotionError, fit_model, hold_out, list_effects
 from pipeline.motion.ladder import compare_losses
 from pipeline.workbench.cards import describe_shortly
@@ -14,15 +16,17 @@ from pipeline.workbench.cards import describe_shortly
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.motion import HeldOut, Model
+    from pipeline.motion import HeldOut, Model, Problem
     from pipeline.store import Manifest
     from pipeline.workbench.bench import Stand
 
 DIAGNOSIS = "diagnosis.json"
 
-_WORTH = 0.995
+_WORTH = 0.99
+_SURE = 2.5
 _EACH_NUMBER = 1.02
 _MOST_KEPT = 40
+_CLIP = 6.0
 
 
 @dataclass
@@ -30,16 +34,23 @@ class Trial:
     """Every effect tried on top of one model.
 
     Attributes:
+        owner: who asked for it.
         total: how many there are to try.
         tried: how many were.
         found: what each would do, as JSON.
         stopped: whether somebody wants it to end.
     """
 
+    owner: str
     total: int
     tried: int = 0
     found: list[dict[str, object]] = field(default_factory=list)
     stopped: bool = False
+
+    @property
+    def is_broken(self) -> bool:
+        """Whether it was stopped before its end."""
+        return self.stopped and self.tried < self.total
 
     def show(self) -> dict[str, object]:
         """As JSON: those that help first."""
@@ -55,18 +66,26 @@ class Trials:
         self._lock = threading.Lock()
 
     def find(self, stand: Stand, model: Model) -> Trial | None:
-        """The trial of a model, if there was one."""
+        """The trial of a model, if there is one that was not stopped before its end."""
         with self._lock:
-            return self._known.get(_key(stand, model))
+            trial = self._known.get(_key(stand, model))
+        return None if trial is None or trial.is_broken else trial
 
-    def begin(self, stand: Stand, model: Model) -> Trial:
-        """Try every effect on top of a model, in the background."""
+    def begin(self, stand: Stand, model: Model, owner: str) -> Trial:
+        """Try every effect on top of a model, in the background; what its owner had begun before ends.
+
+        Args:
+            stand: the run.
+            model: as it stands.
+            owner: who asks: one trial each.
+        """
         key = _key(stand, model)
         with self._lock:
-            if key in self._known:
-                return self._known[key]
-            for other, trial in self._known.items():
-                trial.stopped = trial.stopped or other[:3] == key[:3]
+            known = self._known.get(key)
+            if known is not None and not known.is_broken:
+                return known
+            for trial in self._known.values():
+                trial.stopped = trial.stopped or trial.owner == owner
             while len(self._known) >= _MOST_KEPT:
                 self._known.pop(next(iter(self._known)))
             kinds = [
@@ -74,17 +93,11 @@ class Trials:
                 for effect in list_effects()
                 if stand.vehicle.kind in effect.kinds and effect.id not in model
             ]
-            trial = Trial(len(kinds))
+            trial = Trial(owner, len(kinds))
             self._known[key] = trial
         names = [effect.id for effect in kinds]
         threading.Thread(target=_try_all, args=(stand, model, names, trial), daemon=True).start()
         return trial
-
-    def forget_stopped(self) -> None:
-        """Forget trials that did not end, so that they may begin again."""
-        with self._lock:
-            for key in [k for k, trial in self._known.items() if trial.stopped and trial.tried < trial.total]:
-                del self._known[key]
 
 
 def _key(stand: Stand, model: Model) -> tuple[object, ...]:
@@ -114,12 +127,24 @@ def _try_all(stand: Stand, model: Model, names: list[str], trial: Trial) -> None
                     "ratio": ratio,
                     # Of two that do the same, the one with fewer numbers.
                     "rank": ratio * _EACH_NUMBER ** len(kinds[name].parameters),
-                    "helps": ratio < _WORTH,
+                    "helps": ratio < _WORTH and _is_sure(problem, base, held_out),
                     "from": {"t": base.pooled.t_mrmse_m, "r": base.pooled.r_mrmse_rad},
                     "to": {"t": held_out.pooled.t_mrmse_m, "r": held_out.pooled.r_mrmse_rad},
                 }
             )
         trial.tried += 1
+
+
+def _is_sure(problem: Problem, base: HeldOut, new: HeldOut) -> bool:
+    """Whether the loss falls in most blocks, not by luck in a few: t over blocks of command steps."""
+    known = np.isfinite(base.residuals).all(axis=1) & np.isfinite(new.residuals).all(axis=1)
+    sizes = [base.weights.normalise(side.residuals, problem)[known] for side in (base, new)]
+    before, after = (np.minimum(size**2, _CLIP**2).mean(axis=1) for size in sizes)
+    block = problem.block_of[known]
+    count = np.bincount(block)
+    gain = np.bincount(block, before - after)[count > 0] / count[count > 0]
+    error = float(gain.std(ddof=1)) / np.sqrt(gain.size) if gain.size > 1 else np.inf
+    return bool(gain.mean() > _SURE * error)
 
 
 def read_diagnosis(manifest: Manifest) -> Mapping[str, object] | None:

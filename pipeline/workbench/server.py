@@ -36,7 +36,12 @@ def serve(results: Path, *, host: str, port: int, tell: Callable[[str], None]) -
     shown = f"[{host}]" if ":" in host else host
     tell(f"http://{shown}:{listener.getsockname()[1]}/")
     configuration = uvicorn.Config(
-        app, log_level="warning", server_header=False, access_log=False, timeout_graceful_shutdown=2
+        app,
+        ws="none",
+        log_level="warning",
+        server_header=False,
+        access_log=False,
+        timeout_graceful_shutdown=2,
     )
     uvicorn.Server(configuration).run(sockets=[listener])
 

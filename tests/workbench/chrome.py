@@ -1,4 +1,4 @@
-"""A real Chromium, driven as a person would: DevTools over a pipe, so that nothing else has to be installed."""
+"""A real Chromium, driven as a person would: DevTools over a pipe, nothing else to install."""
 
 from __future__ import annotations
 
@@ -104,7 +104,11 @@ class Chrome:
         """Set the size of the window and the colours that the reader asks for."""
         mobile = width < 600
         self.call(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=mobile
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=mobile,
         )
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.report.figures.figure import Section
-from pipeline.report.run import INPUT_WORDS, RunReport, mapping_in, number_in, numbers_in
+from pipeline.report.run import INPUT_WORDS, RunReport, mapping_in, number_in, numbers_in, objects_in
 from pipeline.report.sections.health import list_findings
 from pipeline.report.words import begin_large, build_table, escape, say_number
 
@@ -22,7 +22,13 @@ def render_how_bad(page: Page) -> str:
     lead = (
         f'<div class="cards">{cards}</div>' if cards else '<p class="lead">No slip could be worked out.</p>'
     )
-    return _render_doubts(report) + lead + page.render_figures(Section.HOW_BAD) + _render_table(report)
+    return (
+        _render_doubts(report)
+        + lead
+        + _render_horizon(report)
+        + page.render_figures(Section.HOW_BAD)
+        + _render_table(report)
+    )
 
 
 def _render_doubts(report: RunReport) -> str:
@@ -32,6 +38,23 @@ def _render_doubts(report: RunReport) -> str:
         return ""
     lines = "".join(f"<li>{begin_large(escape(finding.get('text', '')))}</li>" for finding in errors)
     return f'<div class="doubts"><p>Do not draw conclusions from these numbers:</p><ul>{lines}</ul></div>'
+
+
+def _render_horizon(report: RunReport) -> str:
+    """What a planner would feel: how far the ideal model is off after two seconds, and the named one."""
+    ladder = objects_in(report.diagnosis, "ladder")
+    if not ladder:
+        return ""
+    first, last = ladder[0], ladder[-1]
+    ends = [
+        f"<b>{say_number(number_in(rung, 't_mrmse_m'))} m</b> and "
+        f"<b>{say_number(number_in(rung, 'r_mrmse_rad'))} rad</b>"
+        for rung in (first, last)
+    ]
+    rest = f"; with the named effects {ends[1]}" if len(ladder) > 1 else ""
+    return (
+        f'<p class="lead">Two seconds ahead the ideal model is off by {ends[0]}{rest}, on data not seen.</p>'
+    )
 
 
 def _numbers_of(report: RunReport, name: str) -> Mapping[str, object]:

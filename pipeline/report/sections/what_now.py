@@ -18,12 +18,23 @@ def render_what_now(page: Page) -> str:
         return ""
     # A run that starts with a dash would be read as an option.
     name = shlex.quote(run) if not run.startswith("-") else shlex.quote(f"./{run}")
-    lines = (
-        ("Name the effects that are missing from the model", f"slip diagnose {name}"),
+    lines = [
+        *_list_model_steps(page, name),
         ("Set it beside other vehicles and terrains", "slip compare"),
         ("Look at slip in the viewer that plays the log", f"slip export {name} --to mcap"),
-    )
+    ]
     items = "".join(
         f"<div><dt>{words}</dt><dd><code>{escape(line)}</code></dd></div>" for words, line in lines
     )
     return f'<dl class="steps">{items}</dl>'
+
+
+def _list_model_steps(page: Page, name: str) -> list[tuple[str, str]]:
+    diagnosis = page.report.diagnosis
+    if not diagnosis:
+        return [("Name the effects that are missing from the model", f"slip diagnose {name}")]
+    steps = []
+    if diagnosis.get("effects"):
+        steps.append(("Keep the model that was named", f"slip diagnose {name} --apply model.toml"))
+        steps.append(("Give it to the robot's controller", "slip model export model.toml --to ros2_control"))
+    return [*steps, ("Try other effects and watch the error", "slip serve")]

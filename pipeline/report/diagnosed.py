@@ -1,0 +1,64 @@
+"""The model that a diagnosis named, on its run, for figures."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.motion import Input, Model, MotionError, Problem, find_effect, fit_model, load_run
+from pipeline.report.motion_view import MotionStage, MotionView
+from pipeline.report.run import mapping_in, number_in, objects_in
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import polars as pl
+
+    from pipeline.motion import Effect
+    from pipeline.vehicles import Vehicle
+
+
+def view_diagnosis(
+    tables: Mapping[str, pl.DataFrame],
+    vehicle: Vehicle,
+    diagnosis: Mapping[str, object],
+    *,
+    hold_s: float | None = None,
+) -> MotionView | None:
+    """What the named model says of the run.
+
+    Args:
+        tables: of the run: `poses` and `commands` or `wheels`, better with `imu`, `slip` and `velocities`.
+        vehicle: geometry.
+        diagnosis: the JSON object of one run of ``slip diagnose --json``.
+        hold_s: how long after its last command the controller stops; by default as `load_run` has it.
+
+    Returns:
+        Rows to draw; None where nothing was named, or the run is too poor for a model.
+    """
+    effects = [
+        made for entry in objects_in(diagnosis, "effects") if (made := _make_effect(entry)) is not None
+    ]
+    if not effects or "poses" not in tables:
+        return None
+    source = Input.MEASURED if diagnosis.get("input") == Input.MEASURED.value else Input.COMMAND
+    try:
+        run = load_run(tables, vehicle, name=str(diagnosis.get("run", "")), hold_s=hold_s)
+        problem = Problem([run], vehicle, source)
+        state = fit_model(problem, Model(vehicle, tuple(effects))).state
+    except MotionError:
+        # A log that is too poor for a model has its slip all the same.
+        return None
+    places = tables["velocities"].select("t", "x", "y").sort("t") if "velocities" in tables else None
+    floor = mapping_in(diagnosis, "noise_floor")
+    return MotionStage(problem, places).view(state, objects_in(diagnosis, "ladder"), floor or None)
+
+
+def _make_effect(entry: Mapping[str, object]) -> Effect | None:
+    """An effect with the values of the diagnosis; None for one that no longer exists or cannot be so."""
+    found = mapping_in(entry, "parameters")
+    values = {name: number_in(mapping_in(found, name), "value") for name in found}
+    try:
+        made = find_effect(str(entry.get("id", "")))()
+        return made.change(**{name: value for name, value in values.items() if value is not None})
+    except MotionError:
+        return None

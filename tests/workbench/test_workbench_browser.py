@@ -1,0 +1,204 @@
+"""The workbench in a real browser, as a person uses it: look, add, see the error fall, undo, drop, reload."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+import pytest
+from chrome import BROWSER, Chrome
+from conftest import RUN
+from workbench_server import Workbench
+
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.logs import LogWriter
+from pipeline.simulate import simulate_case
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+PHONE, LAPTOP = 390, 1280
+START = 1_700_000_000_000_000_000
+EVIL = "<img src=x onerror=\"window.pwned='yes'\"><script>window.pwned='yes'</script>"
+SHOWN = "document.querySelector('.pane')?.dataset.drawn"
+ERROR = "Number(document.querySelector('.number.r .value').textContent)"
+
+
+@pytest.fixture
+def chrome(tmp_path: Path) -> Iterator[Chrome]:
+    if BROWSER is None:
+        pytest.skip("no Chromium here to look at the workbench with (`make browser` installs one)")
+    browser = Chrome(tmp_path / "profile")
+    yield browser
+    browser.close()
+
+
+@pytest.fixture(scope="session")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where pictures of the page are kept: SLIP_PICTURES, or the tests' own folder."""
+    kept = os.environ.get("SLIP_PICTURES")
+    return Path(kept) if kept else tmp_path_factory.mktemp("pictures")
+
+
+def look_for_trouble(chrome: Chrome) -> None:
+    assert chrome.errors == []
+    assert {address.split("/")[2].split(":")[0] for address in chrome.requests if "//" in address} == {
+        "127.0.0.1"
+    }
+
+
+def test_a_person_adds_the_hidden_effect_undoes_drops_a_log_and_reloads(
+    chrome: Chrome, workbench: Workbench, pictures: Path, tmp_path: Path
+) -> None:
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    before = cast("float", chrome.run(ERROR))
+    chrome.picture(pictures / "workbench_opened.png")
+
+    chrome.click(".proposals li[data-effect=effective_track] .add")
+    chrome.wait("document.querySelector('.card[data-effect=effective_track]')")
+    chrome.wait(f"{ERROR} < {0.1 * before}")
+    chrome.wait("document.querySelectorAll('[data-figure=ladder] .mark-rect path').length === 2")
+    assert "%" in str(chrome.run("document.querySelector('.number.r .fall').textContent"))
+    chrome.picture(pictures / "workbench_added.png", whole=True)
+
+    # The slider, by keyboard: the value goes with it at once, the number a moment later.
+    chrome.run("document.querySelector('.slider input').focus()")
+    for _ in range(40):
+        chrome.press("ArrowRight", 39)
+    chrome.wait(f"{ERROR} > {0.1 * before}")
+    chrome.wait("document.querySelector('.ideal-said').textContent.includes('by hand')")
+
+    chrome.wait("!document.querySelector('.pane').classList.contains('busy')")
+    for _ in range(40):
+        if chrome.run("document.querySelector('.undo').disabled"):
+            break
+        chrome.click(".undo")
+        chrome.wait("!document.querySelector('.pane').classList.contains('busy')")
+    chrome.wait(f"Math.abs({ERROR} - {before}) < 1e-6")
+    assert chrome.run("document.querySelectorAll('.card').length") == 0
+
+    chrome.click(".redo")
+    chrome.wait("document.querySelector('.card')")
+    chrome.run("location.reload()")
+    chrome.wait(f"document.querySelector('.card') && {SHOWN}")
+    assert str(chrome.run("location.hash")).endswith("hidden")
+
+    other = simulate_case("husky_tile", out=tmp_path / "other.mcap", duration_s=40.0)
+    chrome.drop(other, "#drop")
+    chrome.wait("[...document.querySelectorAll('.run')].length === 2")
+    chrome.wait("document.querySelector('.title h2').textContent !== 'field/hidden'")
+    chrome.wait(SHOWN)
+    look_for_trouble(chrome)
+
+
+def test_two_models_of_a_run_stand_side_by_side(chrome: Chrome, workbench: Workbench, pictures: Path) -> None:
+    workbench.desk(RUN, "add", effect="effective_track")
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    chrome.click("#compare")
+    chrome.wait("document.querySelector('[data-slot=b]')?.dataset.drawn")
+    numbers = "[...document.querySelectorAll('.number.r .value')].map((node) => Number(node.textContent))"
+    first, second = cast("list[float]", chrome.run(numbers))
+    assert first < 0.2 * second
+    assert cast("int", chrome.run("document.documentElement.scrollWidth - innerWidth")) <= 0
+    chrome.picture(pictures / "workbench_compare.png", whole=True)
+    look_for_trouble(chrome)
+
+
+@pytest.mark.parametrize(("width", "dark"), [(PHONE, False), (LAPTOP, True)], ids=["phone", "laptop-dark"])
+def test_nothing_is_cut_or_overlaps(
+    chrome: Chrome, workbench: Workbench, pictures: Path, width: int, *, dark: bool
+) -> None:
+    workbench.desk(RUN, "add", effect="effective_track")
+    chrome.size(width, 844, dark=dark)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    chrome.picture(pictures / f"workbench_{width}{'_dark' if dark else ''}.png", whole=True)
+    assert cast("int", chrome.run("document.documentElement.scrollWidth - innerWidth")) <= 0
+    cut = """[...document.querySelectorAll('.plot svg')].flatMap((svg) => {
+      const box = svg.getBoundingClientRect();
+      return [...svg.querySelectorAll('text')].filter((text) => {
+        const word = text.getBoundingClientRect();
+        return word.width && (word.left < box.left - 1 || word.right > box.right + 1);
+      }).map((text) => text.textContent);
+    })"""
+    assert chrome.run(cut) == []
+    overlapping = """(() => {
+      const parts = [...document.querySelectorAll('.hero > *, .model > *, .figures > *, #side > *')]
+        .map((node) => [node.className || node.id, node.getBoundingClientRect()])
+        .filter(([, box]) => box.width && box.height);
+      const found = [];
+      for (const [i, [one, a]] of parts.entries()) for (const [other, b] of parts.slice(i + 1))
+        if (a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1)
+          found.push([one, other]);
+      return found;
+    })()"""
+    assert chrome.run(overlapping) == []
+    assert chrome.run("document.querySelector('.numbers').getBoundingClientRect().bottom < innerHeight")
+    look_for_trouble(chrome)
+
+
+def test_markup_in_a_log_is_shown_as_text(chrome: Chrome, tmp_path: Path, pictures: Path) -> None:
+    folder = tmp_path / "<b onclick=alert(1)>field"
+    folder.mkdir()
+    log = folder / "<img src=x onerror=window.pwned=1>.mcap"
+    rng = np.random.default_rng(4)
+    stamps = START + np.arange(1600, dtype=np.int64) * 50_000_000
+    speed = np.repeat(rng.uniform(0.2, 0.9, 20), 80)
+    turn = np.repeat(rng.uniform(-0.8, 0.8, 20), 80)
+    yaw = np.cumsum(0.6 * turn) * 0.05
+    pose = {
+        "header.frame_id": EVIL,
+        "pose.pose.position.x": np.cumsum(speed * np.cos(yaw)) * 0.05,
+        "pose.pose.position.y": np.cumsum(speed * np.sin(yaw)) * 0.05,
+        "pose.pose.orientation.z": np.sin(0.5 * yaw),
+        "pose.pose.orientation.w": np.cos(0.5 * yaw),
+    }
+    with LogWriter(log) as writer:
+        writer.metadata("deployment", {"vehicle": "husky_a200", "terrain": EVIL})
+        command = {"linear.x": speed, "angular.z": turn}
+        writer.write_columns(f"/{EVIL}/cmd_vel", "geometry_msgs/msg/Twist", stamps, command)
+        writer.write_columns(f"/{EVIL}/icp_odom", "nav_msgs/msg/Odometry", stamps, pose, header_time=stamps)
+    results = tmp_path / "results"
+    outcome = analyze_log(log, Options(out=results))
+    assert EVIL in str(outcome.summary["terrain"])
+    server = Workbench(results)
+    try:
+        chrome.size(LAPTOP, 900)
+        chrome.open(server.address)
+        chrome.wait(SHOWN)
+        chrome.picture(pictures / "workbench_markup.png")
+        assert EVIL in str(chrome.run("document.querySelector('.facts').textContent"))
+        assert "<img src=x" in str(chrome.run("document.querySelector('.title h2').textContent"))
+        assert chrome.run("document.querySelectorAll('img, b[onclick]').length") == 0
+        assert chrome.run("window.pwned ?? null") is None
+        look_for_trouble(chrome)
+        report = Path(str(outcome.summary["report"]))
+        chrome.open(report.as_uri())
+        chrome.wait("document.documentElement.dataset.drawn === 'yes'")
+        assert EVIL in str(chrome.run("document.body.textContent"))
+        assert chrome.run("document.querySelectorAll('img').length") == 0
+        assert chrome.run("window.pwned ?? null") is None
+        assert chrome.errors == []
+    finally:
+        server.close()
+
+
+def test_an_empty_folder_asks_for_a_log(chrome: Chrome, tmp_path: Path, pictures: Path) -> None:
+    server = Workbench(tmp_path / "nothing yet")
+    try:
+        chrome.size(PHONE, 844)
+        chrome.open(server.address)
+        chrome.wait("document.querySelector('.blank')")
+        chrome.picture(pictures / "workbench_empty.png")
+        assert chrome.run("document.querySelector('#drop').getBoundingClientRect().height > 80")
+        look_for_trouble(chrome)
+    finally:
+        server.close()
+    assert not (tmp_path / "nothing yet").exists()

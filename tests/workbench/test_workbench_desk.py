@@ -1,0 +1,227 @@
+"""A model in the making: what each step does to the numbers, to the files, and how long it takes."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import TYPE_CHECKING, cast
+
+import pytest
+from conftest import RUN, TRACK
+from workbench_server import Workbench
+
+from pipeline.motion import read_model
+from pipeline.simulate import simulate_case
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+Desk = dict[str, dict[str, float]]
+
+
+def errors(answer: dict[str, object], key: str = "errors") -> dict[str, float]:
+    return cast("Desk", answer["desk"])[key]
+
+
+def effects(answer: dict[str, object]) -> list[dict[str, object]]:
+    desk = cast("dict[str, object]", answer["desk"])
+    return cast("list[dict[str, object]]", desk["effects"])
+
+
+def value(answer: dict[str, object]) -> float:
+    parameters = cast("list[dict[str, float]]", effects(answer)[0]["parameters"])
+    return parameters[0]["value"]
+
+
+def test_the_hidden_effect_makes_the_error_fall_and_undo_brings_it_back(workbench: Workbench) -> None:
+    opened = workbench.desk(RUN)
+    added = workbench.desk(RUN, "add", effect="effective_track")
+
+    assert errors(opened) == errors(opened, "ideal")
+    assert errors(added)["r"] < 0.1 * errors(opened)["r"]
+    assert value(added) == pytest.approx(TRACK, rel=0.01)
+    undone = workbench.desk(RUN, "undo")
+    assert errors(undone) == errors(opened)
+    assert effects(undone) == []
+    assert errors(workbench.desk(RUN, "redo")) == errors(added)
+
+
+def test_the_ladder_has_a_rung_for_each_effect_in_the_order_of_adding(workbench: Workbench) -> None:
+    workbench.desk(RUN, "add", effect="drive_lag")
+    workbench.desk(RUN, "add", effect="effective_track")
+    drawn = workbench.post("/api/rows", run=RUN)
+    ladder = cast("dict[str, dict[str, dict[str, object]]]", drawn["rows"])["ladder"]
+    assert ladder["step"]["levels"] == ["ideal", "+ drive_lag", "+ effective_track"]
+
+    dropped = workbench.desk(RUN, "drop", effect="drive_lag")
+    assert [effect["id"] for effect in effects(dropped)] == ["effective_track"]
+
+
+def test_a_value_set_by_hand_is_scored_and_not_fitted(workbench: Workbench) -> None:
+    added = workbench.desk(RUN, "add", effect="effective_track")
+    wrong = workbench.desk(RUN, "set", effect="effective_track", parameter="k", value=1.2)
+    assert value(wrong) == 1.2
+    assert errors(added)["r"] < errors(wrong)["r"] < errors(wrong, "ideal")["r"]
+
+    assert value(workbench.desk(RUN, "fit")) == pytest.approx(TRACK, rel=0.01)
+
+
+def test_a_preview_shows_rows_and_keeps_nothing(workbench: Workbench) -> None:
+    added = workbench.desk(RUN, "add", effect="effective_track")
+    before = (workbench.results / "workbench/desks/a/field/hidden.json").read_bytes()
+    shown = workbench.desk(RUN, "preview", effect="effective_track", parameter="k", value=1.1)
+
+    assert errors(shown)["r"] > errors(added)["r"]
+    assert {"arcs", "model_w", "reach", "residual_w", "ladder"} <= set(cast("Desk", shown["rows"]))
+    assert (workbench.results / "workbench/desks/a/field/hidden.json").read_bytes() == before
+
+
+def test_a_locked_value_stays_in_a_fit(workbench: Workbench) -> None:
+    workbench.desk(RUN, "add", effect="effective_track")
+    workbench.desk(RUN, "set", effect="effective_track", parameter="k", value=1.3)
+    workbench.desk(RUN, "lock", effect="effective_track", parameter="k")
+    assert value(workbench.desk(RUN, "fit")) == 1.3
+    workbench.desk(RUN, "lock", effect="effective_track", parameter="k")
+    assert value(workbench.desk(RUN, "fit")) == pytest.approx(TRACK, rel=0.01)
+
+
+def test_an_effect_switched_off_shows_what_it_carries(workbench: Workbench) -> None:
+    added = workbench.desk(RUN, "add", effect="effective_track")
+    off = workbench.desk(RUN, "switch", effect="effective_track")
+    assert errors(off)["r"] > 5.0 * errors(added)["r"]
+    assert effects(off)[0]["off"]
+    assert errors(workbench.desk(RUN, "switch", effect="effective_track"))["r"] == pytest.approx(
+        errors(added)["r"], rel=0.3
+    )
+
+
+def test_everything_is_there_again_after_the_server_was_started_anew(results: Path) -> None:
+    first = Workbench(results)
+    added = first.desk(RUN, "add", effect="effective_track")
+    first.close()
+    second = Workbench(results)
+    try:
+        assert second.desk(RUN)["desk"] == added["desk"]
+        assert errors(second.desk(RUN, "undo")) == errors(added, "ideal")
+    finally:
+        second.close()
+
+
+def test_a_damaged_desk_is_begun_anew(workbench: Workbench) -> None:
+    workbench.desk(RUN, "add", effect="effective_track")
+    (workbench.results / "workbench/desks/a/field/hidden.json").write_text('{"run": 3}')
+    assert effects(workbench.desk(RUN)) == []
+
+
+def test_two_desks_of_a_run_do_not_touch_each_other(workbench: Workbench) -> None:
+    workbench.desk(RUN, "add", effect="effective_track")
+    other = workbench.desk(RUN, "add", effect="wheel_radius", slot="b")
+    assert [effect["id"] for effect in effects(other)] == ["wheel_radius"]
+    assert [effect["id"] for effect in effects(workbench.desk(RUN))] == ["effective_track"]
+
+
+def test_a_saved_model_is_a_model_file(workbench: Workbench) -> None:
+    added = workbench.desk(RUN, "add", effect="effective_track")
+    saved = workbench.post("/api/save", run=RUN)
+    path = workbench.results / "workbench/models/field/hidden.toml"
+    assert saved["path"] == str(path)
+    assert read_model(path).model.change("effective_track").effect("effective_track").values[
+        "k"
+    ] == pytest.approx(value(added))
+    status, headers, body = workbench.request("GET", "/model.toml?run=field%2Fhidden&slot=a")
+    assert status == 200
+    assert "hidden.toml" in headers["content-disposition"]
+    assert b"effective_track" in body
+
+
+def test_a_formula_is_parsed_with_its_units_and_never_run(workbench: Workbench) -> None:
+    typed = {"effect": "my_track", "channel": "v_w", "formula": "c * w0", "parameters": "c [1] -0.9 .. 0.5"}
+    opened = workbench.desk(RUN)
+    added = workbench.desk(RUN, "formula", **typed)
+    assert errors(added)["r"] < 0.1 * errors(opened)["r"]
+    assert value(added) == pytest.approx(1.0 / TRACK - 1.0, abs=0.01)
+    workbench.desk(RUN, "drop", effect="my_track")
+
+    for wrong in (
+        {"formula": "c * v0"},
+        {"formula": "__import__('os').system('true')"},
+        {"formula": "c * w0.__class__"},
+        {"formula": "open * w0"},
+        {"parameters": "c [1]"},
+        {"parameters": "c [1] 2 .. 1"},
+        {"effect": "../x"},
+        {"channel": "v_z"},
+        {"formula": "c * w0 +" + " w0 +" * 200},
+    ):
+        error = workbench.refuse("/api/desk", run=RUN, action="formula", **{**typed, **wrong})
+        assert error["hint"]
+    assert effects(workbench.desk(RUN)) == []
+
+
+def test_every_effect_is_tried_and_the_hidden_one_comes_first(workbench: Workbench) -> None:
+    workbench.desk(RUN, "try")
+    end = time.monotonic() + 60.0
+    while True:
+        trial = cast("dict[str, object]", workbench.desk(RUN)["trial"])
+        if trial["tried"] == trial["total"]:
+            break
+        assert time.monotonic() < end
+        time.sleep(0.2)
+    found = cast("list[dict[str, object]]", trial["found"])
+    assert found[0]["id"] == "effective_track"
+    assert found[0]["helps"]
+    assert not found[-1]["helps"]
+
+
+def test_what_a_diagnosis_named_is_shown(workbench: Workbench) -> None:
+    home = workbench.results / "runs/field/hidden"
+    manifest = json.loads((home / "manifest.json").read_text())
+    named = {"effects": [{"id": "effective_track", "gain": 0.9}], "undecided": [], "unexplained": None}
+    (home / manifest["folder"] / "diagnosis.json").write_text(json.dumps(named))
+    manifest["files"]["diagnosis.json"] = manifest["files"]["summary.json"]
+    (home / "manifest.json").write_text(json.dumps(manifest))
+    assert workbench.desk(RUN)["diagnosis"] == named
+
+
+def test_what_cannot_be_done_is_said_and_changes_nothing(workbench: Workbench) -> None:
+    assert workbench.refuse("/api/desk", run="nobody")["code"] == "no_such_run"
+    assert workbench.refuse("/api/desk", run=RUN, action="add", effect="magic")["code"] == "unknown_effect"
+    assert workbench.refuse("/api/desk", run=RUN, action="drop", effect="lag")["code"] == "no_such_effect"
+    assert workbench.refuse("/api/desk", run=RUN, action="burn")["code"] == "bad_request"
+    assert workbench.refuse("/api/desk", run=RUN, slot="../a")["code"] == "bad_request"
+    assert workbench.refuse("/api/desk", run="../../etc/passwd")["code"] == "no_such_run"
+    workbench.desk(RUN, "add", effect="effective_track")
+    assert (
+        workbench.refuse("/api/desk", run=RUN, action="add", effect="effective_track")["code"]
+        == "effect_twice"
+    )
+    far = {"effect": "effective_track", "parameter": "k", "value": 99.0}
+    assert workbench.refuse("/api/desk", run=RUN, action="set", **far)["code"] == "out_of_bounds"
+    assert len(effects(workbench.desk(RUN))) == 1
+
+
+@pytest.mark.long
+def test_ten_minutes_are_answered_within_half_a_second_and_fitted_within_two(tmp_path: Path) -> None:
+    log = tmp_path / "long.mcap"
+    simulate_case(None, {"effective_track": 1.6, "drive_lag": 0.5}, out=log, seed=3, duration_s=600.0)
+    server = Workbench(tmp_path / "results")
+    try:
+        body = log.read_bytes()
+        status, _, _ = server.request("POST", "/api/upload?name=long.mcap", body)
+        assert status == 200
+        run = str(server.wait_for_jobs()[0]["run"])
+        server.desk(run)
+        server.desk(run, "add", effect="drive_lag")
+        started = time.perf_counter()
+        server.desk(run, "add", effect="effective_track")
+        fitted = time.perf_counter() - started
+        server.post("/api/figures", run=run)
+        shown = []
+        for number in range(5):
+            started = time.perf_counter()
+            server.desk(run, "preview", effect="effective_track", parameter="k", value=1.4 + 0.02 * number)
+            shown.append(time.perf_counter() - started)
+    finally:
+        server.close()
+    assert fitted < 2.0
+    assert sorted(shown)[2] < 0.5
