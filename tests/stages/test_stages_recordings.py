@@ -51,7 +51,7 @@ KNOWN = {
     "husky_snow_boreal": Known(
         0.52, 0.751, 2.04, 4.98, HELD | ROTATED | {"command_scale"}, COMMON - {"command_scale"}
     ),
-    "husky_wheels_wetgrass": Known(0.0, 0.488, 0.617, 3.16, LIVE, COMMON | ROTATED),
+    "husky_wheels_wetgrass": Known(0.0, 0.488, 0.617, 3.16, LIVE),
     "husky_wheels_avide2": Known(0.0, 0.939, 0.946, 5.83, LIVE | {"not_moving"}, COMMON - {"not_moving"}),
     "warthog_gravel_1": Known(0.52, 1.09, 2.04, 7.15, HELD | ROTATED | LATE | ENCODERS),
     "warthog_wheels_asphalt": Known(0.80, 1.08, 1.65, 8.21, HELD | ROTATED | LATE | ENCODERS),
