@@ -8,6 +8,7 @@ from pipeline.logs.columns import Ragged, RaggedStrings, Strings
 from pipeline.logs.definitions import bundled_types, definition_text, field_names
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.index import ChannelInfo, LogIndex, hash_log, open_log
+from pipeline.logs.join import join_channels
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, read_topics
 from pipeline.logs.remote import RemotePath, to_location
 from pipeline.logs.transforms import TransformBuffer, TransformSeries, wanted_transforms
@@ -32,6 +33,7 @@ __all__ = [
     "definition_text",
     "field_names",
     "hash_log",
+    "join_channels",
     "open_log",
     "read_topics",
     "to_location",

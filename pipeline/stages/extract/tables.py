@@ -13,6 +13,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from pipeline.logs import join_channels
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract import localization, reading
 from pipeline.stages.extract.clocks import Recorded, TopicClock, align_clocks
@@ -124,13 +125,19 @@ class _Extraction:
         return Extracted(tables, tuple(self.findings), self.start_ns, clocks)
 
     def _join_channels(self, topic: str) -> TopicColumns | None:
+        """All channels of a topic as one series; where they cannot be one, the one with most messages."""
         channels = [columns for columns in self.data.of(topic) if columns.log_time.size]
-        if len(channels) > 1:
-            text = f"{topic} was recorded on {len(channels)} channels: the one with most messages was used"
-            self.findings.append(
-                Finding("several_channels", "warning", text, where=topic, count=len(channels))
-            )
-        return max(channels, key=lambda columns: columns.log_time.size, default=None)
+        if len(channels) <= 1:
+            return channels[0] if channels else None
+        joined = join_channels(channels)
+        count = len(channels)
+        if joined is not None:
+            text = f"{topic} was recorded on {count} channels: their messages were put in one order"
+            self.findings.append(Finding("several_channels", "info", text, where=topic, count=count))
+            return joined
+        text = f"{topic} was recorded on {count} channels of different types: the fullest was used"
+        self.findings.append(Finding("several_channels", "warning", text, where=topic, count=count))
+        return max(channels, key=lambda columns: columns.log_time.size)
 
     def _align(self) -> dict[str, TopicClock]:
         asked = self._asked_clocks()
