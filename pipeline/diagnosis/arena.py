@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from pipeline.diagnosis.judge import Fold
     from pipeline.diagnosis.problem import Problem
-    from pipeline.diagnosis.screen import Largest
+    from pipeline.diagnosis.screen import Candidate, Largest, Trial
     from pipeline.diagnosis.state import State
 
 Floats = NDArray[np.float64]
@@ -72,11 +72,12 @@ class Arena:
         metric: cost of residuals at the current model.
         only_early_clock: whether a late clock cannot be told from a late drive.
         least_delay: delays below it are a matter of sampling [s].
+        work: how many times candidates were looked through.
         least_share: share of the asked motion (rms) that an effect must account for.
     """
 
     problem: Problem
-    candidates: tuple[EffectClass, ...]
+    candidates: tuple[Candidate, ...]
     largest: Largest
     noise: Floats
     folds: tuple[Fold, ...]
@@ -87,6 +88,8 @@ class Arena:
     least_share: float = 0.0
     _dropped: dict[tuple[str, ...], Contender] = field(default_factory=dict)
     _suggested: dict[tuple[object, ...], list[Contender]] = field(default_factory=dict)
+    work: int = 0
+    _columns: dict[str, list[Trial]] = field(default_factory=dict)
 
     def enter(self, state: State) -> Contender:
         """Fit a state and hold it out."""
@@ -138,7 +141,10 @@ class Arena:
         if key in self._suggested:
             return self._suggested[key]
         candidates = [c for c in self.candidates if c.id not in barred]
-        proposals = propose(self.problem, self.metric, base.fitted, candidates, self.largest)[:count]
+        self.work += 1
+        proposals = propose(
+            self.problem, self.metric, base.fitted, candidates, self.largest, self._columns
+        )[:count]
         # A few steps tell which of them are worth fitting to the end.
         tried = [polish(self.problem, self.metric, p.state, _FIRST_STEPS) for p in proposals]
         best = min((fitted.loss for fitted in tried), default=0.0)

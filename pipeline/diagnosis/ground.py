@@ -26,6 +26,8 @@ EffectClass = type[Effect]
 
 # Cell means of held commands are exact: finer cells change residuals in the sixth digit.
 _RATE_HZ = 50.0
+_COARSE_HZ = 25.0
+_MOST_CELLS = 20_000
 _FEWEST_WINDOWS = 60
 # A point beside base_link is a shifted centre of rotation: it is searched under that name.
 _TWINS = frozenset({"lever_arm"})
@@ -133,7 +135,9 @@ def _compare_all(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> 
     series = [run.commands if source is Input.COMMAND else run.wheels for run in runs]
     if any(one is None for one in series):
         return ()
-    return tuple(Comparison(run, vehicle, source, rate_hz=_RATE_HZ) for run in runs)
+    long = sum(run.duration_s for run in runs) * _RATE_HZ > _MOST_CELLS
+    rate = _COARSE_HZ if long else _RATE_HZ
+    return tuple(Comparison(run, vehicle, source, rate_hz=rate) for run in runs)
 
 
 def _measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:

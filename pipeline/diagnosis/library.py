@@ -5,12 +5,14 @@ Every term is a formula effect with consistent units, in the syntax that a model
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.diagnosis.screen import TERM
 from pipeline.motion.effect import ANY, Parameter, Search
 from pipeline.motion.formula.formula_effect import FormulaEffect
 
@@ -22,7 +24,6 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 CHANNELS = ("v_x", "v_y", "v_w")
-PREFIX = "term_"
 _WIDE = 50.0
 _WAVE_NUMBERS = np.geomspace(0.15, 6.0, 60)
 
@@ -86,8 +87,13 @@ class Term:
 
     def __call__(self, **values: float) -> FormulaEffect:
         """The formula effect with these values; numbers that only shape it are left alone by fits."""
-        fixed = [p.name for p in self.parameters if p.name in _FIXED]
-        return FormulaEffect(self.id, {self.channel: self.text}, self.parameters, fixed=fixed, **values)
+        return _parse(self).change(**values)
+
+
+@functools.lru_cache(maxsize=512)
+def _parse(term: Term) -> FormulaEffect:
+    fixed = [p.name for p in term.parameters if p.name in _FIXED]
+    return FormulaEffect(term.id, {term.channel: term.text}, term.parameters, fixed=fixed)
 
 
 def list_terms() -> tuple[Term, ...]:
@@ -104,7 +110,7 @@ def _make_term(channel: str, name: str, text: str, unit: str) -> Term:
     ratio = _divide(_UNITS[channel], unit)
     gain = Parameter("k", ratio, (-_WIDE, _WIDE), 0.0, "size", 0.1, step=1e-3)
     shape = tuple(parameter for key, parameter in _FIXED.items() if f" {key})" in text)
-    return Term(f"{PREFIX}{channel[-1]}_{name}", channel, f"k * {text}", (gain, *shape))
+    return Term(f"{TERM}{channel[-1]}_{name}", channel, f"k * {text}", (gain, *shape))
 
 
 def _divide(one: str, other: str) -> str:
@@ -169,12 +175,12 @@ def _make_wave(channel: str, factor: str, axis: str, wave: float) -> Term:
         starts=(wave,),
         step=1e-3,
     )
-    return Term(f"{PREFIX}{channel[-1]}_{factor}_along_{axis}", channel, text, (*parameters, number))
+    return Term(f"{TERM}{channel[-1]}_{factor}_along_{axis}", channel, text, (*parameters, number))
 
 
 def is_term(name: str) -> bool:
     """Whether an id is that of a term."""
-    return name.startswith(PREFIX)
+    return name.startswith(TERM)
 
 
 def join_formula(terms: Sequence[FormulaEffect]) -> dict[str, object]:

@@ -54,7 +54,8 @@ def read_clocks(ground: Ground, body: Search) -> Clocks:
         )
     found: list[Effect] = []
     late = float(np.mean(positions))
-    skewed = extra is not None and ground.has_gyro
+    # A heading that is older than its position is known; the other way round it is a late position.
+    skewed = extra is not None and ground.has_gyro and more < 0.0
     if skewed:
         found.append(find_effect("heading_skew")(d=min(max(-more, -0.6), 0.6)))
     least = max(LEAST_DELAY, _SKEWED_CLOCK if skewed else 0.0, _held_delay(ground))

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from pipeline.motion.effect import Effect
 
 _RATE_HZ = 50.0
+_COARSE_HZ = 25.0
+_LONG_S = 400.0
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,22 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 EffectClass = type[Effect]
+TERM = "term_"
+
+
+class Candidate(Protocol):
+    """What makes an effect of values: a class of the catalogue, or a formula term."""
+
+    @property
+    def id(self) -> str:
+        """Of the effects it makes."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Their numbers."""
+
+    def __call__(self, **values: float) -> Effect:
+        """The effect with these values."""
 
 _LEAST_SHARE = 0.05
 
@@ -69,15 +85,35 @@ class Proposal:
 
 
 def propose(
-    problem: Problem, metric: Metric, fitted: Fitted, candidates: Sequence[EffectClass], largest: Largest
+    problem: Problem,
+    metric: Metric,
+    fitted: Fitted,
+    candidates: Sequence[Candidate],
+    largest: Largest,
+    known: dict[str, list[Trial]],
 ) -> list[Proposal]:
-    """Candidates by promised loss, the best start of each."""
+    """Candidates by promised loss, the best start of each.
+
+    Args:
+        problem: what is explained.
+        metric: cost of residuals.
+        fitted: the model to add to.
+        candidates: effects to try.
+        largest: what relative starts are shares of.
+        known: columns of formula terms: they hardly change with the rest of the model.
+    """
     found = []
     for candidate in candidates:
         if fitted.state.find(candidate.id) is not None:
             continue
         best: Proposal | None = None
-        for trial in list_trials(problem, fitted, candidate, largest):
+        if candidate.id in known:
+            trials = known[candidate.id]
+        else:
+            trials = list(list_trials(problem, fitted, candidate, largest))
+            if candidate.id.startswith(TERM):
+                known[candidate.id] = trials
+        for trial in trials:
             proposal = _promise(metric, fitted, trial)
             if proposal is not None and (best is None or proposal.loss < best.loss):
                 best = proposal
@@ -87,7 +123,7 @@ def propose(
 
 
 def list_trials(
-    problem: Problem, fitted: Fitted, candidate: EffectClass, largest: Largest
+    problem: Problem, fitted: Fitted, candidate: Candidate, largest: Largest
 ) -> Iterator[Trial]:
     """Every start of an effect with its columns."""
     for values in list_starts(candidate, largest):
@@ -113,7 +149,7 @@ def list_trials(
         yield Trial(start, direct, np.stack(columns, axis=2), fitted.residual - base)
 
 
-def list_starts(candidate: EffectClass, largest: Largest) -> list[dict[str, float]]:
+def list_starts(candidate: Candidate, largest: Largest) -> list[dict[str, float]]:
     """Values to start an effect from; parameters that follow linearly stay neutral."""
     searched = [p for p in candidate.parameters if p.search is not Search.DIRECT]
     if not searched:

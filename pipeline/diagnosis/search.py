@@ -10,12 +10,15 @@ from pipeline.diagnosis.judge import LEAST_GAIN
 if TYPE_CHECKING:
     from pipeline.diagnosis.arena import Arena, Contender
 
-_TRIED = 5
-_SWAPPED = 3
+_TRIED = 4
+_SWAPPED = 2
 _MOST_EFFECTS = 8
 _ROUNDS = 6
 _BETTER = 0.005
 _TIE = 0.03
+# Recordings with much structure offer ever another exchange by a hair.
+_MOST_WORK = 16
+_MOST_SPLIT = 3
 
 
 def search_effects(arena: Arena, start: Contender) -> Contender:
@@ -30,6 +33,8 @@ def search_effects(arena: Arena, start: Contender) -> Contender:
     """
     current = grow(arena, start)
     for _ in range(_ROUNDS):
+        if arena.work > _MOST_WORK:
+            return current
         moved = _swap(arena, current) or _join(arena, current) or _split(arena, current)
         if moved is None:
             return current
@@ -85,6 +90,8 @@ def _swap(arena: Arena, current: Contender) -> Contender | None:
     """One effect for another: better, or as good with fewer in the end."""
     best: Contender | None = None
     for name in _free(arena, current):
+        if arena.work > _MOST_WORK:
+            return best
         without = arena.drop(current, [name])
         for rival in arena.suggest(without, _SWAPPED, without=[name]):
             if rival.score < (1.0 - _BETTER) * current.score:
@@ -101,6 +108,8 @@ def _swap(arena: Arena, current: Contender) -> Contender | None:
 def _join(arena: Arena, current: Contender) -> Contender | None:
     """One effect in the place of two."""
     for pair in combinations(_free(arena, current), 2):
+        if arena.work > _MOST_WORK:
+            return None
         without = arena.drop(current, pair)
         for rival in arena.suggest(without, _SWAPPED, without=pair):
             if rival.score < (1.0 + LEAST_GAIN) * current.score:
@@ -110,7 +119,7 @@ def _join(arena: Arena, current: Contender) -> Contender | None:
 
 def _split(arena: Arena, current: Contender) -> Contender | None:
     """Two effects in the place of one, where the model leaves room for them."""
-    if not arena.has_room(current):
+    if not arena.has_room(current) or len(current.ids) > _MOST_SPLIT or arena.work > _MOST_WORK:
         return None
     for name in _free(arena, current):
         without = arena.drop(current, [name])

@@ -13,8 +13,9 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.arena import Arena, Contender
     from pipeline.motion.effect import Effect
 
-_LOOKED_AT = 8
+_LOOKED_AT = 6
 _AS_GOOD = 0.01
+_ALIKE = 0.7
 # Effects that hold the key as a special case explain whatever it explains.
 _HOLDS: dict[str, frozenset[str]] = {
     "drive_lag": frozenset({"turn_lag"}),
@@ -47,7 +48,7 @@ def find_undecided(arena: Arena, final: Contender) -> list[Undecided]:
         rivals = [
             rival
             for rival in arena.suggest(without, _LOOKED_AT, without=[effect.id])
-            if _is_as_good(arena, final, rival)
+            if _is_as_good(arena, final, rival) and _does_the_same(arena, without, final, rival)
         ]
         names = [name for rival in rivals for name in rival.ids if name not in final.ids]
         simple = [name for name in names if not _is_larger(arena, name, effect)]
@@ -61,6 +62,15 @@ def _is_as_good(arena: Arena, final: Contender, rival: Contender) -> bool:
     if arena.metric.loss(rival.held) < (1.0 + _AS_GOOD) * arena.metric.loss(final.held):
         return True
     return not arena.judge(rival, final).accepts()
+
+
+def _does_the_same(arena: Arena, without: Contender, final: Contender, rival: Contender) -> bool:
+    """Whether two effects push the prediction alike: two small ones that do not are no alternatives."""
+    base = without.fitted.residual
+    one = (base - final.fitted.residual) / arena.metric.scale
+    other = (base - rival.fitted.residual) / arena.metric.scale
+    size = float(np.sqrt(np.sum(one**2) * np.sum(other**2)))
+    return size > 0.0 and float(np.sum(one * other)) > _ALIKE * size
 
 
 def _is_larger(arena: Arena, name: str, effect: Effect) -> bool:

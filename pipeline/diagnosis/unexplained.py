@@ -28,6 +28,7 @@ _LEAST_GAIN = 0.02
 _LEAST_T = 3.0
 _LEAST_Z = 3.0
 _BETTER = 0.02
+_MOST_PAIRED = 3
 _EXPLAINABLE = 0.1
 _LAGS_S = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
 _TREES = 60
@@ -64,7 +65,7 @@ def search_formula(arena: Arena, start: Contender, final: Contender, places: Flo
     """
     waves = (*list_waves(arena, final, places), *list_waves(arena, start, places, "_first"))
     terms = (*list_terms(), *waves)
-    wide = replace(arena, candidates=(*arena.candidates, *terms), _dropped={}, _suggested={})
+    wide = replace(arena, candidates=(*arena.candidates, *terms), _dropped={}, _suggested={}, _columns={})
     narrow = {effect.id for effect in arena.candidates}
     current = final
     for _ in range(_MOST_TERMS + 1):
@@ -88,7 +89,8 @@ def _add(arena: Arena, current: Contender, narrow: set[str]) -> Contender | None
 def _replace(arena: Arena, current: Contender, narrow: set[str]) -> Contender | None:
     """A term in the place of one effect or two that only imitate it."""
     free = [name for name in current.ids if name not in arena.kept and not is_term(name)]
-    for names in (*((name,) for name in free), *combinations(free, 2)):
+    pairs = combinations(free, 2) if len(free) <= _MOST_PAIRED else ()
+    for names in (*((name,) for name in free), *pairs):
         without = arena.drop(current, names)
         for rival in arena.suggest(without, _TRIED, without={*narrow, *names}):
             bonus = _BETTER if len(names) == 1 else 0.0

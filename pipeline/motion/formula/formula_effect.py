@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 import math
 from typing import TYPE_CHECKING, Self
 
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.motion.formula.units import Unit
     from pipeline.motion.signals import Rolling, Surroundings, Velocity
 
 
@@ -107,9 +110,11 @@ class FormulaEffect(AddedEffect):
         return total.add(added.get("v_x"), added.get("v_y"), added.get("v_w"))
 
     def _copy(self, values: Mapping[str, float], fixed: Iterable[str]) -> Self:
-        return type(self)(
-            self.id, self.formulas, self.parameters, fixed=fixed, where=self._where, **dict(values)
-        )
+        # The formulas are parsed already: another value changes nothing about them.
+        other = copy.copy(self)
+        other.values = other._complete(dict(values))
+        other.fixed = frozenset(fixed)
+        return other
 
     def _parse(self, channel: str, text: str) -> Expression:
         own = {p.name: parse_unit(p.unit, self._where) for p in self.parameters}
@@ -121,8 +126,7 @@ class FormulaEffect(AddedEffect):
                 where=self._where,
                 hint="Choose another name.",
             )
-        signals = {name: parse_unit(unit, self._where) for name, unit in SIGNAL_UNITS.items()}
-        expression = parse_expression(text, signals | own, self._where)
+        expression = parse_expression(text, {**_parse_signal_units(), **own}, self._where)
         wanted = parse_unit(CHANNELS[channel], self._where)
         if expression.unit != wanted:
             raise MotionError(
@@ -159,6 +163,11 @@ class FormulaEffect(AddedEffect):
                     where=self._where,
                     hint="Give `neutral` to a parameter so that the formula vanishes there, or add a factor.",
                 )
+
+
+@functools.cache
+def _parse_signal_units() -> Mapping[str, Unit]:
+    return {name: parse_unit(unit, name) for name, unit in SIGNAL_UNITS.items()}
 
 
 class _Signals:
