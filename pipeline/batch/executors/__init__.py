@@ -44,7 +44,7 @@ class Blame:
     """Why a task has no report.
 
     Attributes:
-        code: ``worker_died``, ``timed_out``, ``out_of_memory``, ``bad_result``, ...
+        code: ``worker_died``, ``timed_out``, ``out_of_memory``, ``no_result``, ...
         reason: one sentence without a full stop.
         kills: workers that the task has cost.
     """

@@ -125,7 +125,7 @@ class ClusterExecutor:
             notes.remove(task.log.path)
             reason = str(death.get("reason", "its workers died"))
             return Blame(str(death.get("code", "worker_died")), reason, 1)
-        return Blame("bad_result", f"it gave no result: {type(error).__name__}: {error}", 0)
+        return Blame("no_result", f"it gave no result: {type(error).__name__}: {error}", 1)
 
     def close(self) -> None:
         """Leave the cluster; one that was started for this batch ends."""

@@ -51,7 +51,7 @@ class InlineExecutor:
     def blame(self, task: Task, error: BaseException) -> Blame:
         """What the exception of a future means; none is raised by a log."""
         del task
-        return Blame("bad_result", f"it gave no result: {type(error).__name__}: {error}", 0)
+        return Blame("no_result", f"it gave no result: {type(error).__name__}: {error}", 0)
 
     def close(self) -> None:
         """Nothing has to be ended."""

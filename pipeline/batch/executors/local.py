@@ -84,7 +84,7 @@ class LocalExecutor:
                     "out_of_memory", f"it held {held / 1e9:.2g} GB of memory, more than {limit:.2g} GB", 1
                 )
             return Blame("worker_died", f"its process died ({describe_exit(error.exitcode)})", 1)
-        return Blame("bad_result", f"it gave no result: {type(error).__name__}: {error}", 0)
+        return Blame("no_result", f"it gave no result: {type(error).__name__}: {error}", 1)
 
     def close(self) -> None:
         """End the workers, without waiting for unfinished tasks."""
