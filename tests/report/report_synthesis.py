@@ -7,6 +7,8 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.report import RunReport
+from pipeline.report.motion_view import MotionView
+from pipeline.report.run import mapping_in, objects_in
 from schemas import contract_of
 
 RATE_HZ = 20.0
@@ -21,7 +23,83 @@ def make_report(
 ) -> RunReport:
     """A run of so many seconds; ``names`` replaces texts of the summary and the identity columns."""
     tables = make_tables(duration_s=duration_s, seed=seed, measured=measured, names=names or {})
-    return RunReport(make_summary(tables, names or {}), tables)
+    return RunReport(
+        make_summary(tables, names or {}), tables, make_diagnosis(names or {}), make_motion(tables)
+    )
+
+
+def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
+    """The JSON object of a diagnosis of that run."""
+    sizes = ((1.06, 0.96), (0.44, 0.13), (0.31, 0.10))
+    effects = ["effective_track", "drive_lag"]
+    return {
+        "run": names.get("run", "field/2026-11-02_warthog"),
+        "input": "command",
+        "effects": [
+            {
+                "id": "effective_track",
+                "parameters": {"k": {"value": 1.79, "low": 1.74, "high": 1.84, "unit": "1"}},
+                "gain": 12.4,
+                "equivalent_to": [],
+            },
+            {
+                "id": "drive_lag",
+                "parameters": {"tau": {"value": 1.08, "low": 1.01, "high": 1.15, "unit": "s"}},
+                "gain": 0.31,
+                "equivalent_to": ["body_inertia"],
+            },
+        ],
+        "undecided": [
+            {
+                "candidates": ["lateral_skid", "icr_offset"],
+                "separate_by": names.get("advice", "drive circles"),
+            }
+        ],
+        "unobservable": ["slope_drift"],
+        "unexplained": None,
+        "findings": [],
+        "ladder": [
+            {"effects": effects[:count], "t_mrmse_m": t, "r_mrmse_rad": r}
+            for count, (t, r) in enumerate(sizes)
+        ],
+        "noise_floor": {"t_mrmse_m": 0.19, "r_mrmse_rad": 0.07},
+        "explained_share": 0.86,
+    }
+
+
+def make_motion(tables: dict[str, pl.DataFrame]) -> MotionView:
+    """A model that takes most of the ideal one's residuals."""
+    slip = tables["slip"].filter(pl.col("input") == "command").gather_every(5)
+    t, piece = slip["t"].to_numpy(), slip["segment"].to_numpy()
+    ideal = {f"ideal_{axis}": -slip[f"g_{axis}"].to_numpy() for axis in "xyw"}
+    model = {f"model_{axis}": 0.2 * -slip[f"g_{axis}"].to_numpy() for axis in "xyw"}
+    f_x, f_w = slip["f_x"].to_numpy(), slip["f_w"].to_numpy()
+    rates = {"a_x": np.gradient(f_x), "a_w": np.gradient(f_w)}
+    flat = {"roll": np.zeros(t.size), "pitch": np.zeros(t.size)}
+    signals = {"f_x": f_x, "f_w": f_w, "f_x_f_w": f_x * f_w, **rates, **flat}
+    velocity = {f"v_{axis}": slip[f"v_{axis}"].to_numpy() + model[f"model_{axis}"] for axis in "xyw"}
+    size = slip["modulus"].to_numpy()
+    track = tables["velocities"].gather_every(40).select("t", "x", "y")
+    diagnosis = make_diagnosis({})
+    return MotionView(
+        input="command",
+        effects=("drive_lag", "effective_track"),
+        ladder=objects_in(diagnosis, "ladder"),
+        floor=mapping_in(diagnosis, "noise_floor"),
+        residuals=pl.DataFrame({"t": t, **ideal, **model, **signals}),
+        velocity=pl.DataFrame({"t": t, "piece": piece, **velocity}),
+        reach=pl.DataFrame(
+            {
+                "t": t,
+                "piece": piece,
+                "ideal": size,
+                "model": 0.3 * size,
+                "ideal_yaw": size,
+                "model_yaw": 0.1 * size,
+            }
+        ),
+        arcs=track.with_columns(piece=pl.int_range(pl.len()) // 4),
+    )
 
 
 def make_tables(
@@ -161,7 +239,8 @@ def _slip(
         parts |= {f"f_{axis}": ideal[:, i], f"v_{axis}": body[:, i], f"g_{axis}": gap[:, i]}
     parts["modulus"] = np.linalg.norm(gap, axis=1)
     parts["suspect"] = (step == 1) & ((t % STEP_S) > 4.5)
-    return _frame(identity, {**grid, **parts}).with_columns(input=pl.lit(name))
+    model = [pl.lit(None, pl.Float64).alias(name) for name in ("m_x", "m_y", "m_w", "residual_modulus")]
+    return _frame(identity, {**grid, **parts}).with_columns(*model, input=pl.lit(name))
 
 
 def _windows(slip: pl.DataFrame) -> pl.DataFrame:
@@ -209,7 +288,7 @@ def _aggregates(slip: pl.DataFrame, drive: Floats, ground: Floats, *, measured: 
                     else None
                 }
                 | {"distance": 1421.0, "duration": part.height / RATE_HZ, "height_rate": 0.1}
-                | {"largest_kinetic_energy": 3100.0, "length_scale": 1.0}
+                | {"largest_kinetic_energy": 3100.0, "length_scale": 1.0, "median_residual_modulus": None}
             )
     return pl.DataFrame(rows)
 

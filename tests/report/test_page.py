@@ -208,17 +208,37 @@ def test_a_missing_or_empty_table_costs_only_its_figures(
     tables = {name: frame for name, frame in report.tables.items() if name != gone}
     if empty:
         tables[gone] = report.tables[gone].clear()
-    outline = outline_of(render_report(RunReport(report.summary, tables)))
+    outline = outline_of(render_report(RunReport(report.summary, tables, report.diagnosis, report.motion)))
     drawn = {str(found["data-figure"]) for _, found in outline.tags if "data-figure" in found}
     lost: dict[str, set[str]] = {
         "velocities": {"trajectory"},
-        "slip": {"modulus", "distribution", "command_space"},
+        "slip": {"modulus", "distribution", "command_space", "step_response"},
         "windows": {"window_norms"},
         "aggregates": {"split"},
         "findings": set(),
     }
     assert {figure.id for figure in list_figures()} - drawn == lost[gone]
     assert "h2 How bad" in outline.headings
+
+
+def test_without_a_diagnosis_the_page_proposes_one_and_draws_no_model(report: RunReport) -> None:
+    page = render_report(RunReport(report.summary, report.tables))
+    drawn = {str(found["data-figure"]) for _, found in outline_of(page).tags if "data-figure" in found}
+    of_models = {"ladder", "residuals", "autocorrelation", "reach"}
+    assert {figure.id for figure in list_figures()} - drawn == of_models
+    assert "slip diagnose" in page
+    assert "slip serve" not in page
+
+
+def test_what_a_diagnosis_names_is_told_with_its_numbers(page: str) -> None:
+    told = outline_text(page)
+    assert "effective_track" in told
+    assert "1.740 to 1.840" in told
+    assert "the loss is 13 times as high" in told
+    assert "lateral_skid or icr_offset: drive circles" in told
+    assert "slope_drift: this log would not show it" in told
+    assert "off by <b>1.06 m</b> and <b>0.960 rad</b>; with the named effects <b>0.310 m</b>" in told
+    assert "slip diagnose field/2026-11-02_warthog --apply model.toml" in told
 
 
 def test_a_run_of_which_nothing_is_known_still_has_a_page() -> None:
@@ -244,7 +264,8 @@ def test_summary_of_odd_kinds_is_no_reason_to_fail() -> None:
 def test_without_measured_wheels_nothing_is_said_about_the_ground() -> None:
     page = outline_text(render_report(make_report(duration_s=20.0, measured=False)))
     assert "on measured wheels" not in page
-    assert 'id="why"' not in page
+    assert "ground (wheels to body)" not in page
+    assert "drivetrain" not in page
 
 
 def test_a_grave_finding_stands_before_the_numbers() -> None:

@@ -24,7 +24,7 @@ _SCHEMA = {
     "told": pl.String,
     "series": pl.String,
 }
-_ROOM = 1.45
+_ROOM = 2.1
 
 
 def draw_ladder(scene: Scene) -> Drawing | None:
@@ -48,7 +48,9 @@ def draw_ladder(scene: Scene) -> Drawing | None:
     )
     base = alt.Chart(alt.NamedData("ladder")).encode(y=y)
     bars = base.mark_bar(clip=True).encode(x=x, color=alt.Color("series:N", scale=scale, legend=None))
-    words = base.mark_text(align="left", dx=6, color=theme.INK).encode(x=alt.X("t:Q"), text="told:N")
+    words = base.mark_text(align="left", dx=6, color=theme.INK, fontSize=11).encode(
+        x=alt.X("t:Q"), text="told:N"
+    )
     floor = (
         alt.Chart(alt.NamedData("ladder_floor"))
         .mark_rule(color=theme.INK, strokeDash=[4, 3], strokeWidth=1.5)

@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 
 _CHANNELS = {"x": ("forward velocity", 0.15), "w": ("yaw rate", 0.15)}
 _BEFORE_S, _AFTER_S, _RATE_HZ = 0.5, 3.0, 20.0
-_FEWEST = 4
+_FEWEST = 2
 _WORDS = {"command": "command", "velocity": "measured", "model": "model"}
 
 
