@@ -13,7 +13,6 @@ from pipeline.diagnosis.metric import Metric, make_metric, measure_spread, satur
 from pipeline.diagnosis.plausibility import is_nameable
 from pipeline.diagnosis.polish import Fitted, polish
 from pipeline.diagnosis.screen import propose
-from pipeline.motion.effect import Effect
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.state import State
 
 Floats = NDArray[np.float64]
-EffectClass = type[Effect]
 
 # A number more must buy something: between models that predict alike the simpler one is named.
 _PRICE_OF_A_NUMBER = 0.004
@@ -120,7 +118,7 @@ class Arena:
         return self.judge(before, after).accepts(least_gain) and self._matters(before, after)
 
     def _matters(self, before: Contender, after: Contender) -> bool:
-        """Whether enough of the motion itself is explained: encoders are so exact that all else is certain."""
+        """Whether enough of the motion is explained: encoders are so exact that all else is certain."""
         if self.least_share == 0.0:
             return True
         asked = (self.problem.find_ideal()[:, 0, :] ** 2).mean(axis=0)
@@ -142,9 +140,9 @@ class Arena:
             return self._suggested[key]
         candidates = [c for c in self.candidates if c.id not in barred]
         self.work += 1
-        proposals = propose(
-            self.problem, self.metric, base.fitted, candidates, self.largest, self._columns
-        )[:count]
+        proposals = propose(self.problem, self.metric, base.fitted, candidates, self.largest, self._columns)[
+            :count
+        ]
         # A few steps tell which of them are worth fitting to the end.
         tried = [polish(self.problem, self.metric, p.state, _FIRST_STEPS) for p in proposals]
         best = min((fitted.loss for fitted in tried), default=0.0)
@@ -173,7 +171,7 @@ class Arena:
 
 
 def open_arena(
-    problem: Problem, start: State, candidates: tuple[EffectClass, ...], largest: Largest
+    problem: Problem, start: State, candidates: tuple[Candidate, ...], largest: Largest
 ) -> tuple[Arena, Contender]:
     """The arena of a problem, and the model to start from, fitted."""
     residual = problem.find_residuals(start)

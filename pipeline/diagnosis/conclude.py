@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.diagnosis import Json
     from pipeline.diagnosis.ground import Ground
     from pipeline.diagnosis.naming_rules import Clocks
+    from pipeline.diagnosis.problem import Problem
     from pipeline.diagnosis.subject import Recording
     from pipeline.motion import Effect, Estimates, Timing
     from pipeline.motion.workshop import Judgement
@@ -63,7 +64,8 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
         if not _parts(effect) & open_ids
     )
     named = leftover.mark_tentative(named, ways, unexplained)
-    problem, start = body.search.arena.problem, body.search.start
+    problem: Problem = body.search.arena.problem
+    start = body.search.start
     comparisons = ground.compare(source)
     residual = start.fitted.residual
     if source.value != body.search.way:
@@ -100,16 +102,16 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
 def of_run(common: RunDiagnosis, recording: Recording, number: int, ground: Ground) -> RunDiagnosis:
     """The common diagnosis with one run's own name, findings and delays."""
     findings = [cast("Mapping[str, Json]", f) for f in recording.list_findings()]
-    for effect in common.effects:
-        if effect.implausible is not None:
-            findings.append(
-                {
-                    "id": "implausible_effect",
-                    "text": effect.implausible,
-                    "where": effect.id,
-                    "severity": "warning",
-                }
-            )
+    findings += [
+        {
+            "id": "implausible_effect",
+            "text": effect.implausible,
+            "where": effect.id,
+            "severity": "warning",
+        }
+        for effect in common.effects
+        if effect.implausible is not None
+    ]
     runs = cast("Sequence[Mapping[str, Json]]", common.timing["runs"])
     del ground
     return replace(common, run=recording.name, findings=tuple(findings), timing=runs[number])

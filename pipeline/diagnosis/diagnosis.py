@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from pipeline.diagnosis.where import tabulate_regions
 
@@ -215,8 +215,9 @@ class Diagnosis:
         for item in self.runs:
             if item.run == run:
                 rows += list(_ladder_rows(item))
-        schema = {
-            "input": pl.Enum(["command", "measured"]), "rung": pl.Int32, "added": pl.String, "effects": pl.String,
+        schema: dict[str, pl.DataType | type[pl.DataType]] = {
+            "input": pl.Enum(["command", "measured"]), "rung": pl.Int32,
+            "added": pl.String, "effects": pl.String,
             "rms_x": pl.Float64, "rms_y": pl.Float64, "rms_w": pl.Float64,
             "t_mrmse": pl.Float64, "r_mrmse": pl.Float64, "explained_share": pl.Float64,
             "kind": pl.Enum(["rung", "floor"]),
@@ -235,8 +236,8 @@ def _ladder_rows(item: RunDiagnosis) -> list[dict[str, Json]]:
     if item.noise_floor:
         rungs.append(("floor", item.noise_floor))
     for number, (kind, rung) in enumerate(rungs):
-        names = [str(name) for name in rung.get("effects", [])]  # type: ignore[union-attr]
-        x, y, w = rung["velocity_rms"]  # type: ignore[misc]
+        names = [str(name) for name in cast("Sequence[Json]", rung.get("effects", []))]
+        x, y, w = cast("Sequence[float]", rung["velocity_rms"])
         rows.append(
             {
                 "input": item.input,

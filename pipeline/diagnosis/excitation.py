@@ -8,17 +8,16 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.motion.effect import Effect, Excitation
+from pipeline.motion.effect import Excitation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.diagnosis.arena import Arena, Contender
-    from pipeline.diagnosis.screen import Largest
+    from pipeline.diagnosis.screen import Candidate, Largest
+    from pipeline.motion.effect import Effect
 
 Floats = NDArray[np.float64]
-EffectClass = type[Effect]
-
 _STANDARD_ERRORS = 4.0
 
 MANOEUVRES: Mapping[Excitation, str] = {
@@ -63,11 +62,11 @@ def find_unobservable(arena: Arena, final: Contender) -> list[Unobservable]:
         reason: Literal["no excitation", "collinear with what was named"] = (
             "no excitation" if alone < _STANDARD_ERRORS else "collinear with what was named"
         )
-        found.append(Unobservable(candidate.id, reason, suggest_manoeuvre(candidate)))
+        found.append(Unobservable(candidate.id, reason, suggest_manoeuvre(candidate())))
     return found
 
 
-def suggest_manoeuvre(*effects: EffectClass) -> str:
+def suggest_manoeuvre(*effects: Effect) -> str:
     """What to drive so that effects show themselves."""
     needs: list[Excitation] = []
     for effect in effects:
@@ -75,7 +74,7 @@ def suggest_manoeuvre(*effects: EffectClass) -> str:
     return "; ".join(MANOEUVRES[need] for need in needs[:3])
 
 
-def make_usual(candidate: EffectClass, largest: Largest) -> Effect:
+def make_usual(candidate: Candidate, largest: Largest) -> Effect:
     """The effect at a usual size; limits and thresholds as shares of what the run asked for."""
     relative = {"speed": 0.7 * largest.speed, "turn": 0.7 * largest.turn, "wheel": 0.7 * largest.wheel}
     values = {}
@@ -97,7 +96,7 @@ def make_usual(candidate: EffectClass, largest: Largest) -> Effect:
     return candidate(**values)
 
 
-def _shift(arena: Arena, final: Contender, candidate: EffectClass) -> Floats:
+def _shift(arena: Arena, final: Contender, candidate: Candidate) -> Floats:
     changed = arena.problem.find_residuals(final.state.add(make_usual(candidate, arena.largest)))
     shift: Floats = final.fitted.residual - changed
     return shift

@@ -1,9 +1,9 @@
-"""What is diagnosed: the runs made ready, and the problems and candidates that follow from what they recorded."""
+"""What is diagnosed: the runs made ready, and the problems and candidates that follow from their topics."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -13,16 +13,15 @@ from pipeline.diagnosis.screen import Largest
 from pipeline.diagnosis.timing import LEAST_DELAY, YawDelay, measure_yaw_delay
 from pipeline.motion.catalogue import list_effects
 from pipeline.motion.comparison import Comparison, Input
-from pipeline.motion.effect import Effect, Place
+from pipeline.motion.effect import Place
 from pipeline.motion.forward import Timing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.diagnosis.screen import Candidate
     from pipeline.motion.recording import MotionRun
     from pipeline.vehicles import Vehicle
-
-EffectClass = type[Effect]
 
 # Cell means of held commands are exact: finer cells change residuals in the sixth digit.
 _RATE_HZ = 50.0
@@ -76,9 +75,9 @@ class Ground:
             for delay in self.yaw_delays
         )
 
-    def list_candidates(self, source: Input) -> tuple[EffectClass, ...]:
+    def list_candidates(self, source: Input) -> tuple[Candidate, ...]:
         """Effects that can be told on an input of this vehicle."""
-        found = []
+        found: list[Candidate] = []
         for effect in list_effects():
             if self.vehicle.kind not in effect.kinds or effect.id in _TWINS:
                 continue
@@ -86,13 +85,13 @@ class Ground:
                 continue
             if effect.id == "heading_skew" and self.has_gyro:
                 continue
-            found.append(effect)
+            found.append(cast("Candidate", effect))
         return tuple(found)
 
-    def list_drivetrain(self) -> tuple[EffectClass, ...]:
+    def list_drivetrain(self) -> tuple[Candidate, ...]:
         """Effects between command and wheels."""
         return tuple(
-            effect
+            cast("Candidate", effect)
             for effect in list_effects()
             if self.vehicle.kind in effect.kinds and effect.place in _DRIVETRAIN
         )
@@ -122,7 +121,7 @@ def prepare(runs: Sequence[MotionRun], vehicle: Vehicle) -> Ground:
             "too_short",
             f"only {windows} stretches of half a second have both a live input and good poses",
             where=", ".join(run.name for run in runs),
-            hint=f"At least {_FEWEST_WINDOWS} are needed: drive longer, or check the poses with `slip inspect`.",
+            hint=f"{_FEWEST_WINDOWS} are needed: drive longer, or check the poses with `slip inspect`.",
         )
     delays = []
     for comparison in leading:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Integers = NDArray[np.int64]
 
 FOLDS = 5
 GAP_S = 1.5
@@ -111,20 +112,22 @@ def hold_out(fitted: Fitted, metric: Metric, folds: tuple[Fold, ...]) -> Floats:
 def compare(problem: Problem, metric: Metric, before: Floats, after: Floats) -> Verdict:
     """Judge held-out residuals of two models under one metric."""
     old, new = metric.cost(before), metric.cost(after)
+
+    def add_up(label: Integers, values: Floats) -> Floats:
+        return np.asarray(np.bincount(label, values), dtype=np.float64)
+
     count = np.bincount(problem.unit)
     kept = count >= min(_FEWEST_WINDOWS, int(count.max()))
-    sums_old = np.bincount(problem.unit, old)[kept]
-    sums_new = np.bincount(problem.unit, new)[kept]
+    sums_old = add_up(problem.unit, old)[kept]
+    sums_new = add_up(problem.unit, new)[kept]
     gain = 1.0 - float(new.sum()) / max(float(old.sum()), 1e-12)
     difference = sums_old - sums_new
     ratio = np.log(np.maximum(sums_old, 1e-9) / np.maximum(sums_new, 1e-9))
     moved = (((before - after) / metric.scale) ** 2).sum(axis=1)
-    action = np.bincount(problem.unit, moved)[kept]
+    action = add_up(problem.unit, moved)[kept]
     stretch = number_units(problem.run, problem.times, _SHORT_S)
-    short = _ratio_t(np.bincount(stretch, old - new), np.bincount(stretch, moved)) * LEAST_T / _SHORT_T
-    rare = _normal_t(
-        problem, after / metric.scale, np.bincount(stretch, old - new), np.bincount(stretch, moved)
-    )
+    short = _ratio_t(add_up(stretch, old - new), add_up(stretch, moved)) * LEAST_T / _SHORT_T
+    rare = _normal_t(problem, after / metric.scale, add_up(stretch, old - new), add_up(stretch, moved))
     return Verdict(
         gain, max(_block_t(difference), _block_t(ratio), _ratio_t(difference, action), short), rare
     )

@@ -1,4 +1,4 @@
-"""What is left when everything with a name is taken: structure, in words and as a formula; or a disturbance."""
+"""What is left when everything with a name is taken: structure, as words and formula; or a disturbance."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.diagnose import Explored
     from pipeline.diagnosis.diagnosis import Json, Named
     from pipeline.diagnosis.ground import Ground
-    from pipeline.diagnosis.problem import BodyProblem
 
 Floats = NDArray[np.float64]
 

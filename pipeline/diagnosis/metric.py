@@ -75,7 +75,7 @@ def measure_spread(residual: Floats, problem: Problem) -> Floats:
 
 
 def make_metric(residual: Floats, noise: Floats, problem: Problem) -> Metric:
-    """Metric at a model: spreads no larger than what a saturated fit leaves, clipped at six of the model's own.
+    """Metric at a model: spreads at most those that a saturated fit leaves, clipped at six of its own.
 
     Args:
         residual: of the model, shape (n, 3).
@@ -119,8 +119,8 @@ def _fit_robustly(columns: Floats, values: Floats) -> Floats:
         spread = _GAUSSIAN * float(np.median(np.abs(rest))) + 1e-12
         weight = np.minimum(1.0, 3.0 * spread / np.maximum(np.abs(rest), 1e-12))
     freedom = max(values.size - columns.shape[1], 0.25 * values.size)
-    rest = rest * np.sqrt(values.size / freedom)
-    return rest
+    widened: Floats = rest * np.sqrt(values.size / freedom)
+    return widened
 
 
 def _make_features(problem: Problem) -> Floats:

@@ -84,36 +84,39 @@ def is_nameable(effect: Effect, largest: Largest, least_delay: float = 0.0) -> b
         largest: what the run asked for.
         least_delay: delays and lags below it are a matter of sampling [s].
     """
+    return _is_large_enough(effect, least_delay) and _is_itself(effect, largest, least_delay)
+
+
+def _is_large_enough(effect: Effect, least_delay: float) -> bool:
     for (name, parameter), least in _LEAST.items():
         size = abs(effect.values[parameter]) if effect.id == name else math.inf
         if size < least or (effect.id in _LATE and size < least_delay):
             return False
     if effect.id in _LEAST_GAIN:
         names, least = _LEAST_GAIN[effect.id]
-        if max(abs(effect.values[name] - effect.parameter(name).neutral) for name in names) < least:
-            return False
-    if effect.id in _ONE_SIGN and effect.values[_ONE_SIGN[effect.id]] < 0.0:
-        return False
-    if effect.id == "deadband":
-        return effect.values["d"] > _LEAST_DEADBAND * largest.speed
-    if effect.id == "acceleration_limit":
-        return effect.values["limit"] * _LEAST_RAMP_S < largest.wheel
-    if effect.id == "turn_droop":
-        # With its threshold at zero a droop is a wider track under another name.
-        return _SHARE_OF_TURNING < effect.values["threshold"] / largest.difference < _REACHED
-    limit = {
-        "body_speed_limit": largest.speed,
-        "body_turn_limit": largest.turn,
-        "wheel_speed_limit": largest.wheel,
-    }.get(effect.id)
-    if limit is not None and effect.values["limit"] > _REACHED * limit:
-        return False
+        return max(abs(effect.values[name] - effect.parameter(name).neutral) for name in names) >= least
+    return True
+
+
+def _is_itself(effect: Effect, largest: Largest, least_delay: float) -> bool:
+    """Whether an effect is no degenerate form of another one, and of the sign that physics has."""
+    if effect.id in _ONE_SIGN:
+        return effect.values[_ONE_SIGN[effect.id]] > 0.0
     if effect.id == "turn_lag":
         fast, slow = effect.values["tau_mean"], effect.values["tau_diff"]
         # With equal time constants it is a drive lag.
         apart = abs(fast - slow) > max(_APART * max(fast, slow), least_delay, _LEAST_APART_S)
         return apart and max(fast, slow) > max(_LEAST_APART_S, least_delay)
-    return True
+    checks = {
+        "deadband": lambda v: v["d"] > _LEAST_DEADBAND * largest.speed,
+        "acceleration_limit": lambda v: v["limit"] * _LEAST_RAMP_S < largest.wheel,
+        # With its threshold at zero a droop is a wider track under another name.
+        "turn_droop": lambda v: _SHARE_OF_TURNING < v["threshold"] / largest.difference < _REACHED,
+        "body_speed_limit": lambda v: v["limit"] <= _REACHED * largest.speed,
+        "body_turn_limit": lambda v: v["limit"] <= _REACHED * largest.turn,
+        "wheel_speed_limit": lambda v: v["limit"] <= _REACHED * largest.wheel,
+    }
+    return effect.id not in checks or bool(checks[effect.id](effect.values))
 
 
 def find_implausible(effect: Effect) -> str | None:

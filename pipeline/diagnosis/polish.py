@@ -65,9 +65,10 @@ def solve_step(
     factor = metric.weights(residual)
     rows = (jacobian * factor[:, :, None]).reshape(-1, jacobian.shape[2])
     target = (residual * factor).reshape(-1)
-    normal = rows.T @ rows
+    normal = np.asarray(rows.T @ rows, dtype=np.float64)
     size = np.diag(normal) + 1e-12
-    step = np.linalg.solve(normal + np.diag(size * (damping + 1e-9)), rows.T @ target)
+    stiff = normal + np.diag(size * (damping + 1e-9))
+    step = np.asarray(np.linalg.solve(stiff, rows.T @ target), dtype=np.float64)
     return step, normal
 
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.diagnosis.state import DelayName, Slot, State
 from pipeline.motion.forward import Timing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.diagnosis.state import DelayName, Slot, State
     from pipeline.motion.comparison import Comparison
     from pipeline.motion.signals import Velocity
 
@@ -72,7 +72,7 @@ class BodyProblem:
     def __init__(self, comparisons: Sequence[Comparison], delays: tuple[DelayName, ...]) -> None:
         self.comparisons = tuple(comparisons)
         self.delays = delays
-        self.channels = (0, 1, 2)
+        self.channels: tuple[int, ...] = (0, 1, 2)
         self.least = np.full(3, _LEAST_SPREAD)
         sizes = [c.windows.start.size for c in self.comparisons]
         self.run = np.repeat(np.arange(len(sizes)), sizes).astype(np.int64)
@@ -108,7 +108,7 @@ class WheelProblem:
         self.comparisons = tuple(commanded)
         self.measured = tuple(measured)
         self.delays: tuple[DelayName, ...] = ()
-        self.channels = (0, 2)
+        self.channels: tuple[int, ...] = (0, 2)
         sizes = [c.windows.start.size for c in self.comparisons]
         self.run = np.repeat(np.arange(len(sizes)), sizes).astype(np.int64)
         self.times = np.concatenate([c.windows.times for c in self.comparisons])

@@ -38,15 +38,18 @@ class Candidate(Protocol):
     def __call__(self, **values: float) -> Effect:
         """The effect with these values."""
 
+
 _LEAST_SHARE = 0.05
 
 
 @dataclass(frozen=True)
 class Largest:
-    """What relative starts are shares of: largest commanded speed, turn, wheel speed and difference of wheel
-    speeds, and the duration.
+    """What relative starts are shares of: the largest that was commanded, and the duration.
 
     Attributes:
+        speed, turn, wheel: speed [m/s], yaw rate [rad/s], wheel speed [rad/s].
+        difference: of the wheel speeds [rad/s].
+        duration: of the run [s].
         places: x [m] in the map below which the tenths of the run lie, shape (11,).
     """
 
@@ -122,9 +125,7 @@ def propose(
     return sorted(found, key=lambda proposal: proposal.loss)
 
 
-def list_trials(
-    problem: Problem, fitted: Fitted, candidate: Candidate, largest: Largest
-) -> Iterator[Trial]:
+def list_trials(problem: Problem, fitted: Fitted, candidate: Candidate, largest: Largest) -> Iterator[Trial]:
     """Every start of an effect with its columns."""
     for values in list_starts(candidate, largest):
         start = candidate(**values)

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 from pipeline.motion.effect import Search
-from pipeline.motion.forward import Timing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from pipeline.motion.effect import Effect
+    from pipeline.motion.forward import Timing
 
 _DELAY_STEP = 5e-3
 _LARGEST_DELAY = 0.6

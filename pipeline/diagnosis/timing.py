@@ -81,10 +81,10 @@ def _step(
     design = np.column_stack((slope, turn(delay), end - start))
     target = turned - turn(delay)
     weight = np.ones(target.size)
-    solution = np.zeros(3)
+    solution: Floats = np.zeros(3)
     for _ in range(3):
         rows = design * weight[:, None]
-        solution = np.linalg.lstsq(rows.T @ design, rows.T @ target, rcond=None)[0]
+        solution = np.asarray(np.linalg.solve(rows.T @ design, rows.T @ target), dtype=np.float64)
         rest = np.abs(target - design @ solution)
         spread = 1.4826 * float(np.median(rest)) + 1e-9
         weight = np.minimum(1.0, 3.0 * spread / np.maximum(rest, 1e-12))

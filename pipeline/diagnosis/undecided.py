@@ -53,8 +53,8 @@ def find_undecided(arena: Arena, final: Contender) -> list[Undecided]:
         names = [name for rival in rivals for name in rival.ids if name not in final.ids]
         simple = [name for name in names if not _is_larger(arena, name, effect)]
         if simple:
-            classes = [type(effect), *(c for c in arena.candidates if c.id in names)]
-            found.append(Undecided((effect.id, *names), suggest_manoeuvre(*classes)))
+            rest = [c() for c in arena.candidates if c.id in names]
+            found.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest)))
     return found
 
 
@@ -74,7 +74,7 @@ def _does_the_same(arena: Arena, without: Contender, final: Contender, rival: Co
 
 
 def _is_larger(arena: Arena, name: str, effect: Effect) -> bool:
-    """Whether an effect fits as well only because it has more numbers, or holds the other as a special case."""
+    """Whether an effect fits as well only by more numbers, or by holding the other as a special case."""
     if name in _HOLDS.get(effect.id, frozenset()):
         return True
     rival = next(c for c in arena.candidates if c.id == name)

@@ -1,4 +1,4 @@
-"""Structure that no effect of the catalogue takes: how much, in which channel, where, and as which formula."""
+"""Structure that no effect of the catalogue takes: how much, in which channel, and as which formula."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from pipeline.diagnosis.judge import GAP_S
 from pipeline.diagnosis.library import is_term, list_terms, list_waves
 from pipeline.diagnosis.search import prune
-from pipeline.motion.formula.formula_effect import FormulaEffect
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.diagnosis.arena import Arena, Contender
     from pipeline.motion.comparison import Comparison
+    from pipeline.motion.formula.formula_effect import FormulaEffect
 
 Floats = NDArray[np.float64]
 

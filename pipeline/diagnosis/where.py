@@ -1,8 +1,9 @@
-"""Where a model fails: by region of the command space, transitory or steady, by time and by place, in words."""
+"""Where a model fails, in words: by command, transitory or steady, by time and by place."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,7 +50,7 @@ class Region:
     @property
     def sentence(self) -> str:
         """In words: where, and how much of the error in how much of the time."""
-        return f"{self.text}: {self.share:.0%} of the {_WORDS[self.channel]} in {self.time_share:.0%} of the time"
+        return f"{self.text}: {self.share:.0%} of the {_WORDS[self.channel]} in {self.time_share:.0%} of time"
 
 
 def map_errors(problem: Problem, residual: Floats, places: Floats) -> list[Region]:
@@ -115,7 +116,7 @@ def _list_regions(problem: Problem, places: Floats) -> list[tuple[str, str, Flag
     found.append(("phase", "in steady driving", ~transitory & problem.live))
     middle = problem.times.mean(axis=1)
     edges = np.linspace(float(middle.min()), float(middle.max()) + 1e-6, 6)
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges.tolist()):
         found.append(("time", f"from {low:.0f} to {high:.0f} s", (middle >= low) & (middle < high)))
     for axis, name in ((0, "x"), (1, "y")):
         cut = float(np.median(places[:, axis]))

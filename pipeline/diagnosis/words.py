@@ -64,8 +64,9 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
             notes.append("tentative")
         note = f"  ({'; '.join(notes)})" if notes else ""
         rows.append(f"{effect.id:<20}{_values(effect):<34}{falls.get(effect.id, '')}{note}")
-    for item in diagnosis.undecided:
-        rows.append(f"{'undecided':<20}{' or '.join(item.candidates)}: {item.separate_by}")
+    rows += [
+        f"{'undecided':<20}{' or '.join(item.candidates)}: {item.separate_by}" for item in diagnosis.undecided
+    ]
     if diagnosis.unexplained is not None:
         left = diagnosis.unexplained
         rows.append(f"{'unexplained':<20}{left.share:.0%} of what is left: {left.where}")

@@ -220,9 +220,7 @@ def _draw_single(
     chosen = effect or str(draw.choice(DIFFERENTIAL + CAR))
     scene = _excite(_draw_scene(draw, seed, chosen), chosen, draw)
     asked = {chosen: draw_size(chosen, scene, share, draw)}
-    return Riddle(
-        replace(scene, effects=asked), Answer(category, asked, program=scene.program.name)
-    )
+    return Riddle(replace(scene, effects=asked), Answer(category, asked, program=scene.program.name))
 
 
 def _excite(scene: Scenario, effect: str, draw: np.random.Generator) -> Scenario:

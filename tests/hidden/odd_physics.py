@@ -102,7 +102,9 @@ ODD: dict[str, Odd] = {
     "right_turns": Odd("turning right falls short, turning left does not", "w", _right_turns),
     "oval_wheel": Odd("the left wheel is out of round", "xw", _oval_wheel),
     "grass_patch": Odd("stripes of grass across the map slow it down", "x", _grass_patch),
-    "magnetic_floor": Odd("the floor turns the vehicle towards two directions of the world", "w", _magnetic_floor),
+    "magnetic_floor": Odd(
+        "the floor turns the vehicle towards two directions of the world", "w", _magnetic_floor
+    ),
     "turn_climb": Odd("sideways motion that saturates with the yaw rate", "y", _turn_climb),
     "fast_left": Odd("above a speed the vehicle is pushed to the left", "y", _fast_left),
 }

@@ -1,0 +1,171 @@
+"""Opening the seals: what was named, undecided, missed, and falsely named."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from draw import Answer
+
+Json = Mapping[str, object]
+
+# Names of the same thing, as METHODS, section 4, has them: exact classes, both ways.
+CLASSES = (
+    frozenset({"lever_arm", "icr_offset", "icr_lateral"}),
+    frozenset({"clock_offset", "transport_delay"}),
+)
+
+
+@dataclass(frozen=True)
+class Score:
+    """What came of one log.
+
+    Attributes:
+        truth: ids that were hidden.
+        named: ids that were named.
+        found: hidden ids that were named, for themselves or as a member of their class.
+        undecided: hidden ids that stand among candidates.
+        unobservable: hidden ids that the log was said not to tell of.
+        missed: hidden ids of which nothing was said.
+        false: named ids that were not hidden.
+        flagged: channel in which structure was called unexplained, empty without.
+        errors: 2 s position error before, after, and the floor [m].
+        formula: share by which the held-out error fell with the formula, NaN without one.
+    """
+
+    truth: tuple[str, ...]
+    named: tuple[str, ...]
+    found: tuple[str, ...]
+    undecided: tuple[str, ...]
+    unobservable: tuple[str, ...]
+    missed: tuple[str, ...]
+    false: tuple[str, ...]
+    flagged: str
+    errors: tuple[float, float, float]
+    formula: float
+
+    @property
+    def is_exact(self) -> bool:
+        """All that was hidden is named, and nothing else."""
+        return not self.missed and not self.undecided and not self.unobservable and not self.false
+
+
+def score_run(answer: Answer, run: Json) -> Score:
+    """Compare a run of `slip diagnose --json` with its opened answer."""
+    entries = [item for item in _list(run, "effects") if isinstance(item, Mapping)]
+    named = [str(item["id"]) for item in entries]
+    groups = [set(map(str, _list(item, "candidates"))) for item in _list(run, "undecided")]
+    open_ids = set().union(*groups) if groups else set()
+    hidden_ids = set(map(str, _list(run, "unobservable")))
+    truth = tuple(sorted(answer.effects))
+    answered: set[str] = set()
+    found, undecided, unobservable, missed = [], [], [], []
+    for name in truth:
+        match = _find(name, entries)
+        if match is not None:
+            found.append(name)
+            answered.add(match)
+        elif open_ids & _names_of(name):
+            undecided.append(name)
+        elif hidden_ids & _names_of(name):
+            unobservable.append(name)
+        else:
+            missed.append(name)
+    false = sorted(name for name in named if name not in answered and not _covers(name, truth))
+    flagged = run.get("unexplained")
+    channel = "".join(map(str, _list(flagged, "channels"))) if isinstance(flagged, Mapping) else ""
+    return Score(
+        truth, tuple(named), tuple(found), tuple(undecided), tuple(unobservable), tuple(missed),
+        tuple(false), channel, _errors(run), _formula_gain(run),
+    )  # fmt: skip
+
+
+def wilson(successes: int, trials: int) -> tuple[float, float]:
+    """95 % Wilson interval of a rate."""
+    if trials == 0:
+        return 0.0, 1.0
+    z, rate = 1.959964, successes / trials
+    middle = (rate + z * z / (2 * trials)) / (1 + z * z / trials)
+    half = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials**2)) / (1 + z * z / trials)
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def describe_rate(name: str, successes: int, trials: int) -> str:
+    """A rate with its interval as a line."""
+    low, high = wilson(successes, trials)
+    share = successes / trials if trials else math.nan
+    return f"{name:<44}{successes:>4} / {trials:<4} = {share:6.1%}   [{low:.1%}, {high:.1%}]"
+
+
+def confusion_table(scores: Sequence[Score]) -> list[str]:
+    """Rows: what was hidden; columns: what was said of it."""
+    said: dict[str, Counter[str]] = {}
+    for score in scores:
+        for name in score.truth or ("nothing",):
+            row = said.setdefault(name, Counter())
+            if name in score.found or (name == "nothing" and not score.named):
+                row["named" if name != "nothing" else "nothing"] += 1
+            elif name in score.undecided:
+                row["undecided"] += 1
+            elif name in score.unobservable:
+                row["unobservable"] += 1
+            else:
+                row["missed" if name != "nothing" else "wrong"] += 1
+            for other in score.false:
+                row[f"+ {other}"] += 1
+    lines = [f"{'hidden':<22}said of it"]
+    for name in sorted(said):
+        cells = ", ".join(f"{key} {count}" for key, count in said[name].most_common())
+        lines.append(f"{name:<22}{cells}")
+    return lines
+
+
+def _names_of(name: str) -> set[str]:
+    return set().union({name}, *(group for group in CLASSES if name in group))
+
+
+def _find(name: str, entries: Sequence[Json]) -> str | None:
+    for entry in entries:
+        if entry["id"] == name:
+            return name
+    for entry in entries:
+        if name in _list(entry, "equivalent_to"):
+            return str(entry["id"])
+    return None
+
+
+def _covers(name: str, truth: Sequence[str]) -> bool:
+    return any(name in group and group & set(truth) for group in CLASSES[:1])
+
+
+def _errors(run: Json) -> tuple[float, float, float]:
+    ladder = [rung for rung in _list(run, "ladder") if isinstance(rung, Mapping)]
+    floor = run.get("noise_floor")
+    values = [
+        rung.get("t_mrmse_m") if isinstance(rung, Mapping) else None
+        for rung in (ladder[0] if ladder else None, ladder[-1] if ladder else None, floor)
+    ]
+    before, after, least = (float(v) if isinstance(v, int | float) else math.nan for v in values)
+    return before, after, least
+
+
+def _formula_gain(run: Json) -> float:
+    """Fall of the summed squared velocity error on the rung of the formula."""
+    ladder = [rung for rung in _list(run, "ladder") if isinstance(rung, Mapping)]
+    named = [rung for rung in ladder if "unexplained" not in _list(rung, "effects")]
+    if not named or len(named) == len(ladder):
+        return math.nan
+    before, after = named[-1], ladder[-1]
+    falls = [
+        1.0 - float(new) / float(old)
+        for old, new in zip(_list(before, "velocity_rms"), _list(after, "velocity_rms"), strict=True)
+        if isinstance(old, int | float) and isinstance(new, int | float) and old > 0.0
+    ]
+    return max(falls, default=math.nan)
+
+
+def _list(content: object, key: str) -> Sequence[object]:
+    found = content.get(key) if isinstance(content, Mapping) else None
+    return found if isinstance(found, list | tuple) else ()
