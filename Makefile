@@ -32,11 +32,15 @@ batch: $(VENV)/.ready ## LOGS=dir: bring the results up to date with a season of
 compare: $(VENV)/.ready ## deployments in OUT side by side: medians, tests, figure [ARGS=]
 	@$(BIN)/slip compare "$$OUT" $$ARGS
 
+serve: $(VENV)/.ready ## the workbench on this machine: add an effect, watch the error fall [OUT=results, ARGS=]
+	@$(BIN)/slip serve "$$OUT" $$ARGS
+
 inspect: $(VENV)/.ready ## LOG=run.mcap: topics, rates, gaps, clocks, damage
 	@[ -n "$$LOG" ] || { echo "Say which log: make inspect LOG=run.mcap" >&2; exit 2; }
 	@$(BIN)/slip inspect "$$LOG" $(FORGIVE_LOSSES)
 
 test: $(VENV)/.ready-dev ## the fast tests
+	@command -v chromium chromium-browser google-chrome >/dev/null || echo "no Chromium here: tests that look at pages are left out (make browser)" >&2
 	$(BIN)/python -m pytest -n 2 -m "not long"
 
 test-long: $(VENV)/.ready-dev ## the tests that take minutes
@@ -67,7 +71,7 @@ bench-batch: $(VENV)/.ready-dev ## batches of 10, 100 and 1,000 logs, on one and
 bench-reader: $(VENV)/.ready-dev ## reading a 1 GB log: ours, its peers, and the bound
 	$(BIN)/python tests/bench/reader.py
 
-browser: ## install Debian's Chromium, for the tests that look at pages
+browser: ## install Debian's Chromium, for the tests that look at the report and the workbench
 	apt-get update && apt-get install --yes --no-install-recommends chromium
 
 lock: $(VENV)/.ready-dev ## pin the dependencies of pyproject.toml again

@@ -72,6 +72,7 @@ class Web:
             Route("/api/rows", self.rows, methods=["POST"]),
             Route("/api/save", self.save, methods=["POST"]),
             Route("/api/upload", self.upload, methods=["POST"]),
+            Route("/api/diagnose", self.diagnose, methods=["POST"]),
             Route("/api/retry", self.retry, methods=["POST"]),
             Route("/api/dismiss", self.dismiss, methods=["POST"]),
         ]
@@ -136,6 +137,12 @@ class Web:
         name = request.query_params.get("name", "")
         job = await self._hall.jobs.take(name, int(length), request.stream())
         return JSONResponse({"job": job.show()})
+
+    async def diagnose(self, request: Request) -> Response:
+        """Begin to name what is missing from the model of a run."""
+        ask = await read_ask(request)
+        manifest = await run_in_threadpool(find_run, self._hall.store, ask.run)
+        return JSONResponse({"job": self._hall.jobs.diagnose(manifest).show()})
 
     async def retry(self, request: Request) -> Response:
         """Analyze a log again, now that its vehicle is known."""

@@ -14,11 +14,12 @@ from pipeline.workbench import work
 from pipeline.workbench.bench import Bench
 from pipeline.workbench.cards import list_catalogue, show_desk
 from pipeline.workbench.desk import DeskFile, switch_off
+from pipeline.workbench.diagnoses import read_diagnosis
 from pipeline.workbench.errors import WorkbenchError
 from pipeline.workbench.formulas import make_formula
 from pipeline.workbench.jobs import Jobs
 from pipeline.workbench.live import Album
-from pipeline.workbench.proposals import Trials, read_diagnosis
+from pipeline.workbench.proposals import Trials
 from pipeline.workbench.runs import describe_run, find_run
 
 if TYPE_CHECKING:
@@ -158,7 +159,7 @@ class Hall:
             "run": describe_run(stand.manifest),
             "inputs": self._bench.list_inputs(stand.manifest),
             "catalogue": list_catalogue(stand.vehicle),
-            "diagnosis": read_diagnosis(stand.manifest),
+            "diagnosis": read_diagnosis(self.results, stand.manifest),
             "trial": trial.show() if trial is not None else None,
             "slot": file.slot,
         }

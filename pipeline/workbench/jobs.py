@@ -16,11 +16,14 @@ from pipeline.job.analyze import analyze_log, update_datasets
 from pipeline.job.options import STAGES, Options
 from pipeline.store import Store
 from pipeline.workbench.desk import FOLDER
+from pipeline.workbench.diagnoses import write_diagnosis
 from pipeline.workbench.errors import WorkbenchError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
+
+    from pipeline.store import Manifest
 
 WORDS = {
     "upload": "taking the log in",
@@ -29,10 +32,11 @@ WORDS = {
     "velocity": "differentiating poses",
     "slip": "computing slip",
     "aggregate": "aggregating",
+    "diagnosis": "naming what is missing",
     "report": "drawing the report",
 }
 
-_STEPS = ("upload", "read", *STAGES, "report")
+_STEPS = ("upload", "read", *STAGES, "diagnosis", "report")
 _SPARE_BYTES = 200_000_000
 _MOST_JOBS = 50
 _LOST_NAME = "dropped.mcap"
@@ -185,10 +189,37 @@ class Jobs:
         self.start(job, vehicle)
         return job
 
+    def diagnose(self, manifest: Manifest) -> Job:
+        """Name what is missing from the model of a stored run, in the background.
+
+        Raises:
+            WorkbenchError: ``busy``, that is being done already.
+        """
+        name = f"diagnosis of {manifest.run}"
+        if any(job.name == name and not job.done for job in self._jobs.values()):
+            raise WorkbenchError(
+                "busy", "that is being done already", where=manifest.run, hint="Wait for it."
+            )
+        job = Job(secrets.token_hex(4), name, manifest.folder, 0)
+        job.tell("diagnosis")
+        self._jobs[job.id] = job
+        threading.Thread(target=self._diagnose, args=(job, manifest), daemon=True).start()
+        return job
+
+    def _diagnose(self, job: Job, manifest: Manifest) -> None:
+        try:
+            with self._one_at_a_time:
+                write_diagnosis(self._results, manifest)
+            job.run = manifest.run
+        except SlipError as error:
+            job.error = {"code": error.code, "message": str(error), "hint": error.hint}
+        finally:
+            job.done = True
+
     def _analyze(self, job: Job, vehicle: str | None) -> None:
         job.tell("read")
         overrides = {"vehicle": {"preset": vehicle}} if vehicle else {}
-        options = Options(out=self._results, overrides=overrides)
+        options = Options(out=self._results, overrides=overrides, diagnosis=True)
         try:
             with self._one_at_a_time:
                 outcome = analyze_log(job.path, options, job.tell)

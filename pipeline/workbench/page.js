@@ -58,8 +58,8 @@ const load = async () => {
 
 const arrange = (two) => {
   find("compare").checked = two;
-  panes.a ??= new Pane("a", remember);
-  panes.b = two ? (panes.b ?? new Pane("b", remember)) : null;
+  panes.a ??= new Pane("a", remember, () => watch());
+  panes.b = two ? (panes.b ?? new Pane("b", remember, () => watch())) : null;
   find("bench").classList.toggle("single", !two);
   if (!listed.runs.length) return;
   find("panes").replaceChildren(...Object.values(panes).filter(Boolean).map((pane) => pane.root));

@@ -6,8 +6,9 @@ const REST_MS = 350;
 const HEADROOM = 1.05;
 
 export class Pane {
-  constructor(slot, changed) {
+  constructor(slot, changed, working) {
     this.slot = slot;
+    this.working = working;
     this.changed = changed;
     this.state = null;
     this.plots = null;
@@ -281,7 +282,8 @@ export class Pane {
   }
 
   named(diagnosis, there) {
-    if (!diagnosis) return h("p", { class: "quiet" }, "Not diagnosed yet: ", h("code", {}, `slip diagnose ${this.run}`));
+    if (!diagnosis)
+      return h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", onclick: () => this.diagnose() }, "Diagnose"));
     const effects = (diagnosis.effects ?? []).filter((entry) => !there.has(entry.id));
     const told = effects.map((entry) => h("li", { class: "first", data: { effect: entry.id }, bar: 1 },
       h("div", {}, h("b", {}, entry.id), h("span", { class: "quiet" }, `named by the diagnosis${Number.isFinite(entry.gain) ? `: without it the loss is ${say(entry.gain + 1)} times as high` : ""}${(entry.equivalent_to ?? []).length ? `; same as ${entry.equivalent_to.join(", ")}` : ""}`)),
@@ -289,6 +291,15 @@ export class Pane {
     const undecided = (diagnosis.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. ${entry.separate_by ?? ""}`));
     const rest = diagnosis.unexplained ? [h("p", { class: "quiet" }, `Not explained yet: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}`)] : [];
     return h("div", { class: "named" }, told.length ? h("ul", { class: "proposals" }, told) : null, undecided, rest);
+  }
+
+  async diagnose() {
+    try {
+      await post("/api/diagnose", { run: this.run });
+      this.working();
+    } catch (error) {
+      toast(error.message);
+    }
   }
 
   tellNothing(desk) {

@@ -1,8 +1,7 @@
-"""What to add next: each effect of the catalogue tried on top of the model, and what a diagnosis named."""
+"""What to add next: each effect of the catalogue tried on top of the model."""
 
 from __future__ import annotations
 
-import json
 import threading
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -14,13 +13,8 @@ from pipeline.motion.ladder import compare_losses
 from pipeline.workbench.cards import describe_shortly
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from pipeline.motion import HeldOut, Model, Problem
-    from pipeline.store import Manifest
     from pipeline.workbench.bench import Stand
-
-DIAGNOSIS = "diagnosis.json"
 
 _WORTH = 0.99
 _SURE = 2.5
@@ -145,11 +139,3 @@ def _is_sure(problem: Problem, base: HeldOut, new: HeldOut) -> bool:
     gain = np.bincount(block, before - after)[count > 0] / count[count > 0]
     error = float(gain.std(ddof=1)) / np.sqrt(gain.size) if gain.size > 1 else np.inf
     return bool(gain.mean() > _SURE * error)
-
-
-def read_diagnosis(manifest: Manifest) -> Mapping[str, object] | None:
-    """What `slip diagnose` stored with a run; None where it did not."""
-    if DIAGNOSIS not in manifest.files:
-        return None
-    content = json.loads(manifest.path(DIAGNOSIS).read_text(encoding="utf-8"))
-    return content if isinstance(content, dict) else None

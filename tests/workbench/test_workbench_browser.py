@@ -91,7 +91,7 @@ def test_a_person_adds_the_hidden_effect_undoes_drops_a_log_and_reloads(
     other = simulate_case("husky_tile", out=tmp_path / "other.mcap", duration_s=40.0)
     chrome.drop(other, "#drop")
     chrome.wait("[...document.querySelectorAll('.run')].length === 2")
-    chrome.wait("document.querySelector('.title h2').textContent !== 'field/hidden'")
+    chrome.wait("(document.querySelector('.title h2')?.textContent ?? 'field/hidden') !== 'field/hidden'")
     chrome.wait(SHOWN)
     look_for_trouble(chrome)
 
@@ -181,7 +181,7 @@ def test_markup_in_a_log_is_shown_as_text(chrome: Chrome, tmp_path: Path, pictur
         look_for_trouble(chrome)
         report = Path(str(outcome.summary["report"]))
         chrome.open(report.as_uri())
-        chrome.wait("document.documentElement.dataset.drawn === 'yes'")
+        chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
         assert EVIL in str(chrome.run("document.body.textContent"))
         assert chrome.run("document.querySelectorAll('img').length") == 0
         assert chrome.run("window.pwned ?? null") is None

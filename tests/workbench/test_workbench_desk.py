@@ -183,6 +183,17 @@ def test_what_a_diagnosis_named_is_shown(workbench: Workbench) -> None:
     assert workbench.desk(RUN)["diagnosis"] == named
 
 
+@pytest.mark.long
+def test_a_diagnosis_that_is_asked_for_is_kept_beside_the_results(workbench: Workbench) -> None:
+    assert workbench.desk(RUN)["diagnosis"] is None
+    workbench.post("/api/diagnose", run=RUN)
+    assert workbench.refuse("/api/diagnose", run=RUN)["code"] == "busy"
+    (job,) = workbench.wait_for_jobs()
+    assert job["error"] is None
+    named = cast("dict[str, list[dict[str, object]]]", workbench.desk(RUN)["diagnosis"])
+    assert [effect["id"] for effect in named["effects"]] == ["effective_track"]
+
+
 def test_what_cannot_be_done_is_said_and_changes_nothing(workbench: Workbench) -> None:
     assert workbench.refuse("/api/desk", run="nobody")["code"] == "no_such_run"
     assert workbench.refuse("/api/desk", run=RUN, action="add", effect="magic")["code"] == "unknown_effect"
