@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json as decoder
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
 from pipeline.cli.output import CLEAN, print_json
+
+if TYPE_CHECKING:
+    from pipeline.motion import Model
+    from pipeline.store import Manifest
 
 _SUFFIXES = {
     "mcap": "_slip.mcap",
@@ -41,7 +46,7 @@ def export(
         run: name of a run, or its log.
         to: what to write.
         file: where; by default beside you, named after the run (a folder for csv).
-        model: a model file; its velocity and its predicted path are exported too.
+        model: a model file whose velocity and predicted path are exported too (default: what was diagnosed).
         input: what the model is fed with (default: the command where there is one).
         frame: fixed frame of the log's poses.
         out: results folder.
@@ -54,8 +59,8 @@ def export(
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     manifest = find_run(run, Store(out))
-    chosen = read_model(model).model if model is not None else None
-    source = exports.ExportSource(manifest, chosen, input, frame)
+    chosen, named_on = _find_named(manifest) if model is None else (read_model(model).model, None)
+    source = exports.ExportSource(manifest, chosen, input or named_on, frame)
     path = file or Path(manifest.run.replace("/", "_") + _SUFFIXES[to])
     if to == "csv":
         written = exports.write_csv(source, path)
@@ -71,3 +76,17 @@ def export(
     elif not quiet:
         print("\n".join(str(each) for each in written))
     return CLEAN
+
+
+def _find_named(manifest: Manifest) -> tuple[Model | None, str | None]:
+    """The model that the run's diagnosis named, and what it is fed with; None where there is none."""
+    from pipeline.job.diagnosis import DIAGNOSIS  # noqa: PLC0415 - heavy
+    from pipeline.report.diagnosed import name_model  # noqa: PLC0415 - heavy
+    from pipeline.report.motion_run import load_vehicle  # noqa: PLC0415 - heavy
+
+    if DIAGNOSIS not in manifest.files:
+        return None, None
+    diagnosis = decoder.loads(manifest.path(DIAGNOSIS).read_text(encoding="utf-8"))
+    named_on = diagnosis.get("input")
+    usable = named_on if named_on in {"command", "measured"} else None
+    return name_model(diagnosis, load_vehicle(manifest)), usable

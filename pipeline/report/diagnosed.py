@@ -35,22 +35,32 @@ def view_diagnosis(
     Returns:
         Rows to draw; None where nothing was named, or the run is too poor for a model.
     """
-    effects = [
-        made for entry in objects_in(diagnosis, "effects") if (made := _make_effect(entry)) is not None
-    ]
-    if not effects or "poses" not in tables:
+    model = name_model(diagnosis, vehicle)
+    if model is None or "poses" not in tables:
         return None
     source = Input.MEASURED if diagnosis.get("input") == Input.MEASURED.value else Input.COMMAND
     try:
         run = load_run(tables, vehicle, name=str(diagnosis.get("run", "")), hold_s=hold_s)
         problem = Problem([run], vehicle, source)
-        state = fit_model(problem, Model(vehicle, tuple(effects))).state
+        state = fit_model(problem, model).state
     except MotionError:
         # A log that is too poor for a model has its slip all the same.
         return None
     places = tables["velocities"].select("t", "x", "y").sort("t") if "velocities" in tables else None
     floor = mapping_in(diagnosis, "noise_floor")
     return MotionStage(problem, places).view(state, objects_in(diagnosis, "ladder"), floor or None)
+
+
+def name_model(diagnosis: Mapping[str, object], vehicle: Vehicle) -> Model | None:
+    """The model that a diagnosis names, with its values; None where it names nothing.
+
+    Args:
+        diagnosis: the JSON object of one run of ``slip diagnose --json``.
+        vehicle: geometry.
+    """
+    made = [_make_effect(entry) for entry in objects_in(diagnosis, "effects")]
+    effects = tuple(effect for effect in made if effect is not None and vehicle.kind in effect.kinds)
+    return Model(vehicle, effects) if effects else None
 
 
 def _make_effect(entry: Mapping[str, object]) -> Effect | None:

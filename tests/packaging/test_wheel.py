@@ -30,6 +30,9 @@ def test_the_wheel_carries_presets_contracts_and_the_page(wheel: Path) -> None:
         ("pipeline/vehicles/presets", "*.toml"),
         ("schemas", "*.py"),
         ("pipeline/report", "page.*"),
+        ("pipeline/report", "*.js"),
+        ("pipeline/workbench", "page.*"),
+        ("pipeline/workbench", "*.js"),
     ):
         kept = {str(path.relative_to(ROOT)) for path in (ROOT / folder).glob(pattern)}
         assert kept

@@ -40,7 +40,7 @@ def write_derived_log(source: ExportSource, path: Path) -> Path:
         LogError: nothing can be written there.
         MotionError: the model cannot be run on this log.
     """
-    prediction = source.prediction
+    velocity = source.model_velocity
     with LogWriter(path) as writer:
         writer.metadata("slip", {"run": source.manifest.run, "key": source.manifest.key, **_name_log(source)})
         for frame in source.batches("velocities"):
@@ -53,15 +53,9 @@ def write_derived_log(source: ExportSource, path: Path) -> Path:
         _write_path(writer, source)
         for frame in source.batches("slip"):
             _write_slip(writer, source, frame)
-        if prediction is not None:
-            frame = pl.DataFrame(
-                {
-                    "stamp": source.start_ns + np.round(prediction.times * 1e9).astype(np.int64),
-                    **{f"v_{axis}": prediction.velocity[:, i] for i, axis in enumerate("xyw")},
-                }
-            )
-            _write_twist(writer, source, topics.MODEL, frame, "v")
-            _write_predictions(writer, source)
+        if velocity is not None:
+            _write_twist(writer, source, topics.MODEL, velocity, "v")
+        _write_predictions(writer, source)
         write_trail(writer, source)
         write_findings(writer, source)
     return path

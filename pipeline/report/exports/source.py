@@ -14,7 +14,7 @@ from pipeline.report.motion_run import choose_source, load_motion_run
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from pipeline.motion import Model, Prediction
+    from pipeline.motion import Model, MotionRun, Prediction
     from pipeline.store import Manifest
 
 BATCH_ROWS = 65_536
@@ -83,15 +83,36 @@ class ExportSource:
         return np.asarray(stamps, dtype=np.int64) + self.shift_ns
 
     @cached_property
+    def _motion_run(self) -> MotionRun | None:
+        return None if self.model is None else load_motion_run(self.manifest, self.model.vehicle)
+
+    @cached_property
     def prediction(self) -> Prediction | None:
-        """What the model says of the run; None without one.
+        """Where the model goes from measured poses; None without one.
 
         Raises:
             MotionError: the run has too little to predict, or lacks the input.
         """
-        if self.model is None:
-            return None
         from pipeline.motion import predict  # noqa: PLC0415 - heavy
 
-        run = load_motion_run(self.manifest, self.model.vehicle)
+        run = self._motion_run
+        if self.model is None or run is None:
+            return None
         return predict(self.model, run, choose_source(run, self.input))
+
+    @cached_property
+    def model_velocity(self) -> pl.DataFrame | None:
+        """The model's velocity at the stamps of the measured one: ``stamp v_x v_y v_w``; None without one.
+
+        Raises:
+            MotionError: the run has too little to predict, or lacks the input.
+        """
+        from pipeline.motion import predict_at  # noqa: PLC0415 - heavy
+
+        run, parts = self._motion_run, list(self.batches("velocities", ("t", "stamp")))
+        if self.model is None or run is None or not parts:
+            return None
+        at = pl.concat(parts)
+        found = predict_at(self.model, run, choose_source(run, self.input), at["t"].to_numpy())
+        columns = {f"v_{axis}": found[:, i] for i, axis in enumerate("xyw")}
+        return at.select("stamp").with_columns(**columns).filter(pl.col("v_x").is_finite())
