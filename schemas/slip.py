@@ -40,10 +40,12 @@ class Slip(Table):
         metadata={"unit": "m/s", "frame": "base_link", "description": "norm of (g_x, g_y, L g_w)"},
     )
 
-    m_x = fields.body("m/s", "velocity forward of the model given with --model", nullable=True)
-    m_y = fields.body("m/s", "velocity to the left of that model", nullable=True)
-    m_w = fields.body("rad/s", "yaw rate of that model", nullable=True)
-    residual_modulus = fields.body("m/s", "norm of (m_x - v_x, m_y - v_y, L (m_w - v_w))", nullable=True)
+    model_x = fields.body("m/s", "velocity forward of the model given with --model", nullable=True)
+    model_y = fields.body("m/s", "velocity to the left of that model", nullable=True)
+    model_w = fields.body("rad/s", "yaw rate of that model", nullable=True)
+    residual_modulus = fields.body(
+        "m/s", "norm of (model_x - v_x, model_y - v_y, L (model_w - v_w))", nullable=True
+    )
     suspect = fields.flag("in a stretch with a rotated heading or a frozen position; left out of medians")
 
     @dy.rule()

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from pipeline.vehicles import Vehicle
 
-COLUMNS = ("m_x", "m_y", "m_w", "residual_modulus")
+COLUMNS = ("model_x", "model_y", "model_w", "residual_modulus")
 
 
 def hash_model(path: Path | None) -> str | None:

@@ -173,7 +173,10 @@ def _tabulate(base: pl.DataFrame, name: str, ideal: Ideal, suspect: Flags, lengt
         pl.Series("modulus", modulus),
         pl.Series("suspect", suspect),
         # Filled by whoever has a model; the ideal one is all this stage knows.
-        *(pl.lit(None, pl.Float64).alias(name) for name in ("m_x", "m_y", "m_w", "residual_modulus")),
+        *(
+            pl.lit(None, pl.Float64).alias(name)
+            for name in ("model_x", "model_y", "model_w", "residual_modulus")
+        ),
     ).filter(pl.Series(kept))
 
 

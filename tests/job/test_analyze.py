@@ -220,7 +220,7 @@ def test_slip_can_be_told_relative_to_a_model(out: Path, tmp_path: Path) -> None
     for name in ("command", "measured"):
         assert by_input[name]["median_residual_modulus"] < 0.5 * by_input[name]["median_modulus"]
     turning = table.filter(pl.col("f_w").abs() > 0.5).filter(~pl.col("transitory"))
-    assert (turning["m_w"] / turning["f_w"]).median() == pytest.approx(1 / 1.8, rel=0.02)
+    assert (turning["model_w"] / turning["f_w"]).median() == pytest.approx(1 / 1.8, rel=0.02)
 
     assert analyze(log, out, model=tmp_path / "right.toml").computed == ()
     wrong = analyze(log, out, model=write_wide_track(tmp_path / "wrong.toml", 0.7))
@@ -232,7 +232,7 @@ def test_slip_can_be_told_relative_to_a_model(out: Path, tmp_path: Path) -> None
     )
     without = analyze(log, out)
     assert without.summary["by_input"]["command"]["median_residual_modulus"] is None
-    assert without.manifest.read("slip")["m_x"].null_count() == table.height
+    assert without.manifest.read("slip")["model_x"].null_count() == table.height
 
 
 def test_a_model_that_is_missing_or_of_another_kind_is_refused(log: Path, out: Path, tmp_path: Path) -> None:
