@@ -239,7 +239,8 @@ def _slip(
         parts |= {f"f_{axis}": ideal[:, i], f"v_{axis}": body[:, i], f"g_{axis}": gap[:, i]}
     parts["modulus"] = np.linalg.norm(gap, axis=1)
     parts["suspect"] = (step == 1) & ((t % STEP_S) > 4.5)
-    model = [pl.lit(None, pl.Float64).alias(name) for name in ("model_x", "model_y", "model_w", "residual_modulus")]
+    names = ("model_x", "model_y", "model_w", "residual_modulus")
+    model = [pl.lit(None, pl.Float64).alias(column) for column in names]
     return _frame(identity, {**grid, **parts}).with_columns(*model, input=pl.lit(name))
 
 
