@@ -23,6 +23,7 @@ def serve(  # noqa: D417 - the hidden spelling of the folder documents itself
     out: Annotated[Path, Parameter(show=False)] = Path("results"),
     port: int = 8321,
     host: str = "127.0.0.1",
+    diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis")] = True,
     open_browser: Annotated[bool, Parameter(name="--open", negative="")] = False,
     json: bool = False,
     quiet: bool = False,
@@ -33,6 +34,7 @@ def serve(  # noqa: D417 - the hidden spelling of the folder documents itself
         results: results folder (default: results).
         port: port to listen on; 0 takes any that is free.
         host: address to listen on; anything but this machine's own opens it to the network.
+        diagnosis: diagnose logs that are dropped on the page.
         open_browser: open the page in the browser.
         json: print the address as one JSON object.
         quiet: print nothing.
@@ -50,5 +52,5 @@ def serve(  # noqa: D417 - the hidden spelling of the folder documents itself
 
             webbrowser.open(address)
 
-    serve_workbench(results or out, host=host, port=port, tell=tell)
+    serve_workbench(results or out, host=host, port=port, tell=tell, diagnosis=diagnosis)
     return CLEAN

@@ -156,15 +156,22 @@ class Web:
         return JSONResponse({"jobs": self._hall.jobs.show()})
 
 
-def build_app(results: Path, *, hosts: tuple[str, ...] = LOOPBACK, most_bytes: int = MOST_BYTES) -> ASGIApp:
+def build_app(
+    results: Path,
+    *,
+    hosts: tuple[str, ...] = LOOPBACK,
+    most_bytes: int = MOST_BYTES,
+    diagnosis: bool = True,
+) -> ASGIApp:
     """The workbench as an ASGI application.
 
     Args:
         results: the results folder; need not exist yet.
         hosts: names under which it may be addressed, without a port.
         most_bytes: the largest log that is taken in.
+        diagnosis: whether a dropped log is diagnosed too.
     """
-    web = Web(Hall(results, most_bytes))
+    web = Web(Hall(results, most_bytes, diagnosis=diagnosis))
     return Guard(Starlette(routes=web.routes(), exception_handlers={SlipError: _tell_error}), hosts)
 
 

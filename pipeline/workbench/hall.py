@@ -42,12 +42,13 @@ class Hall:
     Args:
         results: the results folder.
         most_bytes: the largest log that is taken in.
+        diagnosis: whether a dropped log is diagnosed too.
     """
 
-    def __init__(self, results: Path, most_bytes: int) -> None:
+    def __init__(self, results: Path, most_bytes: int, *, diagnosis: bool) -> None:
         self.results = results
         self.store = Store(results)
-        self.jobs = Jobs(results, most_bytes)
+        self.jobs = Jobs(results, most_bytes, diagnosis=diagnosis)
         self._bench = Bench()
         self._trials = Trials()
         self._albums: OrderedDict[tuple[str, str], Album] = OrderedDict()

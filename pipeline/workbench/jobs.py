@@ -102,11 +102,13 @@ class Jobs:
     Args:
         results: the results folder.
         most_bytes: the largest log that is taken in.
+        diagnosis: whether a dropped log is diagnosed too.
     """
 
-    def __init__(self, results: Path, most_bytes: int) -> None:
+    def __init__(self, results: Path, most_bytes: int, *, diagnosis: bool) -> None:
         self._results = results
         self._most = most_bytes
+        self._diagnosis = diagnosis
         self._jobs: dict[str, Job] = {}
         self._one_at_a_time = threading.Lock()
 
@@ -219,7 +221,7 @@ class Jobs:
     def _analyze(self, job: Job, vehicle: str | None) -> None:
         job.tell("read")
         overrides = {"vehicle": {"preset": vehicle}} if vehicle else {}
-        options = Options(out=self._results, overrides=overrides, diagnosis=True)
+        options = Options(out=self._results, overrides=overrides, diagnosis=self._diagnosis)
         try:
             with self._one_at_a_time:
                 outcome = analyze_log(job.path, options, job.tell)

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def serve(results: Path, *, host: str, port: int, tell: Callable[[str], None]) -> None:
+def serve(
+    results: Path, *, host: str, port: int, tell: Callable[[str], None], diagnosis: bool = True
+) -> None:
     """Serve the workbench until it is interrupted.
 
     Args:
@@ -23,6 +25,7 @@ def serve(results: Path, *, host: str, port: int, tell: Callable[[str], None]) -
         host: address to listen on; anything but the loopback opens it to the network.
         port: 0 takes any that is free.
         tell: told the address once it listens.
+        diagnosis: whether a dropped log is diagnosed too.
 
     Raises:
         WorkbenchError: ``port_taken``, nothing can listen there.
@@ -31,7 +34,7 @@ def serve(results: Path, *, host: str, port: int, tell: Callable[[str], None]) -
 
     listener = _listen(host, port)
     hosts = LOOPBACK if host in LOOPBACK or host == "::1" else (*LOOPBACK, host.lower(), *_own_names(host))
-    app = build_app(results, hosts=hosts)
+    app = build_app(results, hosts=hosts, diagnosis=diagnosis)
     warm_bundle()
     shown = f"[{host}]" if ":" in host else host
     tell(f"http://{shown}:{listener.getsockname()[1]}/")

@@ -23,7 +23,7 @@ class Workbench:
     """A server on a free port of the loopback."""
 
     def __init__(self, results: Path, *, most_bytes: int = 200_000_000) -> None:
-        app = build_app(results, most_bytes=most_bytes)
+        app = build_app(results, most_bytes=most_bytes, diagnosis=False)
         configuration = uvicorn.Config(
             app, host="127.0.0.1", port=0, ws="none", log_level="warning", timeout_graceful_shutdown=1
         )

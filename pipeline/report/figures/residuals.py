@@ -25,6 +25,9 @@ QUANTITIES = {"x": ("forward", "m/s"), "y": ("sideways", "m/s"), "w": ("yaw rate
 
 _BINS = 18
 _FEWEST = 12
+_FEWEST_BINS = 4
+_LEAST_SHARE = 0.05
+_USUAL = {"x": "f_x", "y": "f_x_f_w", "w": "f_w"}
 _QUARTILES = (0.25, 0.5, 0.75)
 
 
@@ -51,20 +54,21 @@ def list_residuals(scene: Scene) -> dict[str, pl.DataFrame]:
 
 
 def choose_signal(motion: MotionView, component: str) -> str:
-    """The signal whose bins explain most of the ideal model's residual in a channel."""
+    """The signal whose bins explain most of the ideal model's residual; the usual one where none does."""
     residual = motion.residuals[f"ideal_{component}"].to_numpy()
     shares = {name: _explain(motion.residuals[name].to_numpy(), residual) for name in SIGNALS}
-    return max(shares, key=lambda name: shares[name])
+    best = max(shares, key=lambda name: shares[name])
+    return best if shares[best] > _LEAST_SHARE else _USUAL[component]
 
 
 def _explain(signal: Floats, residual: Floats) -> float:
     """Share of the spread of a residual that goes when each bin's median is taken off."""
-    edges = _find_edges(signal)
-    if edges.size == 0:
+    number = np.searchsorted(_find_edges(signal), signal, side="right")
+    filled = np.flatnonzero(np.bincount(number) >= _FEWEST)
+    if filled.size < _FEWEST_BINS:
         return 0.0
-    number = np.searchsorted(edges, signal, side="right")
     rest = residual.copy()
-    for each in np.unique(number):
+    for each in filled:
         rest[number == each] -= np.median(residual[number == each])
     before = float(np.abs(residual).mean())
     return 1.0 - float(np.abs(rest).mean()) / before if before > 0.0 else 0.0

@@ -1,0 +1,115 @@
+"""Figures of models: what they count, and what a diagnosis becomes."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+from report_synthesis import make_report
+
+from pipeline.motion import Input, Model, Problem, State, Timing, find_effect, load_run, predict
+from pipeline.report.diagnosed import name_model
+from pipeline.report.figures.autocorrelation import correlate
+from pipeline.report.figures.ladder import list_rungs
+from pipeline.report.figures.residuals import choose_signal
+from pipeline.report.figures.step_response import find_steps
+from pipeline.report.motion_view import SIGNALS, MotionStage, MotionView
+from pipeline.report.scene import Scene
+from pipeline.simulate import simulate_case
+from pipeline.vehicles import Vehicle, find_preset
+
+
+def vehicle() -> Vehicle:
+    found = find_preset("husky_a200")
+    assert found is not None
+    return found
+
+
+def view_of(**residuals: np.ndarray) -> MotionView:
+    count = next(iter(residuals.values())).size
+    columns = {"t": np.arange(count) * 0.25, **dict.fromkeys(SIGNALS, np.zeros(count)), **residuals}
+    empty = pl.DataFrame()
+    return MotionView("command", (), (), None, pl.DataFrame(columns), empty, empty, empty)
+
+
+def test_the_signal_is_the_one_that_explains() -> None:
+    rng = np.random.default_rng(5)
+    signals = {name: rng.uniform(-1.0, 1.0, 800) for name in SIGNALS}
+    noise = rng.normal(0.0, 0.05, 800)
+    for name in ("f_w", "a_x", "pitch"):
+        assert choose_signal(view_of(**signals, ideal_w=noise + 0.3 * signals[name]), "w") == name
+    assert choose_signal(view_of(**signals, ideal_x=noise), "x") == "f_x"
+
+
+def test_a_signal_that_hardly_moves_explains_nothing() -> None:
+    rng = np.random.default_rng(6)
+    lone = np.zeros(400)
+    lone[:3] = 5.0
+    noise = rng.normal(0.0, 1.0, 400)
+    noise[:3] += 40.0
+    assert choose_signal(view_of(a_x=lone, ideal_x=noise, f_x=rng.uniform(-1, 1, 400)), "x") == "f_x"
+
+
+def test_autocorrelation_tells_noise_from_structure_and_crosses_no_hole() -> None:
+    rng = np.random.default_rng(7)
+    t = np.arange(2000) * 0.25
+    _, noise = correlate(t, rng.normal(size=2000))
+    assert np.abs(noise[1:]).max() < 0.1
+    lags, slow = correlate(t, np.sin(t))
+    assert slow[0] == 1.0
+    assert slow[4] == pytest.approx(np.cos(lags[4]), abs=0.05)
+    split = np.concatenate((t[:1000], t[1000:] + 1e6))
+    assert np.allclose(correlate(split, np.sin(t))[0], lags)
+
+
+def test_steps_are_those_of_a_command_that_rests_before_and_after() -> None:
+    t = np.arange(0.0, 30.0, 0.05)
+    asked = np.select([t < 5.0, t < 10.0, t < 11.0], [0.0, 1.0, 0.5], 0.2)
+    starts, low, high = find_steps(t, asked, smallest=0.15)
+    assert starts == pytest.approx([5.0, 11.0], abs=0.051)
+    assert low == pytest.approx([0.0, 0.5])
+    assert high == pytest.approx([1.0, 0.2])
+    holed = np.concatenate((t[t < 6.0], t[t >= 7.0]))
+    assert find_steps(holed, np.interp(holed, t, asked), smallest=0.15)[0] == pytest.approx([11.0], abs=0.051)
+
+
+def test_the_staircase_names_what_each_rung_adds() -> None:
+    rows = list_rungs(Scene(make_report(duration_s=20.0)))
+    assert rows["ladder"]["step"].to_list() == ["ideal", "+ effective_track", "+ drive_lag"]
+    assert rows["ladder"]["t"].to_list() == [1.06, 0.44, 0.31]
+    assert rows["ladder_floor"]["t"].to_list() == [0.19]
+
+
+def test_a_diagnosis_becomes_the_model_it_names() -> None:
+    entry = {"id": "effective_track", "parameters": {"k": {"value": 1.79, "unit": "1"}}}
+    model = name_model({"effects": [entry, {"id": "no_longer_known", "parameters": {}}]}, vehicle())
+    assert model is not None
+    assert model.ids == ("effective_track",)
+    assert model.effect("effective_track").values["k"] == 1.79
+    assert name_model({"effects": []}, vehicle()) is None
+
+
+def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFactory) -> None:
+    from pipeline.job.analyze import analyze_log  # noqa: PLC0415 - only this test needs a whole run
+    from pipeline.job.options import Options  # noqa: PLC0415
+
+    folder = tmp_path_factory.mktemp("view")
+    log = simulate_case("husky_tile", out=folder / "run.mcap", duration_s=40.0)
+    manifest = analyze_log(log, Options(out=folder / "results", report=False)).manifest
+    tables = {name: manifest.read(name) for name in ("poses", "commands", "wheels", "imu", "slip")}
+    run = load_run(tables, vehicle(), name="run")
+    model = Model(vehicle(), (find_effect("effective_track")(k=1.7),))
+    timing = Timing(0.02, 0.0)
+    places = manifest.read("velocities").select("t", "x", "y")
+    view = MotionStage(Problem([run], vehicle(), Input.COMMAND), places).view(
+        State(model, {}, (timing,)), (), None
+    )
+    made = predict(model, run, Input.COMMAND, timing=timing)
+
+    shown = view.velocity.sort("t")
+    expected = np.interp(shown["t"], made.times + timing.pose_delay_s, made.velocity[:, 2])
+    assert np.allclose(shown["v_w"], expected, atol=1e-9)
+    starts = view.arcs.group_by("piece", maintain_order=True).first()
+    for axis in "xy":
+        at = np.interp(starts["t"], places["t"], places[axis])
+        assert np.allclose(starts[axis], at, atol=1e-6)
