@@ -71,19 +71,42 @@ def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, star
     starts = np.zeros(signal.size, dtype=bool)
     starts[resets.first] = True
     begins = np.flatnonzero(starts | np.concatenate(([True], np.diff(signal) != 0.0)))
-    level = signal[begins].tolist()
-    count = np.diff(np.append(begins, signal.size)).tolist()
-    fresh = {int(cell): float(value) for cell, value in zip(resets.first, start, strict=True)}
-    missing, value = [], level[0]
-    # One short loop over the plateaus of the input; what happens inside a plateau is a straight line.
-    for cell, target, cells in zip(begins.tolist(), level, count, strict=True):
-        if cell in fresh:
-            value = fresh[cell] if np.isfinite(fresh[cell]) else target
-        gap = target - value
-        missing.append(gap)
-        value = target if abs(gap) <= most * cells else value + most * cells * (1.0 if gap > 0.0 else -1.0)
-    gap = np.repeat(np.array(missing), count)
+    count = np.diff(np.append(begins, signal.size))
+    gap = np.repeat(_find_gaps(signal, start, begins, most * count, resets), count)
     inside = np.arange(signal.size) - np.repeat(begins, count) + 0.5
     left = np.maximum(np.abs(gap) - most * inside, 0.0)
     limited: Floats = signal - np.sign(gap) * left
     return limited
+
+
+def _find_gaps(signal: Floats, start: Floats, begins: Integers, reach: Floats, resets: Resets) -> Floats:
+    """How far the limited signal is from its input where each plateau of the input begins.
+
+    Nearly always it has arrived before the plateau ends, so that the next one begins at the level of the one
+    before. Only from where it has not, until it has again, must plateaus be followed one by one.
+    """
+    level = signal[begins]
+    gap = np.diff(level, prepend=level[0])
+    fresh = np.searchsorted(begins, resets.first)
+    gap[fresh] = np.where(np.isfinite(start), level[fresh] - start, 0.0)
+    late = np.flatnonzero(np.abs(gap) > reach)
+    if not late.size:
+        return gap
+    is_fresh = np.zeros(begins.size + 1, dtype=bool)
+    is_fresh[fresh] = True
+    is_fresh[-1] = True
+    levels, gaps, reaches, ends = level.tolist(), gap.tolist(), reach.tolist(), is_fresh.tolist()
+    arrived = -1
+    for first in late.tolist():
+        if first < arrived:
+            continue
+        place = first
+        while abs(gaps[place]) > reaches[place]:
+            missing = gaps[place] - (reaches[place] if gaps[place] > 0.0 else -reaches[place])
+            value = levels[place] - missing
+            place += 1
+            if ends[place]:
+                break
+            gaps[place] = levels[place] - value
+        arrived = place
+    return np.array(gaps)

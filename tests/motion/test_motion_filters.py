@@ -88,3 +88,26 @@ def test_held_commands_keep_their_area_wherever_their_stamps_fall(gaps: list[flo
     assert wheels.left.sum() * STEP == pytest.approx(float(np.sum(values * np.diff(inside))), abs=1e-9)
     assert wheels.left.min() >= values.min() - 1e-9
     assert wheels.left.max() <= values.max() + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_rate_limit_follows_its_input_step_by_step(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    size, step = 600, 0.01
+    signal = np.repeat(rng.normal(size=size) * rng.integers(0, 2, size), rng.integers(1, 25, size))[:size]
+    first = np.unique(np.concatenate(([0], rng.integers(1, size, 3))))
+    start = np.where(rng.random(first.size) < 0.5, np.nan, rng.normal(size=first.size))
+    limit = float(10.0 ** rng.uniform(-0.5, 2.0))
+    found = limit_rate(
+        signal, limit, step, Resets(np.zeros(size, dtype=np.int64), first, first, start[:, None]), start
+    )
+
+    begins = dict(zip(first.tolist(), start.tolist(), strict=True))
+    value = signal[0]
+    for cell in range(size):
+        if cell in begins:
+            value = begins[cell] if np.isfinite(begins[cell]) else signal[cell]
+        # Half a cell on, the mean of a cell in which the signal moves evenly.
+        half = value + np.clip(signal[cell] - value, -limit * step / 2.0, limit * step / 2.0)
+        value += np.clip(signal[cell] - value, -limit * step, limit * step)
+        assert found[cell] == pytest.approx(half, abs=1e-9)
