@@ -8,13 +8,13 @@ BIN    := $(VENV)/bin
 OUT    ?= results
 
 # Values reach the shell through its environment, so that a path may hold spaces and quotes.
-export LOG LOGS OUT VEHICLE ARGS
+export LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT
 
 # Exit code 3 means done, but the log had losses: they are on the screen, and make has not failed.
 FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: help analyze batch bench bench-analyze bench-batch bench-reader browser check clean compare format inspect lock samples \
+.PHONY: hidden-effect mysteries reveal help analyze batch bench bench-analyze bench-batch bench-reader browser check clean compare format inspect lock samples \
 	serve test test-long
 
 help: ## print this list
@@ -60,6 +60,18 @@ format: $(VENV)/.ready-dev ## put the code into the house's layout
 samples: $(VENV)/.ready ## make the logs in data_samples again
 	@for case in husky_tile warthog_ice ackermann_gravel; do \
 		$(BIN)/slip simulate $$case --out data_samples/$$case.mcap || exit 1; done
+
+hidden-effect: $(VENV)/.ready-dev ## SEED=7: draw logs by seed, diagnose them, open the answers [CATEGORY=all, EFFECT=, ARGS=]
+	@[ -n "$$SEED" ] || { echo "Say which seed: make hidden-effect SEED=7, or SEED=7-12" >&2; exit 2; }
+	@$(BIN)/python tests/hidden/play.py --category "$${CATEGORY:-all}" --seeds "$$SEED" \
+		$${EFFECT:+--effect "$$EFFECT"} $$ARGS
+
+mysteries: $(VENV)/.ready-dev ## make the mystery logs in data_samples again, and their seals
+	$(BIN)/python tests/hidden/mystery.py write data_samples
+
+reveal: $(VENV)/.ready-dev ## LOG=data_samples/mystery_1.mcap: open the seal of a mystery log
+	@[ -n "$$LOG" ] || { echo "Say which log: make reveal LOG=data_samples/mystery_1.mcap" >&2; exit 2; }
+	@$(BIN)/python tests/hidden/mystery.py open "$${LOG%.mcap}.sealed"
 
 bench: bench-reader bench-analyze bench-batch ## all benchmarks
 

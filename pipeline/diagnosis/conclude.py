@@ -53,6 +53,7 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
     undecided = [item for way in ways for item in way.undecided]
     open_ids = {item.candidates[0] for item in undecided}
     found = _gather(ways, clocks)
+    known = frozenset().union(*(way.search.arena.kept for way in ways))
     timing = body.search.final.state.timing
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
     judgement = _rate(ground, source, [*found, *terms], timing)
@@ -61,7 +62,7 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
     named = tuple(
         _describe(effect, ground, ways, estimates, judgement)
         for effect in found
-        if not _parts(effect) & open_ids
+        if not _parts(effect) & open_ids and effect.id not in known
     )
     named = leftover.mark_tentative(named, ways, unexplained)
     problem: Problem = body.search.arena.problem

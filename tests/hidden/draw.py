@@ -12,12 +12,13 @@ import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-
 from odd_physics import ODD
+
 from pipeline.simulate import (
     LAYOUTS,
     MACHINES,
@@ -88,14 +89,14 @@ def draw_riddle(category: Category, seed: int, effect: str | None = None) -> Rid
         effect: for singles, the effect; drawn when None.
     """
     maker: dict[Category, Callable[[np.random.Generator, int, str | None], Riddle]] = {
-        "single": lambda g, s, e: _draw_single(g, s, e, "single", 1.0),
-        "small": lambda g, s, e: _draw_single(g, s, e, "small", 0.4),
-        "equipped": lambda g, s, e: _draw_equipped(g, s, e),
+        "single": partial(_draw_single, category="single", share=1.0),
+        "small": partial(_draw_single, category="small", share=0.4),
+        "equipped": _draw_equipped,
         "sets": lambda g, s, _e: _draw_set(g, s),
         "empty": lambda g, s, _e: _draw_empty(g, s),
-        "poor": lambda g, s, e: _draw_poor(g, s, e),
-        "odd": lambda g, s, e: _draw_odd(g, s, e),
-        "rigid": lambda g, s, e: _draw_rigid(g, s, e),
+        "poor": _draw_poor,
+        "odd": _draw_odd,
+        "rigid": _draw_rigid,
     }
     generator = np.random.default_rng([CATEGORIES.index(category), seed])
     return maker[category](generator, seed, effect)
@@ -215,7 +216,7 @@ def _draw_scene(draw: np.random.Generator, seed: int, effect: str | None = None)
 
 
 def _draw_single(
-    draw: np.random.Generator, seed: int, effect: str | None, category: str, share: float
+    draw: np.random.Generator, seed: int, effect: str | None, *, category: str, share: float
 ) -> Riddle:
     chosen = effect or str(draw.choice(DIFFERENTIAL + CAR))
     scene = _excite(_draw_scene(draw, seed, chosen), chosen, draw)

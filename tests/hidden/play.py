@@ -26,6 +26,10 @@ from draw import CAR, CATEGORIES, DIFFERENTIAL, Answer, Category, draw_riddle, o
 from odd_physics import ODD
 from score import Score, confusion_table, describe_rate, score_run
 
+from pipeline.cli.verb_diagnose import _find, _read
+from pipeline.diagnosis import diagnose_runs
+from pipeline.job.options import Options
+
 POOLS = {
     "single": DIFFERENTIAL + CAR,
     "small": DIFFERENTIAL + CAR,
@@ -67,7 +71,16 @@ def play(job: Job) -> Played:
 
 
 def _ask_command_line(log: Path) -> dict[str, object]:
-    command = [sys.executable, "-m", "pipeline", "diagnose", str(log), "--json", "--out", str(log.parent / "out")]
+    command = [
+        sys.executable,
+        "-m",
+        "pipeline",
+        "diagnose",
+        str(log),
+        "--json",
+        "--out",
+        str(log.parent / "out"),
+    ]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     if done.returncode not in {0, 3}:
         raise RuntimeError(done.stderr)
@@ -75,10 +88,6 @@ def _ask_command_line(log: Path) -> dict[str, object]:
 
 
 def _ask_in_process(log: Path) -> dict[str, object]:
-    from pipeline.cli.verb_diagnose import _find, _read
-    from pipeline.diagnosis import diagnose_runs
-    from pipeline.job.options import Options
-
     options = Options(out=log.parent / "out", report=False)
     manifest, _ = _find(str(log), options, quiet=True)
     vehicle, recording = _read(manifest)
@@ -94,7 +103,9 @@ def play_all(jobs: Sequence[Job], workers: int = 2) -> list[Played]:
         return list(pool.map(play, jobs))
 
 
-def list_jobs(category: Category, seeds: Sequence[int], effect: str | None, *, by_command_line: bool) -> list[Job]:
+def list_jobs(
+    category: Category, seeds: Sequence[int], effect: str | None, *, by_command_line: bool
+) -> list[Job]:
     """Jobs of one category; `each` goes through every effect."""
     pool: Sequence[str | None] = POOLS.get(category, (None,)) if effect == "each" else (effect,)
     return [Job(category, seed, name, by_command_line) for name in pool for seed in seeds]
@@ -109,7 +120,9 @@ def describe(category: str, played: Sequence[Played]) -> list[str]:
         clean = sum(not s.named and not s.flagged for s in scores)
         lines.append(describe_rate("nothing named and nothing flagged", clean, count))
     elif category == "odd":
-        right = sum(bool(set(s.flagged) & set(one.answer.channel)) for s, one in zip(scores, played, strict=True))
+        right = sum(
+            bool(set(s.flagged) & set(one.answer.channel)) for s, one in zip(scores, played, strict=True)
+        )
         lowered = sum(s.formula > 0.02 for s in scores)
         lines.append(describe_rate("flagged in the right channel", right, count))
         lines.append(describe_rate("formula lowers the held-out error", lowered, count))
@@ -131,9 +144,10 @@ def describe(category: str, played: Sequence[Played]) -> list[str]:
     for one in played:
         if category not in {"poor", "odd"} and not one.score.is_exact:
             lines.append(
-                f"  seed {one.job.seed} {one.job.effect or ''} {one.answer.program}: hidden {one.answer.effects}, "
-                f"named {list(one.score.named)}, undecided {list(one.score.undecided)}, "
-                f"unobservable {list(one.score.unobservable)} {one.score.flagged and 'flagged ' + one.score.flagged}"
+                f"  seed {one.job.seed} {one.job.effect or ''} {one.answer.program}: "
+                f"hidden {one.answer.effects}, named {list(one.score.named)}, "
+                f"undecided {list(one.score.undecided)}, unobservable {list(one.score.unobservable)}"
+                f"{', flagged ' + one.score.flagged if one.score.flagged else ''}"
             )
         elif category == "poor" and (one.score.missed or one.score.false):
             lines.append(
@@ -141,14 +155,18 @@ def describe(category: str, played: Sequence[Played]) -> list[str]:
                 f"named {list(one.score.named)}"
             )
         elif category == "odd" and not set(one.score.flagged) & set(one.answer.channel):
-            lines.append(f"  seed {one.job.seed} {one.answer.odd}: named {list(one.score.named)}, flagged "
-                         f"{one.score.flagged or 'nothing'}")
+            lines.append(
+                f"  seed {one.job.seed} {one.answer.odd}: named {list(one.score.named)}, flagged "
+                f"{one.score.flagged or 'nothing'}"
+            )
     return lines
 
 
 def main() -> None:
     """Read the command line and play."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--category", default="single", choices=[*CATEGORIES, "all"])
     parser.add_argument("--seeds", default="0", help="one seed, or first-last (the last not included)")
     parser.add_argument("--effect", default=None, help="an id, or `each`")
@@ -158,7 +176,8 @@ def main() -> None:
     seeds = range(int(first), int(last)) if last else [int(first)]
     for category in CATEGORIES if asked.category == "all" else (asked.category,):
         jobs = list_jobs(category, seeds, asked.effect, by_command_line=asked.command_line)
-        print("\n".join(describe(category, play_all(jobs))), flush=True)
+        sys.stdout.write("\n".join(describe(category, play_all(jobs))) + "\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

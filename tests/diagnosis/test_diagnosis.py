@@ -1,0 +1,243 @@
+"""What a user is promised of a diagnosis."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.diagnosis import Diagnosis, Recording, diagnose_runs
+from pipeline.diagnosis.plausibility import find_implausible, is_nameable
+from pipeline.diagnosis.screen import Largest
+from pipeline.diagnosis.words import describe_run
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.motion import find_effect, read_model
+from pipeline.motion.errors import MotionError
+from pipeline.simulate import (
+    VEHICLES,
+    Disturbance,
+    Imu,
+    PoseSensor,
+    Program,
+    Scenario,
+    State,
+    simulate_run,
+    write_log,
+)
+from pipeline.simulate import (
+    Recording as Recorded,
+)
+from pipeline.vehicles import Vehicle, find_preset
+from schemas import contract_of
+
+_SCENE = Scenario(
+    duration_s=120.0, seed=7, disturbance=Disturbance(0.02, 0.03), pose=PoseSensor(drift_m=0.005)
+)
+_PROMISED = {
+    "run", "input", "effects", "undecided", "unobservable", "unexplained", "findings", "ladder", "noise_floor",
+    "explained_share", "where", "timing",
+}  # fmt: skip
+
+
+def _record(scenario: Scenario, folder: Path) -> tuple[Recording, Vehicle]:
+    log = folder / "run.mcap"
+    write_log(simulate_run(scenario), log)
+    manifest = analyze_log(log, Options(out=folder / "out", report=False)).manifest
+    vehicle = find_preset(scenario.vehicle.name)
+    assert vehicle is not None
+    return Recording(manifest.run, {name: manifest.read(name) for name in manifest.tables}), vehicle
+
+
+def _diagnose(scenario: Scenario, folder: Path, **more: object) -> Diagnosis:
+    recording, vehicle = _record(scenario, folder)
+    return diagnose_runs([recording], vehicle, **more)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def skidding(tmp_path_factory: pytest.TempPathFactory) -> Diagnosis:
+    effects = {"effective_track": 1.8, "drive_lag": 0.4}
+    return _diagnose(replace(_SCENE, effects=effects), tmp_path_factory.mktemp("skidding"))
+
+
+def test_what_is_missing_is_named_with_its_size(skidding: Diagnosis) -> None:
+    named = {effect.id: effect for effect in skidding.runs[0].effects}
+    assert set(named) == {"effective_track", "drive_lag"}
+    track = named["effective_track"].parameters["k"]
+    assert track.low < 1.8 < track.high
+    assert named["drive_lag"].parameters["tau"].value == pytest.approx(0.4, abs=0.02)
+    assert named["drive_lag"].way == "wheels"
+    assert named["effective_track"].way == "measured"
+
+
+def test_the_ladder_falls_on_data_that_no_rung_has_seen(skidding: Diagnosis) -> None:
+    errors = [rung["t_mrmse_m"] for rung in skidding.runs[0].ladder]
+    assert len(errors) == 3
+    assert errors == sorted(errors, reverse=True)  # type: ignore[type-var]
+    assert skidding.runs[0].explained_share > 0.9
+
+
+def test_every_promised_key_is_in_the_json_and_it_is_plain(skidding: Diagnosis) -> None:
+    (run,) = skidding.to_json()
+    assert set(run) >= _PROMISED
+    assert json.loads(json.dumps(run, allow_nan=False)) == run
+    (entry, *_) = run["effects"]  # type: ignore[misc, union-attr]
+    assert isinstance(entry, Mapping)
+    assert set(entry) >= {"id", "parameters", "gain", "equivalent_to", "confused_with", "corrected"}
+
+
+def test_the_regions_say_where_it_fails(skidding: Diagnosis) -> None:
+    sentences = [region.sentence for region in skidding.runs[0].where]
+    assert any("turning" in text and "yaw error" in text for text in sentences)
+    assert skidding.tabulate_where(skidding.runs[0].run).height > 20
+
+
+def test_drivetrain_and_ground_agree_with_the_whole_way(skidding: Diagnosis) -> None:
+    consistency = skidding.runs[0].consistency
+    assert set(consistency) == {"drive_lag.tau", "effective_track.k"}
+    assert all(item["agrees"] for item in consistency.values())  # type: ignore[index, call-overload]
+
+
+def test_the_screen_names_each_effect_and_the_fall(skidding: Diagnosis) -> None:
+    text = describe_run(skidding.runs[0])
+    assert "effective_track" in text
+    assert "drive_lag" in text
+    assert "->" in text
+
+
+def test_the_ladder_table_keeps_its_contract(skidding: Diagnosis) -> None:
+    table = skidding.tabulate_ladder(skidding.runs[0].run)
+    assert set(table.columns) <= set(contract_of("ladder").schema.columns())
+    assert table["kind"].to_list() == ["rung", "rung", "rung", "floor"]
+
+
+def test_nothing_is_named_beyond_a_model_that_says_it_all(skidding: Diagnosis, tmp_path: Path) -> None:
+    proposal = skidding.runs[0].proposal
+    assert proposal is not None
+    scenario = replace(_SCENE, effects={"effective_track": 1.8, "drive_lag": 0.4}, seed=8)
+    (run,) = _diagnose(scenario, tmp_path, model=proposal.model).runs
+    assert run.effects == ()
+    assert run.unexplained is None
+
+
+def test_an_early_clock_is_found_corrected_and_not_lost(tmp_path: Path) -> None:
+    (run,) = _diagnose(replace(_SCENE, effects={"clock_offset": -0.15}), tmp_path).runs
+    assert [effect.id for effect in run.effects] == ["clock_offset"]
+    assert run.effects[0].corrected
+    assert run.effects[0].parameters["d"].value == pytest.approx(-0.15, abs=0.01)
+
+
+def test_driven_straight_only_turning_is_said_to_be_unobservable(tmp_path: Path) -> None:
+    scenario = replace(_SCENE, effects={"effective_track": 1.8}, program=Program("straight"))
+    (run,) = _diagnose(scenario, tmp_path).runs
+    assert run.effects == ()
+    hidden = {item.id: item for item in run.unobservable}
+    assert "effective_track" in hidden
+    assert "turn" in hidden["effective_track"].manoeuvre
+
+
+def test_one_circle_leaves_it_undecided_with_a_manoeuvre(tmp_path: Path) -> None:
+    scenario = replace(_SCENE, effects={"turning_resistance": 0.2}, program=Program("circle"))
+    (run,) = _diagnose(scenario, tmp_path).runs
+    assert run.effects == ()
+    assert "turning_resistance" in run.undecided[0].candidates
+    assert run.undecided[0].separate_by
+
+
+def test_a_vehicle_that_does_not_move_gets_no_name(tmp_path: Path) -> None:
+    scenario = replace(_SCENE, effects={"wheel_radius": 0.0}, disturbance=Disturbance())
+    (run,) = _diagnose(scenario, tmp_path).runs
+    assert run.effects == ()
+    assert "not_moving" in {finding["id"] for finding in run.findings}
+    assert "no effect is named" in describe_run(run)
+
+
+def test_a_formula_for_the_unexplained_can_be_pasted_into_a_model_file(tmp_path: Path) -> None:
+    def slip_in_reverse(state: State) -> tuple[float, float, float]:
+        return (-0.3 * state.v0 if state.v0 < 0.0 else 0.0), 0.0, 0.0
+
+    (run,) = _diagnose(replace(_SCENE, extra=slip_in_reverse), tmp_path).runs
+    left = run.unexplained
+    assert left is not None
+    assert left.channel == "x"
+    assert left.formula is not None
+    model = tmp_path / "model.toml"
+    model.write_text(f'format = 1\n[vehicle]\npreset = "husky_a200"\n\n{left.formula}', encoding="utf-8")
+    assert read_model(model).model.ids == ("unexplained",)
+    before, after = run.ladder[0]["velocity_rms"][0], run.ladder[-1]["velocity_rms"][0]  # type: ignore[index]
+    assert after < 0.7 * before  # type: ignore[operator]
+
+
+def test_two_runs_of_one_vehicle_are_judged_together(tmp_path: Path) -> None:
+    recordings = []
+    for seed in (1, 2):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        scenario = replace(_SCENE, effects={"effective_track": 1.6}, seed=seed)
+        recording, vehicle = _record(scenario, folder)
+        recordings.append(replace(recording, name=f"run{seed}"))
+    runs = diagnose_runs(recordings, vehicle).runs
+    assert [run.run for run in runs] == ["run1", "run2"]
+    assert all([effect.id for effect in run.effects] == ["effective_track"] for run in runs)
+
+
+def test_a_log_without_encoders_and_gyro_is_answered_from_the_command_alone(tmp_path: Path) -> None:
+    scenario = replace(
+        _SCENE,
+        vehicle=VEHICLES["husky"],
+        effects={"transport_delay": 0.25},
+        recording=Recorded("body_command"),
+        imu=Imu(),
+    )
+    (run,) = _diagnose(scenario, tmp_path).runs
+    assert [effect.id for effect in run.effects] == ["transport_delay"]
+    assert "clock_offset" in run.effects[0].equivalent_to
+
+
+def test_a_diagnosis_is_the_same_each_time(tmp_path: Path) -> None:
+    recording, vehicle = _record(replace(_SCENE, effects={"lateral_skid": 0.1}), tmp_path)
+    first = diagnose_runs([recording], vehicle).to_json()
+    assert diagnose_runs([recording], vehicle).to_json() == first
+
+
+_LARGEST = Largest(1.0, 1.0, 8.0, 3.0, 120.0, np.zeros(11))
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("transport_delay", {"d": 0.008}),
+        ("lateral_skid", {"c": -0.05}),
+        ("turn_lag", {"tau_mean": 0.5, "tau_diff": 0.51}),
+        ("turn_droop", {"threshold": 0.01, "gain": 0.5}),
+        ("body_speed_limit", {"limit": 1.0}),
+    ],
+)
+def test_what_is_too_small_or_another_in_disguise_is_not_named(name: str, values: dict[str, float]) -> None:
+    assert not is_nameable(find_effect(name)(**values), _LARGEST)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("transport_delay", {"d": 0.05}),
+        ("turn_lag", {"tau_mean": 0.3, "tau_diff": 1.0}),
+        ("body_speed_limit", {"limit": 0.7}),
+    ],
+)
+def test_what_is_large_enough_is_named(name: str, values: dict[str, float]) -> None:
+    assert is_nameable(find_effect(name)(**values), _LARGEST)
+
+
+def test_what_no_vehicle_does_is_said() -> None:
+    assert find_implausible(find_effect("effective_track")(k=6.0)) is not None
+    assert find_implausible(find_effect("effective_track")(k=1.8)) is None
+
+
+def test_an_effect_out_of_bounds_is_an_error_of_the_model() -> None:
+    with pytest.raises(MotionError):
+        find_effect("effective_track")(k=-1.0)
