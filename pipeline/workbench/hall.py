@@ -67,7 +67,9 @@ class Hall:
             desk = work.open_desk(file, stand)
             if ask.action == "preview":
                 return self._preview(file, stand, desk, ask)
-            changed = self._change(file, stand, desk, ask)
+            changed = work.learn_floor(
+                self._change(file, stand, desk, ask), read_diagnosis(self.results, manifest)
+            )
             if changed is not desk:
                 file.write(changed)
             return self._show(file, stand, changed)

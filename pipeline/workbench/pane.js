@@ -44,10 +44,21 @@ export class Pane {
 
   // A change of structure: all figures anew. A change of values: only their rows.
   async act(action, more = {}) {
+    await this.settle();
     if (await this.ask(action, more)) await this.redraw();
   }
 
+  // A value that was set a moment ago becomes a step before anything else happens.
+  async settle() {
+    clearTimeout(this.rest);
+    const asked = this.resting;
+    this.resting = null;
+    this.wanted = null;
+    if (asked) await this.ask("set", asked);
+  }
+
   async open(run) {
+    await this.settle();
     this.wait(run);
     if (await this.ask("open", { run, fresh: true })) {
       await this.draw();
@@ -217,7 +228,8 @@ export class Pane {
     // Keys change the value many times in a row: only where it comes to rest is a step.
     input.addEventListener("change", () => {
       clearTimeout(this.rest);
-      this.rest = setTimeout(() => this.act("set", { effect: effect.id, parameter: name, value: Number(input.value) }), REST_MS);
+      this.resting = { effect: effect.id, parameter: name, value: Number(input.value) };
+      this.rest = setTimeout(() => this.settle().then(() => this.redraw()), REST_MS);
     });
     const span = low === null ? "" : `95 %: ${say(low, 4)} to ${say(high, 4)}`;
     return h("div", { class: "slider" },

@@ -121,12 +121,20 @@ def _try_all(stand: Stand, model: Model, names: list[str], trial: Trial) -> None
                     "ratio": ratio,
                     # Of two that do the same, the one with fewer numbers.
                     "rank": ratio * _EACH_NUMBER ** len(kinds[name].parameters),
-                    "helps": ratio < _WORTH and _is_sure(problem, base, held_out),
+                    "helps": ratio < _WORTH
+                    and _reaches_further(base, held_out)
+                    and _is_sure(problem, base, held_out),
                     "from": {"t": base.pooled.t_mrmse_m, "r": base.pooled.r_mrmse_rad},
                     "to": {"t": held_out.pooled.t_mrmse_m, "r": held_out.pooled.r_mrmse_rad},
                 }
             )
         trial.tried += 1
+
+
+def _reaches_further(base: HeldOut, new: HeldOut) -> bool:
+    """Whether a planner would feel it: predictions over two seconds get better in position or heading."""
+    before, after = base.pooled, new.pooled
+    return after.t_mrmse_m < before.t_mrmse_m or after.r_mrmse_rad < before.r_mrmse_rad
 
 
 def _is_sure(problem: Problem, base: HeldOut, new: HeldOut) -> bool:

@@ -150,9 +150,21 @@ def _known_rungs(step: Step) -> Rungs:
     return {tuple(_effects_of(rung)): rung for rung in rungs}
 
 
+def learn_floor(desk: Desk, diagnosis: Mapping[str, object] | None) -> Desk:
+    """The desk with the floor that a diagnosis found for the same input, where it is lower."""
+    found = diagnosis.get("noise_floor") if diagnosis and diagnosis.get("input") == desk.input else None
+    lower = found if isinstance(found, dict) and isinstance(found.get("t_mrmse_m"), float) else None
+    if lower is None or not _is_below(lower, desk.floor):
+        return desk
+    return msgspec.structs.replace(desk, floor=lower)
+
+
 def _lower_floor(desk: Desk, judged: Judged) -> dict[str, object]:
     """The floor can only sink: the better the model, the sharper it is."""
-    known = desk.floor.get("t_mrmse_m")
-    if isinstance(known, float) and known <= judged.floor.t_mrmse_m:
-        return desk.floor
-    return errors_as_json(judged.floor)
+    found = errors_as_json(judged.floor)
+    return found if _is_below(found, desk.floor) else desk.floor
+
+
+def _is_below(found: Mapping[str, object], known: Mapping[str, object]) -> bool:
+    new, old = found.get("t_mrmse_m"), known.get("t_mrmse_m")
+    return isinstance(new, float) and (not isinstance(old, float) or new < old)

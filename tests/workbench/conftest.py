@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from workbench_server import Workbench
+from workbench_server import TRACK, Workbench
 
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
@@ -15,9 +15,6 @@ from pipeline.simulate import simulate_case
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-RUN = "field/hidden"
-TRACK = 1.6
 
 
 @pytest.fixture(scope="session")

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import pytest
 from chrome import BROWSER, Chrome
-from conftest import RUN
-from workbench_server import Workbench
+from workbench_server import RUN, Workbench
 
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options

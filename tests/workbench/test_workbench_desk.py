@@ -7,8 +7,7 @@ import time
 from typing import TYPE_CHECKING, cast
 
 import pytest
-from conftest import RUN, TRACK
-from workbench_server import Workbench
+from workbench_server import RUN, TRACK, Workbench
 
 from pipeline.motion import read_model
 from pipeline.simulate import simulate_case
@@ -176,11 +175,18 @@ def test_every_effect_is_tried_and_the_hidden_one_comes_first(workbench: Workben
 def test_what_a_diagnosis_named_is_shown(workbench: Workbench) -> None:
     home = workbench.results / "runs/field/hidden"
     manifest = json.loads((home / "manifest.json").read_text())
-    named = {"effects": [{"id": "effective_track", "gain": 0.9}], "undecided": [], "unexplained": None}
+    named = {
+        "input": "command",
+        "effects": [{"id": "effective_track", "gain": 0.9}],
+        "undecided": [],
+        "noise_floor": {"t_mrmse_m": 0.0011, "r_mrmse_rad": 0.0004},
+    }
     (home / manifest["folder"] / "diagnosis.json").write_text(json.dumps(named))
     manifest["files"]["diagnosis.json"] = manifest["files"]["summary.json"]
     (home / "manifest.json").write_text(json.dumps(manifest))
-    assert workbench.desk(RUN)["diagnosis"] == named
+    opened = workbench.desk(RUN)
+    assert opened["diagnosis"] == named
+    assert errors(opened, "floor") == {"t": 0.0011, "r": 0.0004}
 
 
 @pytest.mark.long

@@ -7,7 +7,7 @@ import socket
 from typing import TYPE_CHECKING
 
 import pytest
-from conftest import RUN
+from workbench_server import RUN
 
 from pipeline.workbench import WorkbenchError, serve
 from pipeline.workbench.guard import strip_port

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+RUN = "field/hidden"
+TRACK = 1.6
 PATIENCE_S = 60.0
 
 
