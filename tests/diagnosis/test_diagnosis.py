@@ -39,8 +39,8 @@ _SCENE = Scenario(
     duration_s=120.0, seed=7, disturbance=Disturbance(0.02, 0.03), pose=PoseSensor(drift_m=0.005)
 )
 _PROMISED = {
-    "run", "input", "effects", "undecided", "unobservable", "unexplained", "findings", "ladder", "noise_floor",
-    "explained_share", "where", "timing",
+    "run", "input", "effects", "undecided", "unobservable", "unexplained", "findings", "ladder",
+    "noise_floor", "explained_share", "where", "timing",
 }  # fmt: skip
 
 
