@@ -112,7 +112,7 @@ class FormulaEffect(AddedEffect):
     def _copy(self, values: Mapping[str, float], fixed: Iterable[str]) -> Self:
         # The formulas are parsed already: another value changes nothing about them.
         other = copy.copy(self)
-        other.values = other._complete(dict(values))
+        other.values = self._complete(dict(values))
         other.fixed = frozenset(fixed)
         return other
 
