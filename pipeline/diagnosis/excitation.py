@@ -93,6 +93,10 @@ def make_usual(candidate: Candidate, largest: Largest) -> Effect:
         values["threshold"] = 0.4 * largest.difference
     elif candidate.id == "deadband":
         values["d"] *= min(largest.speed, 1.0)
+    for parameter in candidate.parameters:
+        if parameter.name in values:
+            low, high = parameter.bounds
+            values[parameter.name] = min(max(values[parameter.name], low), high)
     return candidate(**values)
 
 

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 _MOST_TERMS = 3
-_TRIED = 4
+_TRIED = 2
+_MOST_WORK = 10
 _LEAST_GAIN = 0.02
 _LEAST_T = 3.0
 _LEAST_Z = 3.0
@@ -65,11 +66,13 @@ def search_formula(arena: Arena, start: Contender, final: Contender, places: Flo
     """
     waves = (*list_waves(arena, final, places), *list_waves(arena, start, places, "_first"))
     terms = (*list_terms(), *waves)
-    wide = replace(arena, candidates=(*arena.candidates, *terms), _dropped={}, _suggested={}, _columns={})
+    wide = replace(
+        arena, candidates=(*arena.candidates, *terms), _dropped={}, _suggested={}, _columns={}, work=0
+    )
     narrow = {effect.id for effect in arena.candidates}
     current = final
     for _ in range(_MOST_TERMS + 1):
-        if sum(is_term(name) for name in current.ids) >= _MOST_TERMS:
+        if sum(is_term(name) for name in current.ids) >= _MOST_TERMS or wide.work > _MOST_WORK:
             return current
         moved = _replace(wide, current, narrow) or _add(wide, current, narrow)
         if moved is None:
@@ -91,6 +94,8 @@ def _replace(arena: Arena, current: Contender, narrow: set[str]) -> Contender | 
     free = [name for name in current.ids if name not in arena.kept and not is_term(name)]
     pairs = combinations(free, 2) if len(free) <= _MOST_PAIRED else ()
     for names in (*((name,) for name in free), *pairs):
+        if arena.work > _MOST_WORK:
+            return None
         without = arena.drop(current, names)
         for rival in arena.suggest(without, _TRIED, without={*narrow, *names}):
             bonus = _BETTER if len(names) == 1 else 0.0
