@@ -106,7 +106,7 @@ def test_predictions_begin_at_the_measured_pose_and_last_two_seconds(derived: Pa
     times = np.array([time for time, _ in poses])
     for time, path in found["/slip/predicted_path"][5::20]:
         first, last = path.poses[0], path.poses[-1]  # type: ignore[attr-defined]
-        pose = poses[int(np.argmin(np.abs(times - time)))][1].pose.pose.position  # type: ignore[attr-defined]
+        pose = poses[int(np.argmin(np.abs(times - time)))][1].pose.position  # type: ignore[attr-defined]
         assert np.hypot(first.pose.position.x - pose.x, first.pose.position.y - pose.y) < 0.15
         assert last.header.stamp.sec - first.header.stamp.sec == 2
 

@@ -94,18 +94,14 @@ def _write_slip(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) ->
 
 def _write_poses(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -> None:
     stamps = frame["stamp"].to_numpy()
+    # Not odometry: its two covariances, which nobody has, would be four fifths of the file.
     fields: dict[str, Given] = {
         "header.frame_id": source.frame_id,
-        "child_frame_id": _BODY,
-        **{f"pose.pose.position.{axis}": frame[axis].to_numpy() for axis in "xyz"},
-        **_turn(frame["yaw"].to_numpy(), "pose.pose.orientation."),
-        "twist.twist.linear.x": frame["v_x"].to_numpy(),
-        "twist.twist.linear.y": frame["v_y"].to_numpy(),
-        "twist.twist.angular.z": frame["v_w"].to_numpy(),
+        **{f"pose.position.{axis}": frame[axis].to_numpy() for axis in "xyz"},
+        **_turn(frame["yaw"].to_numpy(), "pose.orientation."),
     }
-    writer.write_columns(
-        topics.POSE, "nav_msgs/msg/Odometry", source.log_times(stamps), fields, header_time=stamps
-    )
+    kind, times = "geometry_msgs/msg/PoseStamped", source.log_times(stamps)
+    writer.write_columns(topics.POSE, kind, times, fields, header_time=stamps)
 
 
 def _write_path(writer: LogWriter, source: ExportSource) -> None:
