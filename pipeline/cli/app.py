@@ -32,6 +32,8 @@ def build_app() -> App:
         help_format="plaintext",
         version_flags=["--version"],
         result_action="return_value",
+        # Ctrl-C comes back to `main`, which says what became of the results.
+        suppress_keyboard_interrupt=False,
     )
     for module in sorted(pkgutil.iter_modules(pipeline.cli.__path__), key=lambda found: found.name):
         if module.name.startswith("verb_"):

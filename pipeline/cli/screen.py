@@ -50,11 +50,16 @@ def _describe_head(summary: Summary) -> list[str]:
     losses = cast("Sequence[Mapping[str, object]]", log.get("losses") or [])
     gaps = [f for f in _findings(summary) if f["id"] == "pose_gap"]
     state = "complete" if not losses else "with losses"
-    holes = f", {gaps[0]['count']} gaps in the poses (longest {gaps[0]['value']:.2g} s)" if gaps else ""
+    holes = _describe_gaps(gaps[0]) if gaps else ""
     segments = cast("int", summary["segments"])
     head.append(_row("log", f"{state}{holes}, {segments} segment{'s' if segments != 1 else ''}"))
     head += [_row("  lost", str(loss["text"])) for loss in losses[:_SHOWN]]
     return head
+
+
+def _describe_gaps(found: Mapping[str, object]) -> str:
+    count = cast("int", found["count"])
+    return f", {count} gap{'s' if count != 1 else ''} in the poses (longest {found['value']:.2g} s)"
 
 
 def _describe_slip(summary: Summary) -> list[str]:

@@ -85,9 +85,17 @@ def compute_slip(
         known["command"] = hold_commands(times, commands, vehicle, configuration.command.hold_s)
     if not wheels.is_empty():
         known["measured"] = interpolate_wheels(times, wheels, vehicle)
-    known = {name: ideal for name, ideal in known.items() if np.isfinite(ideal.velocity[ideal.active]).any()}
+    whole = known
+    known = {name: ideal for name, ideal in whole.items() if np.isfinite(ideal.velocity[ideal.active]).any()}
     found = {name: ideal for name, ideal in known.items() if name in inputs}
     if not found:
+        if whole and not any(ideal.active.any() for ideal in whole.values()):
+            raise StageError(
+                "empty_interval",
+                "no pose falls into the intervals in which commands are live",
+                where=where,
+                hint="Mend [[interval]] (seconds from the run's start), or take all with --interval all.",
+            )
         raise StageError(
             "no_command",
             "no command and no measured wheel speed falls together with a pose",

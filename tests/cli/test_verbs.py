@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.cli import main
 from pipeline.logs import LogWriter
 from pipeline.simulate import simulate_case
 
@@ -163,6 +164,30 @@ def test_usage_errors_exit_2(arguments: tuple[str, ...], tmp_path: Path) -> None
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interval_beside_the_poses_is_named_as_what_is_wrong(field: Path, tmp_path: Path) -> None:
+    config = tmp_path / "mine.toml"
+    config.write_text("[[interval]]\nstart_s = 500\nend_s = 600\n")
+    done = slip("analyze", field / "good.mcap", "--config", config, "--out", tmp_path / "out", "--quiet")
+
+    assert done.returncode == 1
+    assert "[[interval]]" in done.stderr
+    assert "[command]" not in done.stderr
+
+
+def test_an_interrupt_says_what_became_of_the_results(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pipeline.motion.catalogue.list_effects", interrupt)
+    with pytest.raises(SystemExit) as left:
+        main(["effects"])
+
+    assert left.value.code == 130
+    assert "nothing was left half-written" in capsys.readouterr().err
 
 
 def test_a_wrong_configuration_names_file_and_key(field: Path, tmp_path: Path) -> None:
