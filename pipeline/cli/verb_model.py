@@ -14,8 +14,11 @@ from pipeline.cli.output import CLEAN, print_json
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.motion.model import Model
     from pipeline.motion.model_file import ModelFile
+    from pipeline.motion.problem import Problem
     from pipeline.motion.recording import MotionRun
+    from pipeline.motion.score import Errors
     from pipeline.motion.transfer import Transfer
     from pipeline.motion.workshop import Judgement
 
@@ -257,9 +260,9 @@ def _change(
     carried = carry_over(written.model, others, source, fitted_on=terrains) if others else []
     warnings = [item.warning for item in carried if item.warning]
     if spoken.json:
-        print_json(_as_json(path, old, new_one, carried, warnings))
+        print_json(_as_json(path, old, new_one, after.model, carried, warnings))
     elif not spoken.quiet:
-        lines = _describe(old, new_one)
+        lines = _describe(old, new_one, after.model)
         if carried:
             lines += ["", *_describe_transfers([(str(path), item) for item in carried])]
         sys.stdout.write("\n".join(lines) + "\n")
@@ -284,7 +287,12 @@ def _terrains(file: ModelFile) -> list[str]:
 
 
 def _as_json(
-    path: Path, old: Judgement, new_one: Judgement, carried: Sequence[Transfer], warnings: Sequence[str]
+    path: Path,
+    old: Judgement,
+    new_one: Judgement,
+    model: Model,
+    carried: Sequence[Transfer],
+    warnings: Sequence[str],
 ) -> Mapping[str, object]:
     from pipeline.motion.describe import (  # noqa: PLC0415 - heavy
         correlations_as_json,
@@ -295,13 +303,15 @@ def _as_json(
     from pipeline.motion.score import measure_by_terrain  # noqa: PLC0415
 
     problem, fitted = new_one.problem, new_one.fitted
+    floor = _choose_floor(old, new_one)
     return {
         "model": str(path),
         "input": problem.source.value,
         "runs": list(problem.names),
-        "ladder_before": ladder_as_json(old.ladder, old.floor),
-        "ladder": ladder_as_json(new_one.ladder, new_one.floor),
+        "ladder_before": ladder_as_json(old.ladder, floor),
+        "ladder": ladder_as_json(new_one.ladder, floor),
         "idle": list(new_one.ladder.idle),
+        "not_fitted": _list_asleep(problem, model),
         "by_run": {
             name: errors_as_json(errors)
             for name, errors in zip(problem.names, new_one.whole.held_out.by_run, strict=True)
@@ -310,7 +320,7 @@ def _as_json(
             terrain: errors_as_json(errors)
             for terrain, errors in measure_by_terrain(problem, new_one.whole.held_out).items()
         },
-        "noise_floor": errors_as_json(new_one.floor),
+        "noise_floor": errors_as_json(floor),
         "parameters": parameters_as_json(fitted.model, new_one.estimates),
         "correlated": correlations_as_json(new_one.estimates),
         "timing": [
@@ -337,7 +347,7 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
     }
 
 
-def _describe(old: Judgement, new_one: Judgement) -> list[str]:
+def _describe(old: Judgement, new_one: Judgement, model: Model) -> list[str]:
     from pipeline.motion.describe import (  # noqa: PLC0415 - heavy
         describe_ladder,
         describe_parameters,
@@ -345,12 +355,28 @@ def _describe(old: Judgement, new_one: Judgement) -> list[str]:
     )
 
     runs = ", ".join(new_one.problem.names)
-    lines = [f"on {new_one.problem.source.value} of {runs}"]
+    floor = _choose_floor(old, new_one)
+    source = new_one.problem.source.value
+    lines = [f"on {source} of {runs}"]
     if old is not new_one:
-        lines += ["", "before", *describe_ladder(old.ladder, old.floor), "", "after"]
-    lines += describe_ladder(new_one.ladder, new_one.floor)
+        lines += ["", "before", *describe_ladder(old.ladder, floor), "", "after"]
+    lines += describe_ladder(new_one.ladder, floor)
+    asleep = _list_asleep(new_one.problem, model)
+    if asleep:
+        lines.append(f"not fitted, acts between command and wheels:  {', '.join(asleep)} (--input command)")
     parameters = parameters_as_json(new_one.fitted.model, new_one.estimates)
     return [*lines, "", "parameters", *describe_parameters(parameters)]
+
+
+def _list_asleep(problem: Problem, model: Model) -> list[str]:
+    """Effects of a model that the input leaves nothing to do: with measured wheels, those before them."""
+    acting = {effect.id for effect in problem.active_effects(model)}
+    return [effect.id for effect in model if effect.id not in acting]
+
+
+def _choose_floor(old: Judgement, new_one: Judgement) -> Errors:
+    """One floor for the ladders before and after: it is the runs', and the better model sees it sharper."""
+    return min(old.floor, new_one.floor, key=lambda errors: errors.t_mrmse_m)
 
 
 def _describe_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:

@@ -30,7 +30,8 @@ def export_ros2_control(file: ModelFile) -> str:
     unmapped = [effect.id for effect in model if effect.id not in _MAPPED]
     if unmapped:
         lines.append(f"# No parameter of the controller stands for: {', '.join(unmapped)}.")
-    if model.vehicle.kind != "differential":
+    track_m = model.vehicle.track_width_m
+    if model.vehicle.kind != "differential" or track_m is None:
         return "\n".join([*lines, "# The vehicle is no differential drive: nothing maps.", ""])
     radius = _value(model, "wheel_radius", "k", 1.0)
     uneven = _value(model, "wheel_asymmetry", "e", 0.0)
@@ -39,22 +40,28 @@ def export_ros2_control(file: ModelFile) -> str:
     lines += [
         "diff_drive_controller:",
         "  ros__parameters:",
-        f"    wheel_separation: {model.vehicle.track_width_m}",
-        f"    wheel_radius: {model.vehicle.wheel_radius_m}",
-        f"    wheel_separation_multiplier: {_value(model, 'effective_track', 'k', 1.0):.5g}",
-        f"    left_wheel_radius_multiplier: {radius * (1.0 - uneven / 2.0):.5g}",
-        f"    right_wheel_radius_multiplier: {radius * (1.0 + uneven / 2.0):.5g}",
+        f"    wheel_separation: {_write_double(track_m)}",
+        f"    wheel_radius: {_write_double(model.vehicle.wheel_radius_m)}",
+        f"    wheel_separation_multiplier: {_write_double(_value(model, 'effective_track', 'k', 1.0))}",
+        f"    left_wheel_radius_multiplier: {_write_double(radius * (1.0 - uneven / 2.0))}",
+        f"    right_wheel_radius_multiplier: {_write_double(radius * (1.0 + uneven / 2.0))}",
     ]
     if math.isfinite(speed):
-        lines += [f"    linear.x.max_velocity: {speed:.5g}", f"    linear.x.min_velocity: {-speed:.5g}"]
+        lines += [
+            f"    linear.x.max_velocity: {_write_double(speed)}",
+            f"    linear.x.min_velocity: {_write_double(-speed)}",
+        ]
     if math.isfinite(turn):
-        lines += [f"    angular.z.max_velocity: {turn:.5g}", f"    angular.z.min_velocity: {-turn:.5g}"]
+        lines += [
+            f"    angular.z.max_velocity: {_write_double(turn)}",
+            f"    angular.z.min_velocity: {_write_double(-turn)}",
+        ]
     if math.isfinite(speed) and math.isfinite(turn):
         lines += [
             "velocity_smoother:",
             "  ros__parameters:",
-            f"    max_velocity: [{speed:.5g}, 0.0, {turn:.5g}]",
-            f"    min_velocity: [{-speed:.5g}, 0.0, {-turn:.5g}]",
+            f"    max_velocity: [{_write_double(speed)}, 0.0, {_write_double(turn)}]",
+            f"    min_velocity: [{_write_double(-speed)}, 0.0, {_write_double(-turn)}]",
         ]
     return "\n".join([*lines, ""])
 
@@ -104,6 +111,13 @@ def export_python(file: ModelFile) -> str:
         MotionError: ``not_exportable``, an effect is a class of the user's own or needs what a planner lacks.
     """
     return write_function(file.model.keep(e.id for e in file.model if e.place is not Place.LOCALIZATION))
+
+
+def _write_double(value: float) -> str:
+    """A number that YAML reads as a double: ROS 2 refuses an integer for a parameter declared as one."""
+    text = repr(float(f"{value:.5g}"))
+    mantissa, mark, exponent = text.partition("e")
+    return text if not mark or "." in mantissa else f"{mantissa}.0e{exponent}"
 
 
 def _value(model: Model, effect: str, name: str, otherwise: float) -> float:

@@ -116,6 +116,16 @@ def test_controllers_get_the_parameters_they_have_and_are_told_of_the_rest() -> 
     assert "lateral_skid" in text.splitlines()[1]
 
 
+def test_controllers_get_doubles_where_they_declare_doubles() -> None:
+    """ROS 2 refuses `1` for a parameter declared as a double."""
+    limits = (find_effect("body_speed_limit")(limit=2.0), find_effect("body_turn_limit")(limit=1.0))
+    text = export_ros2_control(ModelFile(Model(HUSKY, (find_effect("effective_track")(k=2.0), *limits))))
+    values = [line.split(": ")[1] for line in text.splitlines() if ": " in line and not line.startswith("#")]
+    numbers = [number for value in values for number in value.strip("[]").split(", ")]
+    assert len(numbers) == 15
+    assert all("." in number for number in numbers)
+
+
 def test_json_holds_no_number_that_json_does_not_know() -> None:
     file = ModelFile(Model(HUSKY, (find_effect("body_speed_limit")(), find_effect("turn_droop")())))
     content = json.loads(export_json(file))

@@ -62,6 +62,13 @@ def test_a_model_is_made_grown_asked_about_another_run_and_exported(folder: Path
     assert written["effect"][0]["k"]["value"] == pytest.approx(track["value"], rel=1e-4)
     assert len(written["fit"]["runs"][0]["sha256"]) == 64
 
+    asleep = run_slip("model", "add", model, "drive_lag", *on)
+    assert "not fitted, acts between command and wheels:  drive_lag (--input command)" in asleep.stdout
+    floors = [line for line in asleep.stdout.splitlines() if line.startswith("noise floor")]
+    assert len(floors) == 2
+    assert floors[0] == floors[1]
+    run_slip("model", "drop", model, "drive_lag", *on)
+
     dropped = run_slip("model", "drop", model, "lateral_drift", *on)
     assert "before" in dropped.stdout
     assert "noise floor" in dropped.stdout
