@@ -53,8 +53,14 @@ def _describe_head(summary: Summary) -> list[str]:
     holes = _describe_gaps(gaps[0]) if gaps else ""
     segments = cast("int", summary["segments"])
     head.append(_row("log", f"{state}{holes}, {segments} segment{'s' if segments != 1 else ''}"))
-    head += [_row("  lost", str(loss["text"])) for loss in losses[:_SHOWN]]
+    head += [_row("  lost", _describe_loss(loss)) for loss in losses[:_SHOWN]]
     return head
+
+
+def _describe_loss(loss: Mapping[str, object]) -> str:
+    start, end = loss.get("start_s"), loss.get("end_s")
+    known = isinstance(start, (int, float)) and isinstance(end, (int, float))
+    return f"{loss['text']}" + (f" ({start:.1f} to {end:.1f} s of the log)" if known else "")
 
 
 def _describe_gaps(found: Mapping[str, object]) -> str:

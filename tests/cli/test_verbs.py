@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from pipeline.cli import main
+from pipeline.cli.screen import describe_run
 from pipeline.logs import LogWriter
 from pipeline.simulate import simulate_case
 
@@ -164,6 +165,25 @@ def test_usage_errors_exit_2(arguments: tuple[str, ...], tmp_path: Path) -> None
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_loss_is_shown_with_the_time_it_took() -> None:
+    summary = {
+        "run": "field/a",
+        "vehicle": "husky_a200",
+        "terrain": "tile",
+        "segments": 2,
+        "log": {
+            "duration_s": 90.0,
+            "losses": [
+                {"text": "chunk of 9 bytes at 70", "start_s": 72.70, "end_s": 96.94},
+                {"text": "the file breaks off", "start_s": None, "end_s": None},
+            ],
+        },
+    }
+    lines = describe_run(summary, unchanged=False).splitlines()
+    assert lines[2].endswith("chunk of 9 bytes at 70 (72.7 to 96.9 s of the log)")
+    assert lines[3].endswith("the file breaks off")
 
 
 def test_an_interval_beside_the_poses_is_named_as_what_is_wrong(field: Path, tmp_path: Path) -> None:
