@@ -54,6 +54,7 @@ def describe_run(diagnosis: RunDiagnosis) -> str:
 def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
     rows: list[str] = []
     falls = _list_falls(diagnosis)
+    width = max((len(_values(effect)) for effect in diagnosis.effects), default=0) + 2
     for effect in diagnosis.effects:
         notes = []
         if effect.equivalent_to:
@@ -63,7 +64,7 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
         if effect.tentative:
             notes.append("tentative")
         note = f"  ({'; '.join(notes)})" if notes else ""
-        rows.append(f"{effect.id:<20}{_values(effect):<34}{falls.get(effect.id, '')}{note}")
+        rows.append(f"{effect.id:<20}{_values(effect):<{width}}{falls.get(effect.id, '')}{note}")
     rows += [
         f"{'undecided':<20}{' or '.join(item.candidates)}: {item.separate_by}" for item in diagnosis.undecided
     ]
