@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 _LOOKED_AT = 6
 _AS_GOOD = 0.01
 _ALIKE = 0.7
+# Both effects were found worth a name: between two of that kind less evidence decides than for a new one.
+_DECIDED_T = 1.6
+_NEVER = 0.02
 # Effects that hold the key as a special case explain whatever it explains.
 _HOLDS: dict[str, frozenset[str]] = {
     "drive_lag": frozenset({"turn_lag"}),
@@ -61,7 +64,8 @@ def find_undecided(arena: Arena, final: Contender) -> list[Undecided]:
 def _is_as_good(arena: Arena, final: Contender, rival: Contender) -> bool:
     if arena.metric.loss(rival.held) < (1.0 + _AS_GOOD) * arena.metric.loss(final.held):
         return True
-    return not arena.judge(rival, final).accepts()
+    verdict = arena.judge(rival, final)
+    return verdict.gain < _AS_GOOD or verdict.t < _DECIDED_T
 
 
 def _does_the_same(arena: Arena, without: Contender, final: Contender, rival: Contender) -> bool:
@@ -75,6 +79,11 @@ def _does_the_same(arena: Arena, without: Contender, final: Contender, rival: Co
 
 def _is_larger(arena: Arena, name: str, effect: Effect) -> bool:
     """Whether an effect fits as well only by more numbers, or by holding the other as a special case."""
+    largest = arena.largest
+    one_way = min(largest.speed, largest.turn) < _NEVER * max(largest.speed, largest.turn)
+    if one_way and {name, effect.id} <= {"drive_lag", "turn_lag"}:
+        # Driven straight only, or turned on the spot only, one lag cannot be told from two.
+        return False
     if name in _HOLDS.get(effect.id, frozenset()):
         return True
     rival = next(c for c in arena.candidates if c.id == name)
