@@ -12,7 +12,7 @@ from pipeline.diagnosis import leftover
 from pipeline.diagnosis.diagnosis import Named, RunDiagnosis, Value
 from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.naming_rules import join_classes, list_equivalents
-from pipeline.diagnosis.plausibility import find_implausible
+from pipeline.diagnosis.plausibility import find_implausible, is_large_enough
 from pipeline.diagnosis.rating import rate_effects
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.where import map_errors, pick_regions
@@ -156,7 +156,12 @@ def _describe(
     gain, selected = _measure_gain(effect, way)
     fitted = effect
     if judgement is not None and effect.id in judgement.fitted.model:
-        fitted = judgement.fitted.model.effect(effect.id)
+        joint = judgement.fitted.model.effect(effect.id)
+        # Where the whole way from command to body has no room for it, its own way's number is what was found.
+        if is_large_enough(joint):
+            fitted = joint
+        else:
+            estimates = None
     return Named(
         id=effect.id,
         parameters=_list_values(fitted, estimates),

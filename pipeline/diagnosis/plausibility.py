@@ -60,6 +60,7 @@ _PLAUSIBLE: Mapping[tuple[str, str], tuple[float, float]] = {
     ("understeer", "K"): (-0.02, 0.5),
     ("yaw_misalignment", "psi"): (-0.35, 0.35),
     ("heading_skew", "d"): (-0.3, 0.4),
+    ("clock_offset", "d"): (-0.6, 0.6),
 }
 # What only ever takes motion away: the other sign is no physics, but a clock or chance.
 _ONE_SIGN: Mapping[str, str] = {
@@ -84,10 +85,11 @@ def is_nameable(effect: Effect, largest: Largest, least_delay: float = 0.0) -> b
         largest: what the run asked for.
         least_delay: delays and lags below it are a matter of sampling [s].
     """
-    return _is_large_enough(effect, least_delay) and _is_itself(effect, largest, least_delay)
+    return is_large_enough(effect, least_delay) and _is_itself(effect, largest, least_delay)
 
 
-def _is_large_enough(effect: Effect, least_delay: float) -> bool:
+def is_large_enough(effect: Effect, least_delay: float = 0.0) -> bool:
+    """Whether an effect is more than stamps, mounting and rounding make of nothing."""
     for (name, parameter), least in _LEAST.items():
         size = abs(effect.values[parameter]) if effect.id == name else math.inf
         if size < least or (effect.id in _LATE and size < least_delay):
