@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 RATE = 20.0
 STEP_S = 6.0
 _INPUTS = pl.Enum(["command", "measured"])
+_WITHOUT_MODEL = [
+    pl.lit(None, pl.Float64).alias(column) for column in ("model_x", "model_y", "model_w", "residual_modulus")
+]
 _SUBSETS = pl.Enum(["all", "transitory", "steady"])
 
 
@@ -77,7 +80,7 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
                     "modulus": share * modulus,
                     "suspect": np.zeros(count, dtype=bool),
                 }
-            ).with_columns(pl.lit(name).cast(_INPUTS).alias("input"))
+            ).with_columns(pl.lit(name).cast(_INPUTS).alias("input"), *_WITHOUT_MODEL)
         )
     slip = pl.concat(parts)
     tables = {
@@ -162,6 +165,7 @@ def _aggregate(slip: pl.DataFrame, run: Run) -> pl.DataFrame:
         pl.col("input").cast(_INPUTS),
         pl.col("subset").cast(_SUBSETS),
         pl.col("largest_kinetic_energy").cast(pl.Float64),
+        pl.lit(None, pl.Float64).alias("median_residual_modulus"),
     )
 
 

@@ -50,7 +50,7 @@ def test_scores_tell_named_undecided_missed_and_false_apart() -> None:
 def test_intervals_of_rates_are_wilson() -> None:
     low, high = wilson(80, 80)
     assert low == pytest.approx(0.954, abs=1e-3)
-    assert high == 1.0
+    assert high == pytest.approx(1.0)
 
 
 def test_the_command_line_names_a_hidden_effect_as_a_user_would_see_it() -> None:
