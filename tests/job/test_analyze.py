@@ -173,7 +173,7 @@ def test_a_failing_stage_leaves_nothing(out: Path, tmp_path: Path) -> None:
     config = tmp_path / "run.toml"
     config.write_text("[[interval]]\nstart_s = 900\nend_s = 1000\n")
 
-    with pytest.raises(StageError, match="falls together with a pose"):
+    with pytest.raises(StageError, match="no pose falls into the intervals"):
         analyze(log, out, config=config)
     assert Store(out).runs() == ()
     assert list(out.rglob("*.parquet")) == []

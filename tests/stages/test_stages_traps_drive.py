@@ -117,7 +117,7 @@ def test_trap_8_intervals_by_time_and_by_state(drive: TakeThrough) -> None:
     [
         ({"topic": "/drive/calib_state", "equals": "never said"}, "no_interval"),
         ({"start_s": 9.0, "end_s": 3.0}, "bad_interval"),
-        ({"start_s": 1e6}, "no_command"),
+        ({"start_s": 1e6}, "empty_interval"),
     ],
 )
 def test_trap_8_an_interval_without_anything_in_it_is_an_error(
