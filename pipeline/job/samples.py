@@ -23,19 +23,8 @@ def read_moduli(material: Material, input_name: str) -> dict[str, Samples]:
         material: the runs.
         input_name: `command` or `measured`.
     """
-    frame = (
-        material.scan("slip")
-        .filter(
-            pl.col("input") == input_name,
-            ~pl.col("suspect"),
-            pl.col("modulus").is_finite(),
-            pl.col("run").is_in(list(material.manifests)),
-        )
-        .select("run", "t", "segment", "step", "modulus")
-        .collect()
-    )
-    parts = frame.partition_by("run", as_dict=True, maintain_order=True)
-    return {str(run): _take_samples(part) for (run,), part in parts.items() if part.height >= _FEWEST}
+    parts = _split_by_run(material, "slip", input_name, time="t", value="modulus")
+    return {run: _take_samples(part) for run, part in parts.items()}
 
 
 def read_norms(material: Material, input_name: str) -> dict[str, Samples]:
@@ -45,19 +34,27 @@ def read_norms(material: Material, input_name: str) -> dict[str, Samples]:
         material: the runs.
         input_name: `command` or `measured`.
     """
+    parts = _split_by_run(material, "windows", input_name, time="t_start", value="window_norm")
+    return {run: _take_windows(part) for run, part in parts.items()}
+
+
+def _split_by_run(
+    material: Material, table: str, input_name: str, *, time: str, value: str
+) -> dict[str, pl.DataFrame]:
+    """Rows of a table on one input by run: suspect ones and numbers that are none left out."""
     frame = (
-        material.scan("windows")
+        material.scan(table)
         .filter(
             pl.col("input") == input_name,
             ~pl.col("suspect"),
-            pl.col("window_norm").is_finite(),
+            pl.col(value).is_finite(),
             pl.col("run").is_in(list(material.manifests)),
         )
-        .select("run", "t_start", "segment", "step", "window_norm")
+        .select("run", time, "segment", "step", value)
         .collect()
     )
     parts = frame.partition_by("run", as_dict=True, maintain_order=True)
-    return {str(run): _take_windows(part) for (run,), part in parts.items() if part.height >= _FEWEST}
+    return {str(run): part for (run,), part in parts.items() if part.height >= _FEWEST}
 
 
 def follow_published_runs(

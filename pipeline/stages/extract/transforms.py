@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.logs import LogError, TopicColumns, TransformBuffer, TransformSeries
 from pipeline.stages.errors import StageError
-from pipeline.stages.extract.localization import move_to_base
+from pipeline.stages.extract.localization import move_to_base, normalize_quaternions
 from pipeline.stages.extract.reading import PoseArrays
 from pipeline.stages.finding import Finding
 from pipeline.vehicles.topics import TRANSFORM_TYPES, plain_type
@@ -115,11 +115,11 @@ def to_base_link(
             "they were taken as poses of base_link (a lever arm would look like lateral slip in turns)"
         )
         return arrays, [Finding("child_frame", "warning", text, where=topic)]
-    good = np.isfinite(arrays.quaternion).all(axis=1) & (np.linalg.norm(arrays.quaternion, axis=1) > 1e-6)  # noqa: PLR2004 - not a zero quaternion
-    unit = arrays.quaternion[good] / np.linalg.norm(arrays.quaternion[good], axis=1, keepdims=True)
+    # What is wrong with an orientation is said where the track is cut.
+    unit, good, _ = normalize_quaternions(arrays.quaternion, topic)
     position, quaternion = arrays.position.copy(), arrays.quaternion.copy()
     position[good], quaternion[good] = move_to_base(
-        arrays.position[good], unit, offset.position[0], offset.quaternion[0]
+        arrays.position[good], unit[good], offset.position[0], offset.quaternion[0]
     )
     text = f"{topic} gives poses of {child!r}: moved to base_link through the static transforms"
     moved = PoseArrays(position, quaternion, arrays.parent, base)
