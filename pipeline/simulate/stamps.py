@@ -17,10 +17,13 @@ Stamps = NDArray[np.int64]
 def stamp_times(clock: Clock, time_s: Floats) -> Stamps:
     """Nanoseconds that the clock shows at true times since the run's start [s], shape (n,).
 
-    A clock that shows less than zero shows zero: stamps are unsigned.
+    A clock that was set before the run began counts from its own time before the run, too: a pose that is
+    stamped early is a few moments older than the run. A clock that shows less than zero shows zero: stamps
+    are unsigned.
     """
     elapsed = np.rint(time_s * 1e9).astype(np.int64)
-    shown = np.where(time_s < clock.unset_s, elapsed, clock.start_ns + elapsed)
+    unset = (time_s < clock.unset_s) & (clock.unset_s > 0.0)
+    shown = np.where(unset, elapsed, clock.start_ns + elapsed)
     gone_back = time_s >= clock.backward_at_s
     shown = np.where(gone_back, shown - round(clock.backward_s * 1e9), shown)
     return np.maximum(shown, 0)

@@ -208,6 +208,13 @@ def test_clock_may_start_unset_and_go_back(tmp_path: Path) -> None:
     assert twice == pytest.approx(60, abs=2)
 
 
+def test_a_pose_stamped_before_the_start_is_a_moment_older_than_the_run(tmp_path: Path) -> None:
+    early = replace(SHORT, effects={"clock_offset": -0.3})
+    _, topics = record(early, tmp_path / "a.mcap")
+    stamps = np.array([m.stamp_ns for m in topics["/mapping/icp_odom"]])
+    assert stamps.min() == pytest.approx(START_NS - 0.3e9, abs=1e7)
+
+
 def test_a_clock_at_zero_is_written(tmp_path: Path) -> None:
     _, topics = record(replace(SHORT, clock=Clock(start_ns=0)), tmp_path / "a.mcap")
     assert topics["/mapping/icp_odom"][0].stamp_ns == 0
