@@ -121,7 +121,7 @@ export class Pane {
       this.warn(run),
       h("div", { class: "numbers" }, number("t", "m", "position after 2 s"), number("r", "rad", "heading after 2 s")),
       h("div", { class: "scale" },
-        h("div", { class: "track", role: "img" }, h("i", { class: "now" }), h("i", { class: "floor" })),
+        h("div", { class: "track", role: "img" }, h("i", { class: "now" }), h("i", { class: "floor" }), h("i", { class: "ceiling" })),
         h("p", { class: "ends" }, h("span", { class: "floor-said" }), h("span", { class: "ideal-said" }))),
       h("p", { class: "where" }),
       h("div", { class: "tools" },
@@ -162,7 +162,7 @@ export class Pane {
     track.setAttribute("aria-label", `error ${say(errors.t)} m of ${say(ideal.t)} m for the ideal model`);
     this.hero.querySelector(".floor-said").textContent = floor ? `floor at most ${say(floor.t)} m` : "";
     this.hero.querySelector(".ideal-said").textContent =
-      `ideal model ${say(ideal.t)} m${byHand ? " · values set by hand, not fitted" : ""}`;
+      `ceiling: the ideal model, ${say(ideal.t)} m${byHand ? " · values set by hand, not fitted" : ""}`;
   }
 
   async switchInput(name) {

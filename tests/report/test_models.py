@@ -78,6 +78,8 @@ def test_the_staircase_names_what_each_rung_adds() -> None:
     assert rows["ladder"]["step"].to_list() == ["ideal", "+ effective_track", "+ drive_lag"]
     assert rows["ladder"]["t"].to_list() == [1.06, 0.44, 0.31]
     assert rows["ladder_floor"]["t"].to_list() == [0.19]
+    assert rows["ladder_ceiling"]["t"].to_list() == [1.06]
+    assert rows["ladder_ceiling"]["label"].to_list() == ["ceiling 1.06 m"]
 
 
 def test_a_diagnosis_becomes_the_model_it_names() -> None:

@@ -25,10 +25,15 @@ _SCHEMA = {
     "series": pl.String,
 }
 _ROOM = 2.1
+_NAME_HEIGHT = 15
 
 
 def draw_ladder(scene: Scene) -> Drawing | None:
-    """A staircase: one bar a rung, the longest on top; the floor as a dashed line."""
+    """A staircase: one bar a rung, the longest on top, between the ceiling and the floor as dashed lines.
+
+    The ceiling is the error of the ideal model, the floor what no model could remove: what can be explained
+    lies between them, and `explained_share` counts from the one to the other.
+    """
     rows = list_rungs(scene)
     if rows["ladder"].is_empty():
         return None
@@ -48,25 +53,36 @@ def draw_ladder(scene: Scene) -> Drawing | None:
     )
     base = alt.Chart(alt.NamedData("ladder")).encode(y=y)
     bars = base.mark_bar(clip=True).encode(x=x, color=alt.Color("series:N", scale=scale, legend=None))
-    words = base.mark_text(align="left", dx=6, color=theme.INK, fontSize=11).encode(
-        x=alt.X("t:Q"), text="told:N"
+    words = base.mark_text(align="left", dx=6, fontSize=11).encode(x=alt.X("t:Q"), text="told:N")
+    halo = words.mark_text(align="left", dx=6, fontSize=11, stroke=theme.PAPER, strokeWidth=4)
+    # The floor lies left of the ceiling: named one row higher, neither line crosses the other's name.
+    bounds = [*_draw_bound("ladder_ceiling", "ceiling", 1), *_draw_bound("ladder_floor", "floor", 2)]
+    chart = alt.layer(bars, *bounds, halo, words).properties(
+        width=480, height=alt.Step(30), usermeta={"gutter": 130}
     )
-    floor = (
-        alt.Chart(alt.NamedData("ladder_floor"))
-        .mark_rule(color=theme.INK, strokeDash=[4, 3], strokeWidth=1.5)
-        .encode(x="t:Q", tooltip=[alt.Tooltip("told:N", title="floor")])
-    )
-    chart = alt.layer(bars, floor, words).properties(width=480, height=alt.Step(30), usermeta={"gutter": 130})
-    note = (
-        "Dashed: the noise floor, the error that no model could remove."
-        if rows["ladder_floor"].height
-        else ""
-    )
+    note = "Ceiling: the ideal model."
+    if rows["ladder_floor"].height:
+        note += " Floor: the error that no model could remove. What can be explained lies between them."
     return Drawing(chart, rows, note)
 
 
+def _draw_bound(name: str, word: str, row: int) -> list[alt.Chart]:
+    """A dashed line over all rungs and its name above them, in the given row of names."""
+    top = -_NAME_HEIGHT * row
+    base = alt.Chart(alt.NamedData(name)).encode(x="t:Q")
+    line = base.mark_rule(color=theme.INK, strokeDash=[4, 3], strokeWidth=1.5).encode(
+        y=alt.value(top),
+        y2=alt.value("height"),
+        tooltip=[alt.Tooltip("told:N", title=word)],
+    )
+    label = base.mark_text(align="left", baseline="top", dx=5, fontSize=11).encode(
+        y=alt.value(top), text="label:N"
+    )
+    return [line, label]
+
+
 def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Rows of the staircase: ``rung step t told series``, and the floor's ``t told``."""
+    """Rows of the staircase: ``rung step t told series``; the ceiling's and the floor's ``t told label``."""
     rungs, floor = _find_ladder(scene)
     rows = []
     before: Sequence[object] = ()
@@ -87,12 +103,18 @@ def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
                 "series": "model" if effects else "ideal",
             }
         )
-    lowest = number_in(floor, "t_mrmse_m")
-    floors = [] if lowest is None else [{"t": lowest, "told": f"{say_number(lowest)} m"}]
+    highest = number_in(rungs[0], "t_mrmse_m") if rungs else None
     return {
         "ladder": pl.DataFrame(rows, schema=_SCHEMA),
-        "ladder_floor": pl.DataFrame(floors, schema={"t": pl.Float64, "told": pl.String}),
+        "ladder_ceiling": _list_bound("ceiling", highest),
+        "ladder_floor": _list_bound("floor", number_in(floor, "t_mrmse_m")),
     }
+
+
+def _list_bound(word: str, size: float | None) -> pl.DataFrame:
+    told = f"{say_number(size)} m"
+    rows = [] if size is None else [{"t": size, "told": told, "label": f"{word} {told}"}]
+    return pl.DataFrame(rows, schema={"t": pl.Float64, "told": pl.String, "label": pl.String})
 
 
 def name_input(scene: Scene) -> str:
@@ -115,11 +137,13 @@ def describe_ladder(scene: Scene) -> str:
     """Every rung with its errors."""
     rows = list_rungs(scene)
     told = "; ".join(f"{row['step']}: {row['told']}" for row in rows["ladder"].iter_rows(named=True))
-    floor = "".join(
-        f" The noise floor is {row['told']}." for row in rows["ladder_floor"].iter_rows(named=True)
+    bounds = "".join(
+        f" The {word} is {row['told']}."
+        for word, name in (("ceiling, the ideal model,", "ladder_ceiling"), ("noise floor", "ladder_floor"))
+        for row in rows[name].iter_rows(named=True)
     )
     words = INPUT_WORDS.get(name_input(scene), "")
-    return f"Error of two-second predictions {words} on data not seen. {told}.{floor}"
+    return f"Error of two-second predictions {words} on data not seen. {told}.{bounds}"
 
 
 FIGURE = Figure(
