@@ -1,9 +1,10 @@
-"""The noise floor: what is left of the error when a flexible function of the inputs has taken all it can.
+"""The noise floor: the part of the error that is noise of the poses and random motion.
 
 A localization that wanders for seconds cannot be told from motion by its high frequencies, and a jittery one
-is far worse than they say. So the floor is measured the other way round: whatever of a model's residuals can
+is far worse than they say. So the floor is measured the other way round. Whatever of a model's residuals can
 be predicted from commands or wheels, lagged, multiplied and turned into the map, could be removed by some
-model; the rest could not.
+model. Of the rest, what lasts longer than a second is motion that something must have caused, even where
+nothing that was recorded tells what; noise and random motion are what remains.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.motion.forward import Timing
+from pipeline.motion.persistence import split_residuals
 from pipeline.motion.score import HeldOut, assign_folds, list_training, measure_errors
 
 if TYPE_CHECKING:
@@ -31,10 +33,11 @@ _CLIP = 4.0
 
 
 def estimate_floor(problem: Problem, held_out: HeldOut) -> Errors:
-    """The error that no model fed with this input could remove, as far as these runs tell.
+    """The error that would stay if the cause of everything that lasts were known, as far as these runs tell.
 
     A ridge regression of the held-out residuals on functions of the input, fitted with the same blocks and
-    gaps, removes what is predictable; the predictions of two seconds shrink in the same proportion.
+    gaps, removes what is predictable; what remains is divided by how long it lasts (see `persistence`). The
+    predictions of two seconds shrink as the same parts do when they are added up over that time.
 
     Args:
         problem: the runs.
@@ -45,6 +48,30 @@ def estimate_floor(problem: Problem, held_out: HeldOut) -> Errors:
     """
     residuals = held_out.residuals
     known: Flags = np.asarray(np.isfinite(residuals).all(axis=1))
+    left = _remove_predictable(problem, residuals, known)
+    makeup = split_residuals(problem.comparisons, left)
+    square = np.mean(left[known] ** 2, axis=0)
+    floor = square * [1.0 - part.lasting_share for part in makeup]
+    # Positions of predictions err by both speeds, and by a heading that errs on the way.
+    before = np.sqrt(np.mean(residuals[known] ** 2, axis=0))
+    predictable = square / np.maximum(before**2, 1e-24)
+    after = np.linspace(0.25, 2.0, 8)
+    whole = np.array([part.spread_after(after, lasting=True).mean() for part in makeup])
+    noise = np.array([part.spread_after(after, lasting=False).mean() for part in makeup])
+    whole /= np.maximum(predictable, 1e-12)
+    speed = np.concatenate([_measure_speed(comparison) for comparison in problem.comparisons])
+    lever = 0.3 * np.mean((speed * after.mean()) ** 2)
+    weights = np.array([1.0, 1.0, lever])
+    along = np.sqrt(min(float(weights @ noise) / max(float(weights @ whole), 1e-24), 1.0))
+    around = np.sqrt(min(float(noise[2]) / max(float(whole[2]), 1e-24), 1.0))
+    shrink = np.sqrt(floor / np.maximum(square, 1e-24))
+    position = np.concatenate(held_out.position) * along
+    yaw = np.concatenate(held_out.yaw) * around
+    return replace(measure_errors(left[known] * shrink, position, yaw), windows=int(known.sum()))
+
+
+def _remove_predictable(problem: Problem, residuals: Floats, known: Flags) -> Floats:
+    """Residuals without what a regression on the inputs predicts of them, where that makes them smaller."""
     features = np.concatenate([describe_inputs(comparison) for comparison in problem.comparisons])
     fold = assign_folds(problem)
     left = residuals.copy()
@@ -54,15 +81,14 @@ def estimate_floor(problem: Problem, held_out: HeldOut) -> Errors:
         size = np.sqrt(np.mean(rest[known] ** 2, axis=0))
         better = size < best
         left[:, better], best[better] = rest[:, better], size[better]
-    share = best / np.maximum(np.sqrt(np.mean(residuals[known] ** 2, axis=0)), 1e-12)
-    # Position errors come from both speeds, and from yaw through the way driven: the yaw errors' part is
-    # small beside them at the floor.
-    along = np.sqrt(
-        np.sum(best[:2] ** 2) / np.maximum(np.sum(np.mean(residuals[known, :2] ** 2, axis=0)), 1e-24)
-    )
-    position = np.concatenate(held_out.position) * along
-    yaw = np.concatenate(held_out.yaw) * share[2]
-    return replace(measure_errors(left[known], position, yaw), windows=int(known.sum()))
+    return left
+
+
+def _measure_speed(comparison: Comparison) -> Floats:
+    """Forward speed of the input at the middle of every window [m/s], shape (n,)."""
+    velocity = comparison.predict_velocity((), Timing())
+    middle = comparison.windows.times.mean(axis=1) - comparison.usual_delay
+    return np.asarray(np.interp(middle, comparison.surroundings.times, velocity.x), dtype=np.float64)
 
 
 def describe_inputs(comparison: Comparison) -> Floats:

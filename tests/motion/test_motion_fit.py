@@ -187,6 +187,32 @@ def test_the_floor_is_the_true_model_s_error_under_slow_localization_noise(sourc
     assert np.allclose(floor.ratios(true), 1.0, atol=0.15)
 
 
+def test_the_floor_is_one_number_whatever_model_it_is_taken_from() -> None:
+    truth = {"effective_track": 1.8, "drive_lag": 0.3, "icr_offset": 0.1}
+    run = simulate(truth, duration_s=200.0, pose=WANDERING, disturbance=Disturbance(0.03, 0.05))
+    problem = Problem([run], HUSKY, Input.MEASURED)
+    rungs = climb(problem, model_of("effective_track", "icr_offset")).rungs
+    floors = [estimate_floor(problem, rung.held_out) for rung in rungs]
+    for floor in floors[:-1]:
+        assert np.allclose(floor.ratios(floors[-1])[:3], 1.0, atol=0.15)
+
+
+def test_motion_that_lasts_is_no_noise_though_nothing_recorded_tells_of_it() -> None:
+    truth = {"effective_track": 1.8}
+    floors = []
+    for unseen in (Disturbance(), Disturbance(0.1, 0.1, correlation_s=4.0)):
+        run = simulate(truth, duration_s=300.0, pose=WANDERING, disturbance=unseen)
+        problem = Problem([run], HUSKY, Input.MEASURED)
+        held_out = hold_out(problem, fit_model(problem, model_of(*truth)))
+        floors.append((estimate_floor(problem, held_out), held_out.pooled))
+    (quiet, _), (pushed, error) = floors
+    assert np.all(np.array(error.ratios(quiet)) > 3.0)
+    x, y, _, position, _ = pushed.ratios(quiet)
+    assert np.allclose((x, y, position), 1.0, atol=0.3)
+    # A gyro's noise is so small that beside such motion only its bound can be given.
+    assert np.all(np.array(pushed.ratios(error)) < 0.3)
+
+
 def test_predictions_begin_at_measured_poses_and_follow_the_true_motion() -> None:
     run = simulate({"effective_track": 1.8, "drive_lag": 0.3}, duration_s=60.0, disturbance=Disturbance())
     model = Model(HUSKY, (find_effect("effective_track")(k=1.8), find_effect("drive_lag")(tau=0.3)))
