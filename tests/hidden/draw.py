@@ -48,6 +48,22 @@ DIFFERENTIAL = (
     "yaw_misalignment", "lever_arm", "clock_offset",
 )  # fmt: skip
 CAR = ("steering_offset", "steering_gain", "steering_lag", "understeer")
+EMPTY = ("plain", "jumps", "noisy", "tilted")
+MACHINERY = ("track", "payload", "small_wheels", "slope", "slow_motors")
+_CARS = 0.1
+# On top of these two an equipped vehicle has one effect more, or nothing.
+_EQUIPMENT = ("effective_track", "drive_lag")
+_MORE = tuple(name for name in DIFFERENTIAL if name not in {*_EQUIPMENT, "turn_lag"})
+_POOR = tuple(name for name in DIFFERENTIAL if name != "slope_drift")
+POOLS: dict[str, tuple[str, ...]] = {
+    "single": DIFFERENTIAL + CAR,
+    "small": DIFFERENTIAL + CAR,
+    "equipped": (*_MORE, "nothing"),
+    "empty": EMPTY,
+    "poor": _POOR + CAR,
+    "odd": tuple(sorted(ODD)),
+    "rigid": MACHINERY,
+}
 
 
 @dataclass(frozen=True)
@@ -86,14 +102,15 @@ def draw_riddle(category: Category, seed: int, effect: str | None = None) -> Rid
     Args:
         category: kind of riddle.
         seed: from which everything is drawn.
-        effect: for singles, the effect; drawn when None.
+        effect: one of the category's `POOLS`: the effect, the kind of empty log, the odd physics, the
+            machine; drawn when None.
     """
     maker: dict[Category, Callable[[np.random.Generator, int, str | None], Riddle]] = {
         "single": partial(_draw_single, category="single", share=1.0),
         "small": partial(_draw_single, category="small", share=0.4),
         "equipped": _draw_equipped,
         "sets": lambda g, s, _e: _draw_set(g, s),
-        "empty": lambda g, s, _e: _draw_empty(g, s),
+        "empty": _draw_empty,
         "poor": _draw_poor,
         "odd": _draw_odd,
         "rigid": _draw_rigid,
@@ -172,7 +189,7 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
 
 def _draw_scene(draw: np.random.Generator, seed: int, effect: str | None = None) -> Scenario:
     """Everything but the riddle itself."""
-    car = effect in CAR or (effect in {"drive_lag", "wheel_radius", "time_drift"} and draw.random() < 0.1)
+    car = effect in CAR or (effect in {"drive_lag", "wheel_radius", "time_drift"} and draw.random() < _CARS)
     name = "car" if car else str(draw.choice(["husky", "husky", "warthog", "jackal", "marmotte"]))
     vehicle = VEHICLES[name]
     layouts = [key for key, item in LAYOUTS.items() if item.kind == vehicle.kind]
@@ -256,21 +273,23 @@ def _draw_set(draw: np.random.Generator, seed: int) -> Riddle:
 
 
 def _draw_equipped(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:
-    """A vehicle that already has effective track and drive lag, and one thing more."""
-    pool = [name for name in DIFFERENTIAL if name not in {"effective_track", "drive_lag", "turn_lag"}]
-    chosen = effect or str(draw.choice(pool))
+    """A vehicle that already has effective track and drive lag, and one thing more, or nothing."""
+    chosen = effect or str(draw.choice(_MORE))
     scene = _excite(_draw_scene(draw, seed), chosen, draw)
     asked = {
         "effective_track": {"k": float(draw.uniform(1.4, 1.9))},
         "drive_lag": {"tau": float(draw.uniform(0.3, 0.7))},
-        chosen: draw_size(chosen, scene, 1.0, draw),
     }
-    return Riddle(replace(scene, effects=asked), Answer("equipped", asked, program=scene.program.name))
+    if chosen != "nothing":
+        asked[chosen] = draw_size(chosen, scene, 1.0, draw)
+    answer = Answer("equipped", asked, program=scene.program.name, note=chosen)
+    return Riddle(replace(scene, effects=asked), answer)
 
 
-def _draw_empty(draw: np.random.Generator, seed: int) -> Riddle:
-    scene = _draw_scene(draw, seed)
-    kind = ("plain", "jumps", "noisy", "tilted")[int(draw.integers(4))]
+def _draw_empty(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:
+    car = CAR[0] if draw.random() < _CARS else None
+    scene = _draw_scene(draw, seed, car)
+    kind = effect or str(draw.choice(EMPTY))
     if kind == "jumps":
         scene = replace(scene, pose=replace(scene.pose, jumps=6))
     elif kind == "noisy":
@@ -281,9 +300,11 @@ def _draw_empty(draw: np.random.Generator, seed: int) -> Riddle:
 
 
 def _draw_poor(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:
-    chosen = effect or str(draw.choice([name for name in DIFFERENTIAL if name != "slope_drift"]))
-    scene = _draw_scene(draw, seed)
-    program = str(draw.choice(["straight", "circle", "spins"]))
+    chosen = effect or str(draw.choice(_POOR))
+    scene = _draw_scene(draw, seed, chosen if chosen in CAR else None)
+    # A car cannot spin on the spot.
+    ways = ["straight", "circle"] if scene.vehicle.kind == "ackermann" else ["straight", "circle", "spins"]
+    program = str(draw.choice(ways))
     scene = replace(scene, program=replace(scene.program, name=program))  # type: ignore[arg-type]
     asked = {chosen: draw_size(chosen, scene, 1.0, draw)}
     return Riddle(replace(scene, effects=asked), Answer("poor", asked, program=program))
@@ -299,8 +320,7 @@ def _draw_odd(draw: np.random.Generator, seed: int, effect: str | None) -> Riddl
 
 
 def _draw_rigid(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:
-    kinds = ("track", "payload", "small_wheels", "slope", "slow_motors")
-    kind = effect or str(draw.choice(kinds))
+    kind = effect or str(draw.choice(MACHINERY))
     scene = _draw_scene(draw, seed)
     name = str(draw.choice(["husky", "warthog"]))
     machine = MACHINES[name]

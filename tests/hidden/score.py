@@ -32,7 +32,6 @@ class Score:
         false: named ids that were not hidden.
         flagged: channel in which structure was called unexplained, empty without.
         errors: 2 s position error before, after, and the floor [m].
-        formula: share by which the held-out error fell with the formula, NaN without one.
     """
 
     truth: tuple[str, ...]
@@ -44,7 +43,6 @@ class Score:
     false: tuple[str, ...]
     flagged: str
     errors: tuple[float, float, float]
-    formula: float
 
     @property
     def is_exact(self) -> bool:
@@ -78,7 +76,7 @@ def score_run(answer: Answer, run: Json) -> Score:
     channel = "".join(map(str, _list(flagged, "channels"))) if isinstance(flagged, Mapping) else ""
     return Score(
         truth, tuple(named), tuple(found), tuple(undecided), tuple(unobservable), tuple(missed),
-        tuple(false), channel, _errors(run), _formula_gain(run),
+        tuple(false), channel, _errors(run),
     )  # fmt: skip
 
 
@@ -149,21 +147,6 @@ def _errors(run: Json) -> tuple[float, float, float]:
     ]
     before, after, least = (float(v) if isinstance(v, int | float) else math.nan for v in values)
     return before, after, least
-
-
-def _formula_gain(run: Json) -> float:
-    """Fall of the summed squared velocity error on the rung of the formula."""
-    ladder = [rung for rung in _list(run, "ladder") if isinstance(rung, Mapping)]
-    named = [rung for rung in ladder if "unexplained" not in _list(rung, "effects")]
-    if not named or len(named) == len(ladder):
-        return math.nan
-    before, after = named[-1], ladder[-1]
-    falls = [
-        1.0 - float(new) / float(old)
-        for old, new in zip(_list(before, "velocity_rms"), _list(after, "velocity_rms"), strict=True)
-        if isinstance(old, int | float) and isinstance(new, int | float) and old > 0.0
-    ]
-    return max(falls, default=math.nan)
 
 
 def _list(content: object, key: str) -> Sequence[object]:

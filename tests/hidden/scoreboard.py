@@ -1,0 +1,222 @@
+"""Records as text: rates with Wilson intervals, confusion tables, times, and every miss with its seed."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+from draw import CATEGORIES
+from records import Record
+from score import confusion_table, describe_rate
+
+# What contact does to any skid-steer made of rigid bodies, beside what was built into it.
+_CONTACT = frozenset(
+    {
+        "effective_track", "icr_offset", "lateral_skid", "body_inertia", "turning_resistance", "speed_slip",
+        "wheel_radius", "drive_lag", "turn_lag", "acceleration_limit",
+    }
+)  # fmt: skip
+_BUILT_IN = {"payload": {"icr_lateral"}, "small_wheels": {"wheel_asymmetry", "icr_lateral"}}
+_WORSE = 1.05
+_FORMULA = 0.02
+_WEAKEST = 0.8
+
+Test = Callable[[Record], bool]
+
+
+def write_scoreboard(records: Iterable[Record]) -> str:
+    """All categories, one after the other."""
+    by_category = _group(records, lambda record: record.job.category)
+    lines: list[str] = []
+    for category in CATEGORIES:
+        if category in by_category:
+            lines += [*describe(category, by_category[category]), ""]
+    return "\n".join(lines)
+
+
+def describe(category: str, played: Sequence[Record]) -> list[str]:
+    """The rates that belong to a category, by kind of riddle, then confusions, times and misses."""
+    played = sorted(played, key=lambda record: (record.job.seed, record.job.effect or ""))
+    lines = [f"== {category}: {len(played)} logs"]
+    counted = played
+    if category == "empty":
+        lines += _rate_all(played, {"nothing named and nothing flagged": is_clean}, "")
+    elif category == "odd":
+        lines += _rate_all(played, {"flagged in the right channel": is_flagged}, "")
+        lines += _rate_all(played, {"the pasted formula lowers the held-out error": has_useful_formula}, "")
+    elif category == "poor":
+        lines += _rate_all(played, {"undecided or unobservable": is_admitted}, "")
+        lines += _rate_all(played, {"undecided, unobservable or rightly named": is_not_missed}, "")
+        lines += _rate_all(played, {"a confident wrong name": has_wrong_name}, "")
+    else:
+        counted = [record for record in played if not record.is_weak]
+        weak = len(played) - len(counted)
+        lines.append(
+            f"{weak} of them too weak to count: an effect lowers the true model's error by less than 5 %"
+        )
+        lines += _rate_all(counted, {"all that is hidden is named": is_found}, "")
+        lines += _rate_all(counted, {"nothing else beside it": lambda r: not has_wrong_name(r)}, "")
+        lines += _rate_all(counted, {"exactly right": is_exact}, "")
+        lines += _rate_all(counted, {f"error within {_WORSE:g} of the true model's": is_as_good}, "")
+        if category == "rigid":
+            extras = [len(list_unphysical(record)) for record in played]
+            lines.append(
+                f"unphysical names beside them: {sum(extras)} in {len(extras)} logs, "
+                f"{7.0 * sum(extras) / len(extras):.2f} in seven"
+            )
+    right = _choose_test(category)
+    lines += _list_kinds(category, counted, right)
+    if category == "odd":
+        lines += _list_kinds(category, counted, has_useful_formula, "a formula that helps, by kind")
+    lines += confusion_table([record.score for record in counted])
+    lines += describe_times(played)
+    failures = [record for record in played if record.outcome != "scored"]
+    lines += [
+        f"{record.outcome}: {record.job.replay}   {record.note.splitlines()[-1:]}" for record in failures
+    ]
+    misses = [record for record in counted if record.outcome == "scored" and not right(record)]
+    lines += [_describe_miss(record) for record in misses]
+    return lines
+
+
+def is_clean(record: Record) -> bool:
+    """Nothing named, nothing flagged."""
+    return record.outcome == "scored" and not record.score.named and not record.score.flagged
+
+
+def is_exact(record: Record) -> bool:
+    """All that was hidden is named, and nothing else."""
+    return record.score.is_exact
+
+
+def is_found(record: Record) -> bool:
+    """All that was hidden is named."""
+    return len(record.score.found) == len(record.score.truth)
+
+
+def has_wrong_name(record: Record) -> bool:
+    """Something is named that was not hidden."""
+    return bool(record.score.false)
+
+
+def is_not_missed(record: Record) -> bool:
+    """What was hidden is named, undecided or unobservable."""
+    return not record.score.missed
+
+
+def is_admitted(record: Record) -> bool:
+    """What was hidden is undecided or unobservable."""
+    return not record.score.missed and not record.score.found
+
+
+def is_flagged(record: Record) -> bool:
+    """Something is unexplained in a channel that the odd physics acts on."""
+    return bool(set(record.score.flagged) & set(record.answer.channel))
+
+
+def has_useful_formula(record: Record) -> bool:
+    """The formula, pasted after what was named, lowers one 2 s error and raises none."""
+    checked = record.checked
+    if checked is None or checked.formula is None or checked.named is None:
+        return False
+    return checked.formula.falls_below(checked.named, _FORMULA) and (
+        checked.formula.ratio(checked.named) <= 1.0 + _FORMULA
+    )
+
+
+def is_as_good(record: Record) -> bool:
+    """The named model's 2 s errors are within 1.05 times the true model's."""
+    checked = record.checked
+    if checked is None or checked.named is None or checked.true is None:
+        return False
+    return checked.named.ratio(checked.true) <= _WORSE
+
+
+def list_unphysical(record: Record) -> list[str]:
+    """Names that neither contact nor what was built into a rigid body explains."""
+    physical = _CONTACT | _BUILT_IN.get(record.answer.note, set())
+    return [name for name in record.score.false if name not in physical]
+
+
+def describe_times(played: Sequence[Record]) -> list[str]:
+    """Wall and CPU time of `slip diagnose` by length of the log, and of the harness round it."""
+    scored = [record for record in played if "ask" in record.wall_s]
+    if not scored:
+        return []
+    lines = [f"{'log':<10}{'logs':>6}{'wall s: median':>16}{'p95':>8}{'CPU s: median':>16}{'p95':>8}"]
+    by_length = _group(scored, lambda record: f"{float(str(record.scene['duration_s'])):.0f} s")
+    rows = [*sorted(by_length.items(), key=lambda item: float(item[0].split()[0])), ("all", scored)]
+    for name, group in rows:
+        wall = np.array([record.wall_s["ask"] for record in group])
+        cpu = np.array([record.cpu_s["ask"] for record in group])
+        lines.append(
+            f"{name:<10}{len(group):>6}{np.median(wall):>16.2f}{np.quantile(wall, 0.95):>8.2f}"
+            f"{np.median(cpu):>16.2f}{np.quantile(cpu, 0.95):>8.2f}"
+        )
+    beside = [
+        f"{part} {np.median([record.wall_s.get(part, 0.0) for record in scored]):.2f} s"
+        for part in ("draw", "check")
+    ]
+    lines.append(f"beside it, medians: {', '.join(beside)}")
+    return lines
+
+
+def _rate_all(played: Sequence[Record], tests: Mapping[str, Test], indent: str) -> list[str]:
+    return [
+        describe_rate(indent + name, sum(test(record) for record in played), len(played))
+        for name, test in tests.items()
+    ]
+
+
+def _choose_test(category: str) -> Test:
+    """What counts as right, where one thing must be chosen for a table."""
+    tests: dict[str, Test] = {"empty": is_clean, "odd": is_flagged, "rigid": is_found}
+    tests["poor"] = lambda record: is_not_missed(record) and not has_wrong_name(record)
+    return tests.get(category, is_exact)
+
+
+def _list_kinds(
+    category: str, played: Sequence[Record], right: Test, about: str = "right, by kind"
+) -> list[str]:
+    """The rate of each kind: effect, set, empty log, manoeuvre, odd physics, machine."""
+    kinds: dict[str, Callable[[Record], str]] = {
+        "empty": lambda record: record.answer.note,
+        "rigid": lambda record: record.answer.note,
+        "odd": lambda record: record.answer.odd,
+        "poor": lambda record: record.answer.program,
+        "equipped": lambda record: record.answer.note or "more",
+    }
+    by_kind = _group(played, kinds.get(category, lambda record: " + ".join(record.score.truth)))
+    if len(by_kind) <= 1:
+        return []
+    lines = [about]
+    for name, group in sorted(by_kind.items()):
+        good = sum(right(record) for record in group)
+        mark = "   <- under 80 %" if good < _WEAKEST * len(group) else ""
+        lines.append(describe_rate(f"  {name}", good, len(group)) + mark)
+    return lines
+
+
+def _describe_miss(record: Record) -> str:
+    score, hidden = record.score, dict(record.answer.effects)
+    told = [f"hidden {hidden or record.answer.odd or 'nothing'}", f"named {list(score.named)}"]
+    if score.undecided:
+        told.append(f"undecided {list(score.undecided)}")
+    if score.unobservable:
+        told.append(f"unobservable {list(score.unobservable)}")
+    if score.flagged:
+        told.append(f"flagged {score.flagged}")
+    if record.checked is not None and record.checked.true and record.checked.named:
+        ratio = record.checked.named.ratio(record.checked.true)
+        if math.isfinite(ratio):
+            told.append(f"error {ratio:.3g} x the true model's")
+    return f"  {record.job.replay}   {record.answer.program}: {', '.join(told)}"
+
+
+def _group(records: Iterable[Record], key: Callable[[Record], str]) -> dict[str, list[Record]]:
+    groups: defaultdict[str, list[Record]] = defaultdict(list)
+    for record in records:
+        groups[key(record)].append(record)
+    return dict(groups)
