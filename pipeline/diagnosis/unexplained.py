@@ -118,6 +118,7 @@ def boost_residuals(arena: Arena, final: Contender, features: Floats) -> Explain
         features: what was recorded, at every window, shape (n, f).
     """
     from sklearn.ensemble import HistGradientBoostingRegressor  # noqa: PLC0415 - heavy
+    from threadpoolctl import threadpool_limits  # noqa: PLC0415 - heavy
 
     problem = arena.problem
     rest = np.clip(arena.metric.weigh(final.held), -6.0, 6.0)
@@ -136,8 +137,10 @@ def boost_residuals(arena: Arena, final: Contender, features: Floats) -> Explain
                 max_iter=_TREES, learning_rate=0.1, max_leaf_nodes=10, min_samples_leaf=25,
                 l2_regularization=5.0, early_stopping=False, random_state=0,
             )  # fmt: skip
-            model.fit(features[train], rest[train, channel])
-            predicted[test, channel] = model.predict(features[test])
+            # Threads that wait for each other on a busy machine cost ten times the work itself.
+            with threadpool_limits(limits=1, user_api="openmp"):
+                model.fit(features[train], rest[train, channel])
+                predicted[test, channel] = model.predict(features[test])
     live = problem.live
     before = (rest[live] ** 2).mean(axis=0)
     after = ((rest - predicted)[live] ** 2).mean(axis=0)
