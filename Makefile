@@ -8,13 +8,13 @@ BIN    := $(VENV)/bin
 OUT    ?= results
 
 # Values reach the shell through its environment, so that a path may hold spaces and quotes.
-export LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT
+export LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT SCORES
 
 # Exit code 3 means done, but the log had losses: they are on the screen, and make has not failed.
 FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: hidden-effect mysteries reveal help analyze batch bench bench-analyze bench-batch bench-reader browser check clean compare format inspect lock samples \
+.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-reader browser check clean compare format inspect lock samples \
 	serve test test-long
 
 help: ## print this list
@@ -61,10 +61,14 @@ samples: $(VENV)/.ready ## make the logs in data_samples again
 	@for case in husky_tile warthog_ice ackermann_gravel; do \
 		$(BIN)/slip simulate $$case --out data_samples/$$case.mcap || exit 1; done
 
-hidden-effect: $(VENV)/.ready-dev ## SEED=7: draw logs by seed, diagnose them, open the answers [CATEGORY=all, EFFECT=, ARGS=]
+hidden-effect: $(VENV)/.ready-dev ## SEED=7: draw logs by seed, diagnose them, open the answers [CATEGORY=all, EFFECT=, SCORES=file, ARGS=]
 	@[ -n "$$SEED" ] || { echo "Say which seed: make hidden-effect SEED=7, or SEED=7-12" >&2; exit 2; }
 	@$(BIN)/python tests/hidden/play.py --category "$${CATEGORY:-all}" --seeds "$$SEED" \
-		$${EFFECT:+--effect "$$EFFECT"} $$ARGS
+		$${EFFECT:+--effect "$$EFFECT"} $${SCORES:+--out "$$SCORES" --resume} $$ARGS
+
+hidden-table: $(VENV)/.ready-dev ## SCORES=scores.jsonl: the score of what was played, without playing more
+	@[ -n "$$SCORES" ] || { echo "Say which: make hidden-table SCORES=scores.jsonl" >&2; exit 2; }
+	@$(BIN)/python tests/hidden/play.py --table "$$SCORES"
 
 mysteries: $(VENV)/.ready-dev ## make the mystery logs in data_samples again, and their seals
 	$(BIN)/python tests/hidden/mystery.py write data_samples
