@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from pipeline.diagnosis import leftover
-from pipeline.diagnosis.diagnosis import Named, RunDiagnosis, Value
+from pipeline.diagnosis.diagnosis import Named, RunDiagnosis
 from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.naming_rules import join_classes, list_equivalents
-from pipeline.diagnosis.plausibility import find_implausible, is_large_enough
+from pipeline.diagnosis.own_way import list_values, measure_values
+from pipeline.diagnosis.plausibility import find_implausible
 from pipeline.diagnosis.rating import rate_effects
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.where import map_errors, pick_regions
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.naming_rules import Clocks
     from pipeline.diagnosis.problem import Problem
     from pipeline.diagnosis.subject import Recording
-    from pipeline.motion import Effect, Estimates, Timing
+    from pipeline.motion import Effect, Timing
     from pipeline.motion.workshop import Judgement
 
 _DRAWS = 400
@@ -56,12 +57,12 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
     known = frozenset().union(*(way.search.arena.kept for way in ways))
     timing = body.search.final.state.timing
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
-    judgement = _rate(ground, source, [*found, *terms], timing)
-    estimates = None if judgement is None else judgement.estimates
-    unexplained = leftover.describe(ground, ways)
+    judgements = _rate_ways(ground, source, ways, [*found, *terms], timing)
+    judgement = judgements.get(source.value)
+    unexplained = leftover.describe(ways)
     named = tuple(
-        _describe(effect, ground, ways, estimates, judgement)
-        for effect in found
+        _describe(effect, ground, ways, judgements)
+        for effect in _order(found, judgement)
         if not _parts(effect) & open_ids and effect.id not in known
     )
     named = leftover.mark_tentative(named, ways, unexplained)
@@ -93,8 +94,8 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
         regions=tuple(regions),
         where=tuple(pick_regions(regions, residual, body.search.arena.noise[: residual.shape[0]])),
         timing={"runs": cast("Json", list(clocks.timing))},
-        by_way=_describe_ways(ground, ways, source, [*found, *terms]),
-        consistency=_compare_ways(found, estimates) if len(ways) > 1 else {},
+        by_way=_describe_ways(ways, source, judgements.get("measured")),
+        consistency=_compare_ways(named, judgement) if len(ways) > 1 else {},
         disturbance=leftover.describe_disturbance(body, unexplained),
         proposal=None if judgement is None else note_fit(ModelFile(judgement.fitted.model), judgement),
     )
@@ -131,13 +132,22 @@ def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
     return sorted(joined, key=lambda effect: (effect.place, effect.rank, effect.id))
 
 
-def _rate(
-    ground: Ground, source: Input, effects: Sequence[Effect], timing: Sequence[Timing]
-) -> Judgement | None:
-    try:
-        return rate_effects(ground, source, effects, timing).judgement
-    except MotionError:
-        return None
+def _rate_ways(
+    ground: Ground,
+    source: Input,
+    ways: Sequence[Explored],
+    effects: Sequence[Effect],
+    timing: Sequence[Timing],
+) -> dict[str, Judgement]:
+    """The model judged from its input to the body, and from the measured wheels where they were searched."""
+    inputs = dict.fromkeys((source, Input(ways[0].search.way)))
+    found = {}
+    for one in inputs:
+        try:
+            found[one.value] = rate_effects(ground, one, effects, timing).judgement
+        except MotionError:
+            continue
+    return found
 
 
 def _parts(effect: Effect) -> set[str]:
@@ -146,25 +156,19 @@ def _parts(effect: Effect) -> set[str]:
 
 
 def _describe(
-    effect: Effect,
-    ground: Ground,
-    ways: Sequence[Explored],
-    estimates: Estimates | None,
-    judgement: Judgement | None,
+    effect: Effect, ground: Ground, ways: Sequence[Explored], judgements: Mapping[str, Judgement]
 ) -> Named:
     way = _way_of(effect, ways)
     gain, selected = _measure_gain(effect, way)
-    fitted = effect
+    fitted, judgement = effect, judgements.get(way.search.way)
     if judgement is not None and effect.id in judgement.fitted.model:
-        joint = judgement.fitted.model.effect(effect.id)
-        # Where the whole way from command to body has no room for it, its own way's number is what was found.
-        if is_large_enough(joint):
-            fitted = joint
-        else:
-            estimates = None
+        fitted = judgement.fitted.model.effect(effect.id)
+        values = list_values(fitted, judgement.estimates)
+    else:
+        values = measure_values(effect, way.search)
     return Named(
         id=effect.id,
-        parameters=_list_values(fitted, estimates),
+        parameters=values,
         gain=gain,
         equivalent_to=list_equivalents(effect, ground),
         confused_with=effect.confused_with,
@@ -173,6 +177,13 @@ def _describe(
         selected=selected,
         implausible=find_implausible(fitted),
     )
+
+
+def _order(effects: Sequence[Effect], judgement: Judgement | None) -> list[Effect]:
+    """Effects as the ladder takes them, those that it has no rung for last."""
+    top = () if judgement is None else judgement.ladder.rungs
+    first = {name: place for place in range(len(top) - 1, -1, -1) for name in top[place].effects}
+    return sorted(effects, key=lambda effect: first.get(effect.id, len(top)))
 
 
 def _way_of(effect: Effect, ways: Sequence[Explored]) -> Explored:
@@ -204,19 +215,6 @@ def _measure_gain(effect: Effect, way: Explored) -> tuple[float, float]:
     return gain, float(np.mean(falls >= _WORTH))
 
 
-def _list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]:
-    known = {} if estimates is None else {item.free.label: item for item in estimates.items}
-    values = {}
-    for parameter in effect.parameters:
-        value = effect.values[parameter.name]
-        if not math.isfinite(value):
-            continue
-        item = known.get(f"{effect.id}.{parameter.name}")
-        low, high = (math.nan, math.nan) if item is None else (item.low, item.high)
-        values[parameter.name] = Value(value, low, high, parameter.unit)
-    return values
-
-
 def _rungs(judgement: Judgement) -> list[Mapping[str, Json]]:
     rungs = []
     for rung in ladder_as_json(judgement.ladder, judgement.floor):
@@ -229,22 +227,18 @@ def _rungs(judgement: Judgement) -> list[Mapping[str, Json]]:
     return rungs
 
 
-def _describe_ways(
-    ground: Ground, ways: Sequence[Explored], source: Input, effects: Sequence[Effect]
-) -> dict[str, Json]:
+def _describe_ways(ways: Sequence[Explored], source: Input, measured: Judgement | None) -> dict[str, Json]:
     """Ladders of the ground and of the drivetrain apart."""
     if len(ways) == 1:
         return {}
     described: dict[str, Json] = {}
-    body, wheels = ways[0].search, ways[1].search
-    if source is Input.COMMAND:
-        judgement = _rate(ground, Input.MEASURED, effects, body.final.state.timing)
-        if judgement is not None:
-            described["measured"] = {
-                "effects": [e.id for e in effects if e.id in judgement.fitted.model and not is_term(e.id)],
-                "ladder": cast("Json", _rungs(judgement)),
-                "noise_floor": cast("Json", errors_as_json(judgement.floor)),
-            }
+    wheels = ways[1].search
+    if source is Input.COMMAND and measured is not None:
+        described["measured"] = {
+            "effects": [name for name in measured.fitted.model.ids if not is_term(name)],
+            "ladder": cast("Json", _rungs(measured)),
+            "noise_floor": cast("Json", errors_as_json(measured.floor)),
+        }
     described["wheels"] = {
         "effects": list(wheels.new),
         "ladder": [
@@ -258,18 +252,19 @@ def _describe_ways(
     return described
 
 
-def _compare_ways(effects: Sequence[Effect], estimates: Estimates | None) -> dict[str, Json]:
+def _compare_ways(named: Sequence[Named], judgement: Judgement | None) -> dict[str, Json]:
     """Values found on an effect's own way against those of the whole way from command to body."""
     compared: dict[str, Json] = {}
-    for item in () if estimates is None else estimates.items:
-        effect = next((e for e in effects if e.id == item.free.effect), None)
-        if effect is None or not math.isfinite(item.standard_error):
+    by_id = {effect.id: effect for effect in named}
+    for item in () if judgement is None else judgement.estimates.items:
+        effect = by_id.get(item.free.effect)
+        value = None if effect is None else effect.parameters.get(item.free.name)
+        if value is None or not math.isfinite(item.standard_error):
             continue
-        there = effect.values[item.free.name]
         span = max(3.0 * item.standard_error, 0.05 * abs(item.value))
         compared[item.free.label] = {
-            "on_its_way": round(there, 6),
+            "on_its_way": round(value.value, 6),
             "command_to_body": round(item.value, 6),
-            "agrees": abs(there - item.value) <= span,
+            "agrees": abs(value.value - item.value) <= span,
         }
     return compared

@@ -84,12 +84,14 @@ class Unexplained:
     """Structure that no catalogued effect takes.
 
     Attributes:
-        share: of the held-out loss of the named model that a function of the recorded signals takes away.
+        share: of the held-out loss of the named model that a function of the recorded signals takes away; or
+            of the residual's variance that lasts longer than noise and random motion do.
         channel: x, y or w.
         channels: every channel with structure.
         where: in words.
         formula: a formula effect as text of a model file; None where none was found.
-        partial: what the structure depends on most: name, and mean error by value.
+        partial: what the structure depends on most: name, and mean error by value; empty where it depends on
+            nothing that was recorded.
         way: on which way it was found.
     """
 
@@ -135,7 +137,7 @@ class RunDiagnosis:
         timing: delays, and whose heading was used.
         by_way: ladders of the drivetrain and of the ground apart, where there are encoders.
         consistency: whether the ways agree.
-        disturbance: rms of motion that is no function of anything recorded, x, y, w.
+        disturbance: rms of what is left in x, y, w, and the part of it that lasts for seconds.
         proposal: model file with what was named, fitted; None where nothing could be judged.
     """
 

@@ -12,24 +12,34 @@ from pipeline.diagnosis.diagnosis import Unexplained
 from pipeline.diagnosis.library import join_formula
 from pipeline.diagnosis.unexplained import collect_terms, describe_windows, is_explainable
 from pipeline.diagnosis.where import CHANNELS
+from pipeline.motion.persistence import split_residuals
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis.diagnose import Explored
     from pipeline.diagnosis.diagnosis import Json, Named
-    from pipeline.diagnosis.ground import Ground
 
 Floats = NDArray[np.float64]
 
 _BINS = 8
 _PART = 0.3
-_OF_NOISE = 1.15
+# What lasts is structure where it is much of the residual, and of the motion that was asked for.
+_LEAST_SHARE = 0.3
+_LEAST_OF_MOTION = 0.05
+_FEWEST_WINDOWS = 200
+_WORDS = {
+    "wheels": "wheels that stay ahead or behind for seconds, beyond every effect",
+    "body": "motion that lasts for seconds and is not a function of anything recorded",
+}
 
 
-def describe(ground: Ground, ways: Sequence[Explored]) -> Unexplained | None:
-    """Structure that no effect takes on the way to the body; None where there is none."""
-    del ground
+def describe(ways: Sequence[Explored]) -> Unexplained | None:
+    """Structure that no effect takes; None where there is none.
+
+    A formula where one was found, else what can be predicted from what was recorded, else motion that lasts
+    though nothing that was recorded tells of it.
+    """
     body = ways[0]
     arena, final = body.search.arena, body.search.final
     terms = collect_terms(final)
@@ -46,11 +56,11 @@ def describe(ground: Ground, ways: Sequence[Explored]) -> Unexplained | None:
         share, formula = float(body.explainable.shares[channel]), None
         signal = body.explainable.predicted * arena.metric.scale
     else:
-        return None
+        return next((found for way in ways if (found := _find_lasting(way)) is not None), None)
     channel = int(np.argmax(sizes))
     name, table = _depend(body, signal[:, channel])
     every = tuple(CHANNELS[i] for i in np.argsort(-sizes) if sizes[i] > _PART * sizes[channel])
-    unit = "rad/s" if channel == 2 else "m/s"  # noqa: PLR2004 - the third channel
+    unit = _unit(channel)
     low, high = min(table, key=lambda row: row[1]), max(table, key=lambda row: row[1])
     where = (
         f"the {CHANNELS[channel]} error depends on {name}: {high[1]:+.3g} {unit} near {high[0]:.3g}, "
@@ -62,6 +72,37 @@ def describe(ground: Ground, ways: Sequence[Explored]) -> Unexplained | None:
         "table": [{"at": round(at, 6), "mean_error": round(mean, 6)} for at, mean in table],
     }
     return Unexplained(share, CHANNELS[channel], every, where, formula, partial, body.search.way)
+
+
+def _find_lasting(way: Explored) -> Unexplained | None:
+    """Motion that lasts longer than noise and random motion do, whatever causes it."""
+    problem, held = way.search.arena.problem, way.search.final.held
+    if held.shape[0] < _FEWEST_WINDOWS:
+        return None
+    shares = _share_lasting(way)
+    ideal = problem.find_ideal()[:, 0, :]
+    forward, turning = np.sqrt((ideal**2).mean(axis=0)).tolist()
+    asked = np.array([forward, forward, turning])
+    sizes = np.sqrt(shares * (held**2).mean(axis=0))
+    parts = np.where(shares >= _LEAST_SHARE, sizes / np.maximum(asked, 1e-9), 0.0)
+    channel = int(np.argmax(parts))
+    if parts[channel] < _LEAST_OF_MOTION:
+        return None
+    every = tuple(CHANNELS[i] for i in np.argsort(-parts) if parts[i] >= _LEAST_OF_MOTION)
+    told = [f"{sizes[i]:.2g} {_unit(i)} in {CHANNELS[i]}" for i in np.flatnonzero(parts).tolist()]
+    where = f"{_WORDS.get(way.search.way, _WORDS['body'])}: {', '.join(told)}"
+    return Unexplained(float(shares[channel]), CHANNELS[channel], every, where, None, {}, way.search.way)
+
+
+def _share_lasting(way: Explored) -> Floats:
+    """Share of the residual's variance that lasts, x, y, w; zero in channels that say nothing."""
+    problem = way.search.arena.problem
+    makeup = split_residuals(problem.comparisons, way.search.final.held)  # type: ignore[attr-defined]
+    return np.array([part.lasting_share if i in problem.channels else 0.0 for i, part in enumerate(makeup)])
+
+
+def _unit(channel: int) -> str:
+    return "rad/s" if CHANNELS[channel] == "w" else "m/s"
 
 
 def write_formula(joined: Mapping[str, object]) -> str:
@@ -83,8 +124,8 @@ def write_formula(joined: Mapping[str, object]) -> str:
 def mark_tentative(
     named: tuple[Named, ...], ways: Sequence[Explored], unexplained: Unexplained | None
 ) -> tuple[Named, ...]:
-    """Names that explain far less than what stays unexplained in their channel."""
-    if unexplained is None:
+    """Names that explain far less than what stays explainable in their channel."""
+    if unexplained is None or not unexplained.partial:
         return named
     body = ways[0]
     arena, final = body.search.arena, body.search.final
@@ -105,15 +146,20 @@ def mark_tentative(
 
 
 def describe_disturbance(body: Explored, unexplained: Unexplained | None) -> dict[str, Json]:
-    """What is left and cannot be predicted from anything recorded: rms of x, y, w."""
-    final = body.search.final
-    rms = np.sqrt((final.held**2).mean(axis=0))
+    """What is left of x, y, w: rms, and the part of it that lasts longer than noise and random motion do."""
+    held = body.search.final.held
+    rms = np.sqrt((held**2).mean(axis=0))
+    lasting = rms * np.sqrt(_share_lasting(body))
     text = (
         "what is left is not a function of anything recorded: disturbance and localization noise"
         if unexplained is None
         else "beside the structure, what is left is disturbance and localization noise"
     )
-    return {"rms": [round(float(value), 6) for value in rms], "text": text}
+    return {
+        "rms": [round(float(value), 6) for value in rms],
+        "lasting": [round(float(value), 6) for value in lasting],
+        "text": text,
+    }
 
 
 def _depend(body: Explored, signal: Floats) -> tuple[str, list[tuple[float, float]]]:

@@ -54,8 +54,10 @@ def search_body(ground: Ground, source: Input, known: Sequence[Effect]) -> Searc
     usable = [e for e in known if source is Input.COMMAND or e.place > Place.DRIVE]
     start = State((), ground.start_timing()).add(*usable)
     arena, first = open_arena(ground.pose_body(source), start, ground.list_candidates(source), ground.largest)
-    # Without encoders and gyro a late clock is a late drive; only an early one can be nothing else.
-    arena.only_early_clock = source is Input.COMMAND and not ground.has_gyro and not ground.measured
+    # Without encoders and gyro a late clock is a late drive; only an early one can be nothing else. With a
+    # gyro the clock is known from the heading: a position that is later still is a body that follows late.
+    alone = source is Input.COMMAND and not ground.measured
+    arena.only_early_clock = ground.has_gyro or alone
     if source is Input.MEASURED:
         arena.least_delay = ground.sampling_s
     return Search(source.value, arena, first, search_effects(arena, first))

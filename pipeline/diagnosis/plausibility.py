@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.diagnosis.screen import Largest
-    from pipeline.motion.effect import Effect
+    from pipeline.motion.effect import Effect, Parameter
 
 # Below these an effect cannot be told from stamps, mounting and rounding, however small its interval.
 _LEAST: Mapping[tuple[str, str], float] = {
@@ -60,7 +60,7 @@ _PLAUSIBLE: Mapping[tuple[str, str], tuple[float, float]] = {
     ("understeer", "K"): (-0.02, 0.5),
     ("yaw_misalignment", "psi"): (-0.35, 0.35),
     ("heading_skew", "d"): (-0.3, 0.4),
-    ("clock_offset", "d"): (-0.6, 0.6),
+    ("clock_offset", "d"): (-0.8, 0.8),
 }
 # What only ever takes motion away: the other sign is no physics, but a clock or chance.
 _ONE_SIGN: Mapping[str, str] = {
@@ -75,17 +75,19 @@ _APART = 0.08
 _LEAST_APART_S = 0.02
 _LEAST_DEADBAND = 0.02
 _REACHED = 0.99
+_AT_BOUND = 1e-3
 
 
 def is_nameable(effect: Effect, largest: Largest, least_delay: float = 0.0) -> bool:
-    """Whether an effect is large enough to be named and is not another one in disguise.
+    """Whether an effect is large enough to be named, of a vehicle's size, and not another one in disguise.
 
     Args:
         effect: with its values.
         largest: what the run asked for.
         least_delay: delays and lags below it are a matter of sampling [s].
     """
-    return is_large_enough(effect, least_delay) and _is_itself(effect, largest, least_delay)
+    sized = is_large_enough(effect, least_delay) and _is_itself(effect, largest, least_delay)
+    return sized and find_implausible(effect) is None
 
 
 def is_large_enough(effect: Effect, least_delay: float = 0.0) -> bool:
@@ -121,6 +123,15 @@ def _is_itself(effect: Effect, largest: Largest, least_delay: float) -> bool:
     return effect.id not in checks or bool(checks[effect.id](effect.values))
 
 
+def _is_at_bound(value: float, parameter: Parameter) -> bool:
+    """Whether a number only stopped because it may go no further; at no effect it may well stand."""
+    if value == parameter.neutral:
+        return False
+    low, high = parameter.bounds
+    margin = _AT_BOUND * (high - low) if math.isfinite(high - low) else 0.0
+    return value <= low + margin < parameter.neutral or value >= high - margin > parameter.neutral
+
+
 def find_implausible(effect: Effect) -> str | None:
     """In words what no vehicle does, None where the numbers are those of a vehicle."""
     for parameter in effect.parameters:
@@ -128,7 +139,7 @@ def find_implausible(effect: Effect) -> str | None:
         if not math.isfinite(value):
             continue
         low, high = _PLAUSIBLE.get((effect.id, parameter.name), parameter.bounds)
-        if not low <= value <= high:
+        if not low <= value <= high or _is_at_bound(value, parameter):
             unit = "" if parameter.unit == "1" else f" {parameter.unit}"
             return (
                 f"{effect.id}: {parameter.name} = {value:.3g}{unit} is outside of what vehicles show "
