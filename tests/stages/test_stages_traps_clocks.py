@@ -77,6 +77,16 @@ def test_trap_5_stamps_from_before_the_clock_was_set_are_placed_by_their_log_tim
     assert ids == {"clock_unset"}
 
 
+def test_trap_5_stamps_of_an_unset_and_a_set_clock_may_come_in_turns() -> None:
+    log = START + EVERY_50_MS
+    header = log.copy()
+    early = np.array([0, 1, 2, 4, 6])
+    header[early] = EVERY_50_MS[early]
+    stamps, ids = align(pose=recorded(log, header))
+    assert np.allclose(stamps["pose"], log, atol=1000)
+    assert ids == {"clock_unset"}
+
+
 def test_trap_5_log_times_from_before_the_clock_was_set_are_left_out() -> None:
     log = START + EVERY_50_MS
     log[:100] = EVERY_50_MS[:100]

@@ -126,6 +126,14 @@ def _flag_unset(topic: str, unset: NDArray[np.bool_]) -> list[Finding]:
     return [Finding("clock_unset", "warning", text, where=topic, count=count)]
 
 
+def _flag_placed(topic: str, count: int) -> Finding:
+    text = (
+        f"{count} stamps of {topic} come from before the clock was set (1970): "
+        "they were placed by their log times"
+    )
+    return Finding("clock_unset", "warning", text, where=topic, count=count)
+
+
 def _mend_jumps(
     topic: str, header: Stamps, log_time: Stamps, log_known: NDArray[np.bool_]
 ) -> tuple[Stamps, NDArray[np.bool_], tuple[int, ...], list[Finding]]:
@@ -135,6 +143,9 @@ def _mend_jumps(
     known = np.flatnonzero(log_known)
     if known.size < 2:  # noqa: PLR2004 - one message shows no jump
         return header, usable, (), _flag_unset(topic, ~usable)
+    # Messages of both clocks may come in turns: those of a clock that was not set yet end no stretch.
+    is_early = (header[known] < DAY_NS) & (np.median(header[known]) > DAY_NS)
+    early, known = known[is_early], known[~is_early]
     passed, recorded = np.diff(header[known]), np.diff(log_time[known])
     usual = float(np.median(passed))
     # Messages that a busy recorder writes late come at their usual stamps: there the log times jump.
@@ -155,17 +166,16 @@ def _mend_jumps(
     stamp = header.copy()
     found: list[Finding] = []
     largest, jumps = 0.0, 0
+    if early.size:
+        stamp[early] += round(home - float(np.median(offset[early])))
+        found.append(_flag_placed(topic, early.size))
     for span in spans:
         shift = home - float(np.median(offset[span]))
         if abs(shift) < _BACKWARD_NS:
             continue
         stamp[span] += round(shift)
         if header[span[0]] < DAY_NS < stamp[span[0]]:
-            text = (
-                f"{span.size} stamps of {topic} come from before the clock was set (1970): "
-                "they were placed by their log times"
-            )
-            found.append(Finding("clock_unset", "warning", text, where=topic, count=int(span.size)))
+            found.append(_flag_placed(topic, span.size))
         else:
             jumps += 1
             largest = max(largest, abs(shift))
@@ -175,8 +185,10 @@ def _mend_jumps(
             "its stamps were put right by their log times, and segments end there"
         )
         found.append(Finding("clock_jump", "warning", text, where=topic, value=largest / 1e9, count=jumps))
-    breaks = tuple(int(log_time[span[0]]) for span in spans[1:])
-    return stamp, usable, breaks, found + _flag_unset(topic, ~usable)
+    breaks = [int(log_time[span[0]]) for span in spans[1:]]
+    if early.size and early[-1] + 1 < header.size:
+        breaks = sorted({*breaks, int(log_time[early[-1] + 1])})
+    return stamp, usable, tuple(breaks), found + _flag_unset(topic, ~usable)
 
 
 def _check_early_stamps(clocks: Mapping[str, TopicClock]) -> list[Finding]:
