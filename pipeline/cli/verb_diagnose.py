@@ -77,13 +77,15 @@ def _gather(
     logs: list[str], options: Options, *, quiet: bool
 ) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], bool]:
     """Recordings by vehicle; an error costs one log."""
+    from pipeline.job.diagnosis import read_recording  # noqa: PLC0415 - heavy
+
     gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
     errors: list[dict[str, str]] = []
     lossy = False
     for log in logs:
         try:
             manifest, losses = _find(log, options, quiet=quiet)
-            vehicle, recording = _read(manifest)
+            vehicle, recording = read_recording(manifest)
         except SlipError as error:
             print_error(error)
             errors.append(describe_error(log, error))
@@ -106,33 +108,6 @@ def _find(log: str, options: Options, *, quiet: bool) -> tuple[Manifest, bool]:
     with show_progress(Path(log).name, quiet=quiet) as progress:
         outcome = analyze_log(Path(log), options, progress)
     return outcome.manifest, outcome.lossy
-
-
-def _read(manifest: Manifest) -> tuple[Vehicle, Recording]:
-    import msgspec  # noqa: PLC0415
-
-    from pipeline.diagnosis import Recording  # noqa: PLC0415 - heavy
-    from pipeline.vehicles import Vehicle  # noqa: PLC0415
-
-    vehicle = msgspec.convert(manifest.details["vehicle"], Vehicle)
-    tables = {
-        table: manifest.read(table)
-        for table in ("poses", "commands", "wheels", "imu", "slip", "findings")
-        if table in manifest.tables
-    }
-    log = manifest.details.get("log")
-    known = log if isinstance(log, dict) else {}
-    configuration = manifest.details.get("configuration")
-    command = configuration.get("command") if isinstance(configuration, dict) else None
-    hold = command.get("hold_s") if isinstance(command, dict) else None
-    recording = Recording(
-        manifest.run,
-        tables,
-        sha256=str(known.get("sha256", "")),
-        path=str(known.get("path", "")),
-        hold_s=float(hold) if isinstance(hold, int | float) else None,
-    )
-    return vehicle, recording
 
 
 def _judge(

@@ -12,7 +12,7 @@ from pipeline.diagnosis import leftover
 from pipeline.diagnosis.diagnosis import Named, RunDiagnosis
 from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.naming_rules import join_classes, list_equivalents
-from pipeline.diagnosis.own_way import list_values, measure_values
+from pipeline.diagnosis.own_way import list_values, measure_values, read_gyro_clock
 from pipeline.diagnosis.plausibility import find_implausible
 from pipeline.diagnosis.rating import rate_effects
 from pipeline.diagnosis.unexplained import find_places
@@ -161,7 +161,9 @@ def _describe(
     way = _way_of(effect, ways)
     gain, selected = _measure_gain(effect, way)
     fitted, judgement = effect, judgements.get(way.search.way)
-    if judgement is not None and effect.id in judgement.fitted.model:
+    if effect.id == "clock_offset" and ground.has_gyro:
+        values = read_gyro_clock(effect, [delay for delay in ground.yaw_delays if delay is not None])
+    elif judgement is not None and effect.id in judgement.fitted.model:
         fitted = judgement.fitted.model.effect(effect.id)
         values = list_values(fitted, judgement.estimates)
     else:

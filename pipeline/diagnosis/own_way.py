@@ -14,7 +14,10 @@ from pipeline.diagnosis.diagnosis import Value
 from pipeline.motion.effect import Search
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from pipeline.diagnosis.naming import Search as Found
+    from pipeline.diagnosis.timing import YawDelay
     from pipeline.motion import Effect, Estimates
 
 _SURE = 1.96
@@ -66,3 +69,12 @@ def measure_values(effect: Effect, found: Found) -> dict[str, Value]:
         half = half if 2.0 * half <= high - low else math.nan
         values[name] = Value(value.value, value.value - half, value.value + half, value.unit)
     return values
+
+
+def read_gyro_clock(effect: Effect, delays: Sequence[YawDelay]) -> dict[str, Value]:
+    """How late poses are by the gyro's clock: no fit of the motion moves it, its error is the gyro's."""
+    (parameter,) = effect.parameters
+    value = effect.values[parameter.name]
+    half = _SURE * float(np.sqrt(np.mean([delay.error**2 for delay in delays]) / len(delays)))
+    half = half if np.isfinite(half) else math.nan
+    return {parameter.name: Value(value, value - half, value + half, parameter.unit)}

@@ -18,37 +18,33 @@ _WAYS = {"command": "from the command", "measured": "from the measured wheels"}
 
 def describe_run(diagnosis: RunDiagnosis) -> str:
     """The diagnosis of one run for a tired person."""
-    lines = [_row("run", f"{diagnosis.run}    {_WAYS[diagnosis.input]}")]
+    rows = [("run", f"{diagnosis.run}    {_WAYS[diagnosis.input]}"), *list_lines(diagnosis)]
+    return "".join(f"{label:<{_LABEL}}{text}".rstrip() + "\n" for label, text in rows)
+
+
+def list_lines(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
+    """Label and text of every line but the run's own; a line without a label goes on with the one above."""
+    grave = _label("findings", [str(finding["text"]) for finding in _grave(diagnosis)])
     if not diagnosis.ladder:
-        lines += [_row("" if i else "findings", str(f["text"])) for i, f in enumerate(_grave(diagnosis))]
-        lines.append(_row("missing", "no effect is named: a fit to this run would mean nothing"))
-        return "\n".join(lines) + "\n"
+        return [*grave, ("missing", "no effect is named: a fit to this run would mean nothing")]
     first, last = diagnosis.ladder[0], diagnosis.ladder[-1]
-    lines.append(
-        _row(
-            "error",
-            f"of the ideal model over 2 s     {_number(first, 't_mrmse_m')} m   "
-            f"{_number(first, 'r_mrmse_rad')} rad",
-        )
-    )
-    for number, region in enumerate(diagnosis.where[:_WHERE_SHOWN]):
-        lines.append(_row("" if number else "where", region.sentence))
-    lines += _describe_missing(diagnosis)
+    error = f"of the ideal model over 2 s     {_number(first, 't_mrmse_m')} m   "
+    lines = [("error", f"{error}{_number(first, 'r_mrmse_rad')} rad")]
+    lines += _label("where", [region.sentence for region in diagnosis.where[:_WHERE_SHOWN]])
+    lines += _label("missing", _describe_missing(diagnosis))
     if math.isfinite(diagnosis.explained_share) and len(diagnosis.ladder) > 1:
-        floor = diagnosis.noise_floor
-        lines.append(
-            _row(
-                "",
-                f"explained {max(min(diagnosis.explained_share, 1.0), 0.0):.0%} of what can be explained; "
-                f"now {_number(last, 't_mrmse_m')} m, floor {_number(floor, 't_mrmse_m')} m",
-            )
-        )
+        share = max(min(diagnosis.explained_share, 1.0), 0.0)
+        now, floor = _number(last, "t_mrmse_m"), _number(diagnosis.noise_floor, "t_mrmse_m")
+        lines.append(("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m"))
     lines += _describe_unobservable(diagnosis)
-    lines += [_row("" if i else "findings", str(f["text"])) for i, f in enumerate(_grave(diagnosis))]
-    names = [effect.id for effect in diagnosis.effects]
-    if names:
-        lines.append(_row("next", f"slip diagnose {diagnosis.run} --apply model.toml"))
-    return "\n".join(line.rstrip() for line in lines) + "\n"
+    lines += grave
+    if diagnosis.effects:
+        lines.append(("next", f"slip diagnose {diagnosis.run} --apply model.toml"))
+    return lines
+
+
+def _label(label: str, texts: Sequence[str]) -> list[tuple[str, str]]:
+    return [("" if number else label, text) for number, text in enumerate(texts)]
 
 
 def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
@@ -75,7 +71,7 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
             rows += [f"{'':<20}{line}" for line in left.formula.splitlines() if line.startswith("v_")]
     if not rows:
         rows.append("nothing: the model is as good as the localization lets us see")
-    return [_row("" if number else "missing", text) for number, text in enumerate(rows)]
+    return rows
 
 
 def _values(effect: Named) -> str:
@@ -105,7 +101,7 @@ def _list_falls(diagnosis: RunDiagnosis) -> dict[str, str]:
     return falls
 
 
-def _describe_unobservable(diagnosis: RunDiagnosis) -> list[str]:
+def _describe_unobservable(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
     hidden = [item.id for item in diagnosis.unobservable]
     if not hidden:
         return []
@@ -117,8 +113,8 @@ def _describe_unobservable(diagnosis: RunDiagnosis) -> list[str]:
             if part not in manoeuvres:
                 manoeuvres.append(part)
     return [
-        _row("cannot", f"tell of {shown}{more} from this log"),
-        _row("", f"to see them: {'; '.join(manoeuvres[:3])}"),
+        ("cannot", f"tell of {shown}{more} from this log"),
+        ("", f"to see them: {'; '.join(manoeuvres[:3])}"),
     ]
 
 
@@ -129,7 +125,3 @@ def _grave(diagnosis: RunDiagnosis) -> list[Mapping[str, Json]]:
 def _number(content: Mapping[str, Json], key: str) -> str:
     value = content.get(key)
     return f"{value:.3g}" if isinstance(value, int | float) else "-"
-
-
-def _row(label: str, text: str) -> str:
-    return f"{label:<{_LABEL}}{text}"

@@ -9,16 +9,19 @@ from pipeline.core.errors import SlipError
 from pipeline.job.keys import hash_json
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
-    from pipeline.diagnosis import Diagnosis
+    import polars as pl
+
+    from pipeline.diagnosis import Recording
     from pipeline.job.work import Work
     from pipeline.store import JSON, Manifest
+    from pipeline.vehicles import Vehicle
 
 STAGE = "diagnosis"
 DIAGNOSIS = "diagnosis.json"
 VERSION = 1
-_LABEL = 10
+_TABLES = ("poses", "commands", "wheels", "imu", "slip", "findings")
 
 
 def key_diagnosis(keys: Mapping[str, str]) -> str:
@@ -64,15 +67,15 @@ def diagnose_work(work: Work) -> dict[str, JSON] | None:
 
 
 def _diagnose(work: Work) -> dict[str, JSON]:
-    from pipeline.diagnosis import Recording, diagnose_runs  # noqa: PLC0415 - heavy
+    from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy
+    from pipeline.diagnosis.words import list_lines  # noqa: PLC0415 - heavy
 
     generation, subject = work.generation, work.subject
-    recording = Recording(
+    recording = _make_recording(
         work.run,
-        {name: generation.read_table(name) for name in generation.table_names},
-        sha256=work.sha256,
-        path=str(subject.path),
-        hold_s=subject.configuration.command.hold_s,
+        (generation.table_names, generation.read_table),
+        {"sha256": work.sha256, "path": str(subject.path)},
+        subject.configuration.command.hold_s,
     )
     try:
         diagnosis = diagnose_runs([recording], subject.vehicle, inputs=work.options.inputs)
@@ -84,12 +87,42 @@ def _diagnose(work: Work) -> dict[str, JSON]:
     ladder = diagnosis.tabulate_ladder(work.run)
     if not ladder.is_empty():
         work.write("ladder", ladder)
-    return {**diagnosis.to_json()[0], "lines": _list_lines(diagnosis)}
+    return {**diagnosis.to_json()[0], "lines": [list(line) for line in list_lines(diagnosis.runs[0])]}
 
 
-def _list_lines(diagnosis: Diagnosis) -> list[list[str]]:
-    """Label and text of every line that a person reads, without the run's own."""
-    from pipeline.diagnosis.words import describe_run  # noqa: PLC0415 - heavy
+def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
+    """A stored run as it is diagnosed, and its vehicle."""
+    import msgspec  # noqa: PLC0415 - only for stored runs
 
-    lines = describe_run(diagnosis.runs[0]).splitlines()[1:]
-    return [[line[:_LABEL].strip(), line[_LABEL:].rstrip()] for line in lines]
+    from pipeline.vehicles import Vehicle  # noqa: PLC0415 - heavy
+
+    details = manifest.details
+    log, configuration = details.get("log"), details.get("configuration")
+    command = configuration.get("command") if isinstance(configuration, dict) else None
+    hold = command.get("hold_s") if isinstance(command, dict) else None
+    recording = _make_recording(
+        manifest.run,
+        (manifest.tables, manifest.read),
+        log if isinstance(log, dict) else {},
+        float(hold) if isinstance(hold, int | float) else None,
+    )
+    return msgspec.convert(details["vehicle"], Vehicle), recording
+
+
+def _make_recording(
+    run: str,
+    tables: tuple[Iterable[str], Callable[[str], pl.DataFrame]],
+    log: Mapping[str, JSON],
+    hold_s: float | None,
+) -> Recording:
+    """The tables that a diagnosis reads, with where they came from."""
+    from pipeline.diagnosis import Recording  # noqa: PLC0415 - heavy
+
+    names, read = tables
+    return Recording(
+        run,
+        {name: read(name) for name in names if name in _TABLES},
+        sha256=str(log.get("sha256", "")),
+        path=str(log.get("path", "")),
+        hold_s=hold_s,
+    )
