@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
@@ -23,13 +23,24 @@ _WORSE = 1.05
 _FORMULA = 0.02
 _WEAKEST = 0.8
 
+_MODELLED = frozenset({"single", "small", "sets", "equipped", "rigid"})
+_KINDS: dict[str, Callable[[Record], str]] = {
+    "empty": lambda record: record.answer.note,
+    "rigid": lambda record: record.answer.note,
+    "odd": lambda record: record.answer.odd,
+    "poor": lambda record: record.answer.program,
+    "equipped": lambda record: record.answer.note,
+}
+
 Test = Callable[[Record], bool]
 
 
 def write_scoreboard(records: Iterable[Record]) -> str:
     """All categories, one after the other."""
     by_category = _group(records, lambda record: record.job.category)
-    lines: list[str] = []
+    versions = Counter(record.version for group in by_category.values() for record in group)
+    played_with = ", ".join(f"{version or 'unknown'} ({count})" for version, count in versions.items())
+    lines = [f"played with {played_with}", ""]
     for category in CATEGORIES:
         if category in by_category:
             lines += [*describe(category, by_category[category]), ""]
@@ -52,10 +63,11 @@ def describe(category: str, played: Sequence[Record]) -> list[str]:
         lines += _rate_all(played, {"a confident wrong name": has_wrong_name}, "")
     else:
         counted = [record for record in played if not record.is_weak]
-        weak = len(played) - len(counted)
+        weak = Counter(_KINDS.get(category, _join_truth)(record) for record in played if record.is_weak)
         lines.append(
-            f"{weak} of them too weak to count: an effect lowers the true model's error by less than 5 %"
+            f"{weak.total()} too weak to count: an effect lowers the true model's error by less than 5 %"
         )
+        lines += [f"  {', '.join(f'{name} {count}' for name, count in weak.most_common())}"] if weak else []
         lines += _rate_all(counted, {"all that is hidden is named": is_found}, "")
         lines += _rate_all(counted, {"nothing else beside it": lambda r: not has_wrong_name(r)}, "")
         lines += _rate_all(counted, {"exactly right": is_exact}, "")
@@ -181,21 +193,18 @@ def _list_kinds(
     category: str, played: Sequence[Record], right: Test, about: str = "right, by kind"
 ) -> list[str]:
     """The rate of each kind: effect, set, empty log, manoeuvre, odd physics, machine."""
-    kinds: dict[str, Callable[[Record], str]] = {
-        "empty": lambda record: record.answer.note,
-        "rigid": lambda record: record.answer.note,
-        "odd": lambda record: record.answer.odd,
-        "poor": lambda record: record.answer.program,
-        "equipped": lambda record: record.answer.note or "more",
-    }
-    by_kind = _group(played, kinds.get(category, lambda record: " + ".join(record.score.truth)))
+    by_kind = _group(played, _KINDS.get(category, _join_truth))
     if len(by_kind) <= 1:
         return []
     lines = [about]
     for name, group in sorted(by_kind.items()):
         good = sum(right(record) for record in group)
+        line = describe_rate(f"  {name}", good, len(group))
+        if category in _MODELLED:
+            found, near = (sum(test(record) for record in group) for test in (is_found, is_as_good))
+            line += f"   named {found}, within {_WORSE:g}: {near}"
         mark = "   <- under 80 %" if good < _WEAKEST * len(group) else ""
-        lines.append(describe_rate(f"  {name}", good, len(group)) + mark)
+        lines.append(line + mark)
     return lines
 
 
@@ -213,6 +222,10 @@ def _describe_miss(record: Record) -> str:
         if math.isfinite(ratio):
             told.append(f"error {ratio:.3g} x the true model's")
     return f"  {record.job.replay}   {record.answer.program}: {', '.join(told)}"
+
+
+def _join_truth(record: Record) -> str:
+    return " + ".join(record.score.truth)
 
 
 def _group(records: Iterable[Record], key: Callable[[Record], str]) -> dict[str, list[Record]]:
