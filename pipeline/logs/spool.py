@@ -78,8 +78,14 @@ class Spool:
         self._file.write(self._memory)
         self._memory = bytearray()
 
-    def batches(self, size: int) -> Iterator[Batch]:
-        """All messages in batches of about ``size`` bytes, by log time, then in the order of adding."""
+    def batches(self, size: int, before: int | None = None) -> Iterator[Batch]:
+        """Take messages out in batches of about ``size`` bytes, by log time, then in the order of adding.
+
+        Args:
+            size: bytes in a batch.
+            before: take only what was logged before this time [ns], and only batches that are full; the rest
+                stays. By default everything.
+        """
         empty = np.empty(0, dtype=np.int64)
         log = np.concatenate([empty, *self._log])
         order = np.argsort(log, kind="stable")
@@ -87,15 +93,51 @@ class Spool:
         length = np.concatenate([empty, *self._length])[order]
         channel = np.concatenate([empty, *self._channel])[order]
         log = log[order]
-        before = np.cumsum(length) - length
-        cuts = np.flatnonzero(np.diff(before // max(size, 1))) + 1
+        until = np.cumsum(length)
+        number = (until - length) // max(size, 1)
+        count = log.size
+        if before is not None:
+            ready = int(np.searchsorted(log, before))
+            # The last of those ready may have to share its batch with what is still to come.
+            count = int(np.searchsorted(number, number[ready - 1])) if ready else 0
         data = np.frombuffer(self._stored(), dtype=np.uint8)
-        for low, high in zip([0, *cuts.tolist()], [*cuts.tolist(), log.size], strict=True):
+        self._keep(data, order[count:], start[count:], length[count:], channel[count:], log[count:])
+        cuts = np.flatnonzero(np.diff(number[:count])) + 1
+        for low, high in zip([0, *cuts.tolist()], [*cuts.tolist(), count], strict=True):
             if high > low:
                 part = slice(low, high)
-                offset = before[part] - before[low]
+                offset = until[part] - length[part] - (until[low] - length[low])
                 records = _gather(data, start[part], length[part], offset)
                 yield Batch(records, channel[part], log[part], offset)
+
+    def _keep(
+        self,
+        data: NDArray[np.uint8],
+        order: Ints,
+        start: Ints,
+        length: Ints,
+        channel: Ints,
+        log: Ints,
+    ) -> None:
+        """Hold nothing but these messages, in the order in which they were added."""
+        self._forget()
+        added = np.argsort(order)
+        length = length[added]
+        offset = np.cumsum(length) - length
+        if added.size:
+            self._memory += _gather(data, start[added], length, offset)
+            self._size = len(self._memory)
+            self._start, self._length = [offset], [length]
+            self._channel, self._log = [channel[added]], [log[added]]
+        if len(self._memory) > self._limit:
+            self._spill()
+
+    def _forget(self) -> None:
+        # What is being given out is still read from the old memory, or from the file's pages.
+        if self._file is not None:
+            self._file.close()
+        self._memory, self._size, self._file = bytearray(), 0, None
+        self._start, self._length, self._channel, self._log = [], [], [], []
 
     def _stored(self) -> Buffer | mmap.mmap:
         if self._file is None:

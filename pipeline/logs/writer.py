@@ -90,7 +90,11 @@ class LogWriter:
         self._types: dict[str, _Type] = {}
         self._channels: dict[tuple[str, str], _Channel] = {}
         self._crc = 0
+        self._has_begun = False
         self._metadata: list[tuple[str, Mapping[str, str]]] = []
+        self._places: list[tuple[int, int, str]] = []
+        self._chunks: list[ChunkSummary] = []
+        self._written: set[bytes] = set()
         self._spool = Spool(self._path)
         try:
             self._file: BinaryIO = self._draft.open("wb")
@@ -163,40 +167,63 @@ class LogWriter:
             records[:, MESSAGE_OVERHEAD:] = payloads
             self._spool.add(records, channel.number, log[rows])
 
+    def write_before(self, log_time: int) -> None:
+        """Write what was logged before a time, so that memory holds only what comes later.
+
+        Messages that are added afterwards should be later: earlier ones are written too, but then stand in a
+        chunk that overlaps those before it.
+
+        Args:
+            log_time: [ns].
+        """
+        self._begin()
+        self._write_chunks(log_time)
+
     def close(self) -> None:
         """Write everything and put the file in its place."""
-        chunks: list[ChunkSummary] = []
-        metadata: list[tuple[int, int, str]] = []
-        self._put(rec.MAGIC)
-        self._put(pack_record(rec.HEADER, pack_text("ros2") + pack_text(LIBRARY)))
-        for name, entries in self._metadata:
-            packed = pack_metadata(name, entries)
-            metadata.append((self._file.tell(), len(packed), name))
-            self._put(packed)
-        by_number = {channel.number: channel for channel in self._channels.values()}
-        written: set[bytes] = set()
-        for batch in self._spool.batches(self._chunk_size):
-            side = b""
-            for number in np.unique(batch.channel).tolist():
-                for record in (by_number[number].kind.record, by_number[number].record):
-                    side += b"" if record in written else record
-                    written.add(record)
-            packed, indexes, summary = pack_chunk(batch, side, self._compression)
-            chunks.append(replace(summary, offset=self._file.tell()))
-            self._put(packed)
-            self._put(indexes)
+        self._begin()
+        self._write_chunks(None)
         kinds = [kind.record for kind in self._types.values()]
         channels = [channel.record for channel in self._channels.values()]
         for record in [*kinds, *channels]:
-            self._put(b"" if record in written else record)
+            self._put(b"" if record in self._written else record)
+        self._put_metadata()
         self._put(pack_record(rec.DATA_END, self._crc.to_bytes(4, "little")))
-        self._put(pack_summary(self._file.tell(), kinds, channels, chunks, metadata))
+        self._put(pack_summary(self._file.tell(), kinds, channels, self._chunks, self._places))
         self._put(rec.MAGIC)
         self._file.flush()
         os.fsync(self._file.fileno())
         self._file.close()
         self._spool.close()
         self._draft.replace(self._path)
+
+    def _begin(self) -> None:
+        if self._has_begun:
+            return
+        self._has_begun = True
+        self._put(rec.MAGIC)
+        self._put(pack_record(rec.HEADER, pack_text("ros2") + pack_text(LIBRARY)))
+        self._put_metadata()
+
+    def _put_metadata(self) -> None:
+        for name, entries in self._metadata:
+            packed = pack_metadata(name, entries)
+            self._places.append((self._file.tell(), len(packed), name))
+            self._put(packed)
+        self._metadata = []
+
+    def _write_chunks(self, before: int | None) -> None:
+        by_number = {channel.number: channel for channel in self._channels.values()}
+        for batch in self._spool.batches(self._chunk_size, before):
+            side = b""
+            for number in np.unique(batch.channel).tolist():
+                for record in (by_number[number].kind.record, by_number[number].record):
+                    side += b"" if record in self._written else record
+                    self._written.add(record)
+            packed, indexes, summary = pack_chunk(batch, side, self._compression)
+            self._chunks.append(replace(summary, offset=self._file.tell()))
+            self._put(packed)
+            self._put(indexes)
 
     def discard(self) -> None:
         """Leave no trace."""

@@ -36,7 +36,7 @@ from pipeline.motion.ladder import Ladder, Rung, climb
 from pipeline.motion.model import Model
 from pipeline.motion.model_file import ModelFile, read_model
 from pipeline.motion.model_text import write_model
-from pipeline.motion.predict import Prediction, predict, predict_at, predict_from
+from pipeline.motion.predict import Prediction, predict, predict_at, predict_at_from, predict_from
 from pipeline.motion.problem import Free, Problem, State
 from pipeline.motion.recording import MotionRun, load_run
 from pipeline.motion.score import Errors, HeldOut, hold_out, score
@@ -90,6 +90,7 @@ __all__ = [
     "predict",
     "predict_ackermann",
     "predict_at",
+    "predict_at_from",
     "predict_differential",
     "predict_from",
     "read_model",

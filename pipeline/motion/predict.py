@@ -144,8 +144,19 @@ def predict_at(
         MotionError: the run lacks the input.
     """
     comparison = Comparison(run, model.vehicle, source)
-    timing = timing or Timing(comparison.usual_delay)
-    velocity = comparison.predict_velocity(model.effects, timing)
+    return predict_at_from(comparison, model.effects, timing or Timing(comparison.usual_delay), at)
+
+
+def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: Timing, at: Floats) -> Floats:
+    """As `predict_at`, of a run that has been made ready already.
+
+    Args:
+        comparison: the run and its input.
+        effects: of the model, with their values.
+        timing: delays of the recording.
+        at: stamps of poses [s], shape (n,).
+    """
+    velocity = comparison.predict_velocity(effects, timing)
     cells = comparison.cells
     moment = at - timing.pose_delay_s
     columns = [np.interp(moment, cells.times, values) for values in (velocity.x, velocity.y, velocity.w)]

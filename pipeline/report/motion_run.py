@@ -9,11 +9,23 @@ import msgspec
 from pipeline.report.errors import ReportError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import polars as pl
+
     from pipeline.motion import Input, MotionRun
     from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
 
-TABLES = ("poses", "commands", "wheels", "imu", "slip")
+_DRIVE = ("t", "left", "right", "speed", "steering", "body_x", "body_w")
+COLUMNS: Mapping[str, tuple[str, ...]] = {
+    "poses": ("t", "segment", "x", "y", "z", "q_x", "q_y", "q_z", "q_w", "held", "active", "terrain"),
+    "commands": _DRIVE,
+    "wheels": _DRIVE,
+    "imu": ("t", "rate_z"),
+    "slip": ("t", "input", "step", "suspect"),
+}
+"""What models need of a run's tables."""
 
 
 def load_motion_run(manifest: Manifest, vehicle: Vehicle) -> MotionRun:
@@ -23,16 +35,31 @@ def load_motion_run(manifest: Manifest, vehicle: Vehicle) -> MotionRun:
         MotionError: ``no_poses``.
         ReportError: ``no_poses``, the run has no table of poses.
     """
+    tables = {name: manifest.read(name) for name in COLUMNS if name in manifest.tables}
+    return make_motion_run(manifest, vehicle, tables)
+
+
+def make_motion_run(manifest: Manifest, vehicle: Vehicle, tables: Mapping[str, pl.DataFrame]) -> MotionRun:
+    """As `load_motion_run`, from tables that were read already, or from a stretch of each.
+
+    Args:
+        manifest: the run.
+        vehicle: geometry.
+        tables: by name, with the columns of `COLUMNS` at least.
+
+    Raises:
+        MotionError: ``no_poses``.
+        ReportError: ``no_poses``, there is no table of poses.
+    """
     from pipeline.motion import load_run  # noqa: PLC0415 - heavy
 
-    if "poses" not in manifest.tables:
+    if "poses" not in tables:
         raise ReportError(
             "no_poses",
             "the run has no poses to compare a model with",
             where=manifest.run,
             hint="Check the pose topic with `slip inspect`.",
         )
-    tables = {name: manifest.read(name) for name in TABLES if name in manifest.tables}
     log = manifest.details.get("log")
     sha256 = str(log.get("sha256", "")) if isinstance(log, dict) else ""
     return load_run(tables, vehicle, name=manifest.run, sha256=sha256, hold_s=_hold_of(manifest))

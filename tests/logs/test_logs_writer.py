@@ -184,6 +184,46 @@ def test_large_exports_wait_in_a_file(tmp_path: Path) -> None:
     many.close()
 
 
+def test_what_is_settled_is_written_and_forgotten(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    times = START + np.random.default_rng(5).permutation(4000)
+    with LogWriter(path, chunk_size=1000) as writer:
+        writer.metadata("early", {})
+        for low in range(0, 4000, 500):
+            part = times[(times >= START + low) & (times < START + low + 500)]
+            writer.write_columns("/x", FLOAT, part, {"data": (part - START).astype(float)})
+            writer.write_before(START + low + 500)
+            # What stays is less than one chunk.
+            assert writer._spool._size <= 1000
+        writer.metadata("late", {"k": "v"})
+        # Earlier than what is written: it is not lost.
+        writer.write_columns("/x", FLOAT, np.array([START - 1]), {"data": [-1.0]})
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        logged = [m.log_time for _, _, m in reader.iter_messages(log_time_order=False)]
+        assert {record.name for record in reader.iter_metadata()} == {"early", "late"}
+    assert logged[:3500] == sorted(times.tolist())[:3500]
+    assert sorted(logged) == [START - 1, *sorted(times.tolist())]
+    found = read_topics(path, [Wanted("/x")]).of("/x")[0].fields["data"].tolist()
+    assert found == list(range(-1, 4000))
+
+
+def test_messages_that_wait_in_a_file_keep_their_order(tmp_path: Path) -> None:
+    few, many = Spool(tmp_path / "a"), Spool(tmp_path / "b", limit=1000)
+    taken: list[list[bytes]] = [[], []]
+    for spool, found in ((few, taken[0]), (many, taken[1])):
+        rng = np.random.default_rng(6)
+        for begin in (0, 40, 80):
+            for channel in range(3):
+                rows = rng.integers(0, 256, size=(60, 40 + channel), dtype=np.uint8)
+                spool.add(rows, channel, begin + rng.integers(0, 50, size=60))
+            found += [batch.records for batch in spool.batches(512, begin + 40)]
+        found += [batch.records for batch in spool.batches(512)]
+        spool.close()
+    assert taken[0] == taken[1]
+    assert sum(map(len, taken[0])) == 3 * 60 * (40 + 41 + 42)
+
+
 def test_what_was_read_crosses_a_process_boundary(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     write_small(path)

@@ -13,7 +13,8 @@ import polars as pl
 
 from pipeline.logs import LogWriter
 from pipeline.report.exports import topics
-from pipeline.report.exports.markers import write_findings, write_trail
+from pipeline.report.exports.markers import join_track, write_findings, write_trail
+from pipeline.report.exports.stretches import ModelFeed
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -21,12 +22,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.logs.normalize import Given
+    from pipeline.motion import Prediction
     from pipeline.report.exports.source import ExportSource
 
 _BODY = "base_link"
 _TWIST = "geometry_msgs/msg/TwistStamped"
 _PATH_POSES = 5000
 _PREDICTIONS_HZ = 5.0
+_VELOCITIES = ("t", "stamp", "segment", "x", "y", "z", "yaw", "v_x", "v_y", "v_w")
+_SLIP = ("stamp", "f_x", "f_y", "f_w", "g_x", "g_y", "g_w", "modulus")
 
 
 def write_derived_log(source: ExportSource, path: Path) -> Path:
@@ -40,24 +44,28 @@ def write_derived_log(source: ExportSource, path: Path) -> Path:
         LogError: nothing can be written there.
         MotionError: the model cannot be run on this log.
     """
-    velocity = source.model_velocity
     with LogWriter(path) as writer:
         writer.metadata("slip", {"run": source.manifest.run, "key": source.manifest.key, **_name_log(source)})
-        for frame in source.batches("velocities"):
-            _write_twist(writer, source, topics.MEASURED, frame, "v")
-            _write_poses(writer, source, frame)
-            times = source.log_times(frame["stamp"].to_numpy())
-            writer.write_columns(
-                topics.SEGMENT, "std_msgs/msg/Int32", times, {"data": frame["segment"].to_numpy()}
-            )
+        track = join_track(source)
         _write_path(writer, source)
-        for frame in source.batches("slip"):
-            _write_slip(writer, source, frame)
-        if velocity is not None:
-            _write_twist(writer, source, topics.MODEL, velocity, "v")
-        _write_predictions(writer, source)
-        write_trail(writer, source)
-        write_findings(writer, source)
+        write_trail(writer, source, track)
+        write_findings(writer, source, track)
+        velocities = source.feed("velocities", "stamp", _VELOCITIES)
+        slip = {name: source.feed("slip", "stamp", _SLIP, name) for name in source.inputs}
+        model = None if source.model is None else ModelFeed(source, source.model)
+        for low, high in source.stretches:
+            frame = velocities.take(low, high)
+            if frame is not None:
+                _write_velocities(writer, source, frame)
+            for name, feed in slip.items():
+                rows = feed.take(low, high)
+                if rows is not None:
+                    _write_slip(writer, source, name, rows)
+            if model is not None and frame is not None:
+                _write_model(writer, source, model, frame, (low, high))
+            writer.write_before(high + source.shift_ns)
+        if model is not None:
+            model.check()
     return path
 
 
@@ -83,13 +91,32 @@ def _write_twist(
     writer.write_columns(topic, _TWIST, source.log_times(stamps), fields, header_time=stamps)
 
 
-def _write_slip(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -> None:
-    for (name,), rows in frame.group_by("input", maintain_order=True):
-        _write_twist(writer, source, topics.name_ideal(str(name)), rows, "f")
-        _write_twist(writer, source, topics.name_slip(str(name)), rows, "g")
-        times = source.log_times(rows["stamp"].to_numpy())
-        modulus = {"data": rows["modulus"].to_numpy()}
-        writer.write_columns(topics.name_modulus(str(name)), "std_msgs/msg/Float64", times, modulus)
+def _write_velocities(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -> None:
+    _write_twist(writer, source, topics.MEASURED, frame, "v")
+    _write_poses(writer, source, frame)
+    times = source.log_times(frame["stamp"].to_numpy())
+    writer.write_columns(topics.SEGMENT, "std_msgs/msg/Int32", times, {"data": frame["segment"].to_numpy()})
+
+
+def _write_slip(writer: LogWriter, source: ExportSource, name: str, rows: pl.DataFrame) -> None:
+    _write_twist(writer, source, topics.name_ideal(name), rows, "f")
+    _write_twist(writer, source, topics.name_slip(name), rows, "g")
+    times = source.log_times(rows["stamp"].to_numpy())
+    modulus = {"data": rows["modulus"].to_numpy()}
+    writer.write_columns(topics.name_modulus(name), "std_msgs/msg/Float64", times, modulus)
+
+
+def _write_model(
+    writer: LogWriter, source: ExportSource, model: ModelFeed, frame: pl.DataFrame, stretch: tuple[int, int]
+) -> None:
+    low, high = (1e-9 * (edge - source.start_ns) for edge in stretch)
+    found = model.predict(low, high, frame["t"].to_numpy())
+    if found is None:
+        return
+    columns = {f"v_{axis}": found.velocity[:, i] for i, axis in enumerate("xyw")}
+    velocity = frame.select("stamp").with_columns(**columns).filter(pl.col("v_x").is_finite())
+    _write_twist(writer, source, topics.MODEL, velocity, "v")
+    _write_predictions(writer, source, found.prediction)
 
 
 def _write_poses(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -> None:
@@ -132,10 +159,9 @@ def _write_path(writer: LogWriter, source: ExportSource) -> None:
     )
 
 
-def _write_predictions(writer: LogWriter, source: ExportSource) -> None:
+def _write_predictions(writer: LogWriter, source: ExportSource, prediction: Prediction) -> None:
     """Where the model would have gone, over two seconds from measured poses, a few a second."""
-    prediction = source.prediction
-    if prediction is None or prediction.start_times.size == 0:
+    if prediction.start_times.size == 0:
         return
     slot = np.floor(prediction.start_times * _PREDICTIONS_HZ)
     kept = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0.0)

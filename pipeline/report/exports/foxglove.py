@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from pipeline.report import theme
 from pipeline.report.exports import topics
 from pipeline.report.exports.files import write_text
-from pipeline.report.exports.series import list_inputs, list_series
+from pipeline.report.exports.series import list_series
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -26,7 +26,7 @@ def write_foxglove_layout(source: ExportSource, path: Path) -> Path:
 
 
 def _build_layout(source: ExportSource) -> dict[str, object]:
-    inputs = list_inputs(source)
+    inputs = source.inputs
     panels: dict[str, object] = {
         "3D!map": _build_map(source),
         "RosOut!findings": {"searchTerms": [], "minLogLevel": 1, "topicToRender": topics.FINDINGS},

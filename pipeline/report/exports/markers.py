@@ -27,9 +27,14 @@ _CAP_QUANTILE = 0.98
 _LIFT_M = 0.4
 
 
-def write_trail(writer: LogWriter, source: ExportSource) -> None:
-    """One line a segment, coloured by slip modulus on the leading input; grey where there is none."""
-    track = _join_track(source)
+def write_trail(writer: LogWriter, source: ExportSource, track: pl.DataFrame) -> None:
+    """One line a segment, coloured by slip modulus on the leading input; grey where there is none.
+
+    Args:
+        writer: of the derived log.
+        source: the run.
+        track: what `join_track` gives.
+    """
     if track.is_empty():
         return
     cap = float(track["modulus"].quantile(_CAP_QUANTILE) or 1.0) or 1.0
@@ -54,9 +59,15 @@ def write_trail(writer: LogWriter, source: ExportSource) -> None:
         writer.write_columns(topics.TRAIL, _MARKER, source.log_times(stamps), fields, header_time=stamps)
 
 
-def write_findings(writer: LogWriter, source: ExportSource) -> None:
-    """Each finding as a line of a log panel, and as a text at the place where it happened."""
-    places = _join_track(source)
+def write_findings(writer: LogWriter, source: ExportSource, track: pl.DataFrame) -> None:
+    """Each finding as a line of a log panel, and as a text at the place where it happened.
+
+    Args:
+        writer: of the derived log.
+        source: the run.
+        track: what `join_track` gives.
+    """
+    places = track.sort("stamp") if track.width else track
     for frame in source.batches("findings"):
         rows = frame.sort(pl.col("t_start").fill_null(0.0), maintain_order=True)
         seconds = rows["t_start"].fill_null(0.0).to_numpy()
@@ -108,8 +119,8 @@ def _write_texts(
     )
 
 
-def _join_track(source: ExportSource) -> pl.DataFrame:
-    """Thinned ``stamp segment x y z modulus`` in order of time."""
+def join_track(source: ExportSource) -> pl.DataFrame:
+    """Thinned ``stamp segment x y z modulus``, by segment and time; the modulus null where there is none."""
     if "velocities" not in source.manifest.tables:
         return pl.DataFrame()
     every = max(source.manifest.tables["velocities"].rows // _MOST_POINTS, 1)
@@ -118,18 +129,17 @@ def _join_track(source: ExportSource) -> pl.DataFrame:
     if not parts:
         return pl.DataFrame()
     track = pl.concat(parts)
-    if "slip" not in source.manifest.tables:
-        return track.with_columns(modulus=pl.lit(None, pl.Float64)).sort("stamp")
-    slip = pl.scan_parquet(source.manifest.path("slip"), glob=False)
-    known = slip.select(pl.col("input").cast(pl.String).unique()).collect()["input"].to_list()
-    leading = "command" if "command" in known else "measured"
-    modulus = (
-        slip.filter(pl.col("input").cast(pl.String) == leading)
+    leading = source.inputs[0] if source.inputs else ""
+    places = track.select("stamp", "segment")
+    known = [
+        frame.filter(pl.col("input").cast(pl.String) == leading)
         .select("stamp", "segment", "modulus")
-        .join(track.lazy().select("stamp", "segment"), on=["stamp", "segment"], how="semi")
-        .collect(engine="streaming")
-        .unique(["stamp", "segment"], maintain_order=True)
-    )
+        .join(places, on=["stamp", "segment"], how="semi")
+        for frame in source.batches("slip", ("input", "stamp", "segment", "modulus"))
+    ]
+    if not known:
+        return track.with_columns(modulus=pl.lit(None, pl.Float64)).sort("segment", "stamp")
+    modulus = pl.concat(known).unique(["stamp", "segment"], maintain_order=True, keep="first")
     return track.join(modulus, on=["stamp", "segment"], how="left").sort("segment", "stamp")
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from pipeline.report import theme
 from pipeline.report.exports import topics
 from pipeline.report.exports.files import write_text
-from pipeline.report.exports.series import list_inputs, list_series
+from pipeline.report.exports.series import list_series
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,7 +32,7 @@ def _build_layout(source: ExportSource) -> ET.Element:
     window = ET.SubElement(root, "tabbed_widget", {"parent": "main_window", "name": "Main Window"})
     tab = ET.SubElement(window, "Tab", {"containers": "1", "tab_name": "slip"})
     container = ET.SubElement(tab, "Container")
-    slip = [(f"{topics.name_modulus(name)}/data", theme.INPUT_COLOURS[name]) for name in list_inputs(source)]
+    slip = [(f"{topics.name_modulus(name)}/data", theme.INPUT_COLOURS[name]) for name in source.inputs]
     plots = [slip]
     plots += [[(line.path(axis, "/"), line.colour) for line in list_series(source)] for axis in "xyw"]
     sizes = ";".join(["0.25"] * len(plots))

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import polars as pl
-
 from pipeline.report import theme
 from pipeline.report.exports import topics
-from pipeline.report.run import INPUT_WORDS, INPUTS
+from pipeline.report.run import INPUT_WORDS
 
 if TYPE_CHECKING:
     from pipeline.report.exports.source import ExportSource
@@ -36,21 +34,12 @@ class VelocityLine:
         return f"{self.topic}{separator}twist{separator}{_FIELDS[axis].replace('.', separator)}"
 
 
-def list_inputs(source: ExportSource) -> list[str]:
-    """Inputs that the run has slip for, the command first."""
-    if "slip" not in source.manifest.tables:
-        return []
-    slip = pl.scan_parquet(source.manifest.path("slip"), glob=False)
-    known = slip.select(pl.col("input").cast(pl.String).unique()).collect()["input"].to_list()
-    return [name for name in INPUTS if name in known]
-
-
 def list_series(source: ExportSource) -> list[VelocityLine]:
     """Measured, ideal on every input, and the model's where there is one."""
     lines = [VelocityLine(topics.MEASURED, "measured", theme.MEASURED)]
     lines += [
         VelocityLine(topics.name_ideal(name), f"ideal {INPUT_WORDS[name]}", theme.INPUT_COLOURS[name])
-        for name in list_inputs(source)
+        for name in source.inputs
     ]
     if source.model is not None:
         lines.append(VelocityLine(topics.MODEL, "model", theme.MODEL))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -9,17 +10,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.report.motion_run import choose_source, load_motion_run
+from pipeline.report.exports.feed import Feed
+from pipeline.report.run import INPUTS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from pipeline.motion import Model, MotionRun, Prediction
+    from pipeline.motion import Model
     from pipeline.store import Manifest
 
-BATCH_ROWS = 65_536
+BATCH_ROWS = 16_384
+STRETCH_ROWS = 18_000
+"""Rows of velocities in a stretch: a quarter of an hour at the usual rate."""
 
 _AGREE_NS = 1_000_000_000
+_EARLIEST, _LATEST = -(1 << 62), 1 << 62
 
 
 @dataclass(frozen=True)
@@ -31,12 +36,14 @@ class ExportSource:
         model: whose velocity and predicted path are exported too; None for none.
         input: what the model is fed with, `command` or `measured`; None is the command where there is one.
         frame_id: the fixed frame that the original log's poses stand in.
+        stretch_rows: rows of velocities that are worked on at a time.
     """
 
     manifest: Manifest
     model: Model | None = None
     input: str | None = None
     frame_id: str = "map"
+    stretch_rows: int = STRETCH_ROWS
 
     def batches(self, table: str, columns: Sequence[str] | None = None) -> Iterator[pl.DataFrame]:
         """A table in pieces; nothing where the run has no such table."""
@@ -44,15 +51,54 @@ class ExportSource:
 
         if table not in self.manifest.tables:
             return
-        with pq.ParquetFile(self.manifest.path(table)) as file:
-            for batch in file.iter_batches(BATCH_ROWS, columns=list(columns) if columns else None):
+        with pq.ParquetFile(self.manifest.path(table), buffer_size=1 << 16, pre_buffer=False) as file:
+            for batch in file.iter_batches(BATCH_ROWS, use_threads=False, columns=list(columns) if columns else None):
                 frame = pl.from_arrow(batch)
                 if isinstance(frame, pl.DataFrame) and not frame.is_empty():
                     yield frame
 
+    def feed(self, table: str, key: str, columns: Sequence[str], only: str | None = None) -> Feed:
+        """A table by time, stretch after stretch.
+
+        Args:
+            table: its name.
+            key: the column of times, one of ``columns``.
+            columns: what to read.
+            only: rows of this input alone.
+        """
+        return Feed(self._read_in_order(table, key, columns, only), key)
+
+    def _read_in_order(
+        self, table: str, key: str, columns: Sequence[str], only: str | None
+    ) -> Iterator[pl.DataFrame]:
+        def choose(frame: pl.DataFrame) -> pl.DataFrame:
+            return frame if only is None else frame.filter(pl.col("input").cast(pl.String) == only)
+
+        wanted = list(dict.fromkeys((*columns, "input"))) if only is not None else list(columns)
+        last: float | None = None
+        for frame in self.batches(table, [key, "input"] if only is not None else [key]):
+            times = choose(frame)[key]
+            if times.is_empty():
+                continue
+            if not times.is_sorted() or (last is not None and times[0] < last):
+                # Such a table is not what stages write; it costs memory, nothing else.
+                yield choose(self.manifest.read(table).select(wanted)).sort(key, maintain_order=True)
+                return
+            last = times[-1]
+        for frame in self.batches(table, wanted):
+            yield choose(frame)
+
     def columns(self, table: str) -> list[str]:
         """Names of a table's columns."""
         return pl.scan_parquet(self.manifest.path(table), glob=False).collect_schema().names()
+
+    @cached_property
+    def inputs(self) -> list[str]:
+        """Inputs that the run has slip for, the command first."""
+        known: set[str] = set()
+        for frame in self.batches("slip", ("input",)):
+            known |= set(frame["input"].cast(pl.String).unique())
+        return [name for name in INPUTS if name in known]
 
     @cached_property
     def shift_ns(self) -> int:
@@ -60,15 +106,12 @@ class ExportSource:
 
         Zero where both clocks agree to a second: the difference is then the messages' own latency.
         """
-        if "poses" not in self.manifest.tables:
-            return 0
-        late = (
-            pl.scan_parquet(self.manifest.path("poses"), glob=False)
-            .select((pl.col("log_time") - pl.col("stamp")).median())
-            .collect()
-            .item()
-        )
-        return 0 if late is None or abs(late) < _AGREE_NS else int(late)
+        late = [
+            frame["log_time"].to_numpy() - frame["stamp"].to_numpy()
+            for frame in self.batches("poses", ("log_time", "stamp"))
+        ]
+        usual = float(np.median(np.concatenate(late))) if late else 0.0
+        return 0 if abs(usual) < _AGREE_NS else int(usual)
 
     @cached_property
     def start_ns(self) -> int:
@@ -83,36 +126,13 @@ class ExportSource:
         return np.asarray(stamps, dtype=np.int64) + self.shift_ns
 
     @cached_property
-    def _motion_run(self) -> MotionRun | None:
-        return None if self.model is None else load_motion_run(self.manifest, self.model.vehicle)
+    def stretches(self) -> list[tuple[int, int]]:
+        """Stamps [ns] between which the run is worked on at a time: each start, and the end before which.
 
-    @cached_property
-    def prediction(self) -> Prediction | None:
-        """Where the model goes from measured poses; None without one.
-
-        Raises:
-            MotionError: the run has too little to predict, or lacks the input.
+        Together they hold every stamp there is.
         """
-        from pipeline.motion import predict  # noqa: PLC0415 - heavy
-
-        run = self._motion_run
-        if self.model is None or run is None:
-            return None
-        return predict(self.model, run, choose_source(run, self.input))
-
-    @cached_property
-    def model_velocity(self) -> pl.DataFrame | None:
-        """The model's velocity at the stamps of the measured one: ``stamp v_x v_y v_w``; None without one.
-
-        Raises:
-            MotionError: the run has too little to predict, or lacks the input.
-        """
-        from pipeline.motion import predict_at  # noqa: PLC0415 - heavy
-
-        run, parts = self._motion_run, list(self.batches("velocities", ("t", "stamp")))
-        if self.model is None or run is None or not parts:
-            return None
-        at = pl.concat(parts)
-        found = predict_at(self.model, run, choose_source(run, self.input), at["t"].to_numpy())
-        columns = {f"v_{axis}": found[:, i] for i, axis in enumerate("xyw")}
-        return at.select("stamp").with_columns(**columns).filter(pl.col("v_x").is_finite())
+        stamps = [frame["stamp"].to_numpy() for frame in self.batches("velocities", ("stamp",))]
+        whole = np.sort(np.concatenate(stamps)) if stamps else np.zeros(0, dtype=np.int64)
+        inner = whole[self.stretch_rows : -(self.stretch_rows // 2) or None : self.stretch_rows]
+        edges = [_EARLIEST, *np.unique(inner).tolist(), _LATEST]
+        return list(itertools.pairwise(edges))
