@@ -90,7 +90,7 @@ def _render_sections(page: Page) -> str:
 
 def load_scripts() -> list[str]:
     """What a page with figures runs: Vega, what draws, what links."""
-    return [load_bundle(), _read_own("plots.js") + _read_own("page.js")]
+    return [load_bundle(), "".join(_read_own(name) for name in ("plots.js", "marks.js", "page.js"))]
 
 
 def assemble_page(title: str, body: str, data: str, scripts: list[str]) -> str:

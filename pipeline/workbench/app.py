@@ -38,6 +38,7 @@ _PAGES = {
     "/page.js": ("pipeline.workbench", "page.js", "text/javascript"),
     "/pane.js": ("pipeline.workbench", "pane.js", "text/javascript"),
     "/parts.js": ("pipeline.workbench", "parts.js", "text/javascript"),
+    "/marks.js": ("pipeline.report", "marks.js", "text/javascript"),
     "/plots.js": ("pipeline.report", "plots.js", "text/javascript"),
 }
 # The report's own policy stands inside it: it may run what it brought, and reach nothing.

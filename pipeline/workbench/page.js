@@ -61,6 +61,10 @@ const arrange = (two) => {
   panes.a ??= new Pane("a", remember, () => watch());
   panes.b = two ? (panes.b ?? new Pane("b", remember, () => watch())) : null;
   find("bench").classList.toggle("single", !two);
+  // What is marked in one is marked in the other, as long as both show the same run.
+  const other = { a: "b", b: "a" };
+  for (const pane of Object.values(panes))
+    if (pane) pane.marked = (spans) => panes[other[pane.slot]]?.run === pane.run && panes[other[pane.slot]].marks.follow(spans);
   if (!listed.runs.length) return;
   find("panes").replaceChildren(...Object.values(panes).filter(Boolean).map((pane) => pane.root));
   for (const pane of Object.values(panes)) pane?.root.addEventListener("pointerdown", () => (aimed = pane.slot));
@@ -158,6 +162,7 @@ addEventListener("dragleave", (event) => event.relatedTarget === null && documen
 find("search").addEventListener("input", showRuns);
 find("sort").addEventListener("change", showRuns);
 addEventListener("keydown", (event) => {
+  if (event.key === "Escape") Object.values(panes).forEach((pane) => pane?.marks.leave());
   if ((event.ctrlKey || event.metaKey) && event.key === "z" && !/INPUT|SELECT|TEXTAREA/.test(document.activeElement.tagName)) {
     event.preventDefault();
     panes[panes.b ? aimed : "a"]?.act(event.shiftKey ? "redo" : "undo");

@@ -16,7 +16,22 @@ export class Pane {
     this.hero = h("section", { class: "hero", "aria-label": "Error of the model" });
     this.model = h("section", { class: "model", "aria-label": "Model" });
     this.figures = h("section", { class: "figures", "aria-label": "Figures" });
+    this.marks = this.buildMarks();
     this.root = h("article", { class: "pane", data: { slot } }, this.hero, this.model, this.figures);
+  }
+
+  // Marking by dragging, or by numbers for those who use keys.
+  buildMarks() {
+    const number = (name) => h("input", { type: "number", step: "0.1", inputmode: "decimal", class: name });
+    const button = (name, text) => h("button", { type: "button", class: name }, text);
+    const parts = {
+      said: h("span", {}), from: number("mark-from"), to: number("mark-to"), set: button("mark-set", "Mark"),
+      zoomIn: button("zoom-in", "Zoom"), clear: button("mark-clear", "Clear"), zoomOut: button("zoom-out", "Whole run"),
+    };
+    parts.bar = h("div", { class: "marked", role: "status", hidden: true }, parts.said, parts.zoomIn, parts.clear, parts.zoomOut);
+    this.marking = h("div", { class: "marking", role: "group", "aria-label": "Mark a stretch of time" },
+      h("span", {}, "Mark a stretch: drag over a figure, or"), h("label", {}, "from ", parts.from, " s"), h("label", {}, "to ", parts.to, " s"), parts.set, parts.bar);
+    return slipMarks(parts, { marked: (spans) => this.marked?.(spans) });
   }
 
   get run() {
@@ -386,12 +401,15 @@ export class Pane {
     where.textContent = album.where.length
       ? `Where: ${album.where.slice(0, 2).map((region) => `${region.words.toLowerCase()}, ${Math.round(region.slip * 100)} % of the squared slip in ${Math.round(region.time * 100)} % of the time`).join("; ")}`
       : "";
-    this.figures.replaceChildren(...album.shown.map((figure) =>
+    this.figures.replaceChildren(this.marking, ...album.shown.map((figure) =>
       h("figure", { class: figure.width, data: { id: figure.id } },
         h("figcaption", {}, h("h3", {}, figure.title)),
         h("div", { class: "plot", role: "img", "aria-label": figure.words, data: { figure: figure.id } }),
         figure.note && h("p", { class: "note" }, figure.note))));
-    this.plots = slipPlots(album, { strict: true, own: (name) => (name.startsWith("marked_") ? [] : null) });
+    if (this.drawnRun !== this.run) this.marks.reset();
+    this.drawnRun = this.run;
+    this.plots = slipPlots(album, { strict: true, own: this.marks.own, zoomOf: this.marks.zoomOf });
+    this.marks.join(album, this.plots, () => this.paint(), this.figures.querySelectorAll(".plot[data-figure]"));
     await this.paint(turn);
   }
 

@@ -127,11 +127,20 @@ class Chrome:
     def wait(self, condition: str, *, patience_s: float = PATIENCE_S) -> None:
         """Wait until an expression is true."""
         end = time.monotonic() + patience_s
-        while not self.run(f"Boolean({condition})"):
+        while not self._holds(condition):
             if time.monotonic() > end:
                 shown = str(self.run("document.body.innerText.slice(0, 1500)"))
                 raise TimeoutError(f"{condition}\nerrors: {self.errors}\n{shown}")
             time.sleep(0.05)
+
+    def _holds(self, condition: str) -> bool:
+        try:
+            return bool(self.run(f"Boolean({condition})"))
+        except RuntimeError as error:
+            # The page was left while it was asked.
+            if "navigated or closed" not in str(error):
+                raise
+            return False
 
     def click(self, selector: str) -> None:
         """Click the middle of an element, as a person does."""
@@ -145,6 +154,23 @@ class Chrome:
         x, y = cast("list[float]", box)
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def drag(self, selector: str, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """Drag over an element, between two places given as shares of its width and height."""
+        box = self.run(
+            f"(() => {{ const node = document.querySelector({json.dumps(selector)});"
+            " node.scrollIntoView({block: 'center', behavior: 'instant'});"
+            " const { left, top, width, height } = node.getBoundingClientRect();"
+            " return [left, top, width, height]; })()"
+        )
+        left, top, width, height = cast("list[float]", box)
+        steps = [
+            tuple(a + share * (b - a) for a, b in zip(start, end, strict=True)) for share in (0.0, 0.5, 1.0)
+        ]
+        kinds = ("mousePressed", "mouseMoved", "mouseMoved", "mouseReleased")
+        for kind, (x, y) in zip(kinds, (*steps, steps[-1]), strict=True):
+            place = {"x": left + x * width, "y": top + y * height}
+            self.call("Input.dispatchMouseEvent", type=kind, **place, button="left", buttons=1, clickCount=1)
 
     def press(self, key: str, code: int) -> None:
         """Press a key."""

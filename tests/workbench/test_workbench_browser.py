@@ -110,6 +110,53 @@ def test_two_models_of_a_run_stand_side_by_side(chrome: Chrome, workbench: Workb
     look_for_trouble(chrome)
 
 
+def count_marks(figure: str, pane: str = "a") -> str:
+    """How many marked spans or points a figure shows."""
+    kinds = "path[stroke='#00b3d6'], path[fill='#00b3d6']"
+    plot = f"[data-slot={pane}] [data-figure={figure}]"
+    return f"document.querySelector('{plot}').querySelectorAll(\"{kinds}\").length"
+
+
+def test_a_stretch_that_is_brushed_shows_on_the_map_and_in_command_space(
+    chrome: Chrome, workbench: Workbench, pictures: Path
+) -> None:
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    chrome.wait(
+        "document.querySelectorAll('.plot.drawn').length === document.querySelectorAll('.plot').length"
+    )
+    before = {name: chrome.run(count_marks(name)) for name in ("trajectory", "command_space", "reach")}
+    chrome.drag("[data-figure=reach] svg", (0.3, 0.5), (0.5, 0.5))
+    chrome.wait("!document.querySelector('.marked').hidden")
+    assert "highest slip" in str(chrome.run("document.querySelector('.marked').textContent"))
+    for name, count in before.items():
+        chrome.wait(f"{count_marks(name)} > {count}")
+    chrome.picture(pictures / "workbench_brushed.png", whole=True)
+    # The mark outlives a change of the model.
+    chrome.click(".proposals .add")
+    chrome.wait(
+        "document.querySelector('.card') && !document.querySelector('.pane').classList.contains('busy')"
+    )
+    chrome.wait(f"{count_marks('trajectory')} > {before['trajectory']}")
+
+    # A box on the map marks the times the vehicle was there; beside it the same run follows.
+    chrome.click("#compare")
+    chrome.wait("document.querySelector('[data-slot=b]')?.dataset.drawn")
+    chrome.drag("[data-slot=a] [data-figure=trajectory] svg", (0.3, 0.3), (0.8, 0.8))
+    chrome.wait(f"{count_marks('reach', 'b')} > {before['reach']}")
+    chrome.press("Escape", 27)
+    chrome.wait("[...document.querySelectorAll('.marked')].every((bar) => bar.hidden)")
+    chrome.wait(f"{count_marks('trajectory')} === {before['trajectory']}")
+
+    # And by numbers.
+    chrome.run("document.querySelector('.mark-from').value = '10'")
+    chrome.run("document.querySelector('.mark-to').value = '20'")
+    chrome.click(".mark-set")
+    chrome.wait("document.querySelector('.marked').textContent.includes('20.0 s: 10.0 s, highest slip')")
+    look_for_trouble(chrome)
+
+
 @pytest.mark.parametrize(("width", "dark"), [(PHONE, False), (LAPTOP, True)], ids=["phone", "laptop-dark"])
 def test_nothing_is_cut_or_overlaps(
     chrome: Chrome, workbench: Workbench, pictures: Path, width: int, *, dark: bool

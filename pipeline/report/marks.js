@@ -1,0 +1,194 @@
+"use strict";
+// Marking: a stretch of time dragged over one figure, or a box of points, shows in every figure of the run; the
+// report and the workbench use it. `parts` are elements: bar, said, zoomIn, zoomOut, clear, and where the page has
+// them from, to, set. `marked(spans)` is told of what the reader marks.
+const slipMarks = (parts, { marked = () => {} } = {}) => {
+  let spans = [];
+  let points = [];
+  let zoom = null;
+  let track = [];
+  let plots = null;
+  let page = null;
+  let redraw = () => {};
+  let waiting = false;
+
+  const fillsView = (span) => zoom !== null && span.t_start <= zoom[0] && span.t_end >= zoom[1];
+
+  // The rows of what is marked, for `slipPlots`.
+  const own = (name) => {
+    if (name === "marked_spans") return spans.filter((span) => !fillsView(span)).map((span) => ({ ...span }));
+    if (name === "marked_points") return points.map((point) => ({ ...point }));
+    return null;
+  };
+
+  const tell = () => {
+    parts.zoomIn.hidden = parts.clear.hidden = !spans.length;
+    parts.zoomOut.hidden = zoom === null;
+    parts.bar.hidden = !spans.length && !zoom;
+    if (!spans.length) {
+      parts.said.textContent = "Zoomed in";
+      return;
+    }
+    const length = spans.reduce((sum, span) => sum + span.t_end - span.t_start, 0);
+    const start = spans[0].t_start.toFixed(1);
+    const end = spans[spans.length - 1].t_end.toFixed(1);
+    const peak = points.reduce((most, point) => Math.max(most, point.modulus ?? 0), 0);
+    const many = spans.length > 1 ? ` in ${spans.length} stretches` : "";
+    parts.said.textContent = `Marked ${start}–${end} s: ${length.toFixed(1)} s${many}, highest slip ${peak.toFixed(2)} m/s`;
+  };
+
+  const show = () => {
+    for (const { view, names } of plots?.views.values() ?? []) {
+      const changed = ["marked_spans", "marked_points"].filter((name) => names.has(name));
+      for (const name of changed) view.data(name, plots.rowsOf(name));
+      if (changed.length) view.runAsync();
+    }
+    tell();
+  };
+
+  const set = (newSpans, newPoints, { told = true, ends = ["", ""] } = {}) => {
+    spans = newSpans;
+    points = newPoints;
+    if (parts.from) parts.from.value = ends[0];
+    if (parts.to) parts.to.value = ends[1];
+    if (told) marked(spans);
+    if (waiting) return;
+    waiting = true;
+    requestAnimationFrame(() => {
+      waiting = false;
+      show();
+    });
+  };
+
+  const clear = () => set([], []);
+
+  const markTime = (start, end) => {
+    const [low, high] = start < end ? [start, end] : [end, start];
+    const within = track.filter((row) => row.t >= low && row.t <= high);
+    set([{ t_start: low, t_end: high }], within, { ends: [low.toFixed(1), high.toFixed(1)] });
+  };
+
+  const markPoints = (inside) => {
+    const found = [];
+    let open = null;
+    track.forEach((row) => {
+      if (!inside(row)) open = null;
+      else if (open && open.piece === row.piece) open.span.t_end = row.t;
+      else {
+        open = { piece: row.piece, span: { t_start: row.t, t_end: row.t } };
+        found.push(open.span);
+      }
+    });
+    set(found, track.filter(inside));
+  };
+
+  // Spans that were marked beside this one: shown here, not told again.
+  const follow = (others) => {
+    const inside = (row) => others.some((span) => row.t >= span.t_start && row.t <= span.t_end);
+    set(others.map((span) => ({ ...span })), others.length ? track.filter(inside) : [], { told: false });
+  };
+
+  const setZoom = (domain) => {
+    zoom = domain;
+    tell();
+    redraw();
+  };
+
+  const findPanel = (view) => {
+    const [left, top] = view.origin();
+    for (const mark of view.scenegraph().root.items[0].items)
+      if (mark.name === "concat_0_group") return { left: left + mark.items[0].x, top, prefix: "concat_0_" };
+    return { left, top, prefix: "" };
+  };
+
+  const locate = (place, view, event) => {
+    const svg = place.querySelector("svg");
+    const box = svg.getBoundingClientRect();
+    const ratio = box.width / svg.width.baseVal.value;
+    const panel = findPanel(view);
+    const at = (axis, pixel) => view.scale(panel.prefix + axis).invert(pixel);
+    return {
+      x: at("x", (event.clientX - box.left) / ratio - panel.left),
+      y: () => at("y", (event.clientY - box.top) / ratio - panel.top),
+    };
+  };
+
+  const startDrag = (place, event) => {
+    const drawn = plots?.views.get(place.dataset.figure);
+    const brush = drawn?.meta.brush;
+    if (!brush || event.button !== 0 || (brush === "plane" && event.pointerType === "touch")) return;
+    const { view, meta } = drawn;
+    const first = { px: event.clientX, py: event.clientY, ...locate(place, view, event) };
+    const firstY = brush === "plane" ? first.y() : 0;
+    let box = null;
+    place.setPointerCapture(event.pointerId);
+    const move = (now) => {
+      if (Math.abs(now.clientX - first.px) < 4 && !box && brush === "time") return;
+      const here = locate(place, view, now);
+      if (brush === "time") {
+        box = true;
+        markTime(first.x, here.x);
+        return;
+      }
+      if (!box) {
+        box = document.createElement("div");
+        box.className = "box";
+        place.append(box);
+      }
+      const edge = place.getBoundingClientRect();
+      box.style.left = `${Math.min(first.px, now.clientX) - edge.left}px`;
+      box.style.top = `${Math.min(first.py, now.clientY) - edge.top}px`;
+      box.style.width = `${Math.abs(now.clientX - first.px)}px`;
+      box.style.height = `${Math.abs(now.clientY - first.py)}px`;
+      const within = (value, a, b) => value !== null && value >= Math.min(a, b) && value <= Math.max(a, b);
+      const y = here.y();
+      markPoints((row) => within(row[meta.x], first.x, here.x) && within(row[meta.y], firstY, y));
+    };
+    const stop = () => {
+      place.removeEventListener("pointermove", move);
+      if (box instanceof Element) box.remove();
+      if (!box) clear();
+    };
+    place.addEventListener("pointermove", move);
+    place.addEventListener("pointerup", stop, { once: true });
+    place.addEventListener("pointercancel", stop, { once: true });
+    if (event.pointerType !== "touch") event.preventDefault();
+  };
+
+  // Figures that are there now: their rows, how they are drawn, and how those over time are drawn again.
+  const join = (newPage, newPlots, drawAgain, places) => {
+    [page, plots, redraw] = [newPage, newPlots, drawAgain];
+    track = page.rows.track ? plots.unpack(page.rows.track) : [];
+    for (const place of places) {
+      const brush = page.figures[place.dataset.figure].usermeta?.brush;
+      if (!brush) continue;
+      place.classList.add(`brush-${brush}`);
+      place.addEventListener("pointerdown", (event) => startDrag(place, event));
+    }
+  };
+
+  const leave = () => {
+    if (spans.length) clear();
+    else if (zoom) setZoom(null);
+  };
+
+  parts.clear.addEventListener("click", clear);
+  parts.set?.addEventListener("click", () => {
+    const start = parseFloat(parts.from.value);
+    const end = parseFloat(parts.to.value);
+    if (Number.isFinite(start) && Number.isFinite(end) && start !== end) markTime(start, end);
+  });
+  parts.zoomIn.addEventListener("click", () => {
+    const last = spans[spans.length - 1];
+    if (last && last.t_end > spans[0].t_start) setZoom([spans[0].t_start, last.t_end]);
+  });
+  parts.zoomOut.addEventListener("click", () => setZoom(null));
+
+  // For another run.
+  const reset = () => {
+    zoom = null;
+    set([], [], { told: false });
+  };
+
+  return { follow, join, leave, own, reset, zoomOf: () => zoom };
+};
