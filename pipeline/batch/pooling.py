@@ -42,6 +42,14 @@ def refresh_pools(store: Store) -> bool:
     return written
 
 
+def load_libraries() -> None:
+    """Load what pooling needs, for whoever has time to do so before."""
+    import scipy.special  # noqa: F401, PLC0415 - intervals of pooled runs
+
+    import pipeline.batch.catalogue  # noqa: PLC0415
+    import pipeline.job.material  # noqa: F401, PLC0415
+
+
 def refresh_remote_pools(mirror: Mirror) -> None:
     """As `refresh_pools`, for results on an object store, with the runs that other machines have added."""
     mirror.pull_index()

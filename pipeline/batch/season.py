@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 from pipeline.batch.executors import Settings, find_executor
 from pipeline.batch.ledger import STATES, Entry, Ledger
 from pipeline.batch.plan import Item, Plan, make_plan
-from pipeline.batch.pooling import refresh_pools, refresh_remote_pools
+from pipeline.batch.pooling import load_libraries, refresh_pools, refresh_remote_pools
 from pipeline.batch.pruning import prune_results
 from pipeline.batch.recordings import find_recordings
 from pipeline.batch.runner import Result, run_items
@@ -20,7 +21,9 @@ from pipeline.store import Mirror, Store
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
 
+    from pipeline.batch.executors import Executor
     from pipeline.batch.request import Request, Shard
     from pipeline.batch.work import Task
 
@@ -120,10 +123,18 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
         mirror.pull_index()
     found = find_recordings(request.targets, settle_s=request.settle_s)
     store.check_writable()
-    plan = make_plan(found.recordings, store, request)
-    todo = _select(plan.todo, request.shard)
-    watch.plan(len(todo), len(plan.settled), sum(item.log.size for item in todo))
-    result = _work_through(todo, request, Ledger(store, mirror), watch, work)
+    ledger = Ledger(store, mirror)
+    crew = _Crew(request, work, most=len(found.recordings))
+    try:
+        new = _count_new(found.recordings, ledger, request.shard)
+        if new:
+            crew.call(new)
+        plan = make_plan(found.recordings, store, request)
+        todo = _select(plan.todo, request.shard)
+        watch.plan(len(todo), len(plan.settled), sum(item.log.size for item in todo))
+        result = _work_through(todo, request, ledger, watch, crew)
+    finally:
+        crew.dismiss()
     problems, removed = _tidy_up(store, mirror, request)
     growing = [Line(path=str(path), state="growing", reason="still being written") for path in found.growing]
     lines = [*_describe_plan(plan), *map(_describe_report, result.reports), *_describe_left(result), *growing]
@@ -165,28 +176,55 @@ def _number(run: str) -> int:
     return int.from_bytes(hashlib.sha256(run.encode()).digest()[:8], "big")
 
 
+class _Crew:
+    """The workers: called when it is certain that there is work, which may be before it is planned."""
+
+    def __init__(self, request: Request, work: Callable[[Task], Report], *, most: int) -> None:
+        self._request = request
+        self._settings = Settings(
+            jobs=min(request.jobs, most),
+            timeout_s=request.timeout_s,
+            memory_bytes=request.memory_bytes,
+            work=work,
+        )
+        self._executor: Executor | None = None
+
+    def call(self, tasks: int) -> Executor:
+        """The workers, getting ready for so many tasks."""
+        if self._executor is None:
+            self._executor = find_executor(self._request.executor, self._settings)
+        self._executor.expect(tasks)
+        return self._executor
+
+    def dismiss(self) -> None:
+        """End the workers."""
+        if self._executor is not None:
+            self._executor.close()
+
+
+def _count_new(paths: Sequence[Path], ledger: Ledger, shard: Shard | None) -> int:
+    """Logs that nothing is known of; with a shard none is certain to be this machine's."""
+    if shard is not None:
+        return 0
+    known = ledger.read_all()
+    return sum(str(path) not in known for path in paths)
+
+
 def _work_through(
-    todo: Sequence[Item], request: Request, ledger: Ledger, watch: Watch, work: Callable[[Task], Report]
+    todo: Sequence[Item], request: Request, ledger: Ledger, watch: Watch, crew: _Crew
 ) -> Result:
     if not todo:
         return Result(reports=(), left=())
-    settings = Settings(
-        jobs=min(request.jobs, len(todo)),
-        timeout_s=request.timeout_s,
-        memory_bytes=request.memory_bytes,
-        work=work,
+    executor = crew.call(len(todo))
+    # This process only waits while the others work.
+    threading.Thread(target=load_libraries, name="libraries", daemon=True).start()
+    return run_items(
+        todo,
+        executor,
+        request=request,
+        ledger=ledger,
+        tell=lambda report, item: watch.tell(_describe_report(report), item.log.size),
     )
-    executor = find_executor(request.executor, settings)
-    try:
-        return run_items(
-            todo,
-            executor,
-            request=request,
-            ledger=ledger,
-            tell=lambda report, item: watch.tell(_describe_report(report), item.log.size),
-        )
-    finally:
-        executor.close()
 
 
 def _describe_plan(plan: Plan) -> list[Line]:

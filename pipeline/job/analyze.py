@@ -6,6 +6,7 @@ import importlib.metadata
 import json
 import platform
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -204,6 +205,11 @@ def _configuration(work: Work) -> JSON:
 
 def versions() -> dict[str, str]:
     """Versions of what computes the numbers."""
+    return dict(_look_up_versions())
+
+
+@cache
+def _look_up_versions() -> Mapping[str, str]:
     found = {name: importlib.metadata.version(name) for name in _PACKAGES}
     return {"python": platform.python_version(), **found}
 

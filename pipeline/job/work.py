@@ -107,9 +107,9 @@ class Work:
             "vehicle": self.subject.vehicle.id,
             "terrain": self.subject.terrain,
         }
-        columns = contract_of(table).schema.columns()
+        columns = contract_of(table).schema.column_names()
         labelled = frame.with_columns(pl.lit(text).alias(name) for name, text in who.items())
-        return labelled.select(list(columns))
+        return labelled.select(columns)
 
     def _read(self, table: str) -> pl.DataFrame:
         """A table of the stages before; an empty frame where the log has nothing for it."""

@@ -7,6 +7,7 @@ pyarrow writes it. This module is heavy to import; the rest of the room does so 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 import polars as pl
@@ -18,6 +19,8 @@ from pipeline.store.manifest import TableReport
 from schemas import Contract, contract_of, list_contracts
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from dataframely import FailureInfo
 
 QUARANTINE = "quarantine_"
@@ -66,10 +69,23 @@ def schema_of(name: str) -> pl.Schema:
     Raises:
         StoreError: ``no_such_table``.
     """
-    schema = find_contract(name.removeprefix(QUARANTINE)).schema.create_empty().schema
+    schema = _list_columns(find_contract(name.removeprefix(QUARANTINE)))
     if name.startswith(QUARANTINE):
         return pl.Schema({**schema, BROKEN_RULES: pl.List(pl.String())})
-    return schema
+    return pl.Schema(schema)
+
+
+# Contracts never change while the program runs, and asking one takes as long as checking a small table.
+@cache
+def _list_columns(contract: Contract) -> Mapping[str, pl.DataType]:
+    return contract.schema.create_empty().schema
+
+
+@cache
+def _describe_columns(contract: Contract) -> Mapping[str, Mapping[str, str]]:
+    """Metadata of every field as it stands in the files, sorted by key."""
+    names = contract.schema.column_names()
+    return {name: dict(sorted(contract.metadata_of(name).items())) for name in names}
 
 
 def check_table(name: str, frame: pl.DataFrame) -> CheckedTable:
@@ -133,11 +149,12 @@ def encode_parquet(contract: Contract, frame: pl.DataFrame) -> bytes:
 
 def _describe(contract: Contract, schema: pa.Schema) -> pa.Schema:
     fields = []
+    described = _describe_columns(contract)
     for field in schema:
-        ours = _ABOUT_BROKEN_RULES if field.name == BROKEN_RULES else contract.metadata_of(field.name)
+        ours = _ABOUT_BROKEN_RULES if field.name == BROKEN_RULES else described[field.name]
         # polars keeps the values of an Enum in the field's metadata; without them it reads back a category.
         kept = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
-        fields.append(field.with_metadata(kept | dict(sorted(ours.items()))))
+        fields.append(field.with_metadata(kept | dict(ours)))
     return pa.schema(fields, metadata={"contract": contract.name, "contract_version": str(contract.version)})
 
 

@@ -26,7 +26,7 @@ def work_poisoned(task: Task) -> Report:
     if kind == "eats":
         hoard = []
         while True:
-            hoard.append(bytearray(os.urandom(1 << 20) * 32))
+            hoard.append(b"x" * (1 << 26))
     if kind == "dies":
         os.kill(os.getpid(), signal.SIGSEGV)
     if kind == "leaves":

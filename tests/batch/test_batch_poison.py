@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import multiprocessing.spawn
 import shutil
+import time
 from pathlib import Path
 
+import pytest
 from batch_tools import batch, counts, read_tables
 from batch_works import work_poisoned
+from pebble.pool.process import PoolManager
+
+from pipeline.batch import BatchError
 
 KINDS = ("raises", "hangs", "eats", "dies", "leaves", "unpicklable")
 LIMITS = {"executor": "local", "timeout_s": 4.0, "memory_bytes": 700_000_000}
@@ -56,3 +63,35 @@ def test_a_log_that_changed_leaves_the_quarantine(season: Path, tmp_path: Path) 
     assert counts(batch(log, tmp_path / "out", work=work_poisoned, **LIMITS)) == {"quarantined": 1}
     log.write_bytes((season / "b.mcap").read_bytes())
     assert counts(batch(log, tmp_path / "out")) == {"done": 1}
+
+
+def test_a_death_is_understood_however_late_its_pool_hears_of_the_task(
+    season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in "cd":
+        (season / f"{name}.mcap").unlink()
+    (season / "a.mcap").rename(season / "dies.mcap")
+    hear = PoolManager.process_next_message
+
+    def hear_late(manager: PoolManager, timeout: float) -> None:
+        # The loop that looks for dead processes comes round several times meanwhile.
+        time.sleep(0.4)
+        hear(manager, timeout)
+
+    monkeypatch.setattr(PoolManager, "process_next_message", hear_late)
+    outcome = batch(season, tmp_path / "out", work=work_poisoned, **LIMITS | {"timeout_s": 60.0})
+    assert counts(outcome) == {"done": 1, "quarantined": 1}
+    (line,) = (line for line in outcome.lines if line.state == "quarantined")
+    assert (Path(line.path).stem, line.code) == ("dies", "worker_died")
+    assert "signal 11" in line.reason
+
+
+def test_processes_that_cannot_be_started_cost_no_log(
+    season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(multiprocessing.spawn, "_python_exe", b"/bin/false")
+    with pytest.raises(BatchError) as caught:
+        batch(season, tmp_path / "out", **LIMITS)
+    assert caught.value.code == "no_workers"
+    monkeypatch.undo()
+    assert counts(batch(season, tmp_path / "out")) == {"done": 4}

@@ -65,6 +65,9 @@ class Executor(Protocol):
     def spreads_blame(self) -> bool:
         """Whether a worker that dies may make innocent tasks look guilty; suspects are then tried alone."""
 
+    def expect(self, tasks: int) -> None:
+        """Get ready for so many tasks, which are certain to come."""
+
     def submit(self, task: Task) -> Future[Report]:
         """Work on a task some time."""
 

@@ -111,6 +111,9 @@ class ClusterExecutor:
         threads: dict[str, int] = self._client.nthreads()
         return max(1, sum(threads.values()))
 
+    def expect(self, tasks: int) -> None:
+        """The workers are there already."""
+
     def submit(self, task: Task) -> Future[Report]:
         """Work on a task some time."""
         return cast("Future[Report]", self._pool.submit(self._work, task))

@@ -1,28 +1,44 @@
-"""Processes of this machine: a log that crashes, hangs or eats memory costs itself and nothing else."""
+"""Processes of this machine: a log that crashes, hangs or eats memory costs itself and nothing else.
+
+Every process is a pool of its own with one task at a time. In a pool of several, a process that dies before
+its pool has heard which task it took breaks the pool or leaves the task waiting for ever, and one that dies
+with the lock of their common pipe stops the others; here a death has one possible cause, its pool goes with
+it, and whoever waits for a task learns of the death from the process itself.
+"""
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import threading
 import time
+from concurrent.futures import Future, InvalidStateError, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from functools import partial
+from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import TYPE_CHECKING, cast
 
 from pebble import ProcessExpired, ProcessPool
 
+from pipeline.batch.errors import BatchError
 from pipeline.batch.executors import Blame, Settings
 from pipeline.batch.memory import MemoryWatchdog
 from pipeline.batch.work import work_safely
 
 if TYPE_CHECKING:
-    from concurrent.futures import Future
-
     from pipeline.batch.work import Report, Task
 
 _TASKS_PER_WORKER = 500
 """A worker is replaced after so many logs: whatever leaks in a library stays small."""
 
 _ORPHAN_PERIOD_S = 0.5
+_LOOK_PERIOD_S = 0.25
+_LOOKS_UNTIL_DEAD = 4
+"""A pool that does its part has told of a death by then."""
+
+_END_S = 5.0
+"""A process that has been killed is gone within this time."""
+
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
 """What tells numeric libraries how many threads to take."""
 
@@ -46,61 +62,233 @@ class LocalExecutor:
         # Spawned processes take the environment over; more threads than cores only get in each other's way.
         for variable in THREAD_VARIABLES:
             os.environ.setdefault(variable, "1")
-        self._pool = ProcessPool(
-            max_workers=settings.jobs,
-            max_tasks=_TASKS_PER_WORKER,
-            initializer=prepare_worker,
-            initargs=(os.getpid(),),
-            context=multiprocessing.get_context("spawn"),
-        )
+        self._workers: list[_Worker] = []
+        self._ended: list[_Worker] = []
         self._watchdog = MemoryWatchdog(settings.memory_bytes)
         self._watchdog.start()
+        self._closing = threading.Event()
+        self._nurse = threading.Thread(target=self._look_after_workers, name="nurse", daemon=True)
+        self._nurse.start()
 
     @property
     def depth(self) -> int:
-        """Two for each process, so that none waits for us."""
-        return 2 * self._settings.jobs
+        """A task for each process."""
+        return self._settings.jobs
 
     @property
     def spreads_blame(self) -> bool:
         """A process has one task."""
         return False
 
+    def expect(self, tasks: int) -> None:
+        """Start the processes, which load their libraries while it is still being planned what they do.
+
+        Raises:
+            BatchError: ``no_workers``.
+        """
+        for _ in range(min(self._settings.jobs, tasks) - len(self._workers)):
+            self._start_worker()
+
     def submit(self, task: Task) -> Future[Report]:
-        """Work on a task some time."""
-        future = self._pool.submit(work_safely, self._settings.timeout_s, self._settings.work, task)
-        return cast("Future[Report]", future)
+        """Work on a task.
+
+        Raises:
+            BatchError: ``no_workers``, a process cannot be started.
+        """
+        while True:
+            free = [worker for worker in self._workers if not worker.is_busy] or [self._start_worker()]
+            worker = min(free, key=lambda worker: not worker.is_ready)
+            worker.wait_until_ready()
+            try:
+                if worker.count < _TASKS_PER_WORKER:
+                    return worker.begin(self._settings, task)
+            except RuntimeError:
+                # It has died while it had nothing to do.
+                pass
+            self._end_worker(worker)
 
     def blame(self, task: Task, error: BaseException) -> Blame:
         """What the exception of a future means."""
-        del task
+        if not isinstance(error, TimeoutError | ProcessExpired | BrokenProcessPool):
+            return Blame("no_result", f"it gave no result: {type(error).__name__}: {error}", 1)
+        worker = next(worker for worker in self._workers if worker.task == task)
+        self._end_worker(worker)
         if isinstance(error, TimeoutError):
             return Blame("timed_out", f"it was not done within {self._settings.timeout_s:g} s", 1)
-        if isinstance(error, ProcessExpired):
-            held = self._watchdog.held_by(error.pid)
-            if held is not None:
-                limit = self._settings.memory_bytes / 1e9
-                return Blame(
-                    "out_of_memory", f"it held {held / 1e9:.2g} GB of memory, more than {limit:.2g} GB", 1
-                )
-            return Blame("worker_died", f"its process died ({describe_exit(error.exitcode)})", 1)
-        return Blame("no_result", f"it gave no result: {type(error).__name__}: {error}", 1)
+        pid, exit_code = worker.tell_end()
+        held = self._watchdog.held_by(pid)
+        if held is not None:
+            limit = self._settings.memory_bytes / 1e9
+            return Blame(
+                "out_of_memory", f"it held {held / 1e9:.2g} GB of memory, more than {limit:.2g} GB", 1
+            )
+        return Blame("worker_died", f"its process died ({describe_exit(exit_code)})", 1)
 
     def close(self) -> None:
         """End the workers, without waiting for unfinished tasks."""
+        self._closing.set()
+        self._nurse.join()
         self._watchdog.stop()
+        for worker in tuple(self._workers):
+            self._end_worker(worker)
+        for worker in self._ended:
+            worker.wait_for_end()
+
+    def _start_worker(self) -> _Worker:
+        try:
+            worker = _Worker()
+        except (BrokenProcessPool, OSError) as error:
+            raise _describe_failed_start(str(error.__cause__ or error)) from error
+        self._workers.append(worker)
+        return worker
+
+    def _end_worker(self, worker: _Worker) -> None:
+        self._workers.remove(worker)
+        self._ended.append(worker)
+        worker.end()
+
+    def _look_after_workers(self) -> None:
+        while not self._closing.wait(_LOOK_PERIOD_S):
+            for worker in tuple(self._workers):
+                worker.give_up_if_dead()
+
+
+class _Worker:
+    """A pool of one process, which makes itself ready at once.
+
+    Attributes:
+        task: what it works on, or worked on last.
+        count: tasks so far.
+    """
+
+    def __init__(self) -> None:
+        self.task: Task | None = None
+        self.count = 0
+        self._future: Future[Report] | None = None
+        self._looks_dead = 0
+        context = _RememberingContext()
+        self._pool = ProcessPool(
+            max_workers=1, initializer=prepare_worker, initargs=(os.getpid(),), context=context
+        )
+        self._ready = self._pool.submit(load_libraries, None)
+        # Its pool may start another one after a death, which is not given any task.
+        self._process = context.first
+        self._ending = threading.Thread(target=self._pool.join, name="ending", daemon=True)
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether it has a task."""
+        return self._future is not None and not self._future.done()
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether it can begin at once."""
+        return self._ready.done()
+
+    def wait_until_ready(self) -> None:
+        """Wait until it can begin.
+
+        Raises:
+            BatchError: ``no_workers``, the process cannot live.
+        """
+        while not self._ready.done() and self._is_alive():
+            wait([self._ready], timeout=_LOOK_PERIOD_S)
+        if not self._ready.done() or self._ready.exception() is not None:
+            _, exit_code = self.tell_end()
+            raise _describe_failed_start(describe_exit(exit_code))
+
+    def begin(self, settings: Settings, task: Task) -> Future[Report]:
+        """Work on a task.
+
+        Raises:
+            RuntimeError: its process is gone.
+        """
+        if not self._is_alive():
+            raise RuntimeError("the process has died")
+        self.task = task
+        self.count += 1
+        self._looks_dead = 0
+        self._future = Future()
+        given = self._pool.submit(work_safely, settings.timeout_s, settings.work, task)
+        given.add_done_callback(partial(_hand_over, self._future))
+        return self._future
+
+    def give_up_if_dead(self) -> None:
+        """Tell whoever waits for a task that there is nobody to do it, if the pool does not."""
+        if self._future is None or not self.is_busy or self._is_alive():
+            return
+        self._looks_dead += 1
+        if self._looks_dead >= _LOOKS_UNTIL_DEAD:
+            with suppress(InvalidStateError):
+                self._future.set_exception(BrokenProcessPool("the process has died"))
+
+    def tell_end(self) -> tuple[int | None, int | None]:
+        """Number of the process and how it ended, as far as is known."""
+        if self._process is None:
+            return None, None
+        self._process.join(_END_S)
+        return self._process.pid, self._process.exitcode
+
+    def end(self) -> None:
+        """Begin to end the process."""
         self._pool.stop()  # type: ignore[no-untyped-call]
-        self._pool.join()
+        self._ending.start()
+
+    def wait_for_end(self) -> None:
+        """Wait until the process is gone."""
+        self._ending.join()
+
+    def _is_alive(self) -> bool:
+        return self._process is not None and self._process.is_alive()
 
 
-def describe_exit(code: int) -> str:
+def _hand_over(waiting: Future[Report], given: Future[object]) -> None:
+    # Whoever waits may have been told already that the process is dead.
+    with suppress(InvalidStateError):
+        error = given.exception()
+        if error is None:
+            waiting.set_result(cast("Report", given.result()))
+        else:
+            waiting.set_exception(error)
+
+
+class _RememberingContext(SpawnContext):
+    """Spawns processes and remembers the first: pools do not always tell how theirs ended."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first: SpawnProcess | None = None
+
+    def Process(self, *args: object, **options: object) -> SpawnProcess:  # type: ignore[override]  # noqa: N802
+        process = SpawnProcess(*args, **options)  # type: ignore[arg-type]
+        self.first = self.first or process
+        return process
+
+
+def _describe_failed_start(reason: str) -> BatchError:
+    return BatchError(
+        "no_workers",
+        f"worker processes cannot be started ({reason})",
+        hint="See what they said above; --executor inline works without them",
+    )
+
+
+def describe_exit(code: int | None) -> str:
     """An exit code in words."""
+    if code is None:
+        return "nobody knows how"
     return f"signal {-code}" if code < 0 else f"exit code {code}"
 
 
 def prepare_worker(parent: int) -> None:
     """End this process when the batch that it works for is killed."""
     threading.Thread(target=_die_with, args=(parent,), name="parent", daemon=True).start()
+
+
+def load_libraries() -> None:
+    """Load what every log needs, so that it is not part of the time of the first."""
+    import pipeline.job.analyze  # noqa: PLC0415 - only in workers
+    import pipeline.store.tables  # noqa: F401, PLC0415 - likewise
 
 
 def _die_with(parent: int) -> None:
