@@ -19,6 +19,7 @@ from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.where import map_errors, pick_regions
 from pipeline.motion import Input, ModelFile, MotionError
 from pipeline.motion.describe import errors_as_json, ladder_as_json
+from pipeline.motion.windows import WINDOW_S
 from pipeline.motion.workshop import note_fit
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 _DRAWS = 400
 _WORTH = 0.01
 _CLOCKS = frozenset({"clock_offset", "heading_skew"})
+# Eight steps of six seconds, and fifteen: with fewer, a delay or a change of terrain stands for the truth.
+_LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
 
 
 def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -> RunDiagnosis:
@@ -65,7 +68,7 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
         for effect in _order(found, judgement)
         if not _parts(effect) & open_ids and effect.id not in known
     )
-    named = leftover.mark_tentative(named, ways, unexplained)
+    named = leftover.mark_tentative(_mark_idle(named, judgement), ways, unexplained)
     problem: Problem = body.search.arena.problem
     start = body.search.start
     comparisons = ground.compare(source)
@@ -114,9 +117,25 @@ def of_run(common: RunDiagnosis, recording: Recording, number: int, ground: Grou
         for effect in common.effects
         if effect.implausible is not None
     ]
+    findings += _note_brevity(ground, common)
     runs = cast("Sequence[Mapping[str, Json]]", common.timing["runs"])
-    del ground
     return replace(common, run=recording.name, findings=tuple(findings), timing=runs[number])
+
+
+def _note_brevity(ground: Ground, common: RunDiagnosis) -> list[Mapping[str, Json]]:
+    """A word where there was less driving than names can be trusted on."""
+    least, words = _LEAST_DRIVING_S[common.input]
+    driven = sum(
+        float(np.minimum(np.diff(comparison.windows.times[:, 0], append=np.inf), WINDOW_S).sum())
+        for comparison in ground.compare(Input(common.input))
+    )
+    if driven >= least:
+        return []
+    text = (
+        f"{driven:.0f} s of driving can be compared: from {words} names are trusted from {least:.0f} s on, "
+        "with turns and speeds of both signs"
+    )
+    return [{"id": "little_driving", "text": text, "where": "diagnosis", "severity": "warning"}]
 
 
 def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
@@ -179,6 +198,12 @@ def _describe(
         selected=selected,
         implausible=find_implausible(fitted),
     )
+
+
+def _mark_idle(named: tuple[Named, ...], judgement: Judgement | None) -> tuple[Named, ...]:
+    """Effects of one part of the way that leave the error over the whole way as it is are tentative."""
+    idle = () if judgement is None else judgement.ladder.idle
+    return tuple(replace(effect, tentative=effect.id in idle) for effect in named)
 
 
 def _order(effects: Sequence[Effect], judgement: Judgement | None) -> list[Effect]:

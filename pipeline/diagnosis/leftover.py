@@ -25,8 +25,9 @@ Floats = NDArray[np.float64]
 _BINS = 8
 _PART = 0.3
 # What lasts is structure where it is much of the residual, and of the motion that was asked for.
-_LEAST_SHARE = 0.3
+_LEAST_SHARE = 0.5
 _LEAST_OF_MOTION = 0.05
+_LEAST_REPEAT = 0.28
 _FEWEST_WINDOWS = 200
 _WORDS = {
     "wheels": "wheels that stay ahead or behind for seconds, beyond every effect",
@@ -37,26 +38,33 @@ _WORDS = {
 def describe(ways: Sequence[Explored]) -> Unexplained | None:
     """Structure that no effect takes; None where there is none.
 
-    A formula where one was found, else what can be predicted from what was recorded, else motion that lasts
-    though nothing that was recorded tells of it.
+    A formula where one was found; else the larger, against the motion that was asked for, of what can be
+    predicted from what was recorded and of motion that lasts though nothing that was recorded tells of it.
     """
     body = ways[0]
     arena, final = body.search.arena, body.search.final
     terms = collect_terms(final)
     if terms:
         without = arena.drop(final, [term.id for term in terms])
-        pushed = (without.fitted.residual - final.fitted.residual) / arena.metric.scale
-        sizes = np.sqrt((pushed**2).mean(axis=0))
         share = 1.0 - arena.metric.loss(final.held) / arena.metric.loss(without.held)
-        formula = write_formula(join_formula(terms))
-        signal = pushed * arena.metric.scale
-    elif body.explainable is not None and is_explainable(body.explainable):
-        sizes = np.where(body.explainable.shares > 0.0, body.explainable.sizes, 0.0)
-        channel = int(np.argmax(sizes))
-        share, formula = float(body.explainable.shares[channel]), None
-        signal = body.explainable.predicted * arena.metric.scale
-    else:
-        return next((found for way in ways if (found := _find_lasting(way)) is not None), None)
+        signal = without.fitted.residual - final.fitted.residual
+        return _describe_signal(body, signal, share, write_formula(join_formula(terms)))
+    found: list[tuple[float, Unexplained]] = []
+    explainable = body.explainable
+    if explainable is not None and is_explainable(explainable):
+        signal = explainable.predicted * arena.metric.scale * (explainable.shares > 0.0)
+        left = _describe_signal(body, signal, 0.0, None)
+        channel = CHANNELS.index(left.channel)
+        left = replace(left, share=float(explainable.shares[channel]))
+        size = float(np.sqrt((signal[:, channel] ** 2).mean()))
+        found.append((size / float(_measure_asked(body)[channel]), left))
+    found += [one for way in ways if (one := _find_lasting(way)) is not None]
+    return max(found, key=lambda item: item[0])[1] if found else None
+
+
+def _describe_signal(body: Explored, signal: Floats, share: float, formula: str | None) -> Unexplained:
+    """What a push of x, y, w at every window depends on most."""
+    sizes = np.sqrt(((signal / body.search.arena.metric.scale) ** 2).mean(axis=0))
     channel = int(np.argmax(sizes))
     name, table = _depend(body, signal[:, channel])
     every = tuple(CHANNELS[i] for i in np.argsort(-sizes) if sizes[i] > _PART * sizes[channel])
@@ -74,31 +82,42 @@ def describe(ways: Sequence[Explored]) -> Unexplained | None:
     return Unexplained(share, CHANNELS[channel], every, where, formula, partial, body.search.way)
 
 
-def _find_lasting(way: Explored) -> Unexplained | None:
-    """Motion that lasts longer than noise and random motion do, whatever causes it."""
-    problem, held = way.search.arena.problem, way.search.final.held
+def _find_lasting(way: Explored) -> tuple[float, Unexplained] | None:
+    """Motion that lasts longer than noise and random motion do, and its size against the motion asked for."""
+    held = way.search.final.held
     if held.shape[0] < _FEWEST_WINDOWS:
         return None
-    shares = _share_lasting(way)
-    ideal = problem.find_ideal()[:, 0, :]
-    forward, turning = np.sqrt((ideal**2).mean(axis=0)).tolist()
-    asked = np.array([forward, forward, turning])
+    shares, repeats = _share_lasting(way)
     sizes = np.sqrt(shares * (held**2).mean(axis=0))
-    parts = np.where(shares >= _LEAST_SHARE, sizes / np.maximum(asked, 1e-9), 0.0)
+    lasts = (shares >= _LEAST_SHARE) & (repeats >= _LEAST_REPEAT)
+    parts = np.where(lasts, sizes / _measure_asked(way), 0.0)
     channel = int(np.argmax(parts))
     if parts[channel] < _LEAST_OF_MOTION:
         return None
     every = tuple(CHANNELS[i] for i in np.argsort(-parts) if parts[i] >= _LEAST_OF_MOTION)
     told = [f"{sizes[i]:.2g} {_unit(i)} in {CHANNELS[i]}" for i in np.flatnonzero(parts).tolist()]
     where = f"{_WORDS.get(way.search.way, _WORDS['body'])}: {', '.join(told)}"
-    return Unexplained(float(shares[channel]), CHANNELS[channel], every, where, None, {}, way.search.way)
+    left = Unexplained(float(shares[channel]), CHANNELS[channel], every, where, None, {}, way.search.way)
+    return float(parts[channel]), left
 
 
-def _share_lasting(way: Explored) -> Floats:
-    """Share of the residual's variance that lasts, x, y, w; zero in channels that say nothing."""
+def _measure_asked(way: Explored) -> Floats:
+    """Motion that was asked for, rms of x, y, w; sideways it is measured by the way forward."""
+    ideal = way.search.arena.problem.find_ideal()[:, 0, :]
+    forward, turning = np.sqrt((ideal**2).mean(axis=0)).tolist()
+    asked: Floats = np.maximum(np.array([forward, forward, turning]), 1e-9)
+    return asked
+
+
+def _share_lasting(way: Explored) -> tuple[Floats, Floats]:
+    """Of x, y, w: share of the residual's variance that lasts, and correlation over one to two seconds."""
     problem = way.search.arena.problem
     makeup = split_residuals(problem.comparisons, way.search.final.held)  # type: ignore[attr-defined]
-    return np.array([part.lasting_share if i in problem.channels else 0.0 for i, part in enumerate(makeup)])
+    seen = np.isin(np.arange(3), problem.channels)
+    shares = np.array([part.lasting_share for part in makeup])
+    # Random motion that is forgotten within half a second repeats itself by 0.1 over that time.
+    repeats = np.array([part.correlation[1:4].mean() for part in makeup])
+    return np.where(seen, shares, 0.0), np.where(seen, repeats, 0.0)
 
 
 def _unit(channel: int) -> str:
@@ -141,7 +160,7 @@ def mark_tentative(
             fall = ((without.held / arena.metric.scale) ** 2).mean(axis=0)
             fall -= ((final.held / arena.metric.scale) ** 2).mean(axis=0)
             tentative = int(np.argmax(fall)) == channel and float(fall[channel]) < 0.5 * stays
-        marked.append(replace(effect, tentative=tentative))
+        marked.append(replace(effect, tentative=effect.tentative or tentative))
     return tuple(marked)
 
 
@@ -149,7 +168,7 @@ def describe_disturbance(body: Explored, unexplained: Unexplained | None) -> dic
     """What is left of x, y, w: rms, and the part of it that lasts longer than noise and random motion do."""
     held = body.search.final.held
     rms = np.sqrt((held**2).mean(axis=0))
-    lasting = rms * np.sqrt(_share_lasting(body))
+    lasting = rms * np.sqrt(_share_lasting(body)[0])
     text = (
         "what is left is not a function of anything recorded: disturbance and localization noise"
         if unexplained is None
