@@ -14,7 +14,7 @@ export LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT SCORES
 FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader browser check clean compare format inspect lock samples \
+.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader bench-workbench browser check clean compare format inspect lock samples \
 	serve test test-long
 
 help: ## print this list
@@ -77,7 +77,7 @@ reveal: $(VENV)/.ready-dev ## LOG=data_samples/mystery_1.mcap: open the seal of 
 	@[ -n "$$LOG" ] || { echo "Say which log: make reveal LOG=data_samples/mystery_1.mcap" >&2; exit 2; }
 	@$(BIN)/python tests/hidden/mystery.py open "$${LOG%.mcap}.sealed"
 
-bench: bench-reader bench-analyze bench-batch bench-export ## all benchmarks
+bench: bench-reader bench-analyze bench-batch bench-export bench-workbench ## all benchmarks
 
 bench-analyze: $(VENV)/.ready-dev ## a whole analysis of a 10-minute log
 	$(BIN)/python tests/bench/analyze.py
@@ -87,6 +87,9 @@ bench-batch: $(VENV)/.ready-dev ## batches of 10, 100 and 1,000 logs, on one and
 
 bench-export: $(VENV)/.ready-dev ## exporting runs of 1, 3 and 10 hours as MCAP
 	$(BIN)/python tests/bench/export.py
+
+bench-workbench: $(VENV)/.ready-dev ## answers of the workbench on a 10-minute log
+	$(BIN)/python tests/bench/workbench.py
 
 bench-reader: $(VENV)/.ready-dev ## reading a 1 GB log: ours, its peers, and the bound
 	$(BIN)/python tests/bench/reader.py
