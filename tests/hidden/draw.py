@@ -115,8 +115,11 @@ def draw_riddle(category: Category, seed: int, effect: str | None = None) -> Rid
         "odd": _draw_odd,
         "rigid": _draw_rigid,
     }
-    generator = np.random.default_rng([CATEGORIES.index(category), seed])
-    return maker[category](generator, seed, effect)
+    if effect is None:
+        return maker[category](np.random.default_rng([CATEGORIES.index(category), seed]), seed, None)
+    # Logs of one seed must share no noise, or many effects on few seeds would count as many logs.
+    generator = np.random.default_rng([CATEGORIES.index(category), seed, zlib.crc32(effect.encode())])
+    return maker[category](generator, int(generator.integers(2**31)), effect)
 
 
 def write_riddle(riddle: Riddle, path: Path) -> None:

@@ -36,6 +36,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLAR
 _TIME_OUT_S = 180.0
 _STOPPED = 130
 _AGAIN = 200
+_OFTEN = 20
 
 
 def list_jobs(
@@ -157,8 +158,9 @@ def main() -> int:
         if asked.out:
             append_record(known, asked.out)
         left = (time.monotonic() - begin) / count * (len(rest) - count)
-        sys.stderr.write(f"\r{count} of {len(rest)} logs, {left / 60.0:.0f} min left ")
-        sys.stderr.flush()
+        if sys.stderr.isatty() or count % _OFTEN == 0:
+            sys.stderr.write(f"\r{count} of {len(rest)} logs, {left / 60.0:.0f} min left ")
+            sys.stderr.flush()
 
     code = 0
     try:

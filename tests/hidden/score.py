@@ -32,6 +32,7 @@ class Score:
         false: named ids that were not hidden.
         flagged: channel in which structure was called unexplained, empty without.
         errors: 2 s position error before, after, and the floor [m].
+        groups: what was left undecided: candidates joined by `|`.
     """
 
     truth: tuple[str, ...]
@@ -43,6 +44,7 @@ class Score:
     false: tuple[str, ...]
     flagged: str
     errors: tuple[float, float, float]
+    groups: tuple[str, ...] = ()
 
     @property
     def is_exact(self) -> bool:
@@ -76,7 +78,7 @@ def score_run(answer: Answer, run: Json) -> Score:
     channel = "".join(map(str, _list(flagged, "channels"))) if isinstance(flagged, Mapping) else ""
     return Score(
         truth, tuple(named), tuple(found), tuple(undecided), tuple(unobservable), tuple(missed),
-        tuple(false), channel, _errors(run),
+        tuple(false), channel, _errors(run), tuple("|".join(sorted(group)) for group in groups),
     )  # fmt: skip
 
 
