@@ -1,8 +1,10 @@
 """What a batch costs: per log as the season grows, once more over nothing new, on one and two processes.
 
-    python tests/bench/batch.py [--most 1000] [--folder DIR]
+    python tests/bench/batch.py [--counts 10 100 1000] [--compare 100 1000] [--rounds 3] [--folder DIR]
 
-Logs are simulated, ten seconds of a Husky each. Times are of the whole command, its start included.
+Logs are simulated, ten seconds of a Husky each. Times are of the whole command, its start included. One and
+two processes take turns, so that other load hits both, and the best of the rounds counts. *Alone* is the time
+in which no log is worked on: until the first is begun, and after the last is done.
 """
 
 from __future__ import annotations
@@ -18,20 +20,41 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.batch.ledger import Ledger
 from pipeline.simulate import simulate_case
+from pipeline.store import Store
 
 ROOT = Path(__file__).parents[2]
 COUNTS = (10, 100, 1000)
-COMPARED = 100
+COMPARED = (100, 1000)
+PROCESSES = (1, 2)
 
 
 @dataclass(frozen=True)
 class Run:
-    """One command: its wall time [s], the processor time of it and its workers [s], and its answer."""
+    """One command.
+
+    Attributes:
+        seconds: of the clock.
+        begun_s: until the first log was begun.
+        ending_s: after the last log was done.
+        own_s: processor time of the process that leads.
+        workers_s: processor time of the workers.
+        peak_bytes: most memory of the process that leads.
+        rss_bytes: memory of the worker after each log, in the order in which they were done.
+    """
 
     seconds: float
-    cpu_s: float
-    answer: dict[str, list[dict[str, float]]]
+    begun_s: float
+    ending_s: float
+    own_s: float
+    workers_s: float
+    peak_bytes: int
+    rss_bytes: tuple[int, ...]
+
+    @property
+    def alone_s(self) -> float:
+        return self.begun_s + self.ending_s
 
 
 def make_logs(folder: Path, count: int) -> None:
@@ -45,18 +68,29 @@ def make_logs(folder: Path, count: int) -> None:
 
 def run_batch(logs: Path, out: Path, jobs: int) -> Run:
     """Run the command as a user would."""
-    command = [sys.executable, "-m", "pipeline", "batch", str(logs), "--out", str(out), "--jobs", str(jobs)]
-    before, started = os.times(), time.perf_counter()
+    program = [sys.executable, str(Path(__file__).parent / "slip_measured.py")]
+    arguments = ["batch", str(logs), "--out", str(out), "--jobs", str(jobs), "--settle", "0", "--json"]
+    before, started = time.time(), time.perf_counter()
     done = subprocess.run(
-        [*command, "--settle", "0", "--json"],
+        [*program, *arguments],
         capture_output=True,
         text=True,
         check=True,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )
-    seconds, after = time.perf_counter() - started, os.times()
-    cpu = after.children_user + after.children_system - before.children_user - before.children_system
-    return Run(seconds, cpu, json.loads(done.stdout))
+    seconds = time.perf_counter() - started
+    cost = json.loads(done.stderr.splitlines()[-1])
+    rss = {line["path"]: line["rss_bytes"] for line in json.loads(done.stdout)["logs"]}
+    entries = sorted(Ledger(Store(out)).read_all().values(), key=lambda entry: entry.at)
+    return Run(
+        seconds=seconds,
+        begun_s=min(entry.at - entry.seconds for entry in entries) - before,
+        ending_s=before + seconds - entries[-1].at,
+        own_s=cost["own_s"],
+        workers_s=cost["children_s"],
+        peak_bytes=cost["own_peak_bytes"],
+        rss_bytes=tuple(rss[entry.log.path] for entry in entries),
+    )
 
 
 def select(logs: Path, folder: Path, count: int) -> Path:
@@ -68,45 +102,70 @@ def select(logs: Path, folder: Path, count: int) -> Path:
     return folder
 
 
-def measure_growth(logs: Path, work: Path, most: int) -> None:
-    """Cost per log as the season grows, and of a second look at it."""
-    print("  logs    first [s]  per log [ms]  cpu per log [ms]  second [s]  worker MB: first | last tenth")
-    for count in [count for count in COUNTS if count <= most]:
-        season, out = select(logs, work / "season", count), work / f"out{count}"
+def measure_growth(logs: Path, work: Path, counts: list[int]) -> None:
+    """Cost per log as the season grows, of a second look at it, and the memory over time."""
+    print("two processes, as the season grows")
+    print("       first  per log  cpu per   second  memory [MB]: workers in the")
+    print("logs   [s]    [ms]     log [ms]  [s]     first | last tenth; leader")
+    for count in counts:
+        season, out = select(logs, work / "season", count), work / "grown"
         shutil.rmtree(out, ignore_errors=True)
         first = run_batch(season, out, 2)
         second = run_batch(season, out, 2)
-        rss = [line["rss_bytes"] / 1e6 for line in first.answer["logs"]]
         tenth = max(1, count // 10)
+        rss = [held / 1e6 for held in first.rss_bytes]
         print(
-            f"{count:>6}  {first.seconds:>11.1f}  {first.seconds / count * 1e3:>12.0f}  "
-            f"{first.cpu_s / count * 1e3:>16.0f}  {second.seconds:>10.2f}  "
-            f"{max(rss[:tenth]):>22.0f} | {max(rss[-tenth:]):.0f}",
+            f"{count:<5}  {first.seconds:<5.1f}  {first.seconds / count * 1e3:<7.1f}  "
+            f"{(first.own_s + first.workers_s) / count * 1e3:<8.1f}  {second.seconds:<6.2f}  "
+            f"{max(rss[:tenth]):.0f} | {max(rss[-tenth:]):.0f}; {first.peak_bytes / 1e6:.0f}",
             flush=True,
         )
 
 
-def compare_processes(logs: Path, work: Path) -> None:
-    """Throughput on one and two processes, taken in turns so that other load hits both."""
-    season = select(logs, work / "season", COMPARED)
-    times: dict[int, list[float]] = {1: [], 2: []}
-    for jobs in (1, 2, 1, 2):
-        shutil.rmtree(work / "compared", ignore_errors=True)
-        times[jobs].append(run_batch(season, work / "compared", jobs).seconds)
-    one, two = min(times[1]), min(times[2])
-    print(f"{COMPARED} logs: 1 process {one:.1f} s, 2 processes {two:.1f} s: {one / two:.2f} times as fast")
+def compare_processes(logs: Path, work: Path, count: int, rounds: int) -> None:
+    """Throughput on one and two processes."""
+    season = select(logs, work / "season", count)
+    runs: dict[int, list[Run]] = {jobs: [] for jobs in PROCESSES}
+    for _ in range(rounds):
+        for jobs in PROCESSES:
+            shutil.rmtree(work / "compared", ignore_errors=True)
+            runs[jobs].append(run_batch(season, work / "compared", jobs))
+    print(f"\n{count} logs on one and two processes, best of {rounds}")
+    print("           clock  alone:        leader  workers'      workers'")
+    print("processes  [s]    begin + end   cpu [s] cpu/log [ms]  memory [MB]")
+    best = {jobs: min(some, key=lambda run: run.seconds) for jobs, some in runs.items()}
+    for jobs, run in best.items():
+        print(
+            f"{jobs:<9}  {run.seconds:<5.1f}  {run.begun_s:<5.2f} + {run.ending_s:<4.2f}  {run.own_s:<7.2f} "
+            f"{run.workers_s / count * 1e3:<12.1f}  {max(run.rss_bytes) / 1e6:.0f}"
+        )
+    one, two = best[1], best[2]
+    bound = one.seconds / (one.alone_s + (one.seconds - one.alone_s) / 2.0)
+    print(
+        f"two processes are {one.seconds / two.seconds:.2f} times as fast (every round: "
+        f"{', '.join(f'{a.seconds / b.seconds:.2f}' for a, b in zip(runs[1], runs[2], strict=True))}); "
+        f"what happens alone would allow {bound:.2f}",
+        flush=True,
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--most", type=int, default=COUNTS[-1])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--counts", type=int, nargs="*", default=COUNTS)
+    parser.add_argument("--compare", type=int, nargs="*", default=COMPARED)
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--folder", type=Path, default=None)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         work = given.folder or Path(temporary)
-        make_logs(work / "logs", max(given.most, COMPARED))
-        measure_growth(work / "logs", work, given.most)
-        compare_processes(work / "logs", work)
+        make_logs(work / "logs", max((*given.counts, *given.compare)))
+        print(f"{os.cpu_count()} cores, load before: {os.getloadavg()[0]:.1f}")
+        if given.counts:
+            measure_growth(work / "logs", work, given.counts)
+        for count in given.compare:
+            compare_processes(work / "logs", work, count, given.rounds)
 
 
 if __name__ == "__main__":
