@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import runpy
 import shutil
 import sys
@@ -251,6 +252,58 @@ def test_layouts_name_only_topics_of_the_derived_log(
     tree = ET.parse(write_plotjuggler_layout(source, tmp_path / "l.xml"))  # noqa: S314 - our own file
     curves = [curve.get("name", "") for curve in tree.iter("curve")]
     assert {"/".join(curve.split("/")[:-1]).split("/twist")[0] for curve in curves} == drawn
+
+
+def test_the_foxglove_layout_is_of_the_shape_that_its_viewers_save(
+    source: ExportSource, tmp_path: Path
+) -> None:
+    # What Foxglove Studio and Lichtblick declare: PanelsState, PlotConfig, RendererConfig.
+    layout = json.loads(write_foxglove_layout(source, tmp_path / "l.json").read_text())
+    assert set(layout) == {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"}
+
+    def list_leaves(node: object) -> list[str]:
+        if isinstance(node, str):
+            return [node]
+        assert isinstance(node, dict)
+        assert node["direction"] in {"row", "column"}
+        assert set(node) <= {"direction", "first", "second", "splitPercentage"}
+        return [*list_leaves(node["first"]), *list_leaves(node["second"])]
+
+    panels = layout["configById"]
+    assert sorted(list_leaves(layout["layout"])) == sorted(panels)
+    assert {name.split("!")[0] for name in panels} == {"3D", "Plot", "RosOut"}
+    for name, panel in panels.items():
+        if not name.startswith("Plot!"):
+            continue
+        assert {"paths", "showLegend", "showXAxisLabels", "isSynced", "xAxisVal"} <= set(panel)
+        assert panel["xAxisVal"] == "timestamp"
+        for path in panel["paths"]:
+            assert {"value", "enabled", "timestampMethod"} <= set(path)
+            assert path["timestampMethod"] in {"receiveTime", "headerStamp"}
+    camera = panels["3D!map"]["cameraState"]
+    places = source.manifest.read("velocities").select("x", "y").to_numpy()
+    low, high = places.min(axis=0), places.max(axis=0)
+    assert np.allclose(camera["targetOffset"][:2], (low + high) / 2.0, atol=0.01)
+    assert camera["distance"] >= (high - low).max()
+
+
+def test_the_plotjuggler_layout_is_of_the_shape_that_it_loads(source: ExportSource, tmp_path: Path) -> None:
+    tree = ET.parse(write_plotjuggler_layout(source, tmp_path / "l.xml"))  # noqa: S314 - our own file
+    root = tree.getroot()
+    assert root.tag == "root"
+    window = root.find("tabbed_widget")
+    assert window is not None
+    assert window.attrib == {"parent": "main_window", "name": "Main Window"}
+    assert [child.tag for child in window] == ["Tab", "currentTabIndex"]
+    splitter = window.find("Tab/Container/DockSplitter")
+    assert splitter is not None
+    assert splitter.attrib["orientation"] in {"-", "|"}
+    areas = splitter.findall("DockArea")
+    assert len(areas) == int(splitter.attrib["count"]) == len(splitter.attrib["sizes"].split(";"))
+    for area in areas:
+        (plot,) = area
+        assert plot.attrib == {"style": "Lines", "mode": "TimeSeries"}
+        assert all(re.fullmatch("#[0-9a-f]{6}", curve.attrib["color"]) for curve in plot)
 
 
 def test_a_place_that_cannot_be_written_is_named(source: ExportSource, tmp_path: Path) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from pipeline.report import theme
 from pipeline.report.exports import topics
 from pipeline.report.exports.files import write_text
@@ -14,6 +16,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.report.exports.source import ExportSource
+
+_CLOSEST_M = 10.0
 
 
 def write_foxglove_layout(source: ExportSource, path: Path) -> Path:
@@ -73,15 +77,54 @@ def _build_map(source: ExportSource) -> dict[str, object]:
         topics.FINDING_MARKERS: {"visible": True},
         topics.POSE: {"visible": True},
     }
+    middle, extent = _find_extent(source)
     return {
         "followTf": source.frame_id,
         "followMode": "follow-none",
         "scene": {},
-        "cameraState": {"perspective": False, "distance": 40, "phi": 0, "thetaOffset": 90},
+        # From above, north up, the whole way in view.
+        "cameraState": {
+            "perspective": False,
+            "distance": max(_CLOSEST_M, 1.2 * extent),
+            "phi": 0,
+            "thetaOffset": 90,
+            "target": [0, 0, 0],
+            "targetOffset": [*middle, 0],
+            "targetOrientation": [0, 0, 0, 1],
+            "fovy": 45,
+            "near": 0.01,
+            "far": 5000,
+        },
         "transforms": {},
         "topics": lines,
-        "layers": {"grid": {"layerId": "foxglove.Grid", "visible": True, "size": 100, "divisions": 20}},
+        "layers": {
+            "grid": {
+                "layerId": "foxglove.Grid",
+                "instanceId": "grid",
+                "label": "Grid",
+                "visible": True,
+                "frameLocked": True,
+                "size": 100,
+                "divisions": 20,
+                "lineWidth": 1,
+                "color": theme.GRID,
+                "position": [0, 0, 0],
+                "rotation": [0, 0, 0],
+                "order": 1,
+            }
+        },
+        "imageMode": {},
     }
+
+
+def _find_extent(source: ExportSource) -> tuple[list[float], float]:
+    """Middle of the way driven, x and y [m], and the longer side of the box round it [m]."""
+    parts = [frame.to_numpy() for frame in source.batches("velocities", ("x", "y"))]
+    if not parts:
+        return [0.0, 0.0], 0.0
+    low = np.min([part.min(axis=0) for part in parts], axis=0)
+    high = np.max([part.max(axis=0) for part in parts], axis=0)
+    return [round(float(value), 2) for value in (low + high) / 2.0], float((high - low).max())
 
 
 def _build_plot(title: str, lines: list[tuple[str, str, str]]) -> dict[str, object]:
@@ -99,9 +142,11 @@ def _build_plot(title: str, lines: list[tuple[str, str, str]]) -> dict[str, obje
             for value, label, colour in lines
         ],
         "showLegend": True,
+        "showPlotValuesInLegend": False,
         "legendDisplay": "floating",
         "isSynced": True,
         "xAxisVal": "timestamp",
+        "sidebarDimension": 240,
         "showXAxisLabels": True,
         "showYAxisLabels": True,
     }

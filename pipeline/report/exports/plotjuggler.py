@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 
 def write_plotjuggler_layout(source: ExportSource, path: Path) -> Path:
-    """Write a layout file for `plotjuggler --layout`.
+    """Write a layout file for `plotjuggler --datafile run_slip.mcap --layout run_plotjuggler.xml`.
+
+    A layout finds its curves among the data that is loaded already, so the log comes first.
 
     Raises:
         ReportError: ``export_not_written``.
@@ -45,5 +47,6 @@ def _build_layout(source: ExportSource) -> ET.Element:
         plot = ET.SubElement(area, "plot", {"style": "Lines", "mode": "TimeSeries"})
         for curve, colour in curves:
             ET.SubElement(plot, "curve", {"name": curve, "color": colour})
+    ET.SubElement(window, "currentTabIndex", {"index": "0"})
     ET.SubElement(root, "use_relative_time_offset", {"enabled": "1"})
     return root

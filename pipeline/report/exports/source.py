@@ -52,7 +52,9 @@ class ExportSource:
         if table not in self.manifest.tables:
             return
         with pq.ParquetFile(self.manifest.path(table), buffer_size=1 << 16, pre_buffer=False) as file:
-            for batch in file.iter_batches(BATCH_ROWS, use_threads=False, columns=list(columns) if columns else None):
+            for batch in file.iter_batches(
+                BATCH_ROWS, use_threads=False, columns=list(columns) if columns else None
+            ):
                 frame = pl.from_arrow(batch)
                 if isinstance(frame, pl.DataFrame) and not frame.is_empty():
                     yield frame
