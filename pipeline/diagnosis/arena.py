@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from pipeline.diagnosis.judge import Fold
     from pipeline.diagnosis.problem import Problem
-    from pipeline.diagnosis.screen import Candidate, Largest, Trial
+    from pipeline.diagnosis.screen import Candidate, Largest, Proposal, Trial
     from pipeline.diagnosis.state import State
 
 Floats = NDArray[np.float64]
@@ -86,8 +86,19 @@ class Arena:
     least_share: float = 0.0
     _dropped: dict[tuple[str, ...], Contender] = field(default_factory=dict)
     _suggested: dict[tuple[object, ...], list[Contender]] = field(default_factory=dict)
+    _proposed: dict[tuple[object, ...], list[Proposal]] = field(default_factory=dict)
+    _tried: dict[tuple[object, ...], Fitted] = field(default_factory=dict)
+    _finished: dict[tuple[object, ...], Contender] = field(default_factory=dict)
     work: int = 0
     _columns: dict[str, list[Trial]] = field(default_factory=dict)
+
+    def widen(self, candidates: tuple[Candidate, ...]) -> Arena:
+        """The same arena with other candidates; nothing that was tried here counts there."""
+        return Arena(
+            self.problem, candidates, self.largest, self.noise, self.folds, self.metric,
+            kept=self.kept, only_early_clock=self.only_early_clock,
+            least_delay=self.least_delay, least_share=self.least_share,
+        )  # fmt: skip
 
     def enter(self, state: State) -> Contender:
         """Fit a state and hold it out."""
@@ -130,6 +141,9 @@ class Arena:
         self.metric = make_metric(contender.fitted.residual, self.noise, self.problem)
         self._dropped.clear()
         self._suggested.clear()
+        self._proposed.clear()
+        self._tried.clear()
+        self._finished.clear()
         return self.enter(contender.state)
 
     def suggest(self, base: Contender, count: int, without: Iterable[str] = ()) -> list[Contender]:
@@ -138,21 +152,40 @@ class Arena:
         key = (base.ids, count, barred)
         if key in self._suggested:
             return self._suggested[key]
-        candidates = [c for c in self.candidates if c.id not in barred]
         self.work += 1
-        proposals = propose(self.problem, self.metric, base.fitted, candidates, self.largest, self._columns)[
-            :count
-        ]
+        proposals = self._propose(base, barred)[:count]
         # A few steps tell which of them are worth fitting to the end.
-        tried = [polish(self.problem, self.metric, p.state, _FIRST_STEPS) for p in proposals]
+        tried = [self._try(base.ids, proposal.state) for proposal in proposals]
         best = min((fitted.loss for fitted in tried), default=0.0)
         entered = [
-            self.enter(fitted.state) if fitted.loss < _WORTH * best else self._present(fitted)
+            self._finish(base.ids, fitted) if fitted.loss < _WORTH * best else self._present(fitted)
             for fitted in tried
         ]
         ranked = sorted((c for c in entered if self.is_sound(c)), key=lambda c: c.score)
         self._suggested[key] = ranked
         return ranked
+
+    def _propose(self, base: Contender, barred: frozenset[str]) -> list[Proposal]:
+        """Effects beside a model by what they promise; asked again and again for another count of them."""
+        key = (base.ids, barred)
+        if key not in self._proposed:
+            candidates = [c for c in self.candidates if c.id not in barred]
+            self._proposed[key] = propose(
+                self.problem, self.metric, base.fitted, candidates, self.largest, self._columns
+            )
+        return self._proposed[key]
+
+    def _try(self, base: tuple[str, ...], state: State) -> Fitted:
+        key = (base, state.ids)
+        if key not in self._tried:
+            self._tried[key] = polish(self.problem, self.metric, state, _FIRST_STEPS)
+        return self._tried[key]
+
+    def _finish(self, base: tuple[str, ...], fitted: Fitted) -> Contender:
+        key = (base, fitted.state.ids)
+        if key not in self._finished:
+            self._finished[key] = self.enter(fitted.state)
+        return self._finished[key]
 
     def has_room(self, contender: Contender) -> bool:
         """Whether a model leaves more than a saturated fit does in any channel."""

@@ -12,6 +12,8 @@ from pipeline.diagnosis.problem import differentiate
 from pipeline.motion.effect import Search
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from pipeline.diagnosis.metric import Metric
     from pipeline.diagnosis.problem import Problem
     from pipeline.diagnosis.state import Slot, State
@@ -20,6 +22,7 @@ Floats = NDArray[np.float64]
 
 _ITERATIONS = 20
 _ENOUGH = 2e-5
+_NEWS = 0.02
 _GRID_ROUNDS = 4
 _STIFFEST = 30.0
 
@@ -80,7 +83,7 @@ def _descend(problem: Problem, metric: Metric, state: State, iterations: int) ->
     jacobian = differentiate(problem, state, residual, slots)
     if not smooth:
         return Fitted(state, residual, slots, jacobian, loss)
-    damping = 1e-4
+    damping, is_fresh = 1e-4, True
     for _ in range(iterations):
         free = [place for place in smooth if not _pushes_out(state, slots[place], jacobian, residual, place)]
         if not free:
@@ -90,12 +93,13 @@ def _descend(problem: Problem, metric: Metric, state: State, iterations: int) ->
         promised = metric.loss(residual - jacobian[:, :, free] @ step)
         if (loss - promised) / max(loss, 1e-12) < 0.5 * _ENOUGH:
             break
-        trial = state
-        for place, change in zip(free, step.tolist(), strict=True):
-            trial = trial.write(slots[place], trial.read(slots[place]) + change)
+        trial = _move(state, [slots[place] for place in free], step)
         after = problem.find_residuals(trial)
         reached = metric.loss(after)
         if reached > loss:
+            if not is_fresh:
+                jacobian, is_fresh = differentiate(problem, state, residual, slots), True
+                continue
             if damping > _STIFFEST:
                 break
             damping = max(damping * 20.0, 1e-2)
@@ -103,10 +107,19 @@ def _descend(problem: Problem, metric: Metric, state: State, iterations: int) ->
         fall = (loss - reached) / max(loss, 1e-12)
         state, residual, loss = trial, after, reached
         damping = max(damping / 8.0, 1e-8)
-        jacobian = differentiate(problem, state, residual, slots)
+        # After a small step the derivatives still serve: new ones cost a prediction for each number.
+        is_fresh = fall > _NEWS
+        if is_fresh:
+            jacobian = differentiate(problem, state, residual, slots)
         if fall < _ENOUGH:
             break
     return Fitted(state, residual, slots, jacobian, loss)
+
+
+def _move(state: State, slots: Sequence[Slot], step: Floats) -> State:
+    for slot, change in zip(slots, step.tolist(), strict=True):
+        state = state.write(slot, state.read(slot) + change)
+    return state
 
 
 def _pushes_out(state: State, slot: Slot, jacobian: Floats, residual: Floats, place: int) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, cast
 
@@ -66,9 +66,7 @@ def search_formula(arena: Arena, start: Contender, final: Contender, places: Flo
     """
     waves = (*list_waves(arena, final, places), *list_waves(arena, start, places, "_first"))
     terms = (*list_terms(), *waves)
-    wide = replace(
-        arena, candidates=(*arena.candidates, *terms), _dropped={}, _suggested={}, _columns={}, work=0
-    )
+    wide = arena.widen((*arena.candidates, *terms))
     narrow = {effect.id for effect in arena.candidates}
     current = final
     for _ in range(_MOST_TERMS + 1):

@@ -82,19 +82,35 @@ def make_cells(run: MotionRun, rate_hz: float) -> Cells:
     return Cells(step, times, span, first, starts, starts + counts * step)
 
 
-def interpolate_drive(series: DriveSeries, at: Floats, delay_s: float) -> Wheels:
-    """Measured wheels at times, their stamps being late by ``delay_s``; held towards the middle of holes."""
-    times = series.times
-    hole = np.flatnonzero(np.diff(times) > max(_SHORTEST_HOLE, 3.0 * float(np.median(np.diff(times)))))
-    middle = 0.5 * (times[hole] + times[hole + 1])
-    places = np.concatenate((hole + 1, hole + 1))
-    knots = np.insert(times, places, np.concatenate((middle - 1e-6, middle + 1e-6)))
+class MeasuredDrive:
+    """Measured wheels as a function of time, held towards the middle of holes.
 
-    def fill(values: Floats) -> Floats:
-        held = np.insert(values, places, np.concatenate((values[hole], values[hole + 1])))
-        return np.interp(at + delay_s, knots, held)
+    Args:
+        series: wheel speeds [rad/s] and steering [rad] at their stamps.
+    """
 
-    return Wheels(fill(series.left), fill(series.right), fill(series.steering))
+    def __init__(self, series: DriveSeries) -> None:
+        times = series.times
+        period = np.diff(times)
+        hole = np.flatnonzero(period > max(_SHORTEST_HOLE, 3.0 * float(np.median(period))))
+        middle = 0.5 * (times[hole] + times[hole + 1])
+        places = np.concatenate((hole + 1, hole + 1))
+        self._knots = np.insert(times, places, np.concatenate((middle - 1e-6, middle + 1e-6)))
+
+        def fill(values: Floats) -> Floats:
+            return np.insert(values, places, np.concatenate((values[hole], values[hole + 1])))
+
+        self._left, self._right = fill(series.left), fill(series.right)
+        self._steering = fill(series.steering) if series.steering.any() else None
+
+    def interpolate(self, at: Floats, delay_s: float) -> Wheels:
+        """Wheels at times [s] of shape (n,), their stamps being late by ``delay_s``."""
+        late = at + delay_s
+        return Wheels(
+            np.interp(late, self._knots, self._left),
+            np.interp(late, self._knots, self._right),
+            np.zeros(late.size) if self._steering is None else np.interp(late, self._knots, self._steering),
+        )
 
 
 def begin_spans(series: DriveSeries, cells: Cells, measured: Floats) -> Commands:
@@ -143,4 +159,5 @@ def hold_on_cells(commands: Commands, cells: Cells) -> Wheels:
         steady = index[until] == index[: cells.times.size]
         return np.where(steady, values[index[: cells.times.size]], means)
 
-    return Wheels(average(commands.left), average(commands.right), average(commands.steering))
+    steering = average(commands.steering) if commands.steering.any() else np.zeros(cells.times.size)
+    return Wheels(average(commands.left), average(commands.right), steering)

@@ -92,21 +92,28 @@ def _find_gaps(signal: Floats, start: Floats, begins: Integers, reach: Floats, r
     late = np.flatnonzero(np.abs(gap) > reach)
     if not late.size:
         return gap
-    is_fresh = np.zeros(begins.size + 1, dtype=bool)
-    is_fresh[fresh] = True
-    is_fresh[-1] = True
-    levels, gaps, reaches, ends = level.tolist(), gap.tolist(), reach.tolist(), is_fresh.tolist()
+    levels, reaches = level.tolist(), reach.tolist()
+    ends = np.append(fresh, begins.size)
+    stops = ends[np.searchsorted(ends, late, side="right")]
+    changed: list[int] = []
+    values: list[float] = []
     arrived = -1
-    for first in late.tolist():
-        if first < arrived:
+    for first, stop in zip(late.tolist(), stops.tolist(), strict=True):
+        if first <= arrived:
             continue
-        place = first
-        while abs(gaps[place]) > reaches[place]:
-            missing = gaps[place] - (reaches[place] if gaps[place] > 0.0 else -reaches[place])
-            value = levels[place] - missing
-            place += 1
-            if ends[place]:
+        value = levels[first] - float(gap[first])
+        arrived = first
+        for place in range(first, stop):
+            missing = levels[place] - value
+            most = reaches[place]
+            values.append(missing)
+            arrived = place
+            if missing > most:
+                value += most
+            elif missing < -most:
+                value -= most
+            else:
                 break
-            gaps[place] = levels[place] - value
-        arrived = place
-    return np.array(gaps)
+        changed.extend(range(first, arrived + 1))
+    gap[changed] = values
+    return gap

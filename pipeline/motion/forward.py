@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 
-from pipeline.motion.cells import begin_spans, hold_on_cells, interpolate_drive
+from pipeline.motion.cells import MeasuredDrive, begin_spans, hold_on_cells
 from pipeline.motion.effect import (
     AddedEffect,
     BodyEffect,
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 _REMEMBERED = 3
+_REMEMBERED_OF_SHORT = 8
+_SHORT = 200_000
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,10 @@ class Forward:
         self.around = around
         self.encoders = encoders
         self.has_gyro = has_gyro
+        self._measured = MeasuredDrive(series)
+        self._encoders = None if encoders is None else MeasuredDrive(encoders)
+        # A derivative by each number in turn: the state it starts from must outlast the turns.
+        self._most = _REMEMBERED_OF_SHORT if cells.times.size < _SHORT else _REMEMBERED
         self._kept: dict[Place, OrderedDict[object, object]] = {place: OrderedDict() for place in Place}
         self._known: OrderedDict[float, Surroundings] = OrderedDict()
 
@@ -80,26 +87,25 @@ class Forward:
         around = self._start_wheels(timing.wheel_delay_s)
         key: tuple[object, ...] = (timing.wheel_delay_s, *(e.key for e in told))
         wheels = self._keep(Place.COMMAND, key, lambda: self._hold(told, timing.wheel_delay_s))
-        key = (*key, "|", *(e.key for e in driven))
-        wheels = self._keep(Place.DRIVE, key, lambda: self._drive(wheels, driven, around))
+        wheels, key = self._drive(wheels, (*key, "|"), driven, around)
         return self._move(wheels, key, effects)
 
     def run_wheels(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
         """Body velocity as reported, of measured wheels: effects of the drivetrain drop out."""
         key = (timing.wheel_delay_s,)
         wheels = self._keep(
-            Place.DRIVE, key, lambda: interpolate_drive(self.series, self.around.times, timing.wheel_delay_s)
+            Place.DRIVE, key, lambda: self._measured.interpolate(self.around.times, timing.wheel_delay_s)
         )
         return self._move(wheels, key, effects)
 
     def _start_wheels(self, delay_s: float) -> Surroundings:
         """The run with wheel speeds as the encoders had them where states begin."""
-        if self.encoders is None:
+        if self._encoders is None:
             return self.around
         if delay_s not in self._known:
             resets = self.around.wheels
             at = self.around.times[resets.first] - 0.5 * self.around.step_s
-            seen = interpolate_drive(self.encoders, at, delay_s)
+            seen = self._encoders.interpolate(at, delay_s)
             resets = replace(resets, start=np.column_stack((seen.left, seen.right)))
             self._known[delay_s] = replace(self.around, wheels=resets)
             if len(self._known) > _REMEMBERED:
@@ -113,24 +119,29 @@ class Forward:
             return cast("Result", kept[key])
         made = make()
         kept[key] = made
-        if len(kept) > _REMEMBERED:
+        if len(kept) > self._most:
             kept.popitem(last=False)
         return made
 
     def _hold(self, effects: Sequence[Effect], delay_s: float) -> Wheels:
         first = np.full((self.cells.first.size, 2), np.nan)
-        if self.encoders is not None:
-            seen = interpolate_drive(self.encoders, self.cells.starts, delay_s)
+        if self._encoders is not None:
+            seen = self._encoders.interpolate(self.cells.starts, delay_s)
             first = np.column_stack((seen.left, seen.right))
         commands = begin_spans(self.series, self.cells, first)
         for effect in effects:
             commands = cast("CommandEffect", effect).change_commands(commands, self.around)
         return hold_on_cells(commands, self.cells)
 
-    def _drive(self, wheels: Wheels, effects: Sequence[Effect], around: Surroundings) -> Wheels:
+    def _drive(
+        self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect], around: Surroundings
+    ) -> tuple[Wheels, tuple[object, ...]]:
+        """Wheels at the drivetrain's end, and their key; kept after each effect: the next may vary alone."""
         for effect in effects:
-            wheels = cast("DriveEffect", effect).drive_wheels(wheels, around)
-        return wheels
+            key = (*key, effect.key)
+            drive = partial(cast("DriveEffect", effect).drive_wheels, wheels, around)
+            wheels = self._keep(Place.DRIVE, key, drive)
+        return wheels, key
 
     def _move(self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect]) -> Velocity:
         rolled = [e for e in effects if e.place is Place.KINEMATICS]
