@@ -6,6 +6,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+from pipeline.cli.output import say, tidy_line
 from pipeline.cli.screen import format_duration
 
 if TYPE_CHECKING:
@@ -68,8 +69,7 @@ class LineWatch(SilentWatch):
         return (time.monotonic() - self._started) * (1.0 - share) / share
 
     def _write(self, text: str) -> None:
-        sys.stderr.write(f"{text}\n")
-        sys.stderr.flush()
+        say(text)
 
 
 class BarWatch(LineWatch):
@@ -97,7 +97,8 @@ class BarWatch(LineWatch):
         self._done += 1
         self._read += size
         if line.reason:
-            self._bar.console.print(f"{line.run or line.path} {line.state}: {line.reason}", markup=False)
+            text = tidy_line(f"{line.run or line.path} {line.state}: {line.reason}")
+            self._bar.console.print(text, markup=False, highlight=False)
         if self._task is not None:
             left = f"about {format_duration(self.estimate_rest())} left" if self._done < self._todo else ""
             self._bar.update(self._task, advance=1, left=left)

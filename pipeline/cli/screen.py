@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
+from pipeline.cli.output import tidy_line
+
 Summary = Mapping[str, object]
 
 _LABEL = 26
@@ -22,7 +24,7 @@ def describe_run(summary: Summary, *, unchanged: bool) -> str:
         *_describe_diagnosis(summary),
         *_describe_end(summary, unchanged=unchanged),
     ]
-    return "\n".join(line.rstrip() for line in lines) + "\n"
+    return "\n".join(tidy_line(line.rstrip()) for line in lines) + "\n"
 
 
 def _part(summary: Summary, key: str) -> Mapping[str, object]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from pipeline.cli.choices import Choices, build_options
-from pipeline.cli.output import describe_error, exit_code, print_error, print_json, show_progress
+from pipeline.cli.output import describe_error, exit_code, print_error, print_json, print_lines, show_progress
 from pipeline.core.errors import SlipError
 from pipeline.job.options import FigureFormat, Options
 
@@ -90,4 +90,4 @@ def _print_outcomes(outcomes: list[Outcome]) -> None:
     from pipeline.cli.screen import describe_run  # noqa: PLC0415 - only for people
 
     for outcome in outcomes:
-        print(describe_run(outcome.summary, unchanged=not outcome.computed))
+        print_lines(describe_run(outcome.summary, unchanged=not outcome.computed).split("\n"))

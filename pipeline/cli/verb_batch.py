@@ -11,7 +11,7 @@ from cyclopts.types import PositiveFloat, PositiveInt
 
 from pipeline.batch import Pruning, Request, measure_memory, parse_shard, parse_size
 from pipeline.cli.choices import Choices, build_options
-from pipeline.cli.output import CLEAN, FAILED, LOSSY, describe_error, print_error, print_json
+from pipeline.cli.output import CLEAN, FAILED, LOSSY, describe_error, print_error, print_json, print_lines
 from pipeline.cli.results_place import open_results
 from pipeline.core.errors import SlipError
 
@@ -108,7 +108,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
     if json:
         print_json(_as_json(outcome))
     elif not quiet:
-        print("\n".join(describe_outcome(outcome)))
+        print_lines(describe_outcome(outcome))
     if outcome.has_failed:
         return FAILED
     return LOSSY if outcome.has_losses else CLEAN

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.output import CLEAN, print_json
+from pipeline.cli.output import CLEAN, print_json, print_lines
 from pipeline.job.options import FigureFormat
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def compare(  # noqa: D417 - arguments document themselves
     if json:
         print_json({**describe_answer(answer), "page": str(written["comparison.html"])})
     elif not quiet:
-        print(_describe(answer, written))
+        print_lines(_describe(answer, written).split("\n"))
     return CLEAN
 
 

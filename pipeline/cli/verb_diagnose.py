@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from pipeline.cli.choices import Choices, build_options
-from pipeline.cli.output import describe_error, exit_code, print_error, print_json, show_progress
+from pipeline.cli.output import describe_error, exit_code, print_error, print_json, print_lines, show_progress
 from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         from pipeline.diagnosis.words import describe_run  # noqa: PLC0415 - only for people
 
         for run in runs:
-            print(describe_run(run))
+            print_lines(describe_run(run).split("\n"))
     return exit_code(errors, lossy=lossy)
 
 
@@ -144,4 +144,4 @@ def _apply(proposals: list[ModelFile | None], path: Path, *, quiet: bool) -> Non
         )
     write_model(proposal, path)
     if not quiet:
-        print(f"{path}: {', '.join(proposal.model.ids) or 'the ideal model'}")
+        print_lines([f"{path}: {', '.join(proposal.model.ids) or 'the ideal model'}"])

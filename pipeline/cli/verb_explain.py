@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.output import CLEAN, print_json
+from pipeline.cli.output import CLEAN, print_json, print_lines
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -43,10 +43,9 @@ def explain(  # noqa: D417 - arguments document themselves
     if json:
         print_json({"run": manifest.run, "key": manifest.key, **manifest.details, "column": about or None})
         return CLEAN
-    for line in _describe(manifest):
-        print(line)
+    print_lines(_describe(manifest))
     if about:
-        print(f"\n{column}: " + ", ".join(f"{key} {value}" for key, value in about.items()))
+        print_lines(["", f"{column}: " + ", ".join(f"{key} {value}" for key, value in about.items())])
     return CLEAN
 
 

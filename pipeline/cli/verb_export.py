@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.output import CLEAN, print_json
+from pipeline.cli.output import CLEAN, print_json, print_lines
 
 if TYPE_CHECKING:
     from pipeline.motion import Model
@@ -74,7 +74,7 @@ def export(
     if json:
         print_json({"run": manifest.run, "to": to, "files": [str(each) for each in written]})
     elif not quiet:
-        print("\n".join(str(each) for each in written))
+        print_lines(str(each) for each in written)
     return CLEAN
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from pipeline.cli.choices import Choices, build_options
-from pipeline.cli.output import CLEAN, LOSSY, print_json
+from pipeline.cli.output import CLEAN, LOSSY, print_json, print_lines
 from pipeline.cli.screen import format_duration
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def inspect(
     if json:
         print_json(_as_json(seen))
     else:
-        print("\n".join(_describe(seen)))
+        print_lines(_describe(seen))
     return LOSSY if seen.losses else CLEAN
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.output import CLEAN, print_json
+from pipeline.cli.output import CLEAN, print_json, print_lines
 from pipeline.job.options import FigureFormat
 
 if TYPE_CHECKING:
@@ -62,14 +62,14 @@ def draw(  # noqa: D417 - arguments document themselves
             }
         )
     elif not quiet:
-        for row in drawn.own.sort("energy", descending=True).iter_rows(named=True):
-            print(
-                f"{row['dataset']:<34}{row['energy']:>10.3g} J   complexity {row['complexity']:.1f}   "
-                f"slip {row['slip']:.3g} m/s   {row['zone']} risk"
-            )
-        for note in drawn.notes:
-            print(f"! {note}")
-        print(f"page    {page}    ({drawn.points.height} of {drawn.deployments.height} deployments placed)")
+        print_lines(
+            f"{row['dataset']:<34}{row['energy']:>10.3g} J   complexity {row['complexity']:.1f}   "
+            f"slip {row['slip']:.3g} m/s   {row['zone']} risk"
+            for row in drawn.own.sort("energy", descending=True).iter_rows(named=True)
+        )
+        print_lines(f"! {note}" for note in drawn.notes)
+        placed = f"{drawn.points.height} of {drawn.deployments.height} deployments placed"
+        print_lines([f"page    {page}    ({placed})"])
     return CLEAN
 
 
@@ -122,4 +122,4 @@ def _tell(table: pl.DataFrame, path: Path, *, json: bool, quiet: bool) -> None:
     if json:
         print_json({"table": str(path), "deployments": table.height, "keys": table["key"].to_list()})
     elif not quiet:
-        print(f"{path}: {table.height} deployments")
+        print_lines([f"{path}: {table.height} deployments"])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.output import CLEAN, print_json
+from pipeline.cli.output import CLEAN, print_json, print_lines, say
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -82,7 +82,7 @@ def new(
     made = Model(chosen, tuple(find_effect(name)() for name in effects or ()))
     write_model(ModelFile(made), model)
     if not quiet:
-        sys.stdout.write(f"{model}: {chosen.name}, {_list_effects(made.ids)}\n")
+        print_lines([f"{model}: {chosen.name}, {_list_effects(made.ids)}"])
     return CLEAN
 
 
@@ -109,7 +109,7 @@ def show(model: Path, /, *, json: bool = False) -> int:
     runs = file.fit.get("runs")
     if isinstance(runs, list):
         lines.append(f"fitted on {file.fit.get('input')}: {', '.join(str(run['run']) for run in runs)}")
-    sys.stdout.write("\n".join(lines) + "\n")
+    print_lines(lines)
     return CLEAN
 
 
@@ -203,7 +203,7 @@ def compare(  # noqa: D417 - the shared options document themselves
     if spoken.json:
         print_json({"compared": [_transfer_as_json(name, item) for name, item in rows], "warnings": warnings})
     elif not spoken.quiet:
-        sys.stdout.write("\n".join(_describe_transfers(rows)) + "\n")
+        print_lines(_describe_transfers(rows))
         _warn(warnings)
     return CLEAN
 
@@ -265,7 +265,7 @@ def _change(
         lines = _describe(old, new_one, after.model)
         if carried:
             lines += ["", *_describe_transfers([(str(path), item) for item in carried])]
-        sys.stdout.write("\n".join(lines) + "\n")
+        print_lines(lines)
         _warn(warnings)
     return CLEAN
 
@@ -397,4 +397,4 @@ def _list_effects(ids: Sequence[str]) -> str:
 
 def _warn(warnings: Sequence[str]) -> None:
     for text in warnings:
-        sys.stderr.write(f"slip: {text}\n")
+        say(f"slip: {text}")

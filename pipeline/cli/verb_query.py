@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.output import CLEAN
+from pipeline.cli.output import CLEAN, print_lines
 from pipeline.cli.results_place import open_results
 
 if TYPE_CHECKING:
@@ -69,4 +69,4 @@ def _print(answer: pl.DataFrame, form: Literal["table", "csv", "json"]) -> None:
         sys.stdout.write(f'{{"columns": [{names}], "rows": {answer.write_json()}}}\n')
     else:
         with pl.Config(tbl_rows=-1, tbl_cols=-1, fmt_str_lengths=_WIDE, tbl_width_chars=_WIDE):
-            sys.stdout.write(f"{answer}\n")
+            print_lines(str(answer).split("\n"))

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import App, Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline.cli.output import CLEAN, print_json
+from pipeline.cli.output import CLEAN, print_json, print_lines
 from pipeline.core.errors import SlipError
 
 
@@ -69,7 +69,7 @@ def simulate(  # noqa: D417 - arguments document themselves
     if json:
         print_json({"path": str(path), "effects": effects})
     else:
-        print(path)
+        print_lines([str(path)])
     return CLEAN
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import App, Parameter
 
 from pipeline.cli.choices import Choices, build_options
-from pipeline.cli.output import CLEAN, LOSSY, print_json, show_progress
+from pipeline.cli.output import CLEAN, LOSSY, print_json, print_lines, show_progress
 
 
 def register(app: App) -> None:
@@ -46,8 +46,7 @@ def stage(  # noqa: D417 - the shared choices document themselves
         print_json({"run": outcome.manifest.run, "computed": list(outcome.computed), "rows": tables})
     elif not quiet:
         done = ", ".join(outcome.computed) or "nothing: all is as before"
-        print(f"run       {outcome.manifest.run}\ncomputed  {done}")
-        for table, rows in tables.items():
-            print(f"  {table:<12}{rows:>9} rows")
-        print(f"in        {outcome.manifest.folder}")
+        print_lines([f"run       {outcome.manifest.run}", f"computed  {done}"])
+        print_lines(f"  {table:<12}{rows:>9} rows" for table, rows in tables.items())
+        print_lines([f"in        {outcome.manifest.folder}"])
     return LOSSY if outcome.lossy else CLEAN

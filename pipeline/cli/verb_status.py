@@ -6,10 +6,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import msgspec
 from cyclopts import App, Parameter
 
-from pipeline.cli.output import CLEAN, FAILED, describe_error, print_json
+from pipeline.cli.output import CLEAN, FAILED, describe_error, print_json, print_lines
 from pipeline.cli.results_place import open_results
 
 if TYPE_CHECKING:
@@ -47,11 +46,13 @@ def status(  # noqa: D417 - arguments document themselves
     if json:
         print_json(_as_json(found))
     else:
-        print("\n".join(_describe(found)))
+        print_lines(_describe(found))
     return FAILED if found.errors else CLEAN
 
 
 def _as_json(found: Status) -> dict[str, object]:
+    import msgspec  # noqa: PLC0415 - help does without
+
     return {
         **found.counts,
         "runs": found.runs,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 from cyclopts.types import NonNegativeFloat
 
-from pipeline.cli.output import CLEAN, print_json
+from pipeline.cli.output import CLEAN, print_json, print_lines
 from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def trend(  # noqa: D417 - arguments document themselves
     if json:
         print_json({**describe_trend(found), "page": str(page)})
     elif not quiet:
-        print(_describe(found, page))
+        print_lines(_describe(found, page).split("\n"))
     return ALERT if found.alerts else CLEAN
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.output import CLEAN, FAILED, print_json, show_progress
+from pipeline.cli.output import CLEAN, FAILED, print_json, print_lines, show_progress
 from pipeline.cli.results_place import open_results
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def verify(  # noqa: D417 - arguments document themselves
     if json:
         print_json(_as_json(found))
     elif not quiet:
-        print("\n".join(_describe(found)))
+        print_lines(_describe(found))
     return CLEAN if found.is_clean else FAILED
 
 
