@@ -18,8 +18,8 @@ from records import Job, Record, describe_scene
 from score import score_run
 from truth import Json, check_models
 
-from pipeline.cli.verb_diagnose import _find
 from pipeline.diagnosis import Recording, diagnose_runs
+from pipeline.job.analyze import analyze_log
 from pipeline.job.diagnosis import read_recording
 from pipeline.job.options import Options
 from pipeline.vehicles import Vehicle  # noqa: TC001
@@ -99,8 +99,7 @@ def _ask_program(log: Path) -> tuple[Vehicle, Recording, Json]:
 
 def _load(log: Path) -> tuple[Vehicle, Recording]:
     """The log taken through the stages, or what is stored of it."""
-    manifest, _ = _find(str(log), Options(out=_results(log), report=False), quiet=True)
-    return read_recording(manifest)
+    return read_recording(analyze_log(log, Options(out=_results(log), report=False)).manifest)
 
 
 def _results(log: Path) -> Path:
