@@ -42,10 +42,14 @@ def rate_effects(
         effects: with their values to start from.
         timing: delays of each run that are no effect.
     """
-    ids = {effect.id for effect in effects}
+    known = {effect.id: effect for effect in effects}
     # A skew of the reported heading shows against the reported heading only.
-    heading = HeadingSource.POSE if "heading_skew" in ids else HeadingSource.AUTO
-    if "clock_offset" in ids:
+    heading = HeadingSource.POSE if "heading_skew" in known else HeadingSource.AUTO
+    if "clock_offset" in known:
         timing = [replace(one, pose_delay_s=0.0) for one in timing]
+    elif "heading_skew" in known and ground.has_gyro:
+        # The delay against the gyro is the heading's: the position is younger by the skew.
+        skew = known["heading_skew"].values["d"]
+        timing = [replace(one, pose_delay_s=one.pose_delay_s - skew) for one in timing]
     problem = Problem(ground.runs, ground.vehicle, source, heading=heading, timing=timing, rate_hz=_RATE_HZ)
     return Rating(judge_model(problem, Model(ground.vehicle, tuple(effects))))

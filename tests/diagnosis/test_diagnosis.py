@@ -131,6 +131,18 @@ def test_an_early_clock_is_found_corrected_and_not_lost(tmp_path: Path) -> None:
     assert run.effects[0].parameters["d"].value == pytest.approx(-0.15, abs=0.01)
 
 
+def test_an_old_heading_is_found_against_the_gyro_and_rated_with_the_position_as_it_is(
+    tmp_path: Path,
+) -> None:
+    run = _diagnose(replace(_SCENE, effects={"heading_skew": 0.1}), tmp_path).runs[0]
+    (named,) = run.effects
+    assert named.id == "heading_skew"
+    assert named.parameters["d"].value == pytest.approx(0.1, abs=0.02)
+    ideal, last = run.ladder[0], run.ladder[-1]
+    for error in ("t_mrmse_m", "r_mrmse_rad"):
+        assert last[error] < 0.9 * ideal[error]  # type: ignore[operator]
+
+
 def test_driven_straight_only_turning_is_said_to_be_unobservable(tmp_path: Path) -> None:
     scenario = replace(_SCENE, effects={"effective_track": 1.8}, program=Program("straight"))
     (run,) = _diagnose(scenario, tmp_path).runs
