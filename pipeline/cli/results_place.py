@@ -29,10 +29,21 @@ class ResultsPlace:
         return None if self.mirror is None else self.mirror.address
 
     def open_store(self) -> Store:
-        """The results, with the newest index where they are on an object store."""
-        from pipeline.store import Store  # noqa: PLC0415 - verbs that only help need none
+        """The results, with the newest index where they are on an object store.
+
+        Raises:
+            StoreError: ``no_results``, there is no such folder; or the object store does not answer.
+        """
+        from pipeline.store import Store, StoreError  # noqa: PLC0415 - verbs that only help need none
 
         if self.mirror is None:
+            if not self.root.is_dir():
+                raise StoreError(
+                    "no_results",
+                    "there are no results: it is no folder",
+                    where=str(self.root),
+                    hint="Say where they are, or make them with `slip analyze` or `slip batch`",
+                )
             return Store(self.root)
         self.mirror.pull_index()
         return self.mirror.store

@@ -14,14 +14,15 @@ _LABEL = 26
 _SHOWN = 6
 
 
-def describe_run(summary: Summary, *, unchanged: bool) -> str:
-    """The summary of one run as lines of text."""
+def describe_run(summary: Summary, *, unchanged: bool, twin: str = "") -> str:
+    """The summary of one run as lines of text; ``twin`` is a log of the same content that it shares."""
     lines = [
         *_describe_head(summary),
         *_describe_slip(summary),
         *_describe_topics(summary),
         *_describe_findings(summary),
         *_describe_diagnosis(summary),
+        *([_row("same content", f"as {twin}: counted once, under the name it has")] if twin else []),
         *_describe_end(summary, unchanged=unchanged),
     ]
     return "\n".join(tidy_line(line.rstrip()) for line in lines) + "\n"

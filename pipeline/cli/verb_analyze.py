@@ -50,10 +50,14 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     )
     outcomes, errors = _analyze_all(logs, options, quiet=quiet or json)
     if json:
-        print_json({"runs": [dict(outcome.summary) for outcome in outcomes], "errors": errors})
+        print_json({"runs": [_as_json(outcome) for outcome in outcomes], "errors": errors})
     elif not quiet:
         _print_outcomes(outcomes)
     return exit_code(errors, lossy=any(outcome.lossy for outcome in outcomes))
+
+
+def _as_json(outcome: Outcome) -> dict[str, object]:
+    return {**outcome.summary, "same_content_as": outcome.twin or None}
 
 
 def _analyze_all(
@@ -90,4 +94,5 @@ def _print_outcomes(outcomes: list[Outcome]) -> None:
     from pipeline.cli.screen import describe_run  # noqa: PLC0415 - only for people
 
     for outcome in outcomes:
-        print_lines(describe_run(outcome.summary, unchanged=not outcome.computed).split("\n"))
+        text = describe_run(outcome.summary, unchanged=not outcome.computed, twin=outcome.twin)
+        print_lines(text.split("\n"))

@@ -129,6 +129,8 @@ def _as_json(outcome: Outcome) -> dict[str, object]:
 def describe_outcome(outcome: Outcome) -> list[str]:
     """The closing table: how many logs came out how, and of those that need a look, why."""
     lines = [f"{word:<14}{outcome.counts[state]:>6}" for state, word in _WORDS]
+    if not outcome.lines:
+        lines.append("no recording was found; they are files that end in .mcap")
     for state, word in (("growing", "being written"), ("left", "not begun")):
         count = sum(line.state == state for line in outcome.lines)
         lines += [f"{word:<14}{count:>6}"] if count else []
@@ -142,6 +144,9 @@ def describe_outcome(outcome: Outcome) -> list[str]:
         found = [line for line in outcome.lines if line.state == state or (state == "lossy" and line.lossy)]
         if found:
             lines += ["", word, *(text for line in found for text in _explain(line))]
+    copies = [line for line in outcome.lines if line.state == "unchanged" and line.reason and not line.lossy]
+    if copies:
+        lines += ["", "copies, counted once", *(text for line in copies for text in _explain(line))]
     return lines
 
 

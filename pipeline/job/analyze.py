@@ -15,6 +15,7 @@ import msgspec
 from pipeline.job.diagnosis import diagnose_work, has_diagnosis, key_diagnosis
 from pipeline.job.keys import hash_json, key_stages
 from pipeline.job.options import STAGES
+from pipeline.job.peers import find_peers
 from pipeline.job.relative import hash_model
 from pipeline.job.subject import Subject, describe_subject, name_run
 from pipeline.job.summary import summarize_run
@@ -42,11 +43,13 @@ class Outcome:
         summary: the JSON object of the run; empty when a single stage was run.
         manifest: the generation that is current now.
         computed: stages that were computed; empty when nothing had changed.
+        twin: another log of the same content, whose run this one shares; empty where there is none.
     """
 
     summary: Mapping[str, JSON]
     manifest: Manifest
     computed: tuple[str, ...]
+    twin: str = ""
 
     @property
     def lossy(self) -> bool:
@@ -75,31 +78,36 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
     run = options.run or name_run(path, sha256, store)
     keys = key_stages(run, sha256, subject, options.inputs, hash_model(options.model))
     current = store.manifest(run)
+    twin = _find_twin(path, sha256, current)
     if current is not None and not options.force and _is_done(current, keys, options):
-        return Outcome(_read_summary(current, options), current, ())
+        return Outcome(_read_summary(current, options), current, (), twin)
     done = keys[options.through]
     with store.open_generation(run, hash_json([done, options.through])) as generation:
         previous = generation.previous
         if previous is not None and not options.force and _is_done(previous, keys, options):
             # Another writer of this run came first, and what it wrote is what is wanted.
-            return Outcome(_read_summary(previous, options), previous, ())
+            return Outcome(_read_summary(previous, options), previous, (), twin)
         work = Work(run, subject, options, generation, keys, sha256, data, progress)
         work.run_stages()
         log = _describe_log(subject, sha256, work)
         if options.through == STAGES[-1]:
             _write_outputs(work, log, options, progress, diagnose_work(work))
         manifest = generation.commit(_details(work, log, sha256))
-    return Outcome(_read_summary(manifest, options), manifest, tuple(work.computed))
+    return Outcome(_read_summary(manifest, options), manifest, tuple(work.computed), twin)
+
+
+def _find_twin(path: Path, sha256: str, current: Manifest | None) -> str:
+    """The log that made the results there are, where it is another file of the same content."""
+    log = current.details.get("log") if current is not None else None
+    if not isinstance(log, dict) or log.get("sha256") != sha256:
+        return ""
+    recorded = str(log.get("path"))
+    return "" if recorded == str(path.resolve()) else recorded
 
 
 def _identify(path: Path, subject: Subject, store: Store, progress: Progress) -> tuple[str, LogData | None]:
     """Hash of the log: remembered, or computed beside reading it."""
     identities = LogIdentities(store)
-    # The folder of a split recording looks unchanged when a file in it has changed: it is read every time.
-    if not path.is_file():
-        progress("read")
-        data = read_subject(subject)
-        return data.sha256, data
     known = identities.lookup(path)
     if known is not None:
         return known, None
@@ -164,7 +172,8 @@ def _write_outputs(
         tables = {name: generation.read_table(name) for name in generation.table_names}
         hold_s = work.subject.configuration.command.hold_s
         motion = view_diagnosis(tables, work.subject.vehicle, diagnosis or {}, hold_s=hold_s)
-        report = RunReport(summary, tables, diagnosis or {}, motion)
+        peers = find_peers(Store(options.out), summary)
+        report = RunReport(summary, tables, diagnosis or {}, motion, peers)
         if options.report:
             generation.write_text(REPORT, render_report(report))
         if options.figures:

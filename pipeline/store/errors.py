@@ -19,6 +19,7 @@ class StoreError(SlipError):
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _FORBIDDEN = (errno.EACCES, errno.EPERM)
+_NO_FOLDER = (errno.ENOTDIR, errno.EEXIST)
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 
 
@@ -30,7 +31,8 @@ def name_disk_errors(place: Path) -> Iterator[None]:
         place: the file or folder to name where the system's error names none.
 
     Raises:
-        StoreError: ``disk_full``, ``read_only``, ``permission_denied``, ``no_locks`` or ``disk_error``.
+        StoreError: ``disk_full``, ``read_only``, ``permission_denied``, ``not_a_folder``, ``no_locks`` or
+            ``disk_error``.
     """
     try:
         yield
@@ -57,6 +59,13 @@ def name_disk_errors(place: Path) -> Iterator[None]:
                 "permission denied",
                 where=where,
                 hint="Choose another folder with --out or give your user the right to this one",
+            ) from error
+        if error.errno in _NO_FOLDER:
+            raise StoreError(
+                "not_a_folder",
+                "there is a file where the folder of the results, or one in it, should be",
+                where=where,
+                hint="Choose another folder with --out, or move the file away",
             ) from error
         if error.errno in _NO_LOCKS:
             raise StoreError(

@@ -7,10 +7,13 @@ size, modification time and inode did not.
 
 from __future__ import annotations
 
+import json
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from stat import S_ISDIR
 from typing import TYPE_CHECKING
+
+from pipeline.store.manifest import hash_bytes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -18,6 +21,7 @@ if TYPE_CHECKING:
     from pipeline.store.results import Store
 
 FOLDER = "identities"
+_DIGITS = 16
 
 _TICK_NS = 20_000_000
 """Changes within this time may leave the same modification time: clocks of kernels tick every 1 to 10 ms."""
@@ -33,6 +37,7 @@ class LogSighting:
         mtime_ns: modification time [ns since 1970], the latest of a split recording's.
         inode: number of the file in its file system.
         seen_ns: when it was looked at [ns since 1970].
+        parts: hash of what the file system tells of the parts of a split recording; empty for a file.
     """
 
     path: str
@@ -40,15 +45,11 @@ class LogSighting:
     mtime_ns: int
     inode: int
     seen_ns: int
+    parts: str = ""
 
     def is_same_file(self, other: LogSighting) -> bool:
         """Whether nothing that the file system tells has changed."""
-        return (self.path, self.size, self.mtime_ns, self.inode) == (
-            other.path,
-            other.size,
-            other.mtime_ns,
-            other.inode,
-        )
+        return replace(self, seen_ns=0) == replace(other, seen_ns=0)
 
 
 def see_log(path: Path) -> LogSighting:
@@ -59,14 +60,24 @@ def see_log(path: Path) -> LogSighting:
     """
     seen_ns = time.time_ns()
     status = path.stat()
-    # A part may grow without its folder noticing.
-    parts = [part.stat() for part in path.glob("*.mcap")] if S_ISDIR(status.st_mode) else [status]
+    if not S_ISDIR(status.st_mode):
+        return LogSighting(
+            path=str(path.resolve()),
+            size=status.st_size,
+            mtime_ns=status.st_mtime_ns,
+            inode=status.st_ino,
+            seen_ns=seen_ns,
+        )
+    # A part may change without its folder noticing.
+    parts = {part.name: part.stat() for part in path.glob("*.mcap")}
+    told = [[name, part.st_size, part.st_mtime_ns, part.st_ino] for name, part in sorted(parts.items())]
     return LogSighting(
         path=str(path.resolve()),
-        size=sum(part.st_size for part in parts),
-        mtime_ns=max([status.st_mtime_ns, *(part.st_mtime_ns for part in parts)]),
+        size=sum(part.st_size for part in parts.values()),
+        mtime_ns=max([status.st_mtime_ns, *(part.st_mtime_ns for part in parts.values())]),
         inode=status.st_ino,
         seen_ns=seen_ns,
+        parts=hash_bytes(json.dumps(told).encode())[:_DIGITS],
     )
 
 

@@ -80,3 +80,14 @@ def test_a_forbidden_target_is_said_before_the_work(
         batch(season, out)
     assert caught.value.code == "permission_denied"
     assert str(out) in caught.value.where
+
+
+def test_a_file_in_the_place_of_the_results_is_named(season: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.write_text("a list of things to do")
+    with pytest.raises(StoreError) as caught:
+        batch(season, out)
+    assert caught.value.code == "not_a_folder"
+    assert str(out) in caught.value.where
+    assert "--out" in caught.value.hint
+    assert out.read_text() == "a list of things to do"

@@ -50,6 +50,19 @@ def test_batch_tells_what_became_of_every_log(
     assert slip(capsys, "batch", season, "--out", out, *INLINE, "--quiet") == (0, "", "")
 
 
+def test_batch_names_copies_and_empty_folders(
+    capsys: pytest.CaptureFixture[str], season: Path, tmp_path: Path
+) -> None:
+    (season / "z.mcap").write_bytes((season / "a.mcap").read_bytes())
+    text = slip(capsys, "batch", season, "--out", tmp_path / "out", *INLINE)[1]
+    assert "copies, counted once" in text
+    assert f"{season / 'z.mcap'}\n      the same content as season/a" in text
+    (tmp_path / "empty").mkdir()
+    code, text, _ = slip(capsys, "batch", tmp_path / "empty", "--out", tmp_path / "out", *INLINE)
+    assert code == 0
+    assert "no recording was found" in text
+
+
 def test_progress_has_an_estimate(capsys: pytest.CaptureFixture[str], season: Path, tmp_path: Path) -> None:
     _, _, err = slip(capsys, "batch", season, "--out", tmp_path / "out", *INLINE)
     lines = err.splitlines()
@@ -64,6 +77,9 @@ def test_progress_has_an_estimate(capsys: pytest.CaptureFixture[str], season: Pa
     [
         (("batch",), "no log is given"),
         (("batch", "nowhere"), "no such file or folder"),
+        (("status", "nowhere"), "there are no results"),
+        (("verify", "nowhere"), "there are no results"),
+        (("query", "SELECT * FROM runs", "--out", "nowhere"), "there are no results"),
         (("batch", "x", "--shard", "0/4"), "no shard"),
         (("batch", "x", "--memory", "lots"), "no size"),
         (("batch", "x", "--prune", "--quota", "much"), "no size"),

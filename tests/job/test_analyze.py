@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 from pathlib import Path
 
 import polars as pl
 import pytest
 
+from pipeline.cli.screen import describe_run
 from pipeline.core.errors import SlipError
 from pipeline.job.analyze import Outcome, analyze_log, update_datasets
 from pipeline.job.options import Options
@@ -243,3 +245,31 @@ def test_a_model_that_is_missing_or_of_another_kind_is_refused(log: Path, out: P
     with pytest.raises(SlipError, match="kind 'ackermann'"):
         analyze(log, out, model=car)
     assert Store(out).runs() == ()
+
+
+def test_a_split_recording_is_read_once(log: Path, out: Path, tmp_path: Path) -> None:
+    recording = tmp_path / "split"
+    recording.mkdir()
+    shutil.copy(log, recording / "split_0.mcap")
+    for path in (recording / "split_0.mcap", recording):
+        # What has only just changed is not trusted to have stopped.
+        os.utime(path, (1.7e9, 1.7e9))
+    told: list[str] = []
+    first = analyze_log(recording, Options(out=out, report=False), told.append)
+    assert "read" in told
+    told.clear()
+    second = analyze_log(recording, Options(out=out, report=False), told.append)
+    assert (second.computed, told) == ((), [])
+    assert second.manifest == first.manifest
+
+
+def test_a_copy_says_whose_results_it_shares(log: Path, out: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.mcap"
+    shutil.copy(log, copy)
+    first = analyze(copy, out)
+    assert first.twin == ""
+    second = analyze(log, out)
+    assert (second.computed, second.twin) == ((), str(copy))
+    assert second.manifest.run == first.manifest.run
+    text = describe_run(second.summary, unchanged=True, twin=second.twin)
+    assert f"same content              as {copy}" in text

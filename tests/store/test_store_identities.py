@@ -140,3 +140,19 @@ def test_a_part_that_grows_makes_a_split_recording_unknown(identities: LogIdenti
     with (recording / "split_1.mcap").open("ab") as part:
         part.write(b"more")
     assert identities.lookup(recording) is None
+
+
+def test_a_part_of_a_split_recording_that_changed_is_noticed(
+    identities: LogIdentities, tmp_path: Path
+) -> None:
+    recording = tmp_path / "split"
+    recording.mkdir()
+    for name, moment in (("split_0.mcap", 1_000_000_000), ("split_1.mcap", 2_000_000_000)):
+        (recording / name).write_bytes(b"first")
+        os.utime(recording / name, ns=(moment, moment))
+    assert identities.remember(recording, "aa")
+    assert identities.lookup(recording) == "aa"
+    # In place, of the same size, and older than the other part: the folder and the latest time stay the same.
+    (recording / "split_0.mcap").write_bytes(b"other")
+    os.utime(recording / "split_0.mcap", ns=(500_000_000, 500_000_000))
+    assert identities.lookup(recording) is None
