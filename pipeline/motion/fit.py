@@ -22,6 +22,7 @@ Flags = NDArray[np.bool_]
 _HUBER = 3.0
 _MOST_ITERATIONS = 25
 _CONVERGED = 1e-6
+_NEWS = 0.02
 _LEAST_SCALE = 1e-6
 
 
@@ -199,16 +200,14 @@ def _descend(
         return at
     bounds = np.array([number.bounds for number in free])
     loss = measure_loss(problem, residuals, weights, used)
-    damping = 1e-4
+    damping, is_fresh = 1e-4, True
     for _ in range(_MOST_ITERATIONS):
         normal, gradient = weigh_system(problem, residuals, jacobian, weights, used)
         values = np.array([state.get(number) for number in free])
         fell = 0.0
         while damping < 1e6:  # noqa: PLR2004 - beyond it no step is left
-            moved = state
             step = solve_step(normal, gradient, values, bounds, damping)
-            for number, value in zip(free, (values + step).tolist(), strict=True):
-                moved = moved.set(number, value)
+            moved = _move(state, free, values + step)
             trial = problem.find_residuals(moved)
             new = measure_loss(problem, trial, weights, used)
             if new < loss:
@@ -216,10 +215,21 @@ def _descend(
                 state, residuals, loss = moved, trial, new
                 damping = max(damping / 10.0, 1e-7)
                 break
+            if not is_fresh:
+                break
             if np.abs(step / np.maximum(np.abs(values), 1e-2)).max(initial=0.0) < 1e-5:  # noqa: PLR2004
                 return state, residuals, jacobian
             damping *= 10.0
-        jacobian = problem.differentiate(state, free, residuals)
-        if fell < _CONVERGED:
+        if is_fresh and fell < _CONVERGED:
             break
+        # After a small step the derivatives still serve: new ones cost a prediction for each number.
+        is_fresh = not _CONVERGED <= fell < _NEWS
+        if is_fresh:
+            jacobian = problem.differentiate(state, free, residuals)
     return state, residuals, jacobian
+
+
+def _move(state: State, free: Sequence[Free], values: Floats) -> State:
+    for number, value in zip(free, values.tolist(), strict=True):
+        state = state.set(number, value)
+    return state

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import TYPE_CHECKING
 
 from pipeline.motion.fit import Fitted, fit_model
@@ -68,19 +69,43 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
     fitted = fit_model(problem, base)
     rungs = [Rung(fitted, hold_out(problem, fitted))]
     rest = [effect.id for effect in problem.active_effects(model)]
+    hoped = dict.fromkeys(rest, inf)
     while rest:
-        tried = []
-        for name in rest:
-            candidate = fit_model(problem, fitted.model + model.effect(name), per_run=per_run)
-            tried.append((_scale_free(problem, candidate), name, candidate))
-        _, name, candidate = min(tried, key=lambda item: item[0])
+        name, candidate = _take_best(problem, model, fitted, hoped, per_run)
         held_out = hold_out(problem, candidate)
         if compare_losses(held_out, rungs[-1].held_out) >= 1.0:
             break
         fitted = candidate
         rungs.append(Rung(candidate, held_out))
         rest.remove(name)
+        del hoped[name]
     return Ladder(tuple(rungs), tuple(rest))
+
+
+def _take_best(
+    problem: Problem, model: Model, fitted: Fitted, hoped: dict[str, float], per_run: Sequence[str]
+) -> tuple[str, Fitted]:
+    """The effect that lowers the loss most; one that brought less before is tried only if that could win.
+
+    Args:
+        problem: the runs.
+        model: with the effects' starts.
+        fitted: the rung below.
+        hoped: what each effect brought when it was last tried; updated.
+        per_run: as in `fit_model`.
+    """
+    below = _scale_free(fitted)
+    best: tuple[float, str, Fitted] | None = None
+    for name in sorted(hoped, key=lambda one: -hoped[one]):
+        if best is not None and best[0] >= hoped[name]:
+            break
+        candidate = fit_model(problem, fitted.model + model.effect(name), per_run=per_run)
+        hoped[name] = below - _scale_free(candidate)
+        if best is None or hoped[name] > best[0]:
+            best = hoped[name], name, candidate
+    if best is None:
+        raise ValueError("no effect to take")
+    return best[1], best[2]
 
 
 def compare_losses(new: HeldOut, old: HeldOut) -> float:
@@ -92,8 +117,7 @@ def compare_losses(new: HeldOut, old: HeldOut) -> float:
     return float(exp(mean(log(squares[0] / squares[1]))))
 
 
-def _scale_free(problem: Problem, fitted: Fitted) -> float:
+def _scale_free(fitted: Fitted) -> float:
     from numpy import log, mean  # noqa: PLC0415 - names that read well here
 
-    del problem
     return float(mean(log(mean(fitted.residuals**2, axis=0))))
