@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 HELP = """How far was the motion from the ideal model, and why?
 
 Reads MCAP logs of field robots, computes slip per time step, and writes tables, a summary and a report.
+A name that begins with a dash goes behind --, after all options.
 """
 
 

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from pipeline.batch.season import Line
 
-_LEAST_SHARE = 1e-9
-
 
 class SilentWatch:
     """Says nothing."""
@@ -48,7 +46,7 @@ class LineWatch(SilentWatch):
 
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Say how much there is to do."""
-        self._todo, self._size = todo, size
+        self._begin(todo, size)
         self._write(f"{todo} logs to work on ({size / 1e6:.1f} MB), {settled} settled")
 
     def tell(self, line: Line, size: int) -> None:
@@ -63,9 +61,13 @@ class LineWatch(SilentWatch):
             f"[{self._done}/{self._todo}] {line.run or line.path} {what} ({line.seconds:.1f} s){left}"
         )
 
+    def _begin(self, todo: int, size: int) -> None:
+        self._todo, self._size = todo, size
+        self._started = time.monotonic()
+
     def estimate_rest(self) -> float:
-        """Seconds that the rest takes if a byte of it takes as long as those before."""
-        share = max(self._read / self._size if self._size else 1.0, _LEAST_SHARE)
+        """Seconds that the rest takes if a byte of it, or else a log, takes as long as those before."""
+        share = self._read / self._size if self._read else self._done / self._todo
         return (time.monotonic() - self._started) * (1.0 - share) / share
 
     def _write(self, text: str) -> None:
@@ -87,7 +89,7 @@ class BarWatch(LineWatch):
 
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Show the bar."""
-        self._todo, self._size = todo, size
+        self._begin(todo, size)
         del settled
         self._task = self._bar.add_task("logs", total=todo, left="")
         self._bar.start()

@@ -22,7 +22,10 @@ def register(app: App) -> None:
 
 
 def analyze(  # noqa: D417 - the shared choices document themselves
-    logs: Annotated[list[Path], Parameter(help="logs, MCAP files or folders of a split recording")],
+    logs: Annotated[
+        list[Path],
+        Parameter(help="MCAP files or folders of split recordings; after -- if a name begins with a dash"),
+    ],
     /,
     *,
     choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
-from cyclopts.types import PositiveFloat, PositiveInt
+from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from pipeline.batch import Pruning, Request, measure_memory, parse_shard, parse_size
 from pipeline.cli.choices import Choices, build_options
@@ -36,7 +36,10 @@ def register(app: App) -> None:
 
 def batch(  # noqa: D417 - the shared choices document themselves
     logs: Annotated[
-        list[str] | None, Parameter(help="logs, folders, 'globs' and @lists", negative=())
+        list[str] | None,
+        Parameter(
+            help="logs, folders, 'globs' and @lists; after -- where a name begins with a dash", negative=()
+        ),
     ] = None,
     /,
     *,
@@ -50,9 +53,9 @@ def batch(  # noqa: D417 - the shared choices document themselves
     retry_quarantined: Annotated[bool, Parameter(negative=())] = False,
     timeout: PositiveFloat = 3600.0,
     memory: str | None = None,
-    settle: float = 120.0,
+    settle: NonNegativeFloat = 120.0,
     prune: Annotated[bool, Parameter(negative=())] = False,
-    keep: int = 1,
+    keep: NonNegativeInt = 1,
     quota: str | None = None,
     json: bool = False,
     quiet: bool = False,
@@ -80,9 +83,13 @@ def batch(  # noqa: D417 - the shared choices document themselves
 
     if not logs and not prune:
         raise SlipError("no_logs", "no log is given", hint="Say which: slip batch LOGS, a folder or a glob")
+    if quota is not None and not prune:
+        raise SlipError("quota_alone", "--quota does nothing by itself", hint="Add --prune, or leave it out")
     pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
     options = build_options(choices, report=reports, diagnosis=diagnosis, force=force)
     place = open_results(choices.out)
+    if not logs:
+        place.open_store()
     workers = jobs or os.cpu_count() or 1
     request = Request(
         targets=tuple(logs or ()),
@@ -108,7 +115,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
     if json:
         print_json(_as_json(outcome))
     elif not quiet:
-        print_lines(describe_outcome(outcome))
+        print_lines(describe_outcome(outcome, is_search=bool(logs)))
     if outcome.has_failed:
         return FAILED
     return LOSSY if outcome.has_losses else CLEAN
@@ -126,10 +133,10 @@ def _as_json(outcome: Outcome) -> dict[str, object]:
     }
 
 
-def describe_outcome(outcome: Outcome) -> list[str]:
+def describe_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     """The closing table: how many logs came out how, and of those that need a look, why."""
     lines = [f"{word:<14}{outcome.counts[state]:>6}" for state, word in _WORDS]
-    if not outcome.lines:
+    if is_search and not outcome.lines:
         lines.append("no recording was found; they are files that end in .mcap")
     for state, word in (("growing", "being written"), ("left", "not begun")):
         count = sum(line.state == state for line in outcome.lines)
@@ -138,7 +145,7 @@ def describe_outcome(outcome: Outcome) -> list[str]:
     if fetched:
         whole = sum(line.size_bytes for line in outcome.lines if line.fetched_bytes)
         lines.append(f"fetched {fetched / 1e6:.1f} MB of {whole / 1e6:.1f} MB")
-    if outcome.removed:
+    if outcome.removed or not is_search:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generations")
     for state, word in _EXPLAINED:
         found = [line for line in outcome.lines if line.state == state or (state == "lossy" and line.lossy)]

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 from batch_tools import batch
 
+from pipeline.batch.season import Line
 from pipeline.cli import main
+from pipeline.cli.batch_progress import LineWatch
 
 
 def slip(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -63,6 +65,25 @@ def test_batch_names_copies_and_empty_folders(
     assert "no recording was found" in text
 
 
+def test_a_name_that_begins_with_a_dash_goes_behind_two(
+    capsys: pytest.CaptureFixture[str], season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (season / "a.mcap").rename(season / "-a.mcap")
+    monkeypatch.chdir(season)
+    assert slip(capsys, "batch", "-a.mcap", "--out", tmp_path / "out", *INLINE)[0] == 2
+    assert slip(capsys, "batch", "--out", tmp_path / "out", *INLINE, "--", "-a.mcap")[0] == 0
+    assert "--" in slip(capsys, "batch", "--help")[1].split("dash")[0][-60:]
+
+
+def test_estimates_do_without_sizes() -> None:
+    watch = LineWatch()
+    watch.plan(4, 0, 1000)
+    watch.tell(Line(path="empty", state="failed"), 0)
+    assert 0.0 <= watch.estimate_rest() < 10.0
+    watch.tell(Line(path="large", state="done"), 1000)
+    assert watch.estimate_rest() == 0.0
+
+
 def test_progress_has_an_estimate(capsys: pytest.CaptureFixture[str], season: Path, tmp_path: Path) -> None:
     _, _, err = slip(capsys, "batch", season, "--out", tmp_path / "out", *INLINE)
     lines = err.splitlines()
@@ -80,6 +101,8 @@ def test_progress_has_an_estimate(capsys: pytest.CaptureFixture[str], season: Pa
         (("status", "nowhere"), "there are no results"),
         (("verify", "nowhere"), "there are no results"),
         (("query", "SELECT * FROM runs", "--out", "nowhere"), "there are no results"),
+        (("batch", "--prune", "--out", "nowhere"), "there are no results"),
+        (("batch", "x", "--quota", "1GB"), "--quota does nothing by itself"),
         (("batch", "x", "--shard", "0/4"), "no shard"),
         (("batch", "x", "--memory", "lots"), "no size"),
         (("batch", "x", "--prune", "--quota", "much"), "no size"),
