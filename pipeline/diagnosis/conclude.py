@@ -19,6 +19,7 @@ from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.where import map_errors, pick_regions
 from pipeline.motion import Input, ModelFile, MotionError
 from pipeline.motion.describe import errors_as_json, ladder_as_json
+from pipeline.motion.ladder import compare_losses
 from pipeline.motion.windows import WINDOW_S
 from pipeline.motion.workshop import note_fit
 
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
 _DRAWS = 400
 _WORTH = 0.01
+_TOGETHER = 0.995
 _CLOCKS = frozenset({"clock_offset", "heading_skew"})
 # Eight steps of six seconds, and fifteen: with fewer, a delay or a change of terrain stands for the truth.
 _LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
@@ -61,6 +63,10 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
     timing = body.search.final.state.timing
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
     judgements = _rate_ways(ground, source, ways, [*found, *terms], timing)
+    idle = [e for e in _find_idle(found, ways, judgements.get(source.value)) if e.id not in known]
+    if idle:
+        found = [effect for effect in found if effect not in idle]
+        judgements = _rate_ways(ground, source, ways, [*found, *terms], timing)
     judgement = judgements.get(source.value)
     unexplained = leftover.describe(ways)
     named = tuple(
@@ -68,7 +74,7 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
         for effect in _order(found, judgement)
         if not _parts(effect) & open_ids and effect.id not in known
     )
-    named = leftover.mark_tentative(_mark_idle(named, judgement), ways, unexplained)
+    named = leftover.mark_tentative(_mark_idle(named, judgements), ways, unexplained)
     problem: Problem = body.search.arena.problem
     start = body.search.start
     comparisons = ground.compare(source)
@@ -91,6 +97,7 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
         undecided=tuple(undecided),
         unobservable=tuple(unobservable.values()),
         unexplained=unexplained,
+        findings=tuple(_note_idle(effect) for effect in idle),
         ladder=() if judgement is None else tuple(_rungs(judgement)),
         noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
         explained_share=math.nan if last is None else last,
@@ -107,6 +114,7 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
 def of_run(common: RunDiagnosis, recording: Recording, number: int, ground: Ground) -> RunDiagnosis:
     """The common diagnosis with one run's own name, findings and delays."""
     findings = [cast("Mapping[str, Json]", f) for f in recording.list_findings()]
+    findings += common.findings
     findings += [
         {
             "id": "implausible_effect",
@@ -136,6 +144,11 @@ def _note_brevity(ground: Ground, common: RunDiagnosis) -> list[Mapping[str, Jso
         "with turns and speeds of both signs"
     )
     return [{"id": "little_driving", "text": text, "where": "diagnosis", "severity": "warning"}]
+
+
+def _note_idle(effect: Effect) -> Mapping[str, Json]:
+    text = f"{effect.id} shows between command and wheels, but the motion is predicted as well without it"
+    return {"id": "idle_effect", "text": text, "where": effect.id, "severity": "info"}
 
 
 def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
@@ -200,10 +213,27 @@ def _describe(
     )
 
 
-def _mark_idle(named: tuple[Named, ...], judgement: Judgement | None) -> tuple[Named, ...]:
-    """Effects of one part of the way that leave the error over the whole way as it is are tentative."""
-    idle = () if judgement is None else judgement.ladder.idle
-    return tuple(replace(effect, tentative=effect.id in idle) for effect in named)
+def _find_idle(
+    effects: Sequence[Effect], ways: Sequence[Explored], judgement: Judgement | None
+) -> list[Effect]:
+    """Effects of the wheels alone that leave the error from the command to the body as it is."""
+    if judgement is None or len(ways) == 1:
+        return []
+    # Some help only together: then the whole model is better than the ladder's last rung.
+    if compare_losses(judgement.whole.held_out, judgement.ladder.rungs[-1].held_out) < _TOGETHER:
+        return []
+    idle = judgement.ladder.idle
+    return [effect for effect in effects if effect.id in idle and _way_of(effect, ways) is ways[1]]
+
+
+def _mark_idle(named: tuple[Named, ...], judgements: Mapping[str, Judgement]) -> tuple[Named, ...]:
+    """Effects that did not lower the error of their own way in the ladder are tentative."""
+    return tuple(
+        replace(
+            effect, tentative=effect.way in judgements and effect.id in judgements[effect.way].ladder.idle
+        )
+        for effect in named
+    )
 
 
 def _order(effects: Sequence[Effect], judgement: Judgement | None) -> list[Effect]:
