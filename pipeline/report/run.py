@@ -24,12 +24,14 @@ class RunReport:
         tables: tables by contract name (`commands`, `slip`, `windows`, ...); any may be missing or empty.
         diagnosis: the JSON object of one run of ``slip diagnose --json``; empty where there is none.
         motion: a model of the run; None where there is none.
+        peers: median slip moduli [m/s] of comparable runs by input; empty where there are none.
     """
 
     summary: Mapping[str, object]
     tables: Mapping[str, pl.DataFrame] = field(default_factory=dict)
     diagnosis: Mapping[str, object] = field(default_factory=dict)
     motion: MotionView | None = None
+    peers: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     def table(self, name: str) -> pl.DataFrame | None:
         """A table that has rows, or None."""

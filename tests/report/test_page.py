@@ -5,6 +5,7 @@ import hashlib
 import html
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import polars as pl
@@ -13,6 +14,7 @@ from report_synthesis import make_report
 
 from pipeline.report import RunReport, render_report
 from pipeline.report.figures import list_figures
+from pipeline.report.sections.glance import say_standing
 from pipeline.report.words import encode_json, escape, say_date, say_duration, say_number, say_share
 
 HOSTILE = "</script><script>alert(1)</script><!-- <img src=x onerror=alert(2)> \u2028 \" ' & \u202e"
@@ -86,6 +88,7 @@ def outline(page: str) -> Outline:
 def test_page_answers_the_questions_from_top_to_bottom(outline: Outline) -> None:
     questions = [words for words in outline.headings if words.startswith("h2")]
     assert questions == [
+        "h2 At a glance",
         "h2 How bad",
         "h2 Where",
         "h2 Why",
@@ -96,6 +99,30 @@ def test_page_answers_the_questions_from_top_to_bottom(outline: Outline) -> None
     assert outline.headings[0] == "h1 field/2026-11-02_warthog"
     assert outline.open == [], "every element is closed"
     assert len(outline.ids) == len(set(outline.ids))
+
+
+def test_the_first_screen_answers_all_four_in_short(page: str) -> None:
+    first = page[page.index('<section id="glance"') : page.index('<section id="how-bad"')]
+    for anchor in ("how-bad", "where", "why", "what-now"):
+        assert f'href="#{anchor}"' in first
+    assert "off by <b>1.06 m</b>, <b>0.960 rad</b>" in first
+    assert "of the squared slip in" in first
+    assert "Missing: <b>effective_track</b>, <b>drive_lag</b>" in first
+    assert "slip diagnose field/2026-11-02_warthog --apply model.toml" in first
+    assert "To tell lateral_skid or icr_offset: drive circles" in first
+    assert "of what can be explained" in first
+    assert re.findall(r"<h3><a href=[^>]*>([^<]+)</a>", first) == ["How bad", "Where", "Why", "What now"]
+
+
+def test_a_run_stands_beside_those_it_can_be_compared_with(report: RunReport) -> None:
+    name = str(report.summary["dataset"])
+    assert say_standing(report) == ""
+    one = replace(report, peers={"command": [0.01]})
+    assert say_standing(one) == f"more than the one other run of {name}: 0.010 m/s"
+    many = replace(report, peers={"command": [0.01, 0.02, 99.0, 98.0, 97.0], "measured": [1.0]})
+    assert say_standing(many) == f"vs 5 runs of {name}: more slip than 2; their median 97.0 m/s"
+    assert say_standing(many) in render_report(many)
+    assert render_report(many) == render_report(many)
 
 
 def test_every_figure_has_a_place_and_words_for_those_who_cannot_see_it(outline: Outline) -> None:

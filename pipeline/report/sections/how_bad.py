@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.report.figures.figure import Section
 from pipeline.report.run import INPUT_WORDS, RunReport, mapping_in, number_in, numbers_in, objects_in
-from pipeline.report.sections.health import list_findings
-from pipeline.report.words import begin_large, build_table, escape, say_number
+from pipeline.report.words import build_table, escape, say_number
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -22,22 +21,7 @@ def render_how_bad(page: Page) -> str:
     lead = (
         f'<div class="cards">{cards}</div>' if cards else '<p class="lead">No slip could be worked out.</p>'
     )
-    return (
-        _render_doubts(report)
-        + lead
-        + _render_horizon(report)
-        + page.render_figures(Section.HOW_BAD)
-        + _render_table(report)
-    )
-
-
-def _render_doubts(report: RunReport) -> str:
-    """What forbids drawing conclusions from the numbers below; empty when nothing does."""
-    errors = [finding for finding in list_findings(report) if finding.get("severity") == "error"]
-    if not errors:
-        return ""
-    lines = "".join(f"<li>{begin_large(escape(finding.get('text', '')))}</li>" for finding in errors)
-    return f'<div class="doubts"><p>Do not draw conclusions from these numbers:</p><ul>{lines}</ul></div>'
+    return lead + _render_horizon(report) + page.render_figures(Section.HOW_BAD) + _render_table(report)
 
 
 def _render_horizon(report: RunReport) -> str:

@@ -8,29 +8,35 @@ from typing import TYPE_CHECKING
 from pipeline.report.words import escape
 
 if TYPE_CHECKING:
+    from pipeline.report.run import RunReport
     from pipeline.report.sections.page import Page
 
 
 def render_what_now(page: Page) -> str:
     """Commands that go on from this run."""
-    run = page.report.text("run")
-    if not run:
+    if not page.report.text("run"):
         return ""
-    # A run that starts with a dash would be read as an option.
-    name = shlex.quote(run) if not run.startswith("-") else shlex.quote(f"./{run}")
-    lines = [
-        *_list_model_steps(page, name),
-        ("Set it beside other vehicles and terrains", "slip compare"),
-        ("Look at slip in the viewer that plays the log", f"slip export {name} --to mcap"),
-    ]
     items = "".join(
-        f"<div><dt>{words}</dt><dd><code>{escape(line)}</code></dd></div>" for words, line in lines
+        f"<div><dt>{words}</dt><dd><code>{escape(line)}</code></dd></div>"
+        for words, line in list_steps(page.report)
     )
     return f'<dl class="steps">{items}</dl>'
 
 
-def _list_model_steps(page: Page, name: str) -> list[tuple[str, str]]:
-    diagnosis = page.report.diagnosis
+def list_steps(report: RunReport) -> list[tuple[str, str]]:
+    """What to do, and the command that does it; the most useful first."""
+    run = report.text("run")
+    # A run that starts with a dash would be read as an option.
+    name = shlex.quote(run) if not run.startswith("-") else shlex.quote(f"./{run}")
+    return [
+        *_list_model_steps(report, name),
+        ("Set it beside other vehicles and terrains", "slip compare"),
+        ("Look at slip in the viewer that plays the log", f"slip export {name} --to mcap"),
+    ]
+
+
+def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
+    diagnosis = report.diagnosis
     if not diagnosis:
         return [("Name the effects that are missing from the model", f"slip diagnose {name}")]
     steps = []

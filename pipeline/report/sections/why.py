@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.report.figures.figure import Section
 from pipeline.report.run import mapping_in, number_in, objects_in
+from pipeline.report.sections.health import list_findings
 from pipeline.report.words import build_table, escape, say_number, say_share
 
 if TYPE_CHECKING:
@@ -101,7 +102,12 @@ def _render_open(report: RunReport) -> str:
     unseen = diagnosis.get("unobservable")
     if isinstance(unseen, list) and unseen:
         told.append(("unobservable", f"{', '.join(map(str, unseen))}: this log would not show it"))
-    told += [("finding", str(entry.get("text", ""))) for entry in objects_in(diagnosis, "findings")]
+    known = {str(entry.get("text", "")) for entry in list_findings(report)}
+    told += [
+        ("finding", str(entry.get("text", "")))
+        for entry in objects_in(diagnosis, "findings")
+        if str(entry.get("text", "")) not in known
+    ]
     left = mapping_in(diagnosis, "disturbance").get("text")
     if left and not rest:
         told.append(("what is left", str(left)))
