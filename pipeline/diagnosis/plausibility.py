@@ -70,6 +70,7 @@ _ONE_SIGN: Mapping[str, str] = {
     "slope_drift": "k",
 }
 _SHARE_OF_TURNING = 0.1
+_LEAST_RISE = 0.08
 _LEAST_RAMP_S = 0.08
 _APART = 0.08
 _LEAST_APART_S = 0.02
@@ -114,8 +115,10 @@ def _is_itself(effect: Effect, largest: Largest, least_delay: float) -> bool:
     checks = {
         "deadband": lambda v: v["d"] > _LEAST_DEADBAND * largest.speed,
         "acceleration_limit": lambda v: v["limit"] * _LEAST_RAMP_S < largest.wheel,
-        # With its threshold at zero a droop is a wider track under another name.
-        "turn_droop": lambda v: _SHARE_OF_TURNING < v["threshold"] / largest.difference < _REACHED,
+        # With its threshold at zero a droop is a wider track, with no gain beyond it a limit.
+        "turn_droop": lambda v: (
+            _SHARE_OF_TURNING < v["threshold"] / largest.difference < _REACHED and v["gain"] > _LEAST_RISE
+        ),
         "body_speed_limit": lambda v: v["limit"] <= _REACHED * largest.speed,
         "body_turn_limit": lambda v: v["limit"] <= _REACHED * largest.turn,
         "wheel_speed_limit": lambda v: v["limit"] <= _REACHED * largest.wheel,
