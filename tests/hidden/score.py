@@ -11,11 +11,18 @@ from draw import Answer  # noqa: TC002 - a test helper runs as a script, too
 
 Json = Mapping[str, object]
 
-# Names of the same thing, as METHODS, section 4, has them: exact classes, both ways.
-CLASSES = (
-    frozenset({"lever_arm", "icr_offset", "icr_lateral"}),
-    frozenset({"clock_offset", "transport_delay"}),
-)
+# Other names of the same thing, as METHODS, section 4, has them. A point beside base_link is a centre of
+# rotation shifted in two directions: both together, or one where only one was hidden.
+_SHIFTED = frozenset({"icr_offset", "icr_lateral"})
+_SAME: dict[str, frozenset[str]] = {
+    "lever_arm": _SHIFTED,
+    "icr_offset": frozenset({"lever_arm"}),
+    "icr_lateral": frozenset({"lever_arm"}),
+    "clock_offset": frozenset({"transport_delay"}),
+    "transport_delay": frozenset({"clock_offset"}),
+    "drive_lag": frozenset({"body_inertia"}),
+    "body_inertia": frozenset({"drive_lag"}),
+}
 
 
 @dataclass(frozen=True)
@@ -64,16 +71,18 @@ def score_run(answer: Answer, run: Json) -> Score:
     found, undecided, unobservable, missed = [], [], [], []
     for name in truth:
         match = _find(name, entries)
-        if match is not None:
+        answered |= match
+        if match:
             found.append(name)
-            answered.add(match)
-        elif open_ids & _names_of(name):
+        elif open_ids & {name, *_SAME.get(name, ())}:
             undecided.append(name)
-        elif hidden_ids & _names_of(name):
+        elif hidden_ids & {name, *_SAME.get(name, ())}:
             unobservable.append(name)
         else:
             missed.append(name)
-    false = sorted(name for name in named if name not in answered and not _covers(name, truth))
+    false = sorted(
+        name for name in named if name not in answered and not ("lever_arm" in truth and name in _SHIFTED)
+    )
     flagged = run.get("unexplained")
     channel = "".join(map(str, _list(flagged, "channels"))) if isinstance(flagged, Mapping) else ""
     return Score(
@@ -122,22 +131,15 @@ def confusion_table(scores: Sequence[Score]) -> list[str]:
     return lines
 
 
-def _names_of(name: str) -> set[str]:
-    return set().union({name}, *(group for group in CLASSES if name in group))
-
-
-def _find(name: str, entries: Sequence[Json]) -> str | None:
-    for entry in entries:
-        if entry["id"] == name:
-            return name
-    for entry in entries:
-        if name in _list(entry, "equivalent_to"):
-            return str(entry["id"])
-    return None
-
-
-def _covers(name: str, truth: Sequence[str]) -> bool:
-    return any(name in group and group & set(truth) for group in CLASSES[:1])
+def _find(name: str, entries: Sequence[Json]) -> set[str]:
+    """Entries that name an effect: its own, or one that says that it is the same thing and is."""
+    ids = {str(entry["id"]) for entry in entries}
+    if name in ids:
+        return {name}
+    if name == "lever_arm":
+        return set(_SHIFTED) if ids >= _SHIFTED else set()
+    told = {str(entry["id"]) for entry in entries if name in _list(entry, "equivalent_to")}
+    return set(sorted(told & _SAME.get(name, frozenset()))[:1])
 
 
 def _errors(run: Json) -> tuple[float, float, float]:

@@ -19,6 +19,7 @@ from scoreboard import (
     is_found,
     write_scoreboard,
 )
+from truth import Checked, Held
 
 
 def test_a_seal_hides_its_answer_until_it_is_opened(tmp_path: Path) -> None:
@@ -41,21 +42,59 @@ def test_a_seed_draws_the_same_riddle_each_time() -> None:
 def test_scores_tell_named_undecided_missed_and_false_apart() -> None:
     run = {
         "effects": [
-            {"id": "icr_offset", "equivalent_to": ["lever_arm"]},
+            {"id": "lever_arm", "equivalent_to": ["icr_offset", "icr_lateral"]},
             {"id": "speed_slip", "equivalent_to": []},
         ],
         "undecided": [{"candidates": ["drive_lag", "transport_delay"]}],
         "unobservable": ["slope_drift"],
     }
-    hidden = {name: {} for name in ("lever_arm", "drive_lag", "slope_drift", "deadband")}
+    hidden = {name: {} for name in ("icr_offset", "drive_lag", "slope_drift", "deadband")}
     score = score_run(Answer("sets", hidden), run)
-    assert score.found == ("lever_arm",)
+    assert score.found == ("icr_offset",)
     assert score.undecided == ("drive_lag",)
     assert score.unobservable == ("slope_drift",)
     assert score.missed == ("deadband",)
     assert score.false == ("speed_slip",)
     assert not score.is_exact
     assert any("deadband" in line and "missed 1" in line for line in confusion_table([score]))
+
+
+def _name(*ids: str, **same: list[str]) -> dict[str, object]:
+    return {"effects": [{"id": name, "equivalent_to": same.get(name, [])} for name in ids]}
+
+
+def test_a_name_counts_for_another_only_where_both_are_the_same_thing() -> None:
+    arm = Answer("single", {"lever_arm": {}})
+    both = _name("icr_offset", "icr_lateral", icr_offset=["lever_arm"], icr_lateral=["lever_arm"])
+    assert score_run(arm, both).is_exact
+    half = score_run(arm, _name("icr_offset", icr_offset=["lever_arm"]))
+    assert (half.found, half.missed, half.false) == ((), ("lever_arm",), ())
+    delay = Answer("single", {"transport_delay": {}})
+    assert score_run(delay, _name("clock_offset", clock_offset=["transport_delay"])).is_exact
+    assert score_run(delay, _name("clock_offset")).false == ("clock_offset",)
+    boast = score_run(delay, _name("drive_lag", drive_lag=["transport_delay"]))
+    assert (boast.missed, boast.false) == (("transport_delay",), ("drive_lag",))
+    beside = score_run(Answer("single", {"icr_lateral": {}}), _name("icr_lateral", "icr_offset"))
+    assert beside.false == ("icr_offset",)
+
+
+def _check(true: float, named: float, ideal: float = 1.0) -> Record:
+    answer = Answer("single", {"drive_lag": {"tau": 0.5}})
+    models = Checked(*(Held(error, error, error, error, error) for error in (ideal, true, named)))
+    return Record(Job("single", 1, "drive_lag"), answer, score_run(answer, _name("drive_lag")), models)
+
+
+def test_what_is_named_is_as_good_within_five_percent_of_the_true_model() -> None:
+    assert is_as_good(_check(true=0.5, named=0.524))
+    assert not is_as_good(_check(true=0.5, named=0.526))
+
+
+def test_effects_that_hardly_show_are_counted_apart() -> None:
+    strong, weak = _check(true=0.94, named=0.94), _check(true=0.96, named=0.96)
+    assert (strong.is_weak, weak.is_weak) == (False, True)
+    table = "\n".join(describe("single", [strong, weak]))
+    assert "1 too weak to count" in table
+    assert "1 / 1 " in table
 
 
 def test_intervals_of_rates_are_wilson() -> None:
