@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from pipeline.vehicles.complaints import check_preset, describe_fault
 from pipeline.vehicles.configuration import Configuration
 from pipeline.vehicles.errors import ConfigurationError
 from pipeline.vehicles.presets import find_preset
@@ -97,8 +98,13 @@ def merge(layers: Iterable[Tree]) -> dict[str, object]:
     return merged
 
 
-def convert(tree: Tree, where: str) -> Configuration:
+def convert(tree: Tree, where: str, *, source: Path | None = None) -> Configuration:
     """Check a merged table and make a `Configuration` of it.
+
+    Args:
+        tree: the table.
+        where: what it was read from, for the error.
+        source: the file it was read from, to name the line.
 
     Raises:
         ConfigurationError: unknown key or wrong value, with its place.
@@ -106,20 +112,7 @@ def convert(tree: Tree, where: str) -> Configuration:
     try:
         return msgspec.convert(tree, Configuration)
     except msgspec.ValidationError as error:
-        raise ConfigurationError(
-            "config_invalid",
-            f"the configuration is not valid: {_readable(str(error))}",
-            where=where,
-            hint="README.md, Configuration, lists the keys and their units.",
-        ) from None
-
-
-def _readable(message: str) -> str:
-    return (
-        message.replace("Object contains unknown field", "unknown key")
-        .replace(" - at `$.", " in `")
-        .replace("`$`", "the top level")
-    )
+        raise describe_fault(error, where, source) from None
 
 
 def read_toml(path: Path) -> dict[str, object]:
@@ -149,7 +142,8 @@ def read_toml(path: Path) -> dict[str, object]:
 
 def _checked(tree: dict[str, object], path: Path) -> dict[str, object]:
     """Check one file alone first, so that an error names the file it stands in."""
-    convert(tree, str(path))
+    convert(tree, str(path), source=path)
+    check_preset(tree, path)
     return tree
 
 

@@ -155,3 +155,27 @@ def test_a_folder_in_place_of_a_file_says_so(log: Path, tmp_path: Path) -> None:
 def test_a_wrong_override_names_the_command_line(log: Path) -> None:
     with pytest.raises(ConfigurationError, match="command line"):
         load_configuration(log, overrides={"velocity": {"yaw": "gyro"}})
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "what", "hint"),
+    [
+        ('[vehicle]\npreset = "huskie"', 2, "'huskie'", "husky_a200, jackal"),
+        ('\n[velocity]\nyaw = "gyro"', 3, "'gyro' in `velocity.yaw`", "Write one of: imu, pose."),
+        ('[run]\nterain = "ice"', 2, "unknown key `terain` in `run`", "keys there are: dataset, terrain."),
+        ('[comand]\ntopic = "/a"', 1, "unknown key `comand`", "command, imu"),
+        ('[[interval]]\nstart_s = 1\n[[interval]]\nend_s = "late"', 4, "interval[1].end_s", "README.md"),
+        (('[[match]]\nglob = "*"\n[match.command]\nunit = "rpm"\n'
+         '[[match]]\nglob = "b*"\n[match.command]\nunit = "km/h"'), 8, "'km/h'", "m/s, rad/s, rpm"),
+    ],
+)  # fmt: skip
+def test_a_wrong_word_is_named_with_its_line_and_the_right_ones(
+    tmp_path: Path, text: str, line: int, what: str, hint: str
+) -> None:
+    fleet = tmp_path / "fleet.toml"
+    fleet.write_text(text)
+    with pytest.raises(ConfigurationError) as caught:
+        load_configuration(tmp_path / "a.mcap")
+    assert caught.value.where == f"{fleet}, line {line}"
+    assert what in caught.value.what
+    assert hint in caught.value.hint
