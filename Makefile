@@ -13,9 +13,12 @@ export LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT SCORES
 # Exit code 3 means done, but the log had losses: they are on the screen, and make has not failed.
 FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see above)" >&2 || exit $$code; }
 
+# Exit code 4 means that a level moved, which is what was asked.
+FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
+
 .DEFAULT_GOAL := help
-.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader bench-workbench browser check clean compare format inspect lock samples \
-	serve test test-long
+.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader bench-workbench browser check clean compare format inspect lock map samples \
+	serve test test-long trend
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -31,6 +34,12 @@ batch: $(VENV)/.ready ## LOGS=dir: bring the results up to date with a season of
 
 compare: $(VENV)/.ready ## deployments in OUT side by side: medians, tests, figure [ARGS=]
 	@$(BIN)/slip compare "$$OUT" $$ARGS
+
+trend: $(VENV)/.ready ## slip, parameters and data health of the runs in OUT over dates [ARGS=]
+	@$(BIN)/slip trend "$$OUT" $$ARGS $(FORGIVE_ALERTS)
+
+map: $(VENV)/.ready ## deployments of the literature and runs in OUT by energy and terrain [ARGS=]
+	@$(BIN)/slip map "$$OUT" $$ARGS
 
 serve: $(VENV)/.ready ## the workbench on this machine: add an effect, watch the error fall [OUT=results, ARGS=]
 	@$(BIN)/slip serve "$$OUT" $$ARGS
@@ -82,8 +91,8 @@ bench: bench-reader bench-analyze bench-batch bench-export bench-workbench ## al
 bench-analyze: $(VENV)/.ready-dev ## a whole analysis of a 10-minute log
 	$(BIN)/python tests/bench/analyze.py
 
-bench-batch: $(VENV)/.ready-dev ## batches of 10, 100 and 1,000 logs, on one and two processes
-	$(BIN)/python tests/bench/batch.py
+bench-batch: $(VENV)/.ready-dev ## batches of 10, 100 and 1,000 logs, on one and two processes [ARGS="--rounds 5"]
+	$(BIN)/python tests/bench/batch.py $$ARGS
 
 bench-export: $(VENV)/.ready-dev ## exporting runs of 1, 3 and 10 hours as MCAP
 	$(BIN)/python tests/bench/export.py
