@@ -13,7 +13,7 @@ import pytest
 from pipeline.diagnosis import Diagnosis, Recording, diagnose_runs
 from pipeline.diagnosis.plausibility import find_implausible, is_nameable
 from pipeline.diagnosis.screen import Largest
-from pipeline.diagnosis.words import describe_run
+from pipeline.diagnosis.words import describe_run, list_lines
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
 from pipeline.motion import find_effect, read_model
@@ -109,6 +109,17 @@ def test_the_screen_names_each_effect_and_the_fall(skidding: Diagnosis) -> None:
     assert "->" in text
 
 
+def test_what_is_missing_stands_in_the_order_of_the_ladder(skidding: Diagnosis) -> None:
+    run = skidding.runs[0]
+    climbed = [name for rung in run.ladder for name in rung["effects"]]  # type: ignore[union-attr]
+    assert [effect.id for effect in run.effects] == list(dict.fromkeys(climbed))
+    lines = list_lines(run)
+    place = [label for label, _ in lines].index("missing")
+    assert lines[place][1].startswith(run.effects[0].id)
+    assert lines[place + 1] == ("", lines[place + 1][1])
+    assert lines[place + 1][1].startswith(run.effects[1].id)
+
+
 def test_the_ladder_table_keeps_its_contract(skidding: Diagnosis) -> None:
     table = skidding.tabulate_ladder(skidding.runs[0].run)
     assert set(table.columns) <= set(contract_of("ladder").schema.columns())
@@ -184,6 +195,23 @@ def test_a_formula_for_the_unexplained_can_be_pasted_into_a_model_file(tmp_path:
     assert after < 0.7 * before  # type: ignore[operator]
 
 
+def test_motion_that_lasts_is_unexplained_though_nothing_recorded_tells_of_it(tmp_path: Path) -> None:
+    pushed = Disturbance(0.1, 0.15, correlation_s=4.0)
+    scenario = replace(_SCENE, effects={"effective_track": 1.8}, disturbance=pushed, duration_s=240.0)
+    (run,) = _diagnose(scenario, tmp_path).runs
+    left = run.unexplained
+    assert left is not None
+    assert "w" in left.channels
+    assert "not a function of anything recorded" in left.where
+    assert left.formula is None
+    assert run.noise_floor["velocity_rms"][2] < 0.5 * run.ladder[-1]["velocity_rms"][2]  # type: ignore[index, operator]
+
+
+def test_little_driving_is_said(tmp_path: Path) -> None:
+    (run,) = _diagnose(replace(_SCENE, effects={"effective_track": 1.8}, duration_s=45.0), tmp_path).runs
+    assert "little_driving" in {finding["id"] for finding in run.findings}
+
+
 def test_two_runs_of_one_vehicle_are_judged_together(tmp_path: Path) -> None:
     recordings = []
     for seed in (1, 2):
@@ -228,6 +256,8 @@ _LARGEST = Largest(1.0, 1.0, 8.0, 3.0, 120.0, np.zeros(11))
         ("turn_droop", {"threshold": 0.01, "gain": 0.5}),
         ("turn_droop", {"threshold": 1.5, "gain": 0.01}),
         ("body_speed_limit", {"limit": 1.0}),
+        ("effective_track", {"k": 6.0}),
+        ("body_inertia", {"tau": 5.0}),
     ],
 )
 def test_what_is_too_small_or_another_in_disguise_is_not_named(name: str, values: dict[str, float]) -> None:
@@ -249,6 +279,8 @@ def test_what_is_large_enough_is_named(name: str, values: dict[str, float]) -> N
 def test_what_no_vehicle_does_is_said() -> None:
     assert find_implausible(find_effect("effective_track")(k=6.0)) is not None
     assert find_implausible(find_effect("effective_track")(k=1.8)) is None
+    assert find_implausible(find_effect("yaw_drift")(c=0.5)) is not None
+    assert find_implausible(find_effect("yaw_drift")(c=0.1)) is None
 
 
 def test_an_effect_out_of_bounds_is_an_error_of_the_model() -> None:
