@@ -65,7 +65,7 @@ def _play(job: Job, riddle: Riddle, log: Path) -> Record:
     with watch.measure("draw"):
         write_riddle(riddle, log)
     with watch.measure("ask"):
-        vehicle, recording, told = _ask_program(log) if job.by_command_line else _ask(log)
+        vehicle, recording, told = _ask_program(log) if job.by_command_line else _ask(log, watch)
     answer: Answer = open_seal(log.with_suffix(".sealed").read_text(encoding="ascii"))
     checked = None
     if job.category not in _UNCHECKED:
@@ -82,10 +82,13 @@ def _play(job: Job, riddle: Riddle, log: Path) -> Record:
     )
 
 
-def _ask(log: Path) -> tuple[Vehicle, Recording, Json]:
+def _ask(log: Path, watch: Watch) -> tuple[Vehicle, Recording, Json]:
     """What `slip diagnose LOG --json` does, in this process."""
-    vehicle, recording = _load(log)
-    return vehicle, recording, diagnose_runs([recording], vehicle).to_json()[0]
+    with watch.measure("stages"):
+        vehicle, recording = _load(log)
+    with watch.measure("diagnosis"):
+        told = diagnose_runs([recording], vehicle).to_json()[0]
+    return vehicle, recording, told
 
 
 def _ask_program(log: Path) -> tuple[Vehicle, Recording, Json]:

@@ -54,7 +54,7 @@ class Record:
         outcome: whether a diagnosis was given.
         note: why not.
         scene: what the log was like.
-        wall_s, cpu_s: time to `draw`, `ask` and `check` [s].
+        wall_s, cpu_s: time to `draw`, `ask` (of it `stages` and `diagnosis`) and `check` [s].
         version: of the code that was played with.
     """
 

@@ -182,11 +182,12 @@ def describe_times(played: Sequence[Record]) -> list[str]:
             f"{name:<10}{len(group):>6}{np.median(wall):>16.2f}{np.quantile(wall, 0.95):>8.2f}"
             f"{np.median(cpu):>16.2f}{np.quantile(cpu, 0.95):>8.2f}"
         )
-    beside = [
-        f"{part} {np.median([record.wall_s.get(part, 0.0) for record in scored]):.2f} s"
-        for part in ("draw", "check")
+    parts = [
+        f"{part} {np.median([record.cpu_s[part] for record in scored if part in record.cpu_s]):.2f} s"
+        for part in ("draw", "stages", "diagnosis", "check")
+        if any(part in record.cpu_s for record in scored)
     ]
-    lines.append(f"beside it, medians: {', '.join(beside)}")
+    lines.append(f"CPU, medians: {', '.join(parts)}")
     return lines
 
 
