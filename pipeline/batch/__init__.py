@@ -5,6 +5,23 @@ cluster, and ends with what became of each log and why. Doing the same again is 
 """
 
 from pipeline.batch.errors import BatchError
-from pipeline.batch.request import Pruning, Request, Shard, measure_memory, parse_shard, parse_size
+from pipeline.batch.request import (
+    Pruning,
+    Request,
+    Shard,
+    count_cores,
+    measure_memory,
+    parse_shard,
+    parse_size,
+)
 
-__all__ = ["BatchError", "Pruning", "Request", "Shard", "measure_memory", "parse_shard", "parse_size"]
+__all__ = [
+    "BatchError",
+    "Pruning",
+    "Request",
+    "Shard",
+    "count_cores",
+    "measure_memory",
+    "parse_shard",
+    "parse_size",
+]

@@ -4,16 +4,27 @@ from __future__ import annotations
 
 import os
 import re
+import sys
+from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from pipeline.batch.errors import BatchError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from pipeline.job import Options
 
 _SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)i?b?\s*", re.IGNORECASE)
 _SHARD = re.compile(r"(\d+)/(\d+)")
+
+
+def count_cores() -> int:
+    """Cores that this process may use: of the machine, or those that a job of a cluster was given."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +70,7 @@ class Request:
     options: Options
     address: str | None = None
     executor: str = "local"
-    jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
+    jobs: int = field(default_factory=count_cores)
     shard: Shard | None = None
     timeout_s: float = 3600.0
     memory_bytes: int = 4_000_000_000
@@ -95,6 +106,23 @@ def parse_shard(text: str) -> Shard:
     return Shard(number=number, count=count)
 
 
-def measure_memory() -> int:
-    """Bytes of memory of this machine."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+def measure_memory(own: Path = Path("/proc/self/cgroup"), groups: Path = Path("/sys/fs/cgroup")) -> int:
+    """Bytes of memory that this process may use: of the machine, or of its control group where that is less.
+
+    Args:
+        own: tells the control group of this process.
+        groups: the control groups (version 2).
+    """
+    installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return min(installed, *_list_limits(own, groups)) if own.exists() else installed
+
+
+def _list_limits(own: Path, groups: Path) -> Iterator[int]:
+    for line in own.read_text(encoding="utf-8").splitlines():
+        if line.startswith("0::"):
+            inside = PurePosixPath(line[3:].lstrip("/"))
+            for place in (inside, *inside.parents):
+                # "max" means no limit; the root has no such file.
+                with suppress(OSError, ValueError):
+                    yield int((groups / place / "memory.max").read_text(encoding="utf-8"))
+    yield sys.maxsize

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from pipeline.batch import Pruning, Request, measure_memory, parse_shard, parse_size
+from pipeline.batch import Pruning, Request, count_cores, measure_memory, parse_shard, parse_size
 from pipeline.cli.choices import Choices, build_options
 from pipeline.cli.output import CLEAN, FAILED, LOSSY, describe_error, print_error, print_json, print_lines
 from pipeline.cli.results_place import open_results
@@ -63,7 +62,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
     """Bring the results up to date with a season of logs; the same command again continues.
 
     Args:
-        jobs: logs worked on at once (default: the machine's cores).
+        jobs: logs worked on at once (default: the cores it may use).
         executor: local; dask for a cluster on this machine; or a scheduler's address, tcp://host:8786.
         shard: i/n, the i-th of n machines that share the logs.
         reports: write report.html for every log.
@@ -90,7 +89,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
     place = open_results(choices.out)
     if not logs:
         place.open_store()
-    workers = jobs or os.cpu_count() or 1
+    workers = jobs or count_cores()
     request = Request(
         targets=tuple(logs or ()),
         options=replace(options, out=place.root, config=None, fleet=options.config),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import polars as pl
 from batch_tools import Watch, ask, batch, counts, read_tables
 
-from pipeline.batch import Pruning, Shard, basis, parse_shard, parse_size
+from pipeline.batch import Pruning, Shard, basis, measure_memory, parse_shard, parse_size
 from pipeline.batch.season import run_batch
 from pipeline.batch.status import tell_status
 from pipeline.batch.verification import verify_results
@@ -259,6 +259,18 @@ def test_sizes_and_shards_are_read() -> None:
     assert parse_size("1.5 g") == 1_500_000_000
     assert parse_size("10") == 10
     assert parse_shard("2/4") == Shard(number=2, count=4)
+
+
+def test_memory_is_what_the_control_group_leaves(tmp_path: Path) -> None:
+    whole = measure_memory(tmp_path / "none", tmp_path)
+    own, job = tmp_path / "cgroup", tmp_path / "groups" / "slurm" / "job_1"
+    job.mkdir(parents=True)
+    own.write_text("12:cpu:/elsewhere\n0::/slurm/job_1\n")
+    assert measure_memory(own, tmp_path / "groups") == whole
+    (job / "memory.max").write_text("max\n")
+    (job.parent / "memory.max").write_text("300000000\n")
+    assert measure_memory(own, tmp_path / "groups") == 300_000_000
+    assert 0 < measure_memory() <= whole
 
 
 def test_datasets_pool_the_runs(season: Path, tmp_path: Path) -> None:

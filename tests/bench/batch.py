@@ -20,6 +20,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.batch import count_cores
 from pipeline.batch.ledger import Ledger
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
@@ -161,7 +162,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         work = given.folder or Path(temporary)
         make_logs(work / "logs", max((*given.counts, *given.compare)))
-        print(f"{os.cpu_count()} cores, load before: {os.getloadavg()[0]:.1f}")
+        print(f"{count_cores()} cores, load before: {os.getloadavg()[0]:.1f}")
         if given.counts:
             measure_growth(work / "logs", work, given.counts)
         for count in given.compare:
