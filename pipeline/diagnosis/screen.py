@@ -40,6 +40,7 @@ class Candidate(Protocol):
 
 
 _LEAST_SHARE = 0.05
+_NO_TRACE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -186,8 +187,16 @@ def _promise(metric: Metric, fitted: Fitted, trial: Trial) -> Proposal | None:
     factor = metric.weights(fitted.residual)
     rows = (joint * factor[:, :, None]).reshape(-1, joint.shape[2])
     size = np.sqrt(np.einsum("ij,ij->j", rows, rows)) + 1e-12
-    if (size[own:] < 1e-6).any():  # noqa: PLR2004 - leaves no trace
+    traced = size > _NO_TRACE
+    if not traced[own:].any():
         return None
+    if not traced[own:].all():
+        # Driven straight only, a change of ground shows in one gain: the other is left as it is.
+        silent = [n for n, seen in zip(trial.names, traced[own:].tolist(), strict=True) if not seen]
+        kept = np.concatenate((np.ones(own, dtype=bool), traced[own:]))
+        loud = tuple(name for name in trial.names if name not in silent)
+        trial = Trial(trial.effect.fix(*silent), loud, trial.columns[:, :, traced[own:]], trial.shift)
+        joint, rows, size = joint[:, :, kept], rows[:, kept], size[kept]
     rows /= size
     normal = rows.T @ rows + 1e-7 * np.eye(rows.shape[1])
     step = np.linalg.solve(normal, rows.T @ (base * factor).reshape(-1)) / size
