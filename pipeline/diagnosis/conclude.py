@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -219,10 +220,15 @@ def _find_idle(
     """Effects of the wheels alone that leave the error from the command to the body as it is."""
     if judgement is None or len(ways) == 1:
         return []
+    ladder = judgement.ladder
+    idle = set(ladder.idle)
     # Some help only together: then the whole model is better than the ladder's last rung.
-    if compare_losses(judgement.whole.held_out, judgement.ladder.rungs[-1].held_out) < _TOGETHER:
-        return []
-    idle = judgement.ladder.idle
+    if compare_losses(judgement.whole.held_out, ladder.rungs[-1].held_out) < _TOGETHER:
+        idle.clear()
+    for below, rung in pairwise(ladder.rungs):
+        reach = min(rung.errors.ratios(below.errors)[3:])
+        if min(compare_losses(rung.held_out, below.held_out), reach) > 1.0 - _WORTH:
+            idle |= set(rung.effects) - set(below.effects)
     return [effect for effect in effects if effect.id in idle and _way_of(effect, ways) is ways[1]]
 
 
