@@ -49,7 +49,7 @@ DIFFERENTIAL = (
 )  # fmt: skip
 CAR = ("steering_offset", "steering_gain", "steering_lag", "understeer")
 EMPTY = ("plain", "jumps", "noisy", "tilted")
-MACHINERY = ("track", "payload", "small_wheels", "slope", "slow_motors")
+MACHINERY = ("track", "payload", "small_wheels", "slope", "slow_motors", "low_grip")
 _CARS = 0.1
 # On top of these two an equipped vehicle has one effect more, or nothing.
 _EQUIPMENT = ("effective_track", "drive_lag")
@@ -350,4 +350,7 @@ def _draw_rigid(draw: np.random.Generator, seed: int, effect: str | None) -> Rid
     elif kind == "slow_motors":
         scene = replace(scene, effects={"drive_lag": {"tau": 0.5}})
         expected["drive_lag"] = {"tau": 0.5}
+    elif kind == "low_grip":
+        # Which of inertia, lag and limit Coulomb's law looks like is nobody's truth: none is demanded.
+        machine = replace(machine, friction=0.2)
     return Riddle(scene, Answer("rigid", expected, note=kind, program="drive_steps"), machine)

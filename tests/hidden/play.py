@@ -139,6 +139,10 @@ def main() -> int:
     """Read the command line and play."""
     asked = _read_command_line()
     if asked.table:
+        missing = [str(path) for path in asked.table if not path.is_file()]
+        if missing:
+            sys.stderr.write(f"there is no {', '.join(missing)}\n")
+            return 2
         sys.stdout.write(write_scoreboard(read_records(asked.table).values()) + "\n")
         return 0
     categories = list(CATEGORIES) if asked.category == "all" else asked.category.split(",")

@@ -197,7 +197,8 @@ def _rate(played: Sequence[Record], name: str, test: Test) -> str:
 
 def _choose_test(category: str) -> Test:
     """What counts as right, where one thing must be chosen for a table."""
-    tests: dict[str, Test] = {"empty": is_clean, "odd": is_flagged, "rigid": is_found}
+    tests: dict[str, Test] = {"empty": is_clean, "odd": is_flagged}
+    tests["rigid"] = lambda record: is_found_in_contact(record) and not list_unphysical(record)
     tests["poor"] = lambda record: is_not_missed(record) and not has_wrong_name(record)
     return tests.get(category, is_exact)
 
