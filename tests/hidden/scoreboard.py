@@ -86,9 +86,10 @@ def describe(category: str, played: Sequence[Record]) -> list[str]:
         lines += _list_kinds(category, counted, has_useful_formula, "a formula that helps, by kind")
     lines += confusion_table([record.score for record in counted])
     lines += describe_times(played)
-    failures = [record for record in played if record.outcome != "scored"]
     lines += [
-        f"{record.outcome}: {record.job.replay}   {record.note.splitlines()[-1:]}" for record in failures
+        f"  {record.outcome}: {record.job.replay}   {' '.join(record.note.split())[:200]}"
+        for record in played
+        if record.note or record.outcome != "scored"
     ]
     misses = [record for record in counted if record.outcome == "scored" and not right(record)]
     lines += [_describe_miss(record) for record in misses]
