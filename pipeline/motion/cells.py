@@ -49,7 +49,10 @@ class Cells:
 
     def sum_up(self, rate: Signal) -> Signal:
         """Integral of a rate at every cell edge: index 0 is the first edge of all, holes count nothing."""
-        summed: Signal = np.concatenate((np.zeros(1, dtype=rate.dtype), np.cumsum(rate))) * self.step_s
+        summed: Signal = np.empty(rate.size + 1, dtype=rate.dtype)
+        summed[0] = 0.0
+        np.cumsum(rate, out=summed[1:])
+        summed *= self.step_s
         return summed
 
     def locate_edges(self, at: Floats) -> Floats:
