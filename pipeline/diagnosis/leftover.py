@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
     from pipeline.diagnosis.diagnose import Explored
     from pipeline.diagnosis.diagnosis import Json, Named
+    from pipeline.motion.persistence import Makeup
 
 Floats = NDArray[np.float64]
 
@@ -111,13 +113,17 @@ def _measure_asked(way: Explored) -> Floats:
 
 def _share_lasting(way: Explored) -> tuple[Floats, Floats]:
     """Of x, y, w: share of the residual's variance that lasts, and correlation over one to two seconds."""
-    problem = way.search.arena.problem
-    makeup = split_residuals(problem.comparisons, way.search.final.held)  # type: ignore[attr-defined]
-    seen = np.isin(np.arange(3), problem.channels)
+    makeup = _split(way)
+    seen = np.isin(np.arange(3), way.search.arena.problem.channels)
     shares = np.array([part.lasting_share for part in makeup])
     # Random motion that is forgotten within half a second repeats itself by 0.1 over that time.
     repeats = np.array([part.correlation[1:4].mean() for part in makeup])
     return np.where(seen, shares, 0.0), np.where(seen, repeats, 0.0)
+
+
+def _split(way: Explored) -> tuple[Makeup, Makeup, Makeup]:
+    problem = way.search.arena.problem
+    return split_residuals(problem.comparisons, way.search.final.held)  # type: ignore[attr-defined]
 
 
 def _unit(channel: int) -> str:
@@ -165,10 +171,14 @@ def mark_tentative(
 
 
 def describe_disturbance(body: Explored, unexplained: Unexplained | None) -> dict[str, Json]:
-    """What is left of x, y, w: rms, and the part of it that lasts longer than noise and random motion do."""
-    held = body.search.final.held
+    """What is left of x, y, w, divided by how long it lasts.
+
+    ``rms`` [m/s, m/s, rad/s]; ``lasting``: the part of it that lasts for seconds; ``pose_noise`` [m, m, rad]:
+    error of single poses that would make the rest of neighbouring windows as opposite as it is; and
+    ``neighbours``: correlation of windows half a second apart, -0.5 for noise of poses.
+    """
+    held, makeup = body.search.final.held, _split(body)
     rms = np.sqrt((held**2).mean(axis=0))
-    lasting = rms * np.sqrt(_share_lasting(body)[0])
     text = (
         "what is left is not a function of anything recorded: disturbance and localization noise"
         if unexplained is None
@@ -176,7 +186,12 @@ def describe_disturbance(body: Explored, unexplained: Unexplained | None) -> dic
     )
     return {
         "rms": [round(float(value), 6) for value in rms],
-        "lasting": [round(float(value), 6) for value in lasting],
+        "lasting": [
+            round(float(value) * math.sqrt(part.lasting_share), 6)
+            for value, part in zip(rms, makeup, strict=True)
+        ],
+        "pose_noise": [round(part.pose_noise, 6) for part in makeup],
+        "neighbours": [round(float(part.correlation[0]), 3) for part in makeup],
         "text": text,
     }
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 STAGE = "diagnosis"
 DIAGNOSIS = "diagnosis.json"
-VERSION = 1
+VERSION = 2
 _TABLES = ("poses", "commands", "wheels", "imu", "slip", "findings")
 
 

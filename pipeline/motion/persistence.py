@@ -7,6 +7,7 @@ that the model lacks, whether or not anything that was recorded tells of it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -58,6 +59,11 @@ class Makeup:
         """Share of the variance that is structure."""
         total = self.jitter + self.walk + float(self.passing.sum()) + float(self.lasting.sum())
         return float(self.lasting.sum()) / total if total > 0.0 else 0.0
+
+    @property
+    def pose_noise(self) -> float:
+        """Error of a single pose [m or rad]: a window takes the difference of two over its length."""
+        return WINDOW_S * math.sqrt(0.5 * self.jitter)
 
     def spread_after(self, seconds: Floats, *, lasting: bool) -> Floats:
         """Variance of the integral of the residual over ``seconds``, with or without what lasts.

@@ -23,6 +23,7 @@ from pipeline.motion import (
     predict_at,
     score,
 )
+from pipeline.motion.persistence import split_residuals
 from pipeline.motion.score import GAP_S, assign_folds, list_training, measure_by_terrain
 from pipeline.simulate import Disturbance, Imu, PoseSensor
 
@@ -195,6 +196,16 @@ def test_the_floor_is_one_number_whatever_model_it_is_taken_from() -> None:
     floors = [estimate_floor(problem, rung.held_out) for rung in rungs]
     for floor in floors[:-1]:
         assert np.allclose(floor.ratios(floors[-1])[:3], 1.0, atol=0.15)
+
+
+def test_the_noise_of_poses_is_measured_whatever_the_model_lacks() -> None:
+    sparse = PoseSensor(rate_hz=4.0, noise_m=0.03, noise_rad=0.002)
+    run = simulate({"effective_track": 1.8, "icr_offset": 0.1}, duration_s=300.0, pose=sparse)
+    problem = Problem([run], HUSKY, Input.MEASURED)
+    for rung in climb(problem, model_of("effective_track", "icr_offset")).rungs:
+        x, y, _ = split_residuals(problem.comparisons, rung.held_out.residuals)
+        assert x.pose_noise == pytest.approx(0.03, rel=0.15)
+        assert y.pose_noise == pytest.approx(0.03, rel=0.25)
 
 
 def test_motion_that_lasts_is_no_noise_though_nothing_recorded_tells_of_it() -> None:
