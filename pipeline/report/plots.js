@@ -57,6 +57,16 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false
     }
   };
 
+  // Long names beside rows leave little of a narrow screen to the rows themselves.
+  const squeeze = (spec) => {
+    for (const part of [spec, ...(spec.layer ?? [])]) {
+      const axis = part.encoding?.y?.axis;
+      if (!axis) continue;
+      if (axis.minExtent > 60) axis.minExtent = 60;
+      if (axis.labelLimit > 135) axis.labelLimit = 135;
+    }
+  };
+
   const namesIn = (value, found) => {
     if (Array.isArray(value)) value.forEach((entry) => namesIn(entry, found));
     else if (value && typeof value === "object") {
@@ -72,7 +82,10 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false
     const id = place.dataset.figure;
     const spec = swap(page.figures[id], dark.matches ? page.dark : {});
     fit(spec, width);
-    if (place.clientWidth < NARROW) spec.config.legend.columns = 1;
+    if (place.clientWidth < NARROW) {
+      spec.config.legend.columns = 1;
+      squeeze(spec);
+    }
     spec.padding = { left: 2, right: RIGHT - 4, top: 4, bottom: 4 };
     const names = namesIn(spec, new Set());
     spec.datasets = Object.fromEntries([...names].map((name) => [name, rowsOf(name)]));

@@ -66,6 +66,7 @@ def chart_config() -> dict[str, object]:
         "labelColor": QUIET,
         "labelFontSize": 11,
         "labelPadding": 6,
+        "labelSeparation": 5,
         "labelFlush": False,
         "tickCount": 6,
         "ticks": False,

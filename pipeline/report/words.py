@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import math
+import re
 import unicodedata
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
@@ -17,6 +18,8 @@ _MINUTE, _HOUR = 60.0, 3600.0
 _KILOMETRE = 1000.0
 _MOST_PLACES = 3
 _EARLIEST_YEAR = 2000
+_MOST_COLUMNS = 3
+_MARKUP = re.compile("<[^>]*>")
 
 
 def escape(text: object) -> str:
@@ -103,6 +106,8 @@ def build_table(
 ) -> str:
     """An HTML table from cells that are HTML already; the first column is the row's header.
 
+    On a narrow screen a table of many columns becomes a list of rows, each cell beside its column's title.
+
     Args:
         head: column titles as HTML.
         rows: cells as HTML, as many as ``head``.
@@ -114,14 +119,18 @@ def build_table(
         return ' class="number"' if column in numeric else ""
 
     titles = "".join(f'<th scope="col"{style(i)}>{cell}</th>' for i, cell in enumerate(head))
+    titles_alone = [_MARKUP.sub("", cell).replace('"', "&quot;") for cell in head]
     lines = []
     for row in rows:
-        cells = "".join(f"<td{style(i)}>{cell}</td>" for i, cell in enumerate(row) if i)
+        cells = "".join(
+            f'<td{style(i)} data-head="{titles_alone[i]}">{cell}</td>' for i, cell in enumerate(row) if i
+        )
         lines.append(f'<tr><th scope="row">{row[0]}</th>{cells}</tr>')
     body = "\n".join(lines)
+    kind = "table wide" if len(head) > _MOST_COLUMNS else "table"
     return (
         f'<p class="caption">{escape(caption)}</p>'
-        f'<div class="table" tabindex="0" role="region" aria-label="{escape(caption)}">'
+        f'<div class="{kind}" tabindex="0" role="region" aria-label="{escape(caption)}">'
         f'<table aria-label="{escape(caption)}"><thead><tr>{titles}</tr></thead>\n'
         f"<tbody>{body}</tbody></table></div>"
     )

@@ -21,7 +21,7 @@ from pipeline.comparison.deployments import (
 from pipeline.comparison.place import place_deployments
 from pipeline.comparison.terrain import TERRAINS, rate_name, rate_terrain
 from pipeline.job.map import draw_up_map, write_map
-from pipeline.report.deployments.labels import place_labels
+from pipeline.report.deployments.labels import Box, place_labels
 from pipeline.store import Store
 from schemas.deployments import FEATURES
 
@@ -171,13 +171,24 @@ def test_tables_are_added_to_and_merged_by_commands(tmp_path: Path) -> None:
     assert read_deployments(table).height == 38
 
 
-def test_labels_hide_neither_marks_nor_each_other() -> None:
-    marks = [(100.0, 100.0), (104.0, 101.0), (110.0, 99.0), (700.0, 50.0)]
+@pytest.mark.parametrize("width", [720.0, 260.0])
+def test_labels_hide_neither_marks_nor_each_other(width: float) -> None:
+    marks = [(100.0, 100.0), (104.0, 101.0), (110.0, 99.0), (width - 20.0, 50.0)]
     names = ["one", "another", "third", "at the edge"]
-    placed = place_labels(marks, names, width=720.0)
-    spans = [(x, x + 6.7 * len(name), y) for (x, y), name in zip(placed, names, strict=True)]
-    for i, (left, right, y) in enumerate(spans):
-        assert left >= 0.0
-        assert right <= 720.0
-        for other_left, other_right, other_y in spans[:i]:
-            assert right <= other_left or other_right <= left or abs(y - other_y) >= 13.0
+    obstacle = Box(120.0, 180.0, 90.0, 110.0)
+    placed = place_labels(marks, names, width=width, obstacles=[obstacle])
+    found = [(at, name) for at, name in zip(placed, names, strict=True) if at is not None]
+    assert len(found) >= 3
+    boxes = [Box(x, x + 6.7 * len(name), y - 6.5, y + 6.5) for (x, y), name in found]
+    for i, box in enumerate(boxes):
+        assert box.left >= 0.0
+        assert box.right <= width
+        assert not box.overlaps(obstacle)
+        assert not any(box.overlaps(other) for other in boxes[:i])
+
+
+def test_a_name_without_a_place_is_left_out() -> None:
+    marks = [(50.0, 100.0)] * 9
+    placed = place_labels(marks, ["a long name"] * 9, width=200.0, furthest=14.0)
+    assert [at for at in placed if at is not None] != placed
+    assert all(abs(at[1] - 100.0) <= 14.0 for at in placed if at is not None)

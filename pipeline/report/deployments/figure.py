@@ -9,12 +9,15 @@ import polars as pl
 
 from pipeline.comparison.place import ZONES
 from pipeline.report import theme
-from pipeline.report.deployments.labels import place_labels
+from pipeline.report.deployments.labels import Box, place_labels
 from pipeline.report.figures import Drawing
 
 _LOWEST, _HIGHEST = 1.0, 1.0e6
 _ARROW = 1.9
 _WIDTH, _HEIGHT = 720.0, 520.0
+_PHONE_WIDTH, _NARROW = 260.0, 480
+_BESIDE = 12
+_ZONE_NAME, _ZONE_LINE = 85.0, 22.0
 _SHAPES = {
     "kinematic": "circle",
     "dynamic": "square",
@@ -33,6 +36,7 @@ def draw_map(points: pl.DataFrame, own: pl.DataFrame) -> Drawing:
         points: as of `place_deployments`.
         own: as of `place_datasets`; may be empty.
     """
+    own = number_datasets(own)
     arrows = points.filter(pl.col("bound").is_in(["upper", "lower"])).with_columns(
         pl.when(pl.col("bound") == "lower")
         .then(pl.col("energy") * _ARROW)
@@ -54,9 +58,15 @@ def draw_map(points: pl.DataFrame, own: pl.DataFrame) -> Drawing:
     note = (
         "Arrows: bounds. Hollow: mass or speed unconfirmed, inferred or second-hand. The complexity is a "
         "convention (slope, roughness, sinkage, friction); the zones end where log10(energy / J) + "
-        "complexity / 10 is 3.5 and 4.8."
+        "complexity / 10 is 3.5 and 4.8. Names without room are told on touching the mark; "
+        "on a narrow screen own datasets have the numbers of the table."
     )
     return Drawing(chart.properties(width=_WIDTH, height=_HEIGHT, usermeta={"gutter": 70}), rows, note)
+
+
+def number_datasets(own: pl.DataFrame) -> pl.DataFrame:
+    """Own datasets in the order in which they are numbered: the largest energy first."""
+    return own.sort("energy", "dataset", descending=[True, False])
 
 
 def _tabulate_zones() -> pl.DataFrame:
@@ -185,16 +195,33 @@ def _draw_own() -> alt.Chart:
 
 
 def _draw_names() -> list[alt.Chart]:
-    base = alt.Chart(alt.NamedData("names")).encode(
-        x=_complexity("place"), y=_energy("height"), text="name:N"
+    base = (
+        alt.Chart(alt.NamedData("names"))
+        .encode(x=_complexity("place"), y=_energy("height"), text="name:N")
+        .transform_filter(f"datum.wide == (width >= {_NARROW})")
     )
-    quiet = base.mark_text(align="left", baseline="middle", fontSize=10, color=theme.QUIET)
-    strong = base.mark_text(align="left", baseline="middle", fontSize=10.5, fontWeight=600, color=theme.INK)
-    return [quiet.transform_filter("!datum.own"), strong.transform_filter("datum.own")]
+    right, left = (base.transform_filter(f"datum.side == '{side}'") for side in ("right", "left"))
+    # Four kinds of text: quiet or strong, right or left of the mark.
+    texts = (
+        right.mark_text(align="left", dx=_BESIDE, baseline="middle", fontSize=10, color=theme.QUIET),
+        left.mark_text(align="right", dx=-_BESIDE, baseline="middle", fontSize=10, color=theme.QUIET),
+    )
+    strong = (
+        right.mark_text(
+            align="left", dx=_BESIDE, baseline="middle", fontSize=10.5, fontWeight=600, color=theme.INK
+        ),
+        left.mark_text(
+            align="right", dx=-_BESIDE, baseline="middle", fontSize=10.5, fontWeight=600, color=theme.INK
+        ),
+    )
+    return [
+        *(text.transform_filter("!datum.own") for text in texts),
+        *(text.transform_filter("datum.own") for text in strong),
+    ]
 
 
 def _name_marks(points: pl.DataFrame, own: pl.DataFrame) -> pl.DataFrame:
-    """Names with the places where they hide least, own ones first."""
+    """Names with the places where they hide nothing, own ones first; on wide screens and on narrow ones."""
     marks = pl.concat(
         [
             own.select(
@@ -205,15 +232,38 @@ def _name_marks(points: pl.DataFrame, own: pl.DataFrame) -> pl.DataFrame:
             ),
         ]
     )
-    across, up = _WIDTH / 10.0, _HEIGHT / (math.log10(_HIGHEST) - math.log10(_LOWEST))
+    # A narrow map has no room for whole names: own datasets have the numbers of the table there.
+    number = pl.when(pl.col("own")).then(pl.int_range(1, pl.len() + 1).cast(pl.String)).otherwise("name")
+    return pl.concat(
+        [
+            _place_names(marks, _WIDTH, furthest=42.0, apart=0.0).with_columns(wide=pl.lit(value=True)),
+            _place_names(
+                marks.with_columns(name=number), _PHONE_WIDTH, furthest=14.0, apart=6.0
+            ).with_columns(wide=pl.lit(value=False)),
+        ]
+    )
+
+
+def _place_names(marks: pl.DataFrame, width: float, *, furthest: float, apart: float) -> pl.DataFrame:
+    """Names that find a place on a map of that width [pixels]; the others are told on touching their mark."""
+    across, up = width / 10.0, _HEIGHT / (math.log10(_HIGHEST) - math.log10(_LOWEST))
     pixels = [
         (x * across, math.log10(energy) * up)
         for x, energy in zip(marks["complexity"].to_list(), marks["energy"].to_list(), strict=True)
     ]
-    placed = place_labels(pixels, marks["name"].to_list(), width=_WIDTH)
+    corners = [math.log10(high) * up for high in _tabulate_zones().filter(pl.col("place") == 10.0)["high"]]  # noqa: PLR2004 - the end of the axis
+    zones = [Box(width - _ZONE_NAME, width, top - _ZONE_LINE, top) for top in corners]
+    placed = place_labels(
+        pixels, marks["name"].to_list(), width=width, obstacles=zones, furthest=furthest, apart=apart
+    )
     return marks.select(
         "name",
         "own",
-        pl.Series("place", [x / across for x, _ in placed], dtype=pl.Float64),
-        pl.Series("height", [10.0 ** (y / up) for _, y in placed], dtype=pl.Float64),
-    )
+        pl.col("complexity").alias("place"),
+        pl.Series("side", [_name_side(at, x) for at, (x, _) in zip(placed, pixels, strict=True)]),
+        pl.Series("height", [at and 10.0 ** (at[1] / up) for at in placed], dtype=pl.Float64),
+    ).drop_nulls("height")
+
+
+def _name_side(place: tuple[float, float] | None, mark: float) -> str:
+    return "right" if place is None or place[0] > mark else "left"

@@ -33,33 +33,51 @@ class Box:
 
 
 def place_labels(
-    marks: Sequence[tuple[float, float]], names: Sequence[str], *, width: float
-) -> list[tuple[float, float]]:
+    marks: Sequence[tuple[float, float]],
+    names: Sequence[str],
+    *,
+    width: float,
+    obstacles: Sequence[Box] = (),
+    furthest: float = 42.0,
+    apart: float = 0.0,
+) -> list[tuple[float, float] | None]:
     """Left ends of the names' middle lines, one a mark, greedily in the order given.
 
     Each name tries right and left of its mark, then some lines higher and lower; the first place that hides
-    nothing and stays on the map is taken, or the first of all.
+    nothing and stays on the map is taken.
 
     Args:
         marks: positions in pixels, y upward.
         names: as many texts.
         width: of the map in pixels.
+        obstacles: what else must stay visible.
+        apart: from other marks, beside which a name would seem to be theirs [pixels].
+        furthest: how much higher or lower than its mark a name may stand [pixels].
+
+    Returns:
+        A place for each name, None where there is none.
     """
-    taken = [Box(x - _MARK, x + _MARK, y - _MARK, y + _MARK) for x, y in marks]
-    placed = []
-    for (x, y), name in zip(marks, names, strict=True):
+    taken = list(obstacles)
+    own = [Box(x - _MARK, x + _MARK, y - _MARK, y + _MARK) for x, y in marks]
+    others = [Box(box.left - apart, box.right + apart, box.low, box.high) for box in own]
+    placed: list[tuple[float, float] | None] = []
+    steps = [step for step in _STEPS if abs(step) <= furthest]
+    for i, ((x, y), name) in enumerate(zip(marks, names, strict=True)):
         long = _LETTER * len(name)
-        places = [(left, y + step) for step in _STEPS for left in (x + _MARK + 3.0, x - _MARK - 3.0 - long)]
+        places = [(left, y + step) for step in steps for left in (x + _MARK + 3.0, x - _MARK - 3.0 - long)]
+        hidden = [*taken, own[i], *others[:i], *others[i + 1 :]]
         free = [
             place
             for place in places
             if place[0] >= 0.0
             and place[0] + long <= width
-            and not any(_frame(place, long).overlaps(box) for box in taken)
+            and not any(_frame(place, long).overlaps(box) for box in hidden)
         ]
-        best = (free or places)[0]
-        taken.append(_frame(best, long))
-        placed.append(best)
+        if not free:
+            placed.append(None)
+            continue
+        taken.append(_frame(free[0], long))
+        placed.append(free[0])
     return placed
 
 

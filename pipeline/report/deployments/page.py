@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.report.deployments.figure import draw_map
+from pipeline.report.deployments.figure import draw_map, number_datasets
 from pipeline.report.gallery import Chapter, Picture, render_gallery
 from pipeline.report.words import begin_large, build_table, escape, say_number
 
@@ -83,14 +83,14 @@ def _tabulate_own(own: pl.DataFrame) -> str:
     ]
     rows = [
         [
-            escape(row["dataset"]),
+            f"<small>{number}</small> {escape(row['dataset'])}",
             str(row["runs"]),
             say_number(row["energy"]),
             say_number(row["complexity"], digits=2),
             say_number(row["slip"]),
             row["zone"],
         ]
-        for row in own.sort("energy", descending=True).iter_rows(named=True)
+        for number, row in enumerate(number_datasets(own).iter_rows(named=True), start=1)
     ]
     return build_table(
         head, rows, caption="Largest kinetic energy of any run, slip over runs", numeric=(1, 2, 3, 4)

@@ -1,0 +1,73 @@
+"""Pages over many runs in a real browser, as wide as a phone and as a laptop: nothing is cut or overlaps."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, cast
+
+import pytest
+from chrome import BROWSER, Chrome
+from comparison_store import Run, write_run
+
+from pipeline.cli.app import main
+from pipeline.store import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+DRAWN = "document.documentElement?.dataset.drawn === 'yes'"
+CUT = """[...document.querySelectorAll('.table')].filter((box) => box.scrollWidth > box.clientWidth + 1)
+  .map((box) => box.getAttribute('aria-label'))"""
+OVERLAPS = """(() => {
+  const boxes = [...document.querySelectorAll('[data-figure] .mark-text text')]
+    .map((text) => [text.textContent, text.getBoundingClientRect()]).filter(([, box]) => box.width);
+  const found = [];
+  for (const [i, [one, a]] of boxes.entries()) for (const [other, b] of boxes.slice(i + 1))
+    if (a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 2 && b.top < a.bottom - 2)
+      found.push([one, other]);
+  return found;
+})()"""
+
+
+@pytest.fixture
+def chrome(tmp_path: Path) -> Iterator[Chrome]:
+    if BROWSER is None:
+        pytest.skip("no Chromium here to look at the pages with (`make browser` installs one)")
+    browser = Chrome(tmp_path / "profile")
+    yield browser
+    browser.close()
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    folder = tmp_path / "results"
+    for vehicle, mass in (("warthog", 470.0), ("husky_a200", 75.0)):
+        for terrain in ("asphalt", "gravel", "ice", "snow"):
+            for number in range(2):
+                dataset = f"{vehicle}_{terrain}"
+                made = Run(
+                    name=f"field/{dataset}_of_a_long_day_{number}",
+                    dataset=dataset,
+                    vehicle=vehicle,
+                    terrain=terrain,
+                    mass_kg=mass,
+                    sha256=f"{dataset}{number}",
+                )
+                write_run(Store(folder), made, seed=number)
+    return folder
+
+
+@pytest.mark.parametrize("verb", ["compare", "map"])
+def test_nothing_is_cut_or_overlaps(verb: str, chrome: Chrome, results: Path) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([verb, str(results), "--quiet"])
+    assert ended.value.code == 0
+    page = results / ("comparison.html" if verb == "compare" else "map.html")
+    for width in (390, 1280):
+        chrome.size(width, 900, dark=width < 600)
+        chrome.open(page.as_uri())
+        chrome.wait(DRAWN)
+        assert cast("int", chrome.run("document.documentElement.scrollWidth - innerWidth")) <= 0
+        assert chrome.run(CUT) == []
+        assert chrome.run(OVERLAPS) == []
+    assert chrome.errors == []
