@@ -44,10 +44,18 @@ class Input(enum.Enum):
 
 @dataclass(frozen=True)
 class Reach:
-    """Errors of predictions: position [m] and wrapped yaw [rad] at each row of the horizons, shape (n,)."""
+    """Errors of predictions at each row of the horizons, shape (n,).
+
+    Attributes:
+        position: [m].
+        yaw: wrapped [rad].
+        turned: the same with whole turns counted [rad]: a model that turns far too fast is wrong by more than
+            a wrapped angle can say.
+    """
 
     position: Floats
     yaw: Floats
+    turned: Floats
 
 
 class Comparison:
@@ -109,14 +117,32 @@ class Comparison:
         """How late the poses are as far as it is known before any fit [s]: against the gyro."""
         return self.heading.gyro.yaw_delay_s if self.heading.gyro is not None else 0.0
 
+    @property
+    def turning(self) -> Floats:
+        """Measured yaw rate over every window [rad/s], shape (n,)."""
+        heading = self._node_headings(self.usual_delay)
+        turned: Floats = heading[self.windows.end] - heading[self.windows.start]
+        return turned / self.windows.span_s
+
     def predict_velocity(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
         """Body velocity of a model on the cells, as the localization would report it."""
         return self._run(self._forward, effects, timing)
 
     def _run(self, forward: Forward, effects: Sequence[Effect], timing: Timing) -> Velocity:
         if self.source is Input.COMMAND:
-            return forward.run_commands(effects, timing)
+            return forward.run_commands(effects, self._complete_timing(effects, timing))
         return forward.run_wheels(effects, timing)
+
+    def _complete_timing(self, effects: Sequence[Effect], timing: Timing) -> Timing:
+        """The delay of the encoders with what a body that follows late has hidden of it.
+
+        States may only begin with what had been reported when the pose they start from was.
+        """
+        if timing.wheel_delay_s <= 0.0:
+            return timing
+        hidden = sum(effect.values["tau"] for effect in effects if effect.id == "body_inertia")
+        most = max(self.usual_delay, 0.0)
+        return replace(timing, wheel_delay_s=min(timing.wheel_delay_s + hidden, most))
 
     def find_residuals(self, effects: Sequence[Effect], timing: Timing) -> Floats:
         """Measured less predicted displacement of every window, over its length.
@@ -155,7 +181,8 @@ class Comparison:
         turn = np.exp(1j * (heading[origin] - turned[origin]))
         predicted = self._path[origin] + turn * (travelled[node] - travelled[origin])
         yaw = (heading[node] - heading[origin]) - (turned[node] - turned[origin])
-        return Reach(np.abs(predicted - self._path[node]), np.abs(np.angle(np.exp(1j * yaw))))
+        wrapped = np.abs(np.angle(np.exp(1j * yaw)))
+        return Reach(np.abs(predicted - self._path[node]), wrapped, np.abs(yaw))
 
     def list_starts(self, timing: Timing) -> tuple[Floats, Floats]:
         """Where predictions begin: stamps [s], shape (k,), and poses (x, y [m], yaw [rad]), shape (k, 3)."""

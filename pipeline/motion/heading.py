@@ -30,6 +30,7 @@ _REFINEMENTS = 4
 _LEAST_TURNING = 0.02
 _GOOD = 0.35
 _ALIGN_S = 3.0
+_HOLE_S = 0.5
 
 
 class HeadingSource(enum.Enum):
@@ -85,14 +86,30 @@ def choose_heading(run: MotionRun, cells: Cells, source: HeadingSource) -> Headi
     edges = cells.sum_up(on_cells)
     seen = np.interp(cells.locate_edges(track.times - fit.yaw_delay_s), np.arange(edges.size), edges)
     difference = track.heading - seen
-    offset = np.empty(track.times.size)
-    spoilt = _is_barred(run, track.times)
-    spans = cells.find_span(track.times)
-    for begin, end in _find_pieces(track.segment, spans):
-        rows = slice(begin, end)
-        good = ~spoilt[rows] if (~spoilt[rows]).any() else np.ones(end - begin, dtype=bool)
-        offset[rows] = _smooth(track.times[rows], difference[rows], good)
+    good = ~mark_barred(run, track.times)
+    offset = align_heading(track, difference, good, cells.find_span(track.times))
     return Heading(fit, edges, offset)
+
+
+def align_heading(
+    track: Track, difference: Floats, good: NDArray[np.bool_], span: NDArray[np.int64] | None = None
+) -> Floats:
+    """Slow part of the difference between two headings, within segments and spans [rad], shape (n,).
+
+    Args:
+        track: the poses.
+        difference: of the reported heading from the other one, shape (n,).
+        good: poses that count, shape (n,); where a piece has none all of its poses do.
+        span: number of the span of each pose; by default holes in the stamps end a span.
+    """
+    if span is None:
+        span = np.concatenate(([0], np.cumsum(np.diff(track.times) > _HOLE_S)))
+    offset = np.empty(track.times.size)
+    for begin, end in _find_pieces(track.segment, span):
+        rows = slice(begin, end)
+        counts = good[rows] if good[rows].any() else np.ones(end - begin, dtype=bool)
+        offset[rows] = _smooth(track.times[rows], difference[rows], counts)
+    return offset
 
 
 def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out is a reason
@@ -164,7 +181,8 @@ def has_barred(barred: Floats, start: Floats, end: Floats) -> NDArray[np.bool_]:
     return inside
 
 
-def _is_barred(run: MotionRun, times: Floats) -> NDArray[np.bool_]:
+def mark_barred(run: MotionRun, times: Floats) -> NDArray[np.bool_]:
+    """Whether a barred sample lies beside each time."""
     return has_barred(run.barred, times - 0.05, times + 0.05)
 
 

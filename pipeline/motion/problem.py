@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.motion.comparison import Comparison, Input
 from pipeline.motion.effect import Place, Search
+from pipeline.motion.encoders import measure_wheel_delay
 from pipeline.motion.errors import MotionError
 from pipeline.motion.forward import Timing
 from pipeline.motion.heading import HeadingSource
@@ -28,7 +29,6 @@ Integers = NDArray[np.int64]
 _DELAY_BOUNDS = (-0.7, 0.9)
 _DELAY_STEP = 5e-3
 _FEWEST_WINDOWS = 20
-_COARSE_RATE_HZ = 50.0
 
 
 @dataclass(frozen=True)
@@ -175,10 +175,11 @@ class Problem:
             return State(model, {}, self.given_timing)
         known = "clock_offset" not in model
         timing = tuple(
-            Timing(pose_delay_s=c.heading.gyro.yaw_delay_s)
-            if c.heading.gyro is not None and known
-            else Timing()
-            for c in self.comparisons
+            Timing(
+                pose_delay_s=c.heading.gyro.yaw_delay_s if c.heading.gyro is not None and known else 0.0,
+                wheel_delay_s=late,
+            )
+            for c, late in zip(self.comparisons, self._late_wheels, strict=True)
         )
         return State(model, {}, timing)
 
@@ -247,30 +248,6 @@ class Problem:
                 rows = self.run_of == number.run
                 columns[rows, :, index] = (self.find_run_residuals(moved, number.run) - base[rows]) / step
         return columns
-
-
-def measure_wheel_delay(run: MotionRun, vehicle: Vehicle) -> float:
-    """How late the encoders are against the gyro [s]; zero where it cannot be told.
-
-    A body that follows its wheels late hides a part of the delay, so both are fitted together.
-    """
-    from pipeline.motion.catalogue import find_effect  # noqa: PLC0415 - finds the effects by importing them
-    from pipeline.motion.fit import fit_model  # noqa: PLC0415 - the two rely on each other
-    from pipeline.motion.model import Model  # noqa: PLC0415
-
-    if run.wheels is None:
-        return 0.0
-    usual = (
-        ("wheel_radius", "body_inertia")
-        if vehicle.kind == "ackermann"
-        else ("effective_track", "body_inertia")
-    )
-    try:
-        problem = Problem([run], vehicle, Input.MEASURED, rate_hz=_COARSE_RATE_HZ)
-    except MotionError:
-        return 0.0
-    fitted = fit_model(problem, Model(vehicle, tuple(find_effect(name)() for name in usual)))
-    return fitted.state.timing[0].wheel_delay_s
 
 
 def _is_used(effect: Effect, parameter: Parameter) -> bool:

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import rigid, segments
+from pipeline.motion.ages import put_in_time
 from pipeline.motion.errors import MotionError
+from pipeline.motion.faults import bar_faults
 from pipeline.motion.ideal import invert_differential
 
 if TYPE_CHECKING:
@@ -26,6 +28,8 @@ Integers = NDArray[np.int64]
 _SHORTEST_HOLD = 0.5
 _PERIODS = 5.0
 _DEAD = 1e-9
+_LONGEST_WAIT = 1.5
+_ROLLS = 0.3
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,9 @@ class MotionRun:
         step_starts: where command steps begin [s].
         barred: times [s] of samples in bad stretches or without a live command.
         duration_s: length of the run.
+        age_spread_s: by how much the ages of the poses varied before they were put in time (see `ages`);
+            zero where they were not.
+        faulty_s: time barred because the localization was at fault (see `faults`), beside the bad stretches.
     """
 
     name: str
@@ -90,6 +97,8 @@ class MotionRun:
     step_starts: Floats
     barred: Floats
     duration_s: float
+    age_spread_s: float = 0.0
+    faulty_s: float = 0.0
 
 
 def load_run(
@@ -113,9 +122,9 @@ def load_run(
     Raises:
         MotionError: ``no_poses``, fewer than ten poses carry information.
     """
-    track = _read_track(tables["poses"], name)
     commands = _read_drive(tables.get("commands"), vehicle)
     wheels = _read_drive(tables.get("wheels"), vehicle)
+    track = _read_track(tables["poses"], wheels, name)
     if wheels is not None and max(np.abs(wheels.left).max(), np.abs(wheels.right).max()) < _DEAD:
         wheels = None
     imu = tables.get("imu")
@@ -128,7 +137,7 @@ def load_run(
         commands = _stop_when_silent(commands, hold_s)
     steps, barred = _read_steps(tables.get("slip"))
     terrains = tables["poses"]["terrain"] if "terrain" in tables["poses"].columns else None
-    return MotionRun(
+    run = MotionRun(
         name=name,
         sha256=sha256,
         terrain=str(terrains[0]) if terrains is not None else "unknown",
@@ -141,13 +150,17 @@ def load_run(
         barred=barred,
         duration_s=float(streams[-1]),
     )
+    return bar_faults(put_in_time(run), vehicle)
 
 
-def _read_track(poses: pl.DataFrame, name: str) -> Track:
+def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> Track:
     parts = []
     for piece in poses.sort("segment", "t").partition_by("segment", maintain_order=True):
         times = piece["t"].to_numpy()
-        fresh = segments.select_fresh_poses(times, piece["held"].to_numpy())
+        held = piece["held"].to_numpy()
+        fresh = segments.select_fresh_poses(times, held)
+        if wheels is not None:
+            fresh = fresh[~_waits_in_motion(times, held, wheels)[fresh]]
         fresh = fresh[np.diff(times[fresh], prepend=-np.inf) > 0.0]
         if fresh.size > 1:
             parts.append(_unroll(piece[fresh]))
@@ -161,6 +174,18 @@ def _read_track(poses: pl.DataFrame, name: str) -> Track:
     return Track(
         *(np.concatenate([getattr(part, field) for part in parts]) for field in Track.__dataclass_fields__)
     )
+
+
+def _waits_in_motion(times: Floats, held: Flags, wheels: DriveSeries) -> Flags:
+    """Repeats of a pose that are shorter than any rest while the wheels turn: a localization that waits."""
+    waits = np.zeros(times.size, dtype=bool)
+    rim = np.maximum(np.abs(wheels.left), np.abs(wheels.right))
+    for first, end in segments.find_runs(held):
+        if times[end - 1] - times[first] > _LONGEST_WAIT:
+            continue
+        low, high = np.searchsorted(wheels.times, (times[max(first - 1, 0)], times[end - 1]))
+        waits[first:end] = high > low and bool(np.median(rim[low:high]) > _ROLLS)
+    return waits
 
 
 def _unroll(piece: pl.DataFrame) -> Track:

@@ -1,0 +1,157 @@
+"""Faults of the localization: half seconds in which it goes where its own wheels say no vehicle went.
+
+A localization that was lost jumps back, waits and catches up, or reports a way that is turned against the
+heading. Every displacement over half a second, its direction and its length, is compared with a robust model
+of the whole run: a regression on the wheels, late and multiplied, wide enough to hold every effect of the
+catalogue. What is eight times as far off as is usual at that speed, and a quarter of a metre, is not compared
+with any model, up to a tenth of the run. How much that is stands in `MotionRun.faulty_s`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core import timegrid
+from pipeline.motion.heading import align_heading, fit_gyro, has_barred, mark_barred
+
+if TYPE_CHECKING:
+    from pipeline.motion.recording import DriveSeries, MotionRun
+    from pipeline.vehicles import Vehicle
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+
+_WINDOW_S = 0.5
+_LONGEST_S = 1.2
+_FEWEST = 200
+_FAR = 8.0
+_LEAST_M = 0.25
+_LARGEST_SHARE = 0.1
+_LAGS_S = (-0.3, -0.1, 0.1, 0.3, 0.6, 1.0, 1.6)
+_ROUNDS = 10
+_BINS = 6
+_SAMPLE_S = 0.05
+
+
+def bar_faults(run: MotionRun, vehicle: Vehicle) -> MotionRun:
+    """A run in which stretches where the localization is at fault are barred.
+
+    Without measured wheels nothing says where the vehicle cannot have gone: the run stays as it is.
+    """
+    if run.wheels is None:
+        return run
+    first, last = _pair_up(run)
+    if first.size < _FEWEST:
+        return run
+    off = _measure_misfit(run, run.wheels, vehicle, first, last)
+    begin, end = run.track.times[first], run.track.times[last]
+    live = np.diff(run.track.times)[run.track.active[1:]]
+    most = _LARGEST_SHARE * float(live[live < _LONGEST_S].sum())
+    faulty = off > 1.0
+    if not faulty.any():
+        return run
+    grid = _fill(begin[faulty], end[faulty])
+    # More than a tenth is no exception: then only the worst of it counts as fault.
+    while grid.size * _SAMPLE_S > most:
+        faulty &= off > np.quantile(off[faulty], 0.1)
+        grid = _fill(begin[faulty], end[faulty])
+    return replace(run, barred=np.union1d(run.barred, grid), faulty_s=float(grid.size * _SAMPLE_S))
+
+
+def _fill(begin: Floats, end: Floats) -> Floats:
+    """Times all through some intervals, twenty a second."""
+    first, last = np.floor(begin / _SAMPLE_S), np.ceil(end / _SAMPLE_S)
+    ticks = [np.arange(a, b + 1) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
+    times: Floats = np.unique(np.concatenate(ticks)) * _SAMPLE_S if ticks else np.zeros(0)
+    return times
+
+
+def _pair_up(run: MotionRun) -> tuple[Integers, Integers]:
+    """Poses of one segment half a second apart, and those on both sides of a longer wait."""
+    times = run.track.times
+    first = np.arange(times.size)
+    last = np.searchsorted(times, times + _WINDOW_S - 1e-3)
+    kept = last < times.size
+    first, last = first[kept], last[kept].astype(np.int64)
+    kept = (run.track.segment[first] == run.track.segment[last]) & (times[last] - times[first] < _LONGEST_S)
+    kept &= run.track.active[first] & run.track.active[last]
+    kept &= ~has_barred(run.barred, times[first], times[last])
+    return first[kept], last[kept]
+
+
+def _measure_misfit(
+    run: MotionRun, wheels: DriveSeries, vehicle: Vehicle, first: Integers, last: Integers
+) -> Floats:
+    """How far each displacement is from the robust model; one is as far as is just believed, shape (n,)."""
+    track = run.track
+    heading, delay = _choose_heading(run)
+    moved = (track.path[last] - track.path[first]) * np.exp(-0.5j * (heading[first] + heading[last]))
+    span = track.times[last] - track.times[first]
+    forward = 0.5 * vehicle.wheel_radius_m * (wheels.left + wheels.right)
+    if vehicle.kind == "ackermann":
+        turning = forward * np.tan(wheels.steering) / (vehicle.wheelbase_m or 1.0)
+    else:
+        turning = vehicle.wheel_radius_m * (wheels.right - wheels.left) / (vehicle.track_width_m or 1.0)
+
+    def drive(rate: Floats, late: float) -> Floats:
+        way = timegrid.integrate_rate(wheels.times, rate)
+        at = track.times - delay - late
+        whole: Floats = np.interp(at[last], wheels.times, way) - np.interp(at[first], wheels.times, way)
+        return whole
+
+    own = (heading[last] - heading[first]) / span
+    along = [drive(forward, late) for late in _LAGS_S]
+    across = [drive(forward * turning, late) for late in _LAGS_S]
+    beside = [own * way for way in along]
+    rest = [span, drive(forward * np.abs(turning), 0.1), drive(forward * np.abs(forward), 0.1)]
+    rest += [drive(np.abs(forward), 0.1), drive(np.abs(turning), 0.1), drive(turning, 0.1), own * span]
+    columns = np.column_stack((*along, *across, *beside, *rest))
+    gap = np.column_stack([_fit_robustly(columns, part) for part in (moved.real, moved.imag)])
+    size = np.hypot(gap[:, 0], gap[:, 1])
+    usual = _spread_by_speed(size, np.abs(along[2]) / span)
+    misfit: Floats = size / np.maximum(_FAR * usual, _LEAST_M)
+    return misfit
+
+
+def _choose_heading(run: MotionRun) -> tuple[Floats, float]:
+    """Heading at the poses: the gyro's where there is a good one; and how late the poses are [s]."""
+    gyro = fit_gyro(run)
+    if gyro is None or run.gyro is None:
+        return run.track.heading, 0.0
+    times, rate = run.gyro
+    angle = gyro.scale * timegrid.integrate_rate(times, rate) + gyro.bias * times
+    seen = np.interp(run.track.times - gyro.yaw_delay_s, times, angle)
+    good = ~mark_barred(run, run.track.times)
+    return seen + align_heading(run.track, run.track.heading - seen, good), gyro.yaw_delay_s
+
+
+def _fit_robustly(columns: Floats, values: Floats) -> Floats:
+    """What a regression with Cauchy weights leaves, shape (n,)."""
+    scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-9
+    design = columns / scale
+    weight, left = np.ones(values.size), values
+    ridge = 1e-4 * values.size * np.eye(design.shape[1])
+    for _ in range(_ROUNDS):
+        rows = design * weight[:, None]
+        found = np.linalg.solve(rows.T @ design + ridge, rows.T @ values)
+        left = values - design @ found
+        spread = max(1.4826 * float(np.median(np.abs(left))), 1e-3)
+        weight = 1.0 / (1.0 + (left / (2.0 * spread)) ** 2)
+    return left
+
+
+def _spread_by_speed(size: Floats, speed: Floats) -> Floats:
+    """Usual size of a misfit at each speed: faster is less certain, for stamps are what is wrong."""
+    edges = np.quantile(speed, np.linspace(0.0, 1.0, _BINS + 1))
+    place = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, _BINS - 1)
+    middle = np.array([np.median(speed[place == k]) if (place == k).any() else np.nan for k in range(_BINS)])
+    usual = np.array([np.median(size[place == k]) if (place == k).any() else np.nan for k in range(_BINS)])
+    known = np.isfinite(middle)
+    # The median of the length of two normal parts is 1.18 times the spread of either.
+    spread: Floats = np.interp(speed, middle[known], np.maximum.accumulate(usual[known])) / 1.18
+    return spread
