@@ -18,7 +18,7 @@ from pipeline.diagnosis.plausibility import find_implausible
 from pipeline.diagnosis.rating import rate_effects
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.where import map_errors, pick_regions
-from pipeline.motion import Input, ModelFile, MotionError
+from pipeline.motion import Input, ModelFile, MotionError, find_effect
 from pipeline.motion.describe import errors_as_json, ladder_as_json
 from pipeline.motion.ladder import compare_losses
 from pipeline.motion.windows import WINDOW_S
@@ -70,11 +70,12 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
         judgements = _rate_ways(ground, source, ways, [*found, *terms], timing)
     judgement = judgements.get(source.value)
     unexplained = leftover.describe(ways)
-    named = tuple(
+    described = tuple(
         _describe(effect, ground, ways, judgements)
         for effect in _order(found, judgement)
         if not _parts(effect) & open_ids and effect.id not in known
     )
+    named = tuple(effect for effect in described if _doubt(effect) is None)
     named = leftover.mark_tentative(_mark_idle(named, judgements), ways, unexplained)
     problem: Problem = body.search.arena.problem
     start = body.search.start
@@ -98,7 +99,7 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
         undecided=tuple(undecided),
         unobservable=tuple(unobservable.values()),
         unexplained=unexplained,
-        findings=tuple(_note_idle(effect) for effect in idle),
+        findings=(*_note_doubts(described), *(_note_idle(effect) for effect in idle)),
         ladder=() if judgement is None else tuple(_rungs(judgement)),
         noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
         explained_share=math.nan if last is None else last,
@@ -114,21 +115,26 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
 
 def of_run(common: RunDiagnosis, recording: Recording, number: int, ground: Ground) -> RunDiagnosis:
     """The common diagnosis with one run's own name, findings and delays."""
-    findings = [cast("Mapping[str, Json]", f) for f in recording.list_findings()]
-    findings += common.findings
-    findings += [
-        {
-            "id": "implausible_effect",
-            "text": effect.implausible,
-            "where": effect.id,
-            "severity": "warning",
-        }
-        for effect in common.effects
-        if effect.implausible is not None
-    ]
+    findings = list(common.findings)
+    findings += [cast("Mapping[str, Json]", f) for f in recording.list_findings()]
     findings += _note_brevity(ground, common)
     runs = cast("Sequence[Mapping[str, Json]]", common.timing["runs"])
     return replace(common, run=recording.name, findings=tuple(findings), timing=runs[number])
+
+
+def _doubt(effect: Named) -> str | None:
+    """Why an effect with its numbers is none of a vehicle's; None where it may well be one."""
+    values = {name: value.value for name, value in effect.parameters.items()}
+    return find_implausible(find_effect(effect.id)().change(**values))
+
+
+def _note_doubts(described: Sequence[Named]) -> list[Mapping[str, Json]]:
+    doubts = [(effect.id, _doubt(effect)) for effect in described]
+    return [
+        {"id": "implausible_effect", "text": text, "where": name, "severity": "warning"}
+        for name, text in doubts
+        if text is not None
+    ]
 
 
 def _note_brevity(ground: Ground, common: RunDiagnosis) -> list[Mapping[str, Json]]:
@@ -193,12 +199,11 @@ def _describe(
 ) -> Named:
     way = _way_of(effect, ways)
     gain, selected = _measure_gain(effect, way)
-    fitted, judgement = effect, judgements.get(way.search.way)
+    judgement = judgements.get(way.search.way)
     if effect.id == "clock_offset" and ground.has_gyro:
         values = read_gyro_clock(effect, [delay for delay in ground.yaw_delays if delay is not None])
     elif judgement is not None and effect.id in judgement.fitted.model:
-        fitted = judgement.fitted.model.effect(effect.id)
-        values = list_values(fitted, judgement.estimates)
+        values = list_values(judgement.fitted.model.effect(effect.id), judgement.estimates)
     else:
         values = measure_values(effect, way.search)
     return Named(
@@ -210,7 +215,6 @@ def _describe(
         corrected=effect.id in _CLOCKS and ground.has_gyro,
         way=way.search.way,
         selected=selected,
-        implausible=find_implausible(fitted),
     )
 
 

@@ -46,7 +46,6 @@ class Named:
         way: on which way it was found: `command`, `measured` or `wheels`.
         selected: share of resampled recordings in which it is still worth its place.
         tentative: far more structure stays in its channel than it explains.
-        implausible: what no vehicle does, in words; None where it is plausible.
     """
 
     id: str
@@ -58,7 +57,6 @@ class Named:
     way: str
     selected: float
     tentative: bool = False
-    implausible: str | None = None
 
     def to_json(self) -> dict[str, Json]:
         """The promised keys, and more."""
@@ -75,7 +73,6 @@ class Named:
             "found_on": self.way,
             "selection_frequency": _clean(self.selected),
             "tentative": self.tentative,
-            "implausible": self.implausible,
         }
 
 

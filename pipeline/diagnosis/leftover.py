@@ -91,13 +91,15 @@ def _find_lasting(way: Explored) -> tuple[float, Unexplained] | None:
         return None
     shares, repeats = _share_lasting(way)
     sizes = np.sqrt(shares * (held**2).mean(axis=0))
-    lasts = (shares >= _LEAST_SHARE) & (repeats >= _LEAST_REPEAT)
-    parts = np.where(lasts, sizes / _measure_asked(way), 0.0)
-    channel = int(np.argmax(parts))
-    if parts[channel] < _LEAST_OF_MOTION:
+    parts = sizes / _measure_asked(way)
+    sure = np.where((shares >= _LEAST_SHARE) & (repeats >= _LEAST_REPEAT), parts, 0.0)
+    channel = int(np.argmax(sure))
+    if sure[channel] < _LEAST_OF_MOTION:
         return None
-    every = tuple(CHANNELS[i] for i in np.argsort(-parts) if parts[i] >= _LEAST_OF_MOTION)
-    told = [f"{sizes[i]:.2g} {_unit(i)} in {CHANNELS[i]}" for i in np.flatnonzero(parts).tolist()]
+    # Where one channel has a cause that nobody knows, less evidence says that another has its share of it.
+    lasts = (shares >= 0.5 * _LEAST_SHARE) & (repeats >= 0.5 * _LEAST_REPEAT) & (parts >= _LEAST_OF_MOTION)
+    every = tuple(CHANNELS[i] for i in np.argsort(-parts) if lasts[i])
+    told = [f"{sizes[i]:.2g} {_unit(i)} in {CHANNELS[i]}" for i in np.flatnonzero(lasts).tolist()]
     where = f"{_WORDS.get(way.search.way, _WORDS['body'])}: {', '.join(told)}"
     left = Unexplained(float(shares[channel]), CHANNELS[channel], every, where, None, {}, way.search.way)
     return float(parts[channel]), left

@@ -38,7 +38,7 @@ _LEAST_GAIN: Mapping[str, tuple[tuple[str, ...], float]] = {
 }
 # Sizes that vehicles show (a wider range than was ever seen): outside, a name stands for something else.
 _PLAUSIBLE: Mapping[tuple[str, str], tuple[float, float]] = {
-    ("wheel_radius", "k"): (0.5, 1.4),
+    ("wheel_radius", "k"): (0.7, 1.3),
     ("wheel_asymmetry", "e"): (-0.2, 0.2),
     ("effective_track", "k"): (0.7, 4.0),
     ("icr_offset", "x_icr"): (-0.6, 0.6),

@@ -120,7 +120,7 @@ def test_what_is_named_is_what_a_vehicle_can_do(asked: Asked, name: str, source:
     named = {effect.id: effect for effect in run.effects}
     for effect in run.effects:
         values = {key: value.value for key, value in effect.parameters.items()}
-        assert find_implausible(find_effect(effect.id)(**values)) is None
+        assert find_implausible(find_effect(effect.id)().change(**values)) is None
     track = named["effective_track"].parameters["k"].value
     assert 1.5 < track < (2.7 if name == "husky_snow_boreal" else 2.1)
 
