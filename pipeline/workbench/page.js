@@ -47,6 +47,13 @@ const open_ = async (run) => {
   await panes[slot].open(run);
 };
 
+// Runs that can be set beside one: of its vehicle on its terrain, slip on the same input.
+const findPeers = (run) => {
+  if (!run.terrain || run.terrain === "unknown") return [];
+  const same = (other) => ["dataset", "leading_input"].every((key) => other[key] === run[key]);
+  return listed.runs.filter((other) => other.run !== run.run && same(other) && Number.isFinite(other.median_modulus));
+};
+
 const load = async () => {
   listed = await get("/api/runs");
   find("results").textContent = listed.results;
@@ -61,6 +68,7 @@ const arrange = (two) => {
   panes.a ??= new Pane("a", remember, () => watch());
   panes.b = two ? (panes.b ?? new Pane("b", remember, () => watch())) : null;
   find("bench").classList.toggle("single", !two);
+  for (const pane of Object.values(panes)) if (pane) pane.findPeers = findPeers;
   // What is marked in one is marked in the other, as long as both show the same run.
   const other = { a: "b", b: "a" };
   for (const pane of Object.values(panes))

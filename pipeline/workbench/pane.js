@@ -119,7 +119,7 @@ export class Pane {
 
   buildHero() {
     const { desk, run, inputs } = this.state;
-    const facts = [run.vehicle_name ?? run.vehicle, run.terrain, sayDuration(run.duration_s)].filter(Boolean);
+    const facts = [run.vehicle_name ?? run.vehicle, run.terrain, sayDuration(run.duration_s), this.sayStanding(run)].filter(Boolean);
     const words = { command: "on command", measured: "on measured wheels" };
     const choice = h("div", { class: "inputs", role: "group", "aria-label": "What the model is fed with" },
       inputs.map((name) => h("button", {
@@ -149,6 +149,15 @@ export class Pane {
         h("span", { class: "said", role: "status" })),
     ];
     this.hero.replaceChildren(...parts.filter(Boolean));
+  }
+
+  // The run beside the others of its dataset.
+  sayStanding(run) {
+    const others = this.findPeers?.(run) ?? [];
+    if (!others.length || !Number.isFinite(run.median_modulus)) return "";
+    const below = others.filter((other) => other.median_modulus < run.median_modulus).length;
+    if (others.length === 1) return `${below ? "more" : "less"} slip than the one other run of ${run.dataset}`;
+    return `vs ${others.length} runs of ${run.dataset}: more slip than ${below}`;
   }
 
   warn(run) {
@@ -311,13 +320,14 @@ export class Pane {
   named(diagnosis, there) {
     if (!diagnosis)
       return h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", onclick: () => this.diagnose() }, "Diagnose"));
-    const effects = (diagnosis.effects ?? []).filter((entry) => !there.has(entry.id));
+    const effects = (diagnosis.effects ?? []).filter((entry) => !there.has(entry.id)).sort((a, b) => (b.gain ?? 0) - (a.gain ?? 0));
     const told = effects.map((entry) => h("li", { class: "first", data: { effect: entry.id }, bar: 1 },
       h("div", {}, h("b", {}, entry.id), h("span", { class: "quiet" }, `named by the diagnosis${Number.isFinite(entry.gain) ? `: without it the loss is ${say(entry.gain + 1)} times as high` : ""}${(entry.equivalent_to ?? []).length ? `; same as ${entry.equivalent_to.join(", ")}` : ""}`)),
       h("button", { type: "button", class: "add", "aria-label": `add ${entry.id}, named by the diagnosis`, onclick: () => this.add(entry.id) }, "Add")));
+    const all = effects.length > 1 && h("button", { type: "button", class: "add-all", onclick: () => this.addAll(effects.map((entry) => entry.id)) }, `Add all ${effects.length}`);
     const undecided = (diagnosis.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. ${entry.separate_by ?? ""}`));
     const rest = diagnosis.unexplained ? [h("p", { class: "quiet" }, `Not explained yet: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}`)] : [];
-    return h("div", { class: "named" }, told.length ? h("ul", { class: "proposals" }, told) : null, undecided, rest);
+    return h("div", { class: "named" }, told.length ? h("ul", { class: "proposals" }, told) : null, all, undecided, rest);
   }
 
   async diagnose() {
@@ -338,6 +348,15 @@ export class Pane {
   async add(effect) {
     await this.act("add", { effect });
     if (this.state?.desk.effects.some((entry) => entry.id === effect)) this.tryAll();
+  }
+
+  // One after the other: each is a step that can be undone, and a step of the staircase.
+  async addAll(effects) {
+    for (const effect of effects) {
+      await this.act("add", { effect });
+      if (!this.state?.desk.effects.some((entry) => entry.id === effect)) return;
+    }
+    this.tryAll();
   }
 
   async tryAll() {

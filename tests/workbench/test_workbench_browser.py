@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -15,6 +16,7 @@ from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
 from pipeline.logs import LogWriter
 from pipeline.simulate import simulate_case
+from pipeline.store import Store
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -154,6 +156,24 @@ def test_a_stretch_that_is_brushed_shows_on_the_map_and_in_command_space(
     chrome.run("document.querySelector('.mark-to').value = '20'")
     chrome.click(".mark-set")
     chrome.wait("document.querySelector('.marked').textContent.includes('20.0 s: 10.0 s, highest slip')")
+    look_for_trouble(chrome)
+
+
+def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, workbench: Workbench) -> None:
+    manifest = Store(workbench.results).manifest(RUN)
+    assert manifest is not None
+    effects = [{"id": "drive_lag", "gain": 0.1}, {"id": "effective_track", "gain": 9.0}]
+    path = workbench.results / "workbench" / "diagnoses" / f"{RUN}.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps({"key": manifest.key, "diagnosis": {"effects": effects}}))
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    named = "[...document.querySelectorAll('.named li')].map((entry) => entry.dataset.effect)"
+    assert chrome.run(named) == ["effective_track", "drive_lag"]
+    chrome.click(".add-all")
+    chrome.wait("document.querySelectorAll('.card').length === 2")
+    chrome.wait("document.querySelectorAll('[data-figure=ladder] .mark-rect path').length === 3")
     look_for_trouble(chrome)
 
 
