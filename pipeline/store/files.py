@@ -6,16 +6,18 @@ import errno
 import os
 import secrets
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
 TEMPORARY = ".tmp-"
 """How the names of unfinished files and folders begin; no reader looks at them."""
 
+_SYNCS_AT_ONCE = 8
 _NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF)
 _NO_LINK = (errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS)
 
@@ -29,18 +31,53 @@ def write_new_file(path: Path, data: bytes) -> None:
         FileExistsError: there is a file already.
         OSError: the disk is full, read-only, ...; no half-written file remains.
     """
+    _create_file(path, data, lambda file: os.fsync(file.fileno()))
+
+
+def draft_file(path: Path, data: bytes) -> None:
+    """As `write_new_file`, without waiting for the disk: `sync_files` does so for many at once.
+
+    Raises:
+        FileExistsError: there is a file already.
+        OSError: the disk is full, read-only, ...; no half-written file remains.
+    """
+    _create_file(path, data, _do_nothing)
+
+
+def _create_file(path: Path, data: bytes, finish: Callable[[BinaryIO], None]) -> None:
     with path.open("xb") as file:
         try:
             file.write(data)
             file.flush()
-            os.fsync(file.fileno())
+            finish(file)
         except BaseException:
             with suppress(OSError):
                 path.unlink()
             raise
 
 
-def _do_nothing() -> None:
+def sync_files(paths: Sequence[Path]) -> None:
+    """Wait until the disk has files; asked at once, file systems need hardly longer for many than for one.
+
+    Raises:
+        OSError: the disk did not take one of them.
+    """
+    if not paths:
+        return
+    with ThreadPoolExecutor(min(len(paths), _SYNCS_AT_ONCE), thread_name_prefix="sync") as pool:
+        for _ in pool.map(_sync_file, paths):
+            pass
+
+
+def _sync_file(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _do_nothing(*_: object) -> None:
     pass
 
 

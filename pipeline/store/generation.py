@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 from pipeline.store.errors import StoreError, name_disk_errors
 from pipeline.store.files import (
+    draft_file,
     link_or_copy,
     make_folder,
     replace_file,
+    sync_files,
     sync_folder,
     temporary_beside,
-    write_new_file,
 )
 from pipeline.store.homes import name_free_folder, point_latest
 from pipeline.store.manifest import (
@@ -72,6 +73,7 @@ class Generation:
         self._folder = temporary_beside(home / key)
         self._tables: dict[str, TableEntry] = {}
         self._files: dict[str, FileEntry] = {}
+        self._drafts: list[Path] = []
         self._is_open = True
         with name_disk_errors(self._folder):
             self._folder.mkdir()
@@ -188,7 +190,8 @@ class Generation:
         with name_disk_errors(self._home):
             manifest = self._describe(details)
             data = encode_manifest(manifest)
-            write_new_file(self._folder / MARKER, b"")
+            self._draft(self._folder / MARKER, b"")
+            sync_files(self._drafts)
             for folder in sorted(path for path in self._folder.rglob("*") if path.is_dir()):
                 sync_folder(folder)
             sync_folder(self._folder)
@@ -235,9 +238,13 @@ class Generation:
         path = self._folder / name
         with name_disk_errors(path):
             make_folder(path.parent)
-            write_new_file(path, data)
+            self._draft(path, data)
         self._watch("file_written")
         return FileEntry(sha256=hash_bytes(data), bytes=len(data))
+
+    def _draft(self, path: Path, data: bytes) -> None:
+        draft_file(path, data)
+        self._drafts.append(path)
 
     def _link(self, name: str, sha256: str) -> None:
         self._require_new(name)
