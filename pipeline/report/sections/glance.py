@@ -138,8 +138,8 @@ def _answer_why(report: RunReport) -> str:
 
 def _tell_effects(effects: list[Mapping[str, object]], diagnosis: Mapping[str, object]) -> str:
     names = [f"<b>{escape(entry.get('id', ''))}</b>" for entry in effects[:_MOST_NAMES]]
-    rest = len(effects) - len(names)
-    lines = [f"<p>Missing: {', '.join(names)}{f' and {rest} more' if rest > 0 else ''}</p>"]
+    more = len(effects) - len(names)
+    lines = [f"<p>Missing: {', '.join(names)}{f' and {more} more' if more > 0 else ''}</p>"]
     ladder = objects_in(diagnosis, "ladder")
     share = number_in(diagnosis, "explained_share")
     if len(ladder) > 1:
@@ -150,6 +150,9 @@ def _tell_effects(effects: list[Mapping[str, object]], diagnosis: Mapping[str, o
         )
     if share is not None:
         lines.append(f"<p>{say_share(share)} of what can be explained</p>")
+    rest = mapping_in(diagnosis, "unexplained")
+    if rest.get("where"):
+        lines.append(f"<p>Not explained: {escape(rest['where'])}</p>")
     return "".join(lines)
 
 

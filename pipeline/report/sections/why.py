@@ -63,7 +63,7 @@ def _list_parameters(entry: Mapping[str, object]) -> list[list[str]]:
     for number, key in enumerate(parameters):
         values = mapping_in(parameters, key)
         unit = values.get("unit")
-        shown = f" <small>{escape(unit)}</small>" if unit not in (None, "1", "") else ""
+        shown = f" <small>{escape(unit).replace('^2', '²')}</small>" if unit not in (None, "1", "") else ""
         low, high = number_in(values, "low"), number_in(values, "high")
         rows.append(
             [
@@ -98,7 +98,10 @@ def _render_open(report: RunReport) -> str:
     if rest:
         share = say_share(number_in(rest, "share"))
         formula = f", for example {rest['formula']}" if rest.get("formula") else ""
-        told.append(("unexplained", f"{share} of {rest.get('channel', '')} {rest.get('where', '')}{formula}"))
+        channel = _CHANNELS.get(str(rest.get("channel")), "motion")
+        told.append(
+            ("unexplained", f"{share} of what is left in the {channel}: {rest.get('where', '')}{formula}")
+        )
     unseen = diagnosis.get("unobservable")
     if isinstance(unseen, list) and unseen:
         told.append(("unobservable", f"{', '.join(map(str, unseen))}: this log would not show it"))
@@ -128,6 +131,7 @@ def _render_split(report: RunReport) -> str:
     )
 
 
+_CHANNELS = {"x": "forward motion", "y": "sideways motion", "w": "yaw rate"}
 _PLACES = {
     "drivetrain": "between command and wheels",
     "ground": "between wheels and ground",
