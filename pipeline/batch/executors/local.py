@@ -28,7 +28,7 @@ from pipeline.batch.work import work_safely
 if TYPE_CHECKING:
     from pipeline.batch.work import Report, Task
 
-_TASKS_PER_WORKER = 500
+_TASKS_PER_WORKER = 2000
 """A worker is replaced after so many logs: whatever leaks in a library stays small."""
 
 _ORPHAN_PERIOD_S = 0.5
@@ -193,9 +193,12 @@ class _Worker:
         """
         while not self._ready.done() and self._is_alive():
             wait([self._ready], timeout=_LOOK_PERIOD_S)
-        if not self._ready.done() or self._ready.exception() is not None:
+        error = self._ready.exception() if self._ready.done() else BrokenProcessPool("the process has died")
+        if isinstance(error, BrokenProcessPool | ProcessExpired):
             _, exit_code = self.tell_end()
             raise _describe_failed_start(describe_exit(exit_code))
+        if error is not None:
+            raise _describe_failed_start(f"{type(error).__name__}: {error}")
 
     def begin(self, settings: Settings, task: Task) -> Future[Report]:
         """Work on a task.
