@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from pipeline.motion.problem import Problem
     from pipeline.motion.score import Errors
 
+_NOTHING = 1e-3
+
 
 @dataclass(frozen=True)
 class Rung:
@@ -58,7 +60,8 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
     """Build the ladder of a model's effects, the most useful first.
 
     At each rung every remaining effect is tried on top of those below; the one that lowers the loss most is
-    taken if it lowers the held-out loss too. Effects that do not are left out and named.
+    taken if it lowers the held-out loss too, and the error over 2 s does not rise: else the next best one is.
+    Effects that do neither are left out and named.
 
     Args:
         problem: the runs.
@@ -71,9 +74,17 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
     rest = [effect.id for effect in problem.active_effects(model)]
     hoped = dict.fromkeys(rest, inf)
     while rest:
-        name, candidate = _take_best(problem, model, fitted, hoped, per_run)
-        held_out = hold_out(problem, candidate)
-        if compare_losses(held_out, rungs[-1].held_out) >= 1.0:
+        waiting = dict(hoped)
+        while waiting:
+            name, candidate = _take_best(problem, model, fitted, waiting, per_run)
+            hoped.update(waiting)
+            held_out = hold_out(problem, candidate)
+            if compare_losses(held_out, rungs[-1].held_out) >= 1.0:
+                return Ladder(tuple(rungs), tuple(rest))
+            if not _rises(held_out, rungs[-1].held_out):
+                break
+            del waiting[name]
+        else:
             break
         fitted = candidate
         rungs.append(Rung(candidate, held_out))
@@ -106,6 +117,11 @@ def _take_best(
     if best is None:
         raise ValueError("no effect to take")
     return best[1], best[2]
+
+
+def _rises(new: HeldOut, old: HeldOut) -> bool:
+    """Whether the position error over 2 s is larger than before; where nothing was predicted it is not."""
+    return new.pooled.t_mrmse_m > old.pooled.t_mrmse_m * (1.0 + _NOTHING)
 
 
 def compare_losses(new: HeldOut, old: HeldOut) -> float:
