@@ -34,6 +34,8 @@ _LASTING_S = (1.5, 4.0, 16.0)
 _FIRST = 4.0
 # Below a fiftieth of the variance nobody can tell noise from structure.
 _RESOLVED = 0.02
+# Correlation over one to two seconds from which on something lasts: random motion comes to 0.1.
+_REPEATED = 0.18
 
 
 @dataclass(frozen=True)
@@ -144,6 +146,10 @@ def _split(covariance: Floats) -> Makeup:
     design = np.column_stack(columns) * weight[:, None]
     parts = np.asarray(nnls(design, covariance / total * weight)[0]) * total
     known = len(_PASSING_S) + 2
+    if covariance[2:5].mean() < _REPEATED * total:
+        # Sampled random motion repeats itself by chance: that is no structure.
+        parts[1] += parts[known:].sum()
+        parts[known:] = 0.0
     noise = float(parts[:known].sum())
     if noise < _RESOLVED * total:
         parts[known:] *= (1.0 - _RESOLVED) / max(float(parts[known:].sum()) / total, 1e-12)
