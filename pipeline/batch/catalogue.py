@@ -12,11 +12,12 @@ from urllib.parse import quote
 import polars as pl
 
 from pipeline.report.words import escape, say_number
+from pipeline.store.queries import scan_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.store import Store
+    from pipeline.store import Manifest, Store
 
 _REPORT = "report.html"
 
@@ -49,8 +50,10 @@ def render_catalogue(store: Store) -> str:
     Args:
         store: the results.
     """
-    rows = _gather_rows(store)
-    links = _list_links(store)
+    # Looking through the manifests of a long season takes a while: once for all that is asked of them.
+    manifests = store.manifests()
+    rows = _gather_rows(store, manifests)
+    links = _list_links(store, manifests)
     titles = "".join(
         f'<th scope="col"{_style(column)}><button type="button">{escape(_title(column))}</button></th>'
         for column in (_Column("run", "run"), *_COLUMNS, _Column("state", "log"))
@@ -69,10 +72,10 @@ def render_catalogue(store: Store) -> str:
     return _assemble(f"<h1>Runs</h1>{lead}{box}{table}")
 
 
-def _gather_rows(store: Store) -> list[dict[str, object]]:
-    runs = store.scan("runs").collect()
+def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, object]]:
+    runs = scan_table("runs", root=store.root, manifests=manifests).collect()
     medians = (
-        store.scan("aggregates")
+        scan_table("aggregates", root=store.root, manifests=manifests)
         .filter(pl.col("subset") == "all")
         .select("run", "input", "median_modulus", "distance", "samples")
         .collect()
@@ -84,10 +87,10 @@ def _gather_rows(store: Store) -> list[dict[str, object]]:
     return runs.join(facts, on="run", how="left").sort("run").to_dicts()
 
 
-def _list_links(store: Store) -> Mapping[str, str]:
+def _list_links(store: Store, manifests: Sequence[Manifest]) -> Mapping[str, str]:
     """Relative address of each run's report, or of its folder where it has none."""
     links: dict[str, str] = {}
-    for manifest in store.survey().manifests:
+    for manifest in manifests:
         place = manifest.folder / _REPORT if _REPORT in manifest.files else manifest.folder
         links[manifest.run] = quote(place.relative_to(store.root).as_posix())
     return links
