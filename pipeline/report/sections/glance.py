@@ -129,10 +129,9 @@ def _answer_why(report: RunReport) -> str:
     drivetrain, ground = number_in(split, "drivetrain"), number_in(split, "ground")
     lines = ["<p>No effect could be named as missing</p>"] if diagnosis else []
     if drivetrain is not None and ground is not None:
-        lines.append(
-            f"<p><b>{say_share(ground)}</b> arises between wheels and ground, "
-            f"<b>{say_share(drivetrain)}</b> in the drivetrain</p>"
-        )
+        parts = [(ground, "between wheels and ground"), (drivetrain, "in the drivetrain")]
+        told = ", ".join(f"<b>{say_share(share)}</b> {place}" for share, place in sorted(parts, reverse=True))
+        lines.append(f"<p>The slip arises: {told}</p>")
     return "".join(lines)
 
 
