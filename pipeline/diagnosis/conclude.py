@@ -13,7 +13,7 @@ from pipeline.diagnosis import leftover
 from pipeline.diagnosis.diagnosis import Named, RunDiagnosis
 from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.naming_rules import join_classes, list_equivalents
-from pipeline.diagnosis.own_way import list_values, measure_values, read_gyro_clock
+from pipeline.diagnosis.own_way import list_values, measure_values, read_gyro_clock, refer_to_radius
 from pipeline.diagnosis.plausibility import find_implausible
 from pipeline.diagnosis.rating import rate_effects
 from pipeline.diagnosis.unexplained import find_places
@@ -57,7 +57,7 @@ def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -
 def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: Clocks) -> RunDiagnosis:
     """What is common to the runs that were judged together."""
     body = ways[0]
-    undecided = [item for way in ways for item in way.undecided]
+    undecided = [item for way in ways for item in way.undecided if not is_term(item.candidates[0])]
     open_ids = {item.candidates[0] for item in undecided}
     found = _gather(ways, clocks)
     known = frozenset().union(*(way.search.arena.kept for way in ways))
@@ -71,7 +71,7 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
     judgement = judgements.get(source.value)
     unexplained = leftover.describe(ways)
     described = tuple(
-        _describe(effect, ground, ways, judgements)
+        _describe(effect, ground, ways, judgements, open_ids)
         for effect in _order(found, judgement)
         if not _parts(effect) & open_ids and effect.id not in known
     )
@@ -195,7 +195,11 @@ def _parts(effect: Effect) -> set[str]:
 
 
 def _describe(
-    effect: Effect, ground: Ground, ways: Sequence[Explored], judgements: Mapping[str, Judgement]
+    effect: Effect,
+    ground: Ground,
+    ways: Sequence[Explored],
+    judgements: Mapping[str, Judgement],
+    open_ids: set[str],
 ) -> Named:
     way = _way_of(effect, ways)
     gain, selected = _measure_gain(effect, way)
@@ -204,6 +208,8 @@ def _describe(
         values = read_gyro_clock(effect, [delay for delay in ground.yaw_delays if delay is not None])
     elif judgement is not None and effect.id in judgement.fitted.model:
         values = list_values(judgement.fitted.model.effect(effect.id), judgement.estimates)
+        if effect.id == "effective_track" and "wheel_radius" in open_ids & set(judgement.fitted.model.ids):
+            values = refer_to_radius(values, judgement.fitted.model.effect("wheel_radius"))
     else:
         values = measure_values(effect, way.search)
     return Named(

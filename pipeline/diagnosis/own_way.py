@@ -14,7 +14,7 @@ from pipeline.diagnosis.diagnosis import Value
 from pipeline.motion.effect import Search
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis.naming import Search as Found
     from pipeline.diagnosis.timing import YawDelay
@@ -78,3 +78,15 @@ def read_gyro_clock(effect: Effect, delays: Sequence[YawDelay]) -> dict[str, Val
     half = _SURE * float(np.sqrt(np.mean([delay.error**2 for delay in delays]) / len(delays)))
     half = half if np.isfinite(half) else math.nan
     return {parameter.name: Value(value, value - half, value + half, parameter.unit)}
+
+
+def refer_to_radius(track: Mapping[str, Value], radius: Effect) -> dict[str, Value]:
+    """An effective track for wheels of the nominal radius, where their radius is one explanation of several.
+
+    The yaw rate is that of the ratio of both, k_radius / k_track: what turns the vehicle is the same.
+    """
+    scale = 1.0 / radius.values["k"]
+    return {
+        name: Value(scale * value.value, scale * value.low, scale * value.high, value.unit)
+        for name, value in track.items()
+    }

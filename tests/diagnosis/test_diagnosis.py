@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.diagnosis import Diagnosis, Recording, diagnose_runs
+from pipeline.diagnosis import Diagnosis, Recording, Value, diagnose_runs
+from pipeline.diagnosis.own_way import refer_to_radius
 from pipeline.diagnosis.plausibility import find_implausible, is_nameable
 from pipeline.diagnosis.screen import Largest
 from pipeline.diagnosis.words import describe_run, list_lines
@@ -281,6 +282,13 @@ def test_what_no_vehicle_does_is_said() -> None:
     assert find_implausible(find_effect("effective_track")(k=1.8)) is None
     assert find_implausible(find_effect("yaw_drift")(c=0.5)) is not None
     assert find_implausible(find_effect("yaw_drift")(c=0.1)) is None
+
+
+def test_a_track_is_told_for_the_nominal_radius_where_the_radius_is_undecided() -> None:
+    track = {"k": Value(1.65, 1.6, 1.7, "1")}
+    told = refer_to_radius(track, find_effect("wheel_radius")(k=0.95))["k"]
+    assert told.value == pytest.approx(1.65 / 0.95)
+    assert (told.low, told.high) == pytest.approx((1.6 / 0.95, 1.7 / 0.95))
 
 
 def test_an_effect_out_of_bounds_is_an_error_of_the_model() -> None:
