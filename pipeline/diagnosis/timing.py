@@ -47,7 +47,7 @@ def measure_yaw_delay(run: MotionRun, fit: GyroFit) -> YawDelay:
     if run.gyro is None:
         return YawDelay(0.0, np.inf)
     times, rate = run.gyro
-    angle = timegrid.integrate_rate(times, rate) * fit.scale
+    angle = timegrid.integrate_rate(times, rate) * fit.signed_scale
     track = run.track
     second = np.searchsorted(track.times, track.times + _WINDOW_S - 0.02)
     first = np.arange(track.times.size)

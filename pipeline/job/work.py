@@ -162,7 +162,7 @@ class Work:
         gyro = None if made.gyro is None else {
             "usable": made.gyro.usable,
             "sign": made.gyro.sign,
-            "scale": round(made.gyro.scale, 6),
+            "scale": round(made.gyro.size, 6),
             "bias_radps": round(made.gyro.bias, 6),
             "pose_delay_s": round(made.gyro.pose_delay_s, 4),
             "correlation": round(made.gyro.correlation, 4),

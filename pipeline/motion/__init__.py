@@ -21,7 +21,7 @@ from pipeline.motion.effect import (
     Search,
 )
 from pipeline.motion.errors import MotionError
-from pipeline.motion.fit import Fitted, Weights, fit_model
+from pipeline.motion.fit import Fitted, fit_model
 from pipeline.motion.floor import estimate_floor
 from pipeline.motion.forward import Timing
 from pipeline.motion.heading import HeadingSource
@@ -39,6 +39,7 @@ from pipeline.motion.model_text import write_model
 from pipeline.motion.predict import Prediction, predict, predict_at, predict_at_from, predict_from
 from pipeline.motion.problem import Free, Problem, State
 from pipeline.motion.recording import MotionRun, load_run
+from pipeline.motion.robust import Weights
 from pipeline.motion.score import Errors, HeldOut, hold_out, score
 from pipeline.motion.transfer import Transfer, carry_over
 

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import timegrid
 from pipeline.motion.heading import align_heading, fit_gyro, mark_barred
 
 if TYPE_CHECKING:
@@ -81,7 +80,7 @@ def put_in_time(run: MotionRun) -> MotionRun:
 def _look(run: MotionRun, track: Track, gyro: GyroFit, ages: Floats) -> _Seen:
     """Compare reported headings with the gyro's at the moments that the ages found so far give."""
     times, rate = run.gyro if run.gyro is not None else (np.zeros(0), np.zeros(0))
-    angle = gyro.scale * timegrid.integrate_rate(times, rate) + gyro.bias * times
+    angle = gyro.turn(times, rate)
     at = track.times - gyro.yaw_delay_s
     turning = (np.interp(at + 0.05, times, angle) - np.interp(at - 0.05, times, angle)) / 0.1
     difference = track.heading - np.interp(at, times, angle)

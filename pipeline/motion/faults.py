@@ -124,7 +124,7 @@ def _choose_heading(run: MotionRun) -> tuple[Floats, float]:
     if gyro is None or run.gyro is None:
         return run.track.heading, 0.0
     times, rate = run.gyro
-    angle = gyro.scale * timegrid.integrate_rate(times, rate) + gyro.bias * times
+    angle = gyro.turn(times, rate)
     seen = np.interp(run.track.times - gyro.yaw_delay_s, times, angle)
     good = ~mark_barred(run, run.track.times)
     return seen + align_heading(run.track, run.track.heading - seen, good), gyro.yaw_delay_s

@@ -42,21 +42,26 @@ class HeadingSource(enum.Enum):
 
 @dataclass(frozen=True)
 class GyroFit:
-    """Yaw rate = scale * gyro + bias; `scale` carries the sign.
+    """Yaw rate = signed_scale * gyro + bias.
 
     Attributes:
-        scale: with the sign.
+        signed_scale: negative where the gyro turns the other way.
         bias: [rad/s].
         yaw_delay_s: how late the reported heading is against the gyro.
         delay_error_s: standard error of that delay.
         residual: robust spread of what is left over that of the turning itself.
     """
 
-    scale: float
+    signed_scale: float
     bias: float
     yaw_delay_s: float
     delay_error_s: float
     residual: float
+
+    def turn(self, times: Floats, rate: Floats) -> Floats:
+        """Angle that the gyro has turned by [rad], of its own rate [rad/s] at times [s], shape (n,)."""
+        angle: Floats = self.signed_scale * timegrid.integrate_rate(times, rate) + self.bias * times
+        return angle
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,7 @@ def choose_heading(run: MotionRun, cells: Cells, source: HeadingSource) -> Headi
     if fit is None or run.gyro is None:
         return Heading(None, np.zeros(0), track.heading)
     times, rate = run.gyro
-    on_cells = fit.scale * np.interp(cells.times, times, rate) + fit.bias
+    on_cells = fit.signed_scale * np.interp(cells.times, times, rate) + fit.bias
     edges = cells.sum_up(on_cells)
     seen = np.interp(cells.locate_edges(track.times - fit.yaw_delay_s), np.arange(edges.size), edges)
     difference = track.heading - seen

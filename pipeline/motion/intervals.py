@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.motion.fit import weigh_system
 from pipeline.motion.problem import Free, needs_search
+from pipeline.motion.robust import weigh_system
 
 if TYPE_CHECKING:
     from pipeline.motion.fit import Fitted

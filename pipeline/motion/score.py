@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.motion.fit import Fitted, measure_loss, solve_step, weigh_system
 from pipeline.motion.problem import needs_search
+from pipeline.motion.robust import measure_loss, solve_step, weigh_system
 from pipeline.motion.starts import refine_grid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.motion.fit import Weights
+    from pipeline.motion.fit import Fitted
     from pipeline.motion.problem import Problem, State
+    from pipeline.motion.robust import Weights
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from pipeline.motion.comparison import Input
 from pipeline.motion.effect import Search
+from pipeline.motion.robust import estimate_scales, measure_loss, solve_step, weigh_system
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.motion.fit import Weights
     from pipeline.motion.model import Model
     from pipeline.motion.problem import Free, Problem, State
+    from pipeline.motion.robust import Weights
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -65,8 +66,6 @@ def find_starts(problem: Problem, model: Model, free: Sequence[Free], used: Flag
 
 def refine_grid(problem: Problem, state: State, free: Sequence[Free], weights: Weights, used: Flags) -> State:
     """Shrink a grid round every number that is not smooth, the others staying put."""
-    from pipeline.motion.fit import measure_loss  # noqa: PLC0415 - the two rely on each other
-
     for number in free:
         if number.parameter is None or number.parameter.search is not Search.GRID:
             continue
@@ -139,13 +138,6 @@ def _solve_linear(
     problem: Problem, state: State, free: Sequence[Free], used: Flags, *, steps: int
 ) -> tuple[State, float]:
     """Gauss-Newton steps over some numbers, and the loss reached under fixed plain scales."""
-    from pipeline.motion.fit import (  # noqa: PLC0415 - the two rely on each other
-        estimate_scales,
-        measure_loss,
-        solve_step,
-        weigh_system,
-    )
-
     residuals = problem.find_residuals(state)
     for _ in range(steps if free else 0):
         weights = estimate_scales(problem, residuals, used)

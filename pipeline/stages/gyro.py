@@ -28,21 +28,21 @@ _LONGEST_SILENCE = 0.25
 
 
 @dataclass(frozen=True)
-class GyroFit:
-    """Yaw rate of the poses = scale * gyro + bias, the poses being late by `pose_delay_s`.
+class GyroCheck:
+    """Yaw rate of the poses = sign * size * gyro + bias, the poses being late by `pose_delay_s`.
 
     Attributes:
         usable: whether the gyro agrees with the poses well enough to replace their yaw rate.
         sign: -1 where the gyro turns the other way.
-        scale: slope without the sign.
-        bias: what must be added after sign and scale [rad/s].
+        size: of the slope, without its sign.
+        bias: what must be added after sign and size [rad/s].
         pose_delay_s: how late the poses are against the gyro.
         correlation: signed correlation at that delay.
     """
 
     usable: bool
     sign: int
-    scale: float
+    size: float
     bias: float
     pose_delay_s: float
     correlation: float
@@ -50,7 +50,7 @@ class GyroFit:
 
 def fit_gyro(
     velocities: pl.DataFrame, imu: pl.DataFrame, window: float
-) -> tuple[GyroFit | None, list[Finding]]:
+) -> tuple[GyroCheck | None, list[Finding]]:
     """Compare the gyro with the yaw rate of the poses.
 
     Args:
@@ -72,17 +72,17 @@ def fit_gyro(
     shifted = np.interp(times - delay.seconds, grid, rate)
     slope, offset = _fit_line(shifted, turning)
     usable = abs(delay.correlation) > _AGREES and abs(slope) > 0.5  # noqa: PLR2004 - a gyro is no worse than that
-    fit = GyroFit(usable, -1 if slope < 0.0 else 1, abs(slope), offset, delay.seconds, delay.correlation)
+    fit = GyroCheck(usable, -1 if slope < 0.0 else 1, abs(slope), offset, delay.seconds, delay.correlation)
     return fit, _describe(fit)
 
 
-def rate_of_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -> Floats:
+def rate_of_gyro(times: Floats, imu: pl.DataFrame, fit: GyroCheck, window: float) -> Floats:
     """The gyro's yaw rate [rad/s] at grid times, sign, scale and bias corrected, at its own clock.
 
     NaN where the gyro was silent: a hole is not bridged.
     """
     grid, rate = _smooth_gyro(times, imu, window)
-    corrected: Floats = fit.sign * fit.scale * np.interp(times, grid, rate) + fit.bias
+    corrected: Floats = fit.sign * fit.size * np.interp(times, grid, rate) + fit.bias
     stamps = imu["t"].to_numpy()
     following = np.searchsorted(stamps, times)
     before = stamps[np.maximum(following - 1, 0)]
@@ -120,7 +120,7 @@ def _fit_line(x: Floats, y: Floats) -> tuple[float, float]:
     return float(slope), float(offset)
 
 
-def _describe(fit: GyroFit) -> list[Finding]:
+def _describe(fit: GyroCheck) -> list[Finding]:
     findings = []
     if abs(fit.correlation) < _DOUBTFUL or not fit.usable:
         text = f"the gyro does not agree with the poses (correlation {fit.correlation:.2f}): it was not used"
@@ -130,9 +130,9 @@ def _describe(fit: GyroFit) -> list[Finding]:
             f"the gyro's yaw rate has the wrong sign (correlation {fit.correlation:.2f}): it was turned round"
         )
         findings.append(Finding("imu_sign", "warning", text, where="imu", value=fit.correlation))
-    if abs(fit.scale - 1.0) > _SCALE_FORGIVEN:
-        text = f"the poses turn {fit.scale:.3f} times as much as the gyro says: it was scaled"
-        findings.append(Finding("imu_scale", "warning", text, where="imu", value=fit.scale))
+    if abs(fit.size - 1.0) > _SCALE_FORGIVEN:
+        text = f"the poses turn {fit.size:.3f} times as much as the gyro says: it was scaled"
+        findings.append(Finding("imu_scale", "warning", text, where="imu", value=fit.size))
     if abs(fit.bias) > _BIAS_FORGIVEN:
         text = f"the gyro has a bias of {-fit.bias:.4f} rad/s against the poses: it was taken off"
         findings.append(Finding("imu_bias", "info", text, where="imu", value=-fit.bias))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pipeline.core import rigid, segments, timegrid
 from pipeline.stages.errors import StageError
 from pipeline.stages.finding import Finding
-from pipeline.stages.gyro import GyroFit, fit_gyro, rate_of_gyro
+from pipeline.stages.gyro import GyroCheck, fit_gyro, rate_of_gyro
 
 if TYPE_CHECKING:
     from pipeline.vehicles.configuration import VelocitySection
@@ -33,7 +33,7 @@ class VelocityResult:
 
     table: pl.DataFrame
     findings: tuple[Finding, ...] = field(default=())
-    gyro: GyroFit | None = None
+    gyro: GyroCheck | None = None
 
 
 def compute_velocities(

@@ -102,7 +102,7 @@ def test_a_gyro_of_the_wrong_sign_and_a_late_pose_are_found_and_named() -> None:
     problem = Problem([run], HUSKY, Input.MEASURED)
     gyro = problem.comparisons[0].heading.gyro
     assert gyro is not None
-    assert gyro.scale == pytest.approx(-1.0, abs=0.02)
+    assert gyro.signed_scale == pytest.approx(-1.0, abs=0.02)
     assert gyro.bias == pytest.approx(-0.01, abs=0.002)
     assert gyro.yaw_delay_s == pytest.approx(0.12, abs=0.01)
 
