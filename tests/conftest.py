@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -26,3 +27,10 @@ def shared_logs() -> Path:
     if not folder.is_dir():
         pytest.skip("../shared/logs is not here: the real recordings are not part of the repository")
     return folder
+
+
+@pytest.fixture(scope="session")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where pictures of pages are kept: SLIP_PICTURES, or the tests' own folder."""
+    kept = os.environ.get("SLIP_PICTURES")
+    return Path(kept).resolve() if kept else tmp_path_factory.mktemp("pictures")

@@ -58,7 +58,7 @@ def results(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("verb", ["compare", "map"])
-def test_nothing_is_cut_or_overlaps(verb: str, chrome: Chrome, results: Path) -> None:
+def test_nothing_is_cut_or_overlaps(verb: str, chrome: Chrome, results: Path, pictures: Path) -> None:
     with pytest.raises(SystemExit) as ended:
         main([verb, str(results), "--quiet"])
     assert ended.value.code == 0
@@ -67,6 +67,7 @@ def test_nothing_is_cut_or_overlaps(verb: str, chrome: Chrome, results: Path) ->
         chrome.size(width, 900, dark=width < 600)
         chrome.open(page.as_uri())
         chrome.wait(DRAWN)
+        chrome.picture(pictures / f"{page.stem}_{width}.png", whole=True)
         assert cast("int", chrome.run("document.documentElement.scrollWidth - innerWidth")) <= 0
         assert chrome.run(CUT) == []
         assert chrome.run(OVERLAPS) == []

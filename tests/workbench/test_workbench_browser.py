@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -35,13 +34,6 @@ def chrome(tmp_path: Path) -> Iterator[Chrome]:
     browser = Chrome(tmp_path / "profile")
     yield browser
     browser.close()
-
-
-@pytest.fixture(scope="session")
-def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where pictures of the page are kept: SLIP_PICTURES, or the tests' own folder."""
-    kept = os.environ.get("SLIP_PICTURES")
-    return Path(kept) if kept else tmp_path_factory.mktemp("pictures")
 
 
 def look_for_trouble(chrome: Chrome) -> None:
@@ -248,6 +240,7 @@ def test_markup_in_a_log_is_shown_as_text(chrome: Chrome, tmp_path: Path, pictur
         report = Path(str(outcome.summary["report"]))
         chrome.open(report.as_uri())
         chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
+        chrome.picture(pictures / "report_markup.png", whole=True)
         assert EVIL in str(chrome.run("document.body.textContent"))
         assert chrome.run("document.querySelectorAll('img').length") == 0
         assert chrome.run("window.pwned ?? null") is None
