@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.diagnosis.judge import LEAST_STRETCHES, SHORT_S
+from pipeline.diagnosis.problem import number_units
 from pipeline.motion.effect import Excitation
 
 if TYPE_CHECKING:
@@ -50,17 +52,21 @@ class Unobservable:
 
 
 def find_unobservable(arena: Arena, final: Contender) -> list[Unobservable]:
-    """Candidates of which a usual size would move the prediction by less than four standard errors."""
+    """Candidates of which a usual size would move the prediction by less than four standard errors.
+
+    Neither can be told what shows but once: an event of its own would look the same.
+    """
     found = []
     for candidate in arena.candidates:
         if final.state.find(candidate.id) is not None:
             continue
         column = _shift(arena, final, candidate)
         alone, beside = _evidence(arena, final, column)
-        if beside >= _STANDARD_ERRORS:
+        rare = _count_stretches(arena, column) < LEAST_STRETCHES
+        if beside >= _STANDARD_ERRORS and not rare:
             continue
         reason: Literal["no excitation", "collinear with what was named"] = (
-            "no excitation" if alone < _STANDARD_ERRORS else "collinear with what was named"
+            "no excitation" if alone < _STANDARD_ERRORS or rare else "collinear with what was named"
         )
         found.append(Unobservable(candidate.id, reason, suggest_manoeuvre(candidate())))
     return found
@@ -119,6 +125,15 @@ def _evidence(arena: Arena, final: Contender, shift: Floats) -> tuple[float, flo
     rest = metric.weigh(fitted.residual)
     noise = _inflation(rest, arena)
     return tuple(float(np.sqrt(np.sum(c**2) / noise)) for c in (column, beside))  # type: ignore[return-value]
+
+
+def _count_stretches(arena: Arena, shift: Floats) -> float:
+    """Number of short stretches over which a shift of the prediction is spread."""
+    moved = ((shift / arena.metric.scale) ** 2).sum(axis=1)
+    stretch = number_units(arena.problem.run, arena.problem.times, SHORT_S)
+    action = np.bincount(stretch, moved)
+    power = float(np.sum(action**2))
+    return float(action.sum()) ** 2 / power if power > 0.0 else 0.0
 
 
 def _inflation(rest: Floats, arena: Arena) -> float:

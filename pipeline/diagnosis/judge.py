@@ -32,14 +32,14 @@ LEAST_T = 2.5
 _FEWEST_WINDOWS = 6
 _FEWEST_ACTIVE = 2.5
 # In shorter stretches neighbours are not quite independent: more is asked of them.
-_SHORT_S = 3.0
+SHORT_S = 3.0
 _SHORT_T = 3.5
 _FAINT_Z = 1.5
 _RARE_GAIN = 0.02
 _RARE_Z = 3.0
 _RARE_T = 1.5
 _PLAIN_Z = 6.0
-_LEAST_STRETCHES = 1.7
+LEAST_STRETCHES = 1.7
 _LAGS = 8
 
 
@@ -125,7 +125,7 @@ def compare(problem: Problem, metric: Metric, before: Floats, after: Floats) -> 
     ratio = np.log(np.maximum(sums_old, 1e-9) / np.maximum(sums_new, 1e-9))
     moved = (((before - after) / metric.scale) ** 2).sum(axis=1)
     action = add_up(problem.unit, moved)[kept]
-    stretch = number_units(problem.run, problem.times, _SHORT_S)
+    stretch = number_units(problem.run, problem.times, SHORT_S)
     short = _ratio_t(add_up(stretch, old - new), add_up(stretch, moved)) * LEAST_T / _SHORT_T
     rare = _normal_t(problem, after / metric.scale, add_up(stretch, old - new), add_up(stretch, moved))
     return Verdict(
@@ -154,7 +154,7 @@ def _ratio_t(difference: Floats, action: Floats) -> float:
 def _normal_t(problem: Problem, rest: Floats, difference: Floats, action: Floats) -> float:
     """Loss taken away over its deviation if the better model's residuals were all the noise there is."""
     total = float(action.sum())
-    if total <= 0.0 or total**2 / float(np.sum(action**2)) < _LEAST_STRETCHES:
+    if total <= 0.0 or total**2 / float(np.sum(action**2)) < LEAST_STRETCHES:
         return 0.0
     noise = 0.0
     for channel in problem.channels:

@@ -41,6 +41,7 @@ class Candidate(Protocol):
 
 _LEAST_SHARE = 0.05
 _NO_TRACE = 1e-6
+_FAINT = 3.0
 
 
 @dataclass(frozen=True)
@@ -179,6 +180,16 @@ def _list_values(parameter: Parameter, largest: Largest) -> list[float]:
     return [share * scale for share in parameter.starts if low <= share * scale <= high]
 
 
+def _find_traced(trial: Trial, size: Floats) -> NDArray[np.bool_]:
+    """Numbers of an effect that would show at a usual size; all of them where none would, shape (p,)."""
+    if not trial.names:
+        return np.ones(size.size, dtype=bool)
+    parameters = [trial.effect.parameter(name) for name in trial.names]
+    usual = np.array([abs(p.typical - p.neutral) for p in parameters])
+    traced: NDArray[np.bool_] = size * usual > _FAINT
+    return traced if traced.any() else size > _NO_TRACE
+
+
 def _promise(metric: Metric, fitted: Fitted, trial: Trial) -> Proposal | None:
     """Loss after one joint step of the model's numbers and the effect's."""
     base = fitted.residual - trial.shift
@@ -187,15 +198,15 @@ def _promise(metric: Metric, fitted: Fitted, trial: Trial) -> Proposal | None:
     factor = metric.weights(fitted.residual)
     rows = (joint * factor[:, :, None]).reshape(-1, joint.shape[2])
     size = np.sqrt(np.einsum("ij,ij->j", rows, rows)) + 1e-12
-    traced = size > _NO_TRACE
-    if not traced[own:].any():
+    if not (size[own:] > _NO_TRACE).any():
         return None
-    if not traced[own:].all():
+    traced = _find_traced(trial, size[own:])
+    if not traced.all():
         # Driven straight only, a change of ground shows in one gain: the other is left as it is.
-        silent = [n for n, seen in zip(trial.names, traced[own:].tolist(), strict=True) if not seen]
-        kept = np.concatenate((np.ones(own, dtype=bool), traced[own:]))
+        silent = [n for n, seen in zip(trial.names, traced.tolist(), strict=True) if not seen]
+        kept = np.concatenate((np.ones(own, dtype=bool), traced))
         loud = tuple(name for name in trial.names if name not in silent)
-        trial = Trial(trial.effect.fix(*silent), loud, trial.columns[:, :, traced[own:]], trial.shift)
+        trial = Trial(trial.effect.fix(*silent), loud, trial.columns[:, :, traced], trial.shift)
         joint, rows, size = joint[:, :, kept], rows[:, kept], size[kept]
     rows /= size
     normal = rows.T @ rows + 1e-7 * np.eye(rows.shape[1])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.diagnosis.excitation import suggest_manoeuvre
+from pipeline.diagnosis.excitation import make_usual, suggest_manoeuvre
 
 if TYPE_CHECKING:
     from pipeline.diagnosis.arena import Arena, Contender
@@ -26,6 +26,8 @@ _HOLDS: dict[str, frozenset[str]] = {
     "wheel_radius": frozenset({"terrain_change"}),
     "time_drift": frozenset({"terrain_change"}),
 }
+# What a limit explains a droop of some rise may explain as well, where only one turn beyond it was asked for.
+_RISING = {"body_turn_limit": ("turn_droop", "gain")}
 
 
 @dataclass(frozen=True)
@@ -54,11 +56,25 @@ def find_undecided(arena: Arena, final: Contender) -> list[Undecided]:
             if _is_as_good(arena, final, rival) and _does_the_same(arena, without, final, rival)
         ]
         names = [name for rival in rivals for name in rival.ids if name not in final.ids]
-        simple = [name for name in names if not _is_larger(arena, name, effect)]
+        rising = _find_rising(arena, without, final, effect)
+        if rising is not None and rising not in names:
+            names.append(rising)
+        simple = [name for name in names if name == rising or not _is_larger(arena, name, effect)]
         if simple:
             rest = [c() for c in arena.candidates if c.id in names]
             found.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest)))
     return found
+
+
+def _find_rising(arena: Arena, without: Contender, final: Contender, effect: Effect) -> str | None:
+    """The effect that bends where the named one stops, if at a usual bend it does as well."""
+    name, bend = _RISING.get(effect.id, ("", ""))
+    candidate = next((c for c in arena.candidates if c.id == name), None)
+    if candidate is None:
+        return None
+    rival = arena.enter(without.state.add(make_usual(candidate, arena.largest).fix(bend)))
+    alike = _is_as_good(arena, final, rival) and _does_the_same(arena, without, final, rival)
+    return name if alike and arena.is_sound(rival) else None
 
 
 def _is_as_good(arena: Arena, final: Contender, rival: Contender) -> bool:
