@@ -4,7 +4,7 @@ A localization that was lost jumps back, waits and catches up, or reports a way 
 heading. Every displacement over half a second, its direction and its length, is compared with a robust model
 of the whole run: a regression on the wheels, late and multiplied, wide enough to hold every effect of the
 catalogue. What is eight times as far off as is usual at that speed, and a quarter of a metre, is not compared
-with any model, up to a tenth of the run. How much that is stands in `MotionRun.faulty_s`.
+with any model, up to a twentieth of the run. How much that is stands in `MotionRun.faulty_s`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _LONGEST_S = 1.2
 _FEWEST = 200
 _FAR = 8.0
 _LEAST_M = 0.25
-_LARGEST_SHARE = 0.1
+_LARGEST_SHARE = 0.05
 _LAGS_S = (-0.3, -0.1, 0.1, 0.3, 0.6, 1.0, 1.6)
 _ROUNDS = 10
 _BINS = 6
@@ -56,7 +56,7 @@ def bar_faults(run: MotionRun, vehicle: Vehicle) -> MotionRun:
     if not faulty.any():
         return run
     grid = _fill(begin[faulty], end[faulty])
-    # More than a tenth is no exception: then only the worst of it counts as fault.
+    # More than a twentieth is no exception: then only the worst of it counts as fault.
     while grid.size * _SAMPLE_S > most:
         faulty &= off > np.quantile(off[faulty], 0.1)
         grid = _fill(begin[faulty], end[faulty])

@@ -72,12 +72,12 @@ def test_a_localization_that_jumps_away_and_back_is_not_compared(tables: Mapping
         assert np.abs(more - edge).min() < 0.1
 
 
-def test_faults_are_never_more_than_a_tenth(tables: Mapping[str, pl.DataFrame]) -> None:
+def test_faults_are_never_more_than_a_twentieth(tables: Mapping[str, pl.DataFrame]) -> None:
     poses = tables["poses"]
     times = poses["t"].to_numpy()
     often = np.where(times % 4.0 < 1.0, 1.5, 0.0)
     run = load(tables, poses=poses.with_columns(pl.Series("y", poses["y"].to_numpy() + often)))
-    assert 0.0 < run.faulty_s <= 0.1 * run.duration_s + 0.5
+    assert 0.0 < run.faulty_s <= 0.05 * run.duration_s + 0.5
 
 
 def test_a_pose_that_is_only_waited_for_is_no_rest(tables: Mapping[str, pl.DataFrame]) -> None:
