@@ -309,7 +309,11 @@ def _draw_poor(draw: np.random.Generator, seed: int, effect: str | None) -> Ridd
     ways = ["straight", "circle"] if scene.vehicle.kind == "ackermann" else ["straight", "circle", "spins"]
     program = str(draw.choice(ways))
     scene = replace(scene, program=replace(scene.program, name=program))  # type: ignore[arg-type]
-    asked = {chosen: draw_size(chosen, scene, 1.0, draw)}
+    size = draw_size(chosen, scene, 1.0, draw)
+    if program == "circle" and "limit" in size:
+        # The circle asks for six tenths of everything: a limit beyond it would hide nothing at all.
+        size = {"limit": 0.6 * size["limit"]}
+    asked = {chosen: size}
     return Riddle(replace(scene, effects=asked), Answer("poor", asked, program=program))
 
 
