@@ -324,8 +324,14 @@ def _as_json(
         "parameters": parameters_as_json(fitted.model, new_one.estimates),
         "correlated": correlations_as_json(new_one.estimates),
         "timing": [
-            {"run": name, "pose_delay_s": timing.pose_delay_s, "wheel_delay_s": timing.wheel_delay_s}
-            for name, timing in zip(problem.names, fitted.state.timing, strict=True)
+            {
+                "run": comparison.run.name,
+                "pose_delay_s": timing.pose_delay_s,
+                "wheel_delay_s": timing.wheel_delay_s,
+                "age_spread_s": comparison.run.age_spread_s,
+                "faulty_s": comparison.run.faulty_s,
+            }
+            for comparison, timing in zip(problem.comparisons, fitted.state.timing, strict=True)
         ],
         "carried_over": [_transfer_as_json(str(path), item) for item in carried],
         "warnings": list(warnings),
@@ -351,6 +357,7 @@ def _describe(old: Judgement, new_one: Judgement, model: Model) -> list[str]:
     from pipeline.motion.describe import (  # noqa: PLC0415 - heavy
         describe_ladder,
         describe_parameters,
+        describe_recordings,
         parameters_as_json,
     )
 
@@ -358,6 +365,7 @@ def _describe(old: Judgement, new_one: Judgement, model: Model) -> list[str]:
     floor = _choose_floor(old, new_one)
     source = new_one.problem.source.value
     lines = [f"on {source} of {runs}"]
+    lines += describe_recordings([comparison.run for comparison in new_one.problem.comparisons])
     if old is not new_one:
         lines += ["", "before", *describe_ladder(old.ladder, floor), "", "after"]
     lines += describe_ladder(new_one.ladder, floor)

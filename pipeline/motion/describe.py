@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pipeline.motion.intervals import Estimates
     from pipeline.motion.ladder import Ladder, Rung
     from pipeline.motion.model import Model
+    from pipeline.motion.recording import MotionRun
     from pipeline.motion.score import Errors
 
 _DIGITS = 6
@@ -110,6 +111,19 @@ def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
         lines.append(f"{'noise floor (estimated)':<34}{_columns(floor)}")
     if ladder.idle:
         lines.append(f"left out, no help on unseen data:  {', '.join(ladder.idle)}")
+    return lines
+
+
+def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:
+    """What was put right or left out of the poses before anything was compared; empty where nothing was."""
+    lines = []
+    for run in runs:
+        if run.age_spread_s > 0.0:
+            lines.append(f"{run.name}: ages of poses vary by {run.age_spread_s:.2g} s, put right by the gyro")
+        if run.faulty_s > 0.0:
+            lines.append(
+                f"{run.name}: {run.faulty_s:.3g} s left out, the localization goes where the wheels did not"
+            )
     return lines
 
 
