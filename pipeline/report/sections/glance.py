@@ -132,7 +132,7 @@ def _answer_why(report: RunReport) -> str:
         parts = [(ground, "between wheels and ground"), (drivetrain, "in the drivetrain")]
         told = ", ".join(f"<b>{say_share(share)}</b> {place}" for share, place in sorted(parts, reverse=True))
         lines.append(f"<p>The slip arises: {told}</p>")
-    return "".join(lines)
+    return "".join(lines) or "<p>Not diagnosed yet</p>"
 
 
 def _tell_effects(effects: list[Mapping[str, object]], diagnosis: Mapping[str, object]) -> str:
