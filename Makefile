@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader bench-workbench browser check clean compare format inspect lock map samples \
+.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader bench-real bench-workbench browser check clean compare format inspect lock map samples \
 	serve test test-long trend
 
 help: ## print this list
@@ -96,6 +96,9 @@ bench-batch: $(VENV)/.ready-dev ## batches of 10, 100 and 1,000 logs, on one and
 
 bench-export: $(VENV)/.ready-dev ## exporting runs of 1, 3 and 10 hours as MCAP
 	$(BIN)/python tests/bench/export.py
+
+bench-real: $(VENV)/.ready-dev ## the right effects on the real recordings, beside METHODS' table [ARGS="--ladders"]
+	$(BIN)/python tests/bench/recordings.py $$ARGS
 
 bench-workbench: $(VENV)/.ready-dev ## answers of the workbench on a 10-minute log
 	$(BIN)/python tests/bench/workbench.py
