@@ -70,6 +70,23 @@ def estimate_floor(problem: Problem, held_out: HeldOut) -> Errors:
     return replace(measure_errors(left[known] * shrink, position, yaw), windows=int(known.sum()))
 
 
+def hold_below(floor: Errors, reached: Errors) -> Errors:
+    """A floor of which no part is above what a model has reached: by then it was no floor."""
+    names = ("t_mrmse_m", "r_mrmse_rad", "t_mean_m", "r_mean_rad", "t_median_m", "r_median_rad")
+    return replace(
+        floor,
+        velocity_rms=_take_lower(floor.velocity_rms, reached.velocity_rms),
+        velocity_spread=_take_lower(floor.velocity_spread, reached.velocity_spread),
+        **{name: min(getattr(floor, name), getattr(reached, name)) for name in names},
+    )
+
+
+def _take_lower(
+    one: tuple[float, float, float], other: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    return min(one[0], other[0]), min(one[1], other[1]), min(one[2], other[2])
+
+
 def _remove_predictable(problem: Problem, residuals: Floats, known: Flags) -> Floats:
     """Residuals without what a regression on the inputs predicts of them, where that makes them smaller."""
     features = np.concatenate([describe_inputs(comparison) for comparison in problem.comparisons])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from pipeline.motion.comparison import Input
 from pipeline.motion.describe import errors_as_json
 from pipeline.motion.fit import Fitted, fit_model
-from pipeline.motion.floor import estimate_floor
+from pipeline.motion.floor import estimate_floor, hold_below
 from pipeline.motion.intervals import Estimates, estimate_intervals
 from pipeline.motion.ladder import Ladder, Rung, climb, compare_losses
 from pipeline.motion.score import hold_out
@@ -72,7 +72,7 @@ def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) 
         held_out = hold_out(problem, fitted)
     whole = Rung(fitted, held_out)
     best = whole if compare_losses(held_out, top.held_out) < 1.0 else top
-    floor = estimate_floor(problem, best.held_out)
+    floor = hold_below(estimate_floor(problem, best.held_out), top.errors)
     return Judgement(problem, ladder, whole, estimate_intervals(problem, fitted), floor)
 
 

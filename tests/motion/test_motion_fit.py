@@ -23,6 +23,7 @@ from pipeline.motion import (
     predict_at,
     score,
 )
+from pipeline.motion.floor import hold_below
 from pipeline.motion.persistence import split_residuals
 from pipeline.motion.score import GAP_S, assign_folds, list_training, measure_by_terrain
 from pipeline.simulate import Disturbance, Imu, PoseSensor
@@ -196,6 +197,9 @@ def test_the_floor_is_one_number_whatever_model_it_is_taken_from() -> None:
     floors = [estimate_floor(problem, rung.held_out) for rung in rungs]
     for floor in floors[:-1]:
         assert np.allclose(floor.ratios(floors[-1])[:3], 1.0, atol=0.15)
+        held = hold_below(floor, rungs[-1].errors)
+        assert np.all(np.array(held.ratios(rungs[-1].errors)) <= 1.0)
+        assert np.all(np.array(held.ratios(floor)) <= 1.0)
 
 
 def test_the_noise_of_poses_is_measured_whatever_the_model_lacks() -> None:
