@@ -42,16 +42,16 @@ _STANDING = {"husky_wheels_avide2", "husky_wheels_plank_2024_10_24_11h24s5"}
 _DRIVEN = sorted(set(_FAULTS) - _STANDING)
 # Share of the ideal model's error over 2 s, position and yaw, that is left on measured wheels.
 _LEFT: Mapping[str, tuple[float, float]] = {
-    "husky_snow_boreal": (0.45, 0.19),
+    "husky_snow_boreal": (0.43, 0.19),
     "husky_wheels-deflated_tile_2023_12_12_16h16": (0.23, 0.06),
-    "husky_wheels_wetgrass": (0.90, 0.11),
+    "husky_wheels_wetgrass": (0.80, 0.12),
     "warthog_gravel_1": (0.25, 0.14),
-    "warthog_wheels_asphalt": (0.50, 0.14),
-    "warthog_wheels_asphalt_2024_8_7_11h30s30": (0.50, 0.14),
+    "warthog_wheels_asphalt": (0.40, 0.14),
+    "warthog_wheels_asphalt_2024_8_7_11h30s30": (0.40, 0.14),
     "warthog_wheels_asphalt_2024_9_20_8h13s12": (0.60, 0.07),
-    "warthog_wheels_grass_2024_7_29_14h46s15": (0.56, 0.10),
-    "warthog_wheels_grass_2024_8_8_16h19s23": (0.56, 0.10),
-    "warthog_wheels_gravel_2024_8_6_11h37s32": (0.60, 0.20),
+    "warthog_wheels_grass_2024_7_29_14h46s15": (0.56, 0.07),
+    "warthog_wheels_grass_2024_8_8_16h19s23": (0.56, 0.07),
+    "warthog_wheels_gravel_2024_8_6_11h37s32": (0.25, 0.14),
     "warthog_wheels_ice_2024_7_30_16h30s21": (0.48, 0.27),
     "warthog_wheels_sand_2024_9_25_14h32s32": (0.49, 0.22),
 }
@@ -61,6 +61,7 @@ _ASPHALT = (
     "warthog_wheels_asphalt_2024_9_20_8h13s12",
 )
 _GRASS = ("warthog_wheels_grass_2024_7_29_14h46s15", "warthog_wheels_grass_2024_8_8_16h19s23")
+_GRAVEL = ("warthog_gravel_1", "warthog_wheels_gravel_2024_8_6_11h37s32")
 
 
 @pytest.fixture(scope="module")
@@ -132,10 +133,10 @@ def test_the_error_falls_as_far_as_it_can(asked: Asked, name: str) -> None:
     position, yaw = _LEFT[name]
     assert last["t_mrmse_m"] < position * first["t_mrmse_m"]  # type: ignore[operator]
     assert last["r_mrmse_rad"] < yaw * first["r_mrmse_rad"]  # type: ignore[operator]
-    assert run.noise_floor["t_mrmse_m"] < last["t_mrmse_m"]  # type: ignore[operator]
+    assert run.noise_floor["t_mrmse_m"] <= last["t_mrmse_m"]  # type: ignore[operator]
 
 
-@pytest.mark.parametrize("names", [_ASPHALT, _GRASS])
+@pytest.mark.parametrize("names", [_ASPHALT, _GRASS, _GRAVEL])
 @pytest.mark.parametrize("source", ["command", "measured"])
 def test_runs_of_one_vehicle_on_one_ground_agree(asked: Asked, names: tuple[str, ...], source: str) -> None:
     tracks = []
