@@ -58,6 +58,7 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
     """What is common to the runs that were judged together."""
     body = ways[0]
     undecided = [item for way in ways for item in way.undecided if not is_term(item.candidates[0])]
+    undecided += clocks.undecided
     open_ids = {item.candidates[0] for item in undecided}
     found = _gather(ways, clocks)
     known = frozenset().union(*(way.search.arena.kept for way in ways))

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.diagnosis.timing import LEAST_DELAY
+from pipeline.diagnosis.undecided import Undecided
 from pipeline.motion.catalogue import find_effect
 
 if TYPE_CHECKING:
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.naming import Search
     from pipeline.motion.effect import Effect
 
+_STANDING = 0.05
 _SKEWED_CLOCK = 0.03
 _HELD_SHARE = 0.2
 
@@ -28,10 +31,12 @@ class Clocks:
     Attributes:
         effects: `clock_offset` and `heading_skew`, as far as they are certain.
         timing: of every run, in JSON's words.
+        undecided: a late heading whose position may be late with it or not.
     """
 
     effects: tuple[Effect, ...]
     timing: tuple[Mapping[str, float | str | None], ...]
+    undecided: tuple[Undecided, ...] = ()
 
 
 def read_clocks(ground: Ground, body: Search) -> Clocks:
@@ -61,8 +66,19 @@ def read_clocks(ground: Ground, body: Search) -> Clocks:
     least = max(LEAST_DELAY, _SKEWED_CLOCK if skewed else 0.0, _held_delay(ground))
     known = extra is not None if not ground.has_gyro else all(certain)
     if known and abs(late) >= least:
-        found.append(find_effect("clock_offset")(d=min(max(late, -1.0), 1.0)))
+        clock = find_effect("clock_offset")(d=min(max(late, -1.0), 1.0))
+        if ground.has_gyro and not moves_both_ways(ground):
+            # The gyro dates the heading; only driving and turning at once tie the position's clock to it.
+            skew = find_effect("heading_skew")()
+            pair = Undecided((clock.id, skew.id), suggest_manoeuvre(clock, skew))
+            return Clocks(tuple(found), tuple(rows), (pair,))
+        found.append(clock)
     return Clocks(tuple(found), tuple(rows))
+
+
+def moves_both_ways(ground: Ground) -> bool:
+    """Whether a run both drives and turns."""
+    return ground.largest.speed > _STANDING and ground.largest.turn > _STANDING
 
 
 def _held_delay(ground: Ground) -> float:
@@ -93,8 +109,6 @@ def list_equivalents(effect: Effect, ground: Ground) -> tuple[str, ...]:
         alone = not ground.measured and not ground.has_gyro
         if not alone or (effect.id == "clock_offset" and effect.values["d"] < 0.0):
             return ()
-    if effect.id in {"drive_lag", "body_inertia"}:
-        both = ground.largest.speed > 0.05 and ground.largest.turn > 0.05  # noqa: PLR2004 - standing still
-        if both or ground.measured:
-            return ()
+    if effect.id in {"drive_lag", "body_inertia"} and (moves_both_ways(ground) or ground.measured):
+        return ()
     return effect.equivalent_to

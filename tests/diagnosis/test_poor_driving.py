@@ -1,0 +1,70 @@
+"""What a user is told where the driving cannot decide: the candidates, or that the log says nothing of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from pipeline.diagnosis import Recording, RunDiagnosis, diagnose_runs
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.simulate import (
+    VEHICLES,
+    Disturbance,
+    Imu,
+    PoseSensor,
+    Program,
+    Scenario,
+    simulate_run,
+    write_log,
+)
+from pipeline.vehicles import find_preset
+
+
+def _drive(program: str, effects: Mapping[str, object], folder: Path, vehicle: str = "husky") -> RunDiagnosis:
+    scenario = Scenario(
+        vehicle=VEHICLES[vehicle],
+        effects=effects,  # type: ignore[arg-type]
+        program=Program(name=program),  # type: ignore[arg-type]
+        duration_s=120.0,
+        seed=11,
+        disturbance=Disturbance(0.02, 0.03),
+        pose=PoseSensor(drift_m=0.005),
+        imu=Imu(),
+    )
+    write_log(simulate_run(scenario), folder / "run.mcap")
+    manifest = analyze_log(folder / "run.mcap", Options(out=folder / "out", report=False)).manifest
+    preset = find_preset(VEHICLES[vehicle].name)
+    assert preset is not None
+    tables = {name: manifest.read(name) for name in manifest.tables}
+    return diagnose_runs([Recording(manifest.run, tables)], preset).runs[0]
+
+
+@pytest.mark.parametrize("program", ["straight", "spins"])
+def test_an_old_heading_is_no_old_position_unless_the_vehicle_drives_and_turns(
+    program: str, tmp_path: Path
+) -> None:
+    found = _drive(program, {"heading_skew": 0.12}, tmp_path)
+    assert not found.effects
+    assert {"clock_offset", "heading_skew"} in [set(item.candidates) for item in found.undecided]
+
+
+def test_one_circle_does_not_tell_a_droop_from_a_limit(tmp_path: Path) -> None:
+    found = _drive("circle", {"turn_droop": {"threshold": 1.2, "gain": 0.4}}, tmp_path)
+    assert not found.effects
+    assert any({"body_turn_limit", "turn_droop"} <= set(item.candidates) for item in found.undecided)
+
+
+def test_a_change_of_ground_on_a_straight_is_a_change_of_speed(tmp_path: Path) -> None:
+    found = _drive("straight", {"terrain_change": {"k_v": 0.8, "k_w": 0.75}}, tmp_path)
+    named = {effect.id: effect for effect in found.effects}
+    assert set(named) == {"terrain_change"}
+    assert named["terrain_change"].parameters["k_v"].value == pytest.approx(0.8, abs=0.02)
+
+
+def test_what_shows_but_once_cannot_be_told(tmp_path: Path) -> None:
+    found = _drive("circle", {"steering_lag": 0.4}, tmp_path, vehicle="car")
+    assert not found.effects
+    assert "steering_lag" in {item.id for item in found.unobservable}
