@@ -68,6 +68,8 @@ _ONE_SIGN: Mapping[str, str] = {
     "speed_slip": "k",
     "turning_resistance": "k",
     "slope_drift": "k",
+    # A heading newer than its position is lateral skid to the first order, and skid is what vehicles do.
+    "heading_skew": "d",
 }
 _SHARE_OF_TURNING = 0.1
 _LEAST_RISE = 0.08

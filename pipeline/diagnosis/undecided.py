@@ -26,6 +26,8 @@ _HOLDS: dict[str, frozenset[str]] = {
     "wheel_radius": frozenset({"terrain_change"}),
     "time_drift": frozenset({"terrain_change"}),
 }
+# Driven straight only, or turned on the spot only, one lag cannot be told from two.
+_SPLIT = {"drive_lag": "turn_lag", "turn_lag": "drive_lag"}
 # What a limit explains a droop of some rise may explain as well, where only one turn beyond it was asked for.
 _RISING = {"body_turn_limit": ("turn_droop", "gain")}
 
@@ -56,10 +58,9 @@ def find_undecided(arena: Arena, final: Contender) -> list[Undecided]:
             if _is_as_good(arena, final, rival) and _does_the_same(arena, without, final, rival)
         ]
         names = [name for rival in rivals for name in rival.ids if name not in final.ids]
-        rising = _find_rising(arena, without, final, effect)
-        if rising is not None and rising not in names:
-            names.append(rising)
-        simple = [name for name in names if name == rising or not _is_larger(arena, name, effect)]
+        alike = [_find_rising(arena, without, final, effect), _find_split(arena, effect)]
+        names += [name for name in alike if name is not None and name not in names]
+        simple = [name for name in names if name in alike or not _is_larger(arena, name, effect)]
         if simple:
             rest = [c() for c in arena.candidates if c.id in names]
             found.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest)))
@@ -75,6 +76,19 @@ def _find_rising(arena: Arena, without: Contender, final: Contender, effect: Eff
     rival = arena.enter(without.state.add(make_usual(candidate, arena.largest).fix(bend)))
     alike = _is_as_good(arena, final, rival) and _does_the_same(arena, without, final, rival)
     return name if alike and arena.is_sound(rival) else None
+
+
+def _find_split(arena: Arena, effect: Effect) -> str | None:
+    """The effect that treats driving and turning apart, where only one of them was asked for."""
+    name = _SPLIT.get(effect.id)
+    known = name in {candidate.id for candidate in arena.candidates}
+    return name if known and _moves_one_way(arena) else None
+
+
+def _moves_one_way(arena: Arena) -> bool:
+    """Driven straight only, or turned on the spot only."""
+    speed, turn = arena.largest.speed, arena.largest.turn
+    return min(speed, turn) < _NEVER * max(speed, turn)
 
 
 def _is_as_good(arena: Arena, final: Contender, rival: Contender) -> bool:
@@ -95,11 +109,6 @@ def _does_the_same(arena: Arena, without: Contender, final: Contender, rival: Co
 
 def _is_larger(arena: Arena, name: str, effect: Effect) -> bool:
     """Whether an effect fits as well only by more numbers, or by holding the other as a special case."""
-    largest = arena.largest
-    one_way = min(largest.speed, largest.turn) < _NEVER * max(largest.speed, largest.turn)
-    if one_way and {name, effect.id} <= {"drive_lag", "turn_lag"}:
-        # Driven straight only, or turned on the spot only, one lag cannot be told from two.
-        return False
     if name in _HOLDS.get(effect.id, frozenset()):
         return True
     rival = next(c for c in arena.candidates if c.id == name)

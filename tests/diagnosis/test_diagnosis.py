@@ -253,6 +253,7 @@ _LARGEST = Largest(1.0, 1.0, 8.0, 3.0, 120.0, np.zeros(11))
     [
         ("transport_delay", {"d": 0.008}),
         ("lateral_skid", {"c": -0.05}),
+        ("heading_skew", {"d": -0.1}),
         ("turn_lag", {"tau_mean": 0.5, "tau_diff": 0.51}),
         ("turn_droop", {"threshold": 0.01, "gain": 0.5}),
         ("turn_droop", {"threshold": 1.5, "gain": 0.01}),

@@ -68,3 +68,9 @@ def test_what_shows_but_once_cannot_be_told(tmp_path: Path) -> None:
     found = _drive("circle", {"steering_lag": 0.4}, tmp_path, vehicle="car")
     assert not found.effects
     assert "steering_lag" in {item.id for item in found.unobservable}
+
+
+def test_straight_only_does_not_tell_one_lag_from_two(tmp_path: Path) -> None:
+    found = _drive("straight", {"turn_lag": {"tau_mean": 0.3, "tau_diff": 1.0}}, tmp_path)
+    assert not found.effects
+    assert {"drive_lag", "turn_lag"} in [set(item.candidates) for item in found.undecided]
