@@ -244,12 +244,27 @@ def _find_idle(
 
 
 def _mark_idle(named: tuple[Named, ...], judgements: Mapping[str, Judgement]) -> tuple[Named, ...]:
-    """Effects that did not lower the error of their own way in the ladder are tentative."""
+    """Effects are tentative that lower no error on the ladder of their own way, or may as well be nothing."""
     return tuple(
         replace(
-            effect, tentative=effect.way in judgements and effect.id in judgements[effect.way].ladder.idle
+            effect,
+            tentative=_may_be_nothing(effect)
+            or (effect.way in judgements and effect.id in judgements[effect.way].ladder.idle),
         )
         for effect in named
+    )
+
+
+def _may_be_nothing(effect: Named) -> bool:
+    """Whether no interval of an effect leaves out where it does nothing; a limit does nothing at infinity."""
+    known = [
+        (value, find_effect(effect.id)().parameter(name).neutral)
+        for name, value in effect.parameters.items()
+        if math.isfinite(value.high - value.low) and value.high > value.low
+    ]
+    return bool(known) and all(
+        value.low <= neutral <= value.high if math.isfinite(neutral) else value.low <= 0.0
+        for value, neutral in known
     )
 
 
