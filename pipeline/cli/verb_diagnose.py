@@ -58,10 +58,10 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     if json:
         print_json({"runs": [run.to_json() for run in runs], "errors": errors})
     elif not quiet:
-        from pipeline.diagnosis.words import describe_run  # noqa: PLC0415 - only for people
+        from pipeline.diagnosis.words import describe  # noqa: PLC0415 - only for people
 
-        for run in runs:
-            print_lines(describe_run(run).split("\n"))
+        for diagnosis in diagnoses:
+            print_lines(describe(diagnosis).split("\n"))
     return exit_code(errors, lossy=lossy)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.diagnosis.diagnosis import Json, Named, RunDiagnosis, Value
+    from pipeline.diagnosis.diagnosis import Diagnosis, Json, Named, RunDiagnosis, Value
 
 _LABEL = 10
 _WHERE_SHOWN = 3
@@ -16,17 +16,44 @@ _UNOBSERVABLE_SHOWN = 8
 _WAYS = {"command": "from the command", "measured": "from the measured wheels"}
 
 
-def describe_run(diagnosis: RunDiagnosis) -> str:
-    """The diagnosis of one run for a tired person."""
-    rows = [("run", f"{diagnosis.run}    {_WAYS[diagnosis.input]}"), *list_lines(diagnosis)]
+def describe(diagnosis: Diagnosis) -> str:
+    """A diagnosis for a tired person; of runs that were judged together what they share is said once."""
+    if len(diagnosis.runs) == 1:
+        return _write(_describe_alone(diagnosis.runs[0]))
+    first = diagnosis.runs[0]
+    names = [run.run for run in diagnosis.runs]
+    rows = [("runs", names[0]), *(("", name) for name in names[1:]), ("", f"together, {_WAYS[first.input]}")]
+    rows += _list_shared(first)
+    for run in diagnosis.runs:
+        rows += _label("findings", [f"{run.run}: {finding['text']}" for finding in _grave(run)])
+    if first.effects:
+        rows.append(("next", f"slip diagnose {' '.join(names)} --apply model.toml"))
+    return _write(rows)
+
+
+def _write(rows: Sequence[tuple[str, str]]) -> str:
     return "".join(f"{label:<{_LABEL}}{text}".rstrip() + "\n" for label, text in rows)
+
+
+def _describe_alone(run: RunDiagnosis) -> list[tuple[str, str]]:
+    return [("run", f"{run.run}    {_WAYS[run.input]}"), *list_lines(run)]
 
 
 def list_lines(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
     """Label and text of every line but the run's own; a line without a label goes on with the one above."""
     grave = _label("findings", [str(finding["text"]) for finding in _grave(diagnosis)])
     if not diagnosis.ladder:
-        return [*grave, ("missing", "no effect is named: a fit to this run would mean nothing")]
+        return [*grave, *_list_shared(diagnosis)]
+    lines = [*_list_shared(diagnosis), *grave]
+    if diagnosis.effects:
+        lines.append(("next", f"slip diagnose {diagnosis.run} --apply model.toml"))
+    return lines
+
+
+def _list_shared(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
+    """Lines of what all runs that were judged together have in common."""
+    if not diagnosis.ladder:
+        return [("missing", "no effect is named: a fit to this run would mean nothing")]
     first, last = diagnosis.ladder[0], diagnosis.ladder[-1]
     error = f"of the ideal model over 2 s     {_number(first, 't_mrmse_m')} m   "
     lines = [("error", f"{error}{_number(first, 'r_mrmse_rad')} rad")]
@@ -36,11 +63,7 @@ def list_lines(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
         share = max(min(diagnosis.explained_share, 1.0), 0.0)
         now, floor = _number(last, "t_mrmse_m"), _number(diagnosis.noise_floor, "t_mrmse_m")
         lines.append(("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m"))
-    lines += _describe_unobservable(diagnosis)
-    lines += grave
-    if diagnosis.effects:
-        lines.append(("next", f"slip diagnose {diagnosis.run} --apply model.toml"))
-    return lines
+    return [*lines, *_describe_unobservable(diagnosis)]
 
 
 def _label(label: str, texts: Sequence[str]) -> list[tuple[str, str]]:

@@ -14,7 +14,7 @@ from pipeline.diagnosis import Diagnosis, Recording, Value, diagnose_runs
 from pipeline.diagnosis.own_way import refer_to_radius
 from pipeline.diagnosis.plausibility import find_implausible, is_nameable
 from pipeline.diagnosis.screen import Largest
-from pipeline.diagnosis.words import describe_run, list_lines
+from pipeline.diagnosis.words import describe, list_lines
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
 from pipeline.motion import find_effect, read_model
@@ -104,10 +104,19 @@ def test_drivetrain_and_ground_agree_with_the_whole_way(skidding: Diagnosis) -> 
 
 
 def test_the_screen_names_each_effect_and_the_fall(skidding: Diagnosis) -> None:
-    text = describe_run(skidding.runs[0])
+    text = describe(skidding)
     assert "effective_track" in text
     assert "drive_lag" in text
     assert "->" in text
+
+
+def test_what_runs_judged_together_share_is_said_once(skidding: Diagnosis) -> None:
+    run = skidding.runs[0]
+    spoiled = {"id": "imu_sign", "text": "the gyro turns the wrong way", "severity": "warning"}
+    text = describe(Diagnosis((run, replace(run, run="season/tuesday", findings=(spoiled,)))))
+    assert text.count("effective_track  ") == 1
+    assert "findings  season/tuesday: the gyro turns the wrong way" in text
+    assert f"slip diagnose {run.run} season/tuesday --apply" in text
 
 
 def test_what_is_missing_stands_in_the_order_of_the_ladder(skidding: Diagnosis) -> None:
@@ -177,7 +186,7 @@ def test_a_vehicle_that_does_not_move_gets_no_name(tmp_path: Path) -> None:
     (run,) = _diagnose(scenario, tmp_path).runs
     assert run.effects == ()
     assert "not_moving" in {finding["id"] for finding in run.findings}
-    assert "no effect is named" in describe_run(run)
+    assert "no effect is named" in describe(Diagnosis((run,)))
 
 
 def test_a_formula_for_the_unexplained_can_be_pasted_into_a_model_file(tmp_path: Path) -> None:
