@@ -122,7 +122,7 @@ def _answer_where(page: Page) -> str:
 
 def _answer_why(report: RunReport) -> str:
     diagnosis = report.diagnosis
-    effects = sorted(objects_in(diagnosis, "effects"), key=lambda entry: -(number_in(entry, "gain") or 0.0))
+    effects = objects_in(diagnosis, "effects")
     if effects:
         return _tell_effects(effects, diagnosis)
     split = report.part("split")
