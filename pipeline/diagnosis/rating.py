@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from pipeline.motion.effect import Effect
 
 _RATE_HZ = 50.0
-_COARSE_HZ = 25.0
-_LONG_S = 400.0
 
 
 @dataclass(frozen=True)
@@ -25,7 +23,6 @@ class Rating:
 
     Attributes:
         judgement: ladder, estimates and floor.
-        names: how effects of the model are called in the diagnosis, where that differs.
     """
 
     judgement: Judgement

@@ -31,7 +31,6 @@ _SLIP = {
     "steady_median_modulus": "m/s",
     "transitory_median_modulus": "m/s",
 }
-_COLUMNS = ("group", "quantity", "unit", "run", "value")
 
 
 @dataclass(frozen=True)

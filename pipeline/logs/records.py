@@ -260,20 +260,6 @@ def parse_metadata(body: Buffer) -> tuple[str, dict[str, str]]:
     return parser.text(), parser.texts()
 
 
-def parse_metadata_index(body: Buffer) -> tuple[int, int, str]:
-    """Offset, length and name of a metadata record."""
-    parser = Parser(body)
-    return parser.number(8), parser.number(8), parser.text()
-
-
-def parse_attachment_index(body: Buffer) -> tuple[int, int, str]:
-    """Offset, length and name of an attachment."""
-    parser = Parser(body)
-    offset, length = parser.number(8), parser.number(8)
-    parser.take(24)
-    return offset, length, parser.text()
-
-
 def parse_attachment_name(body: Buffer) -> str:
     """Name of an attachment, from the first bytes of its record's body."""
     parser = Parser(body)

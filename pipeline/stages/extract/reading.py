@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.logs import LogData, Strings, TopicColumns, Wanted, wanted_transforms
+from pipeline.logs import Strings, TopicColumns, Wanted, wanted_transforms
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract.drive import ACKERMANN_FIELDS, BODY_FIELDS
 from pipeline.vehicles import DriveForm, DriveSource, Signal, Sources
@@ -142,9 +142,3 @@ def texts(columns: TopicColumns, name: str) -> list[str]:
     """A column of strings."""
     column = columns.fields[name]
     return column.to_list() if isinstance(column, Strings) else []
-
-
-def busiest_channel(data: LogData, topic: str) -> TopicColumns | None:
-    """The channel of a topic with most messages; a topic may be recorded on several."""
-    channels = [columns for columns in data.of(topic) if columns.log_time.size]
-    return max(channels, key=lambda columns: columns.log_time.size, default=None)
