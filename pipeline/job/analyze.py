@@ -97,12 +97,12 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
 
 
 def _find_twin(path: Path, sha256: str, current: Manifest | None) -> str:
-    """The log that made the results there are, where it is another file of the same content."""
+    """The log that made the results there are, where it is another file of that content and still there."""
     log = current.details.get("log") if current is not None else None
     if not isinstance(log, dict) or log.get("sha256") != sha256:
         return ""
-    recorded = str(log.get("path"))
-    return "" if recorded == str(path.resolve()) else recorded
+    recorded = Path(str(log.get("path")))
+    return str(recorded) if recorded != path.resolve() and recorded.exists() else ""
 
 
 def _identify(path: Path, subject: Subject, store: Store, progress: Progress) -> tuple[str, LogData | None]:

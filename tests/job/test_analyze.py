@@ -273,3 +273,13 @@ def test_a_copy_says_whose_results_it_shares(log: Path, out: Path, tmp_path: Pat
     assert second.manifest.run == first.manifest.run
     text = describe_run(second.summary, unchanged=True, twin=second.twin)
     assert f"same content              as {copy}" in text
+
+
+def test_a_log_that_was_moved_is_no_copy(log: Path, out: Path, tmp_path: Path) -> None:
+    before, after = tmp_path / "before.mcap", tmp_path / "after.mcap"
+    shutil.copy(log, before)
+    first = analyze(before, out)
+    before.rename(after)
+    second = analyze(after, out)
+    assert (second.computed, second.twin) == ((), "")
+    assert second.manifest.run == first.manifest.run
