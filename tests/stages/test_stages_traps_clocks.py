@@ -87,6 +87,15 @@ def test_trap_5_stamps_of_an_unset_and_a_set_clock_may_come_in_turns() -> None:
     assert ids == {"clock_unset"}
 
 
+def test_trap_5_one_stamp_of_an_unset_clock_beside_one_other_is_placed() -> None:
+    log = START + EVERY_50_MS[:2]
+    header = log.copy()
+    header[0] = 0.1 * SECOND
+    stamps, ids = align(pose=recorded(log, header))
+    assert np.allclose(stamps["pose"], log, atol=1000)
+    assert ids == {"clock_unset"}
+
+
 def test_trap_5_log_times_from_before_the_clock_was_set_are_left_out() -> None:
     log = START + EVERY_50_MS
     log[:100] = EVERY_50_MS[:100]

@@ -147,7 +147,7 @@ def _mend_jumps(
     is_early = (header[known] < DAY_NS) & (np.median(header[known]) > DAY_NS)
     early, known = known[is_early], known[~is_early]
     passed, recorded = np.diff(header[known]), np.diff(log_time[known])
-    usual = float(np.median(passed))
+    usual = float(np.median(passed)) if passed.size else 0.0
     # Messages that a busy recorder writes late come at their usual stamps: there the log times jump.
     jumped = np.abs(passed - usual) >= np.abs(recorded - usual)
     candidates = np.flatnonzero(
