@@ -139,7 +139,7 @@ def test_an_interrupted_scoring_loses_only_the_line_that_was_being_written(tmp_p
     assert set(read_records([path])) == {one.job, two.job, three.job}
 
 
-def test_a_log_that_fails_or_takes_too_long_is_a_miss_that_can_be_replayed(tmp_path: Path) -> None:
+def test_a_log_that_fails_or_takes_too_long_is_a_miss_that_can_be_replayed() -> None:
     told: list[Record] = []
     play_all(list_jobs(["single"], [3], "drive_lag"), told.append, time_out_s=0.2)
     assert [(record.outcome, record.score.missed) for record in told] == [("timeout", ("drive_lag",))]
@@ -147,7 +147,6 @@ def test_a_log_that_fails_or_takes_too_long_is_a_miss_that_can_be_replayed(tmp_p
     assert "make hidden-effect SEED=3 CATEGORY=single EFFECT=drive_lag" in table
     assert "0 / 1" in table
     assert not is_clean(record_failure(Job("empty", 3), "failed", "out of memory"))
-    assert not list(tmp_path.iterdir())
 
 
 def test_the_command_line_names_a_hidden_effect_as_a_user_would_see_it(tmp_path: Path) -> None:
