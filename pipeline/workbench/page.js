@@ -47,11 +47,18 @@ const open_ = async (run) => {
   await panes[slot].open(run);
 };
 
-// Runs that can be set beside one: of its vehicle on its terrain, slip on the same input.
+// Runs that can be set beside one, as the report chooses them: of its vehicle on its terrain, slip on the same input
+// and scale, each recording once, none with a finding that forbids conclusions.
 const findPeers = (run) => {
   if (!run.terrain || run.terrain === "unknown") return [];
-  const same = (other) => ["dataset", "leading_input"].every((key) => other[key] === run[key]);
-  return listed.runs.filter((other) => other.run !== run.run && same(other) && Number.isFinite(other.median_modulus));
+  const seen = new Set([run.sha256]);
+  return listed.runs.filter((other) => {
+    const alike = ["dataset", "leading_input", "length_scale_m"].every((key) => other[key] === run[key]);
+    const doubtful = other.findings.some((finding) => finding.severity === "error");
+    if (other.run === run.run || !alike || doubtful || !Number.isFinite(other.median_modulus) || seen.has(other.sha256)) return false;
+    seen.add(other.sha256);
+    return true;
+  });
 };
 
 const load = async () => {

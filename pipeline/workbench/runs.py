@@ -12,7 +12,16 @@ if TYPE_CHECKING:
 
     from pipeline.store import Manifest, Store
 
-_KEYS = ("vehicle", "vehicle_name", "terrain", "dataset", "median_modulus", "distance_m", "leading_input")
+_KEYS = (
+    "vehicle",
+    "vehicle_name",
+    "terrain",
+    "dataset",
+    "median_modulus",
+    "length_scale_m",
+    "distance_m",
+    "leading_input",
+)
 
 
 def list_runs(store: Store) -> dict[str, object]:
@@ -34,6 +43,7 @@ def describe_run(manifest: Manifest) -> dict[str, object]:
     return {
         "run": manifest.run,
         **{key: summary.get(key) for key in _KEYS},
+        "sha256": log.get("sha256"),
         "duration_s": log.get("duration_s"),
         "complete": log.get("complete"),
         "losses": log.get("losses") or [],

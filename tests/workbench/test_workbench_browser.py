@@ -13,6 +13,7 @@ from workbench_server import RUN, Workbench
 
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
+from pipeline.job.peers import find_peers
 from pipeline.logs import LogWriter
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
@@ -166,6 +167,36 @@ def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, workbench: Work
     chrome.click(".add-all")
     chrome.wait("document.querySelectorAll('.card').length === 2")
     chrome.wait("document.querySelectorAll('[data-figure=ladder] .mark-rect path').length === 3")
+    look_for_trouble(chrome)
+
+
+def test_a_run_stands_beside_those_that_its_report_does(chrome: Chrome, workbench: Workbench) -> None:
+    store = Store(workbench.results)
+    manifest = store.manifest(RUN)
+    assert manifest is not None
+    own = json.loads(manifest.path("summary.json").read_text()) | {"terrain": "ice", "dataset": "husky_ice"}
+    manifest.path("summary.json").write_text(json.dumps(own))
+    doubtful = [{"id": "not_moving", "severity": "error", "text": "it does not move"}]
+    others: list[dict[str, object]] = [
+        {"median_modulus": 0.0, "log": {"sha256": "low"}},
+        {"median_modulus": 9.0, "log": {"sha256": "high"}},
+        {"median_modulus": 9.0, "log": {"sha256": "high"}},
+        {"median_modulus": 0.0, "log": own["log"]},
+        {"median_modulus": 0.0, "log": {"sha256": "still"}, "findings": doubtful},
+        {"median_modulus": 0.0, "log": {"sha256": "scaled"}, "length_scale_m": 0.5},
+        {"median_modulus": 0.0, "log": {"sha256": "grass"}, "dataset": "husky_grass"},
+    ]
+    for number, other in enumerate(others):
+        summary = {**own, "findings": [], "run": f"field/other_{number}", **other}
+        with store.open_generation(f"field/other_{number}", "0" * 16) as generation:
+            generation.write_text("summary.json", json.dumps(summary))
+            generation.commit({"dataset": summary["dataset"], "log": summary["log"]})
+    assert len(find_peers(store, own)[own["leading_input"]]) == 2
+    chrome.size(LAPTOP, 900)
+    chrome.open(f"{workbench.address}#a={RUN}")
+    chrome.wait(SHOWN)
+    facts = str(chrome.run("document.querySelector('.facts').textContent"))
+    assert "vs 2 runs of husky_ice: more slip than 1" in facts
     look_for_trouble(chrome)
 
 
