@@ -8,7 +8,6 @@ const slipMarks = (parts, { marked = () => {} } = {}) => {
   let zoom = null;
   let track = [];
   let plots = null;
-  let page = null;
   let redraw = () => {};
   let waiting = false;
 
@@ -144,20 +143,20 @@ const slipMarks = (parts, { marked = () => {} } = {}) => {
       const y = here.y();
       markPoints((row) => within(row[meta.x], first.x, here.x) && within(row[meta.y], firstY, y));
     };
+    const drag = new AbortController();
     const stop = () => {
-      place.removeEventListener("pointermove", move);
+      drag.abort();
       if (box instanceof Element) box.remove();
       if (!box) clear();
     };
-    place.addEventListener("pointermove", move);
-    place.addEventListener("pointerup", stop, { once: true });
-    place.addEventListener("pointercancel", stop, { once: true });
+    for (const [name, act] of [["pointermove", move], ["pointerup", stop], ["pointercancel", stop]])
+      place.addEventListener(name, act, { signal: drag.signal });
     if (event.pointerType !== "touch") event.preventDefault();
   };
 
   // Figures that are there now: their rows, how they are drawn, and how those over time are drawn again.
-  const join = (newPage, newPlots, drawAgain, places) => {
-    [page, plots, redraw] = [newPage, newPlots, drawAgain];
+  const join = (page, newPlots, drawAgain, places) => {
+    [plots, redraw] = [newPlots, drawAgain];
     track = page.rows.track ? plots.unpack(page.rows.track) : [];
     for (const place of places) {
       const brush = page.figures[place.dataset.figure].usermeta?.brush;
