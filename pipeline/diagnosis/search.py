@@ -19,6 +19,9 @@ _TIE = 0.03
 # Recordings with much structure offer ever another exchange by a hair.
 _MOST_WORK = 16
 _MOST_SPLIT = 3
+_SLOW = frozenset(
+    {"drive_lag", "turn_lag", "transport_delay", "acceleration_limit", "body_inertia", "clock_offset"}
+)
 
 
 def search_effects(arena: Arena, start: Contender) -> Contender:
@@ -106,12 +109,15 @@ def _swap(arena: Arena, current: Contender) -> Contender | None:
 
 
 def _join(arena: Arena, current: Contender) -> Contender | None:
-    """One effect in the place of two."""
-    for pair in combinations(_free(arena, current), 2):
+    """One effect in the place of two, or of all that are slow: lags together imitate a delay."""
+    free = _free(arena, current)
+    slow = tuple(name for name in free if name in _SLOW)
+    groups = [*combinations(free, 2), *([slow] if len(slow) > 2 else [])]  # noqa: PLR2004 - pairs are there
+    for group in groups:
         if arena.work > _MOST_WORK:
             return None
-        without = arena.drop(current, pair)
-        for rival in arena.suggest(without, _SWAPPED, without=pair):
+        without = arena.drop(current, group)
+        for rival in arena.suggest(without, _SWAPPED, without=group):
             if rival.score < (1.0 + LEAST_GAIN) * current.score:
                 return rival
     return None

@@ -18,6 +18,8 @@ _AS_GOOD = 0.01
 _ALIKE = 0.7
 # Both effects were found worth a name: between two of that kind less evidence decides than for a new one.
 _DECIDED_T = 1.6
+# What separates them must stand out of the noise too: a nearly exact encoder splits hairs that mean nothing.
+_DECIDED_Z = 1.0
 _NEVER = 0.02
 # Effects that hold the key as a special case explain whatever it explains.
 _HOLDS: dict[str, frozenset[str]] = {
@@ -95,7 +97,7 @@ def _is_as_good(arena: Arena, final: Contender, rival: Contender) -> bool:
     if arena.metric.loss(rival.held) < (1.0 + _AS_GOOD) * arena.metric.loss(final.held):
         return True
     verdict = arena.judge(rival, final)
-    return verdict.gain < _AS_GOOD or verdict.t < _DECIDED_T
+    return verdict.gain < _AS_GOOD or verdict.t < _DECIDED_T or verdict.z < _DECIDED_Z
 
 
 def _does_the_same(arena: Arena, without: Contender, final: Contender, rival: Contender) -> bool:

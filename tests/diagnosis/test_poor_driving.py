@@ -74,3 +74,10 @@ def test_straight_only_does_not_tell_one_lag_from_two(tmp_path: Path) -> None:
     found = _drive("straight", {"turn_lag": {"tau_mean": 0.3, "tau_diff": 1.0}}, tmp_path)
     assert not found.effects
     assert {"drive_lag", "turn_lag"} in [set(item.candidates) for item in found.undecided]
+
+
+def test_encoders_split_no_hairs_between_what_one_circle_makes_alike(tmp_path: Path) -> None:
+    found = _drive("circle", {"steering_gain": 0.85}, tmp_path, vehicle="car")
+    assert not found.effects
+    told = {name for item in found.undecided for name in item.candidates} | {u.id for u in found.unobservable}
+    assert "steering_gain" in told

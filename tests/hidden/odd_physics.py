@@ -61,8 +61,7 @@ def _grass_patch(vehicle: Vehicle) -> Push:
     del vehicle
 
     def push(state: State) -> tuple[float, float, float]:
-        # Two metres each: an edge between two kinds of ground, which the catalogue has, is no explanation.
-        inside = math.sin(0.5 * math.pi * state.x) > 0.0
+        inside = math.sin(state.x / 1.5) > 0.0
         return (-0.25 * state.v0 if inside else 0.0), 0.0, 0.0
 
     return push
