@@ -86,7 +86,7 @@ reveal: $(VENV)/.ready-dev ## LOG=data_samples/mystery_1.mcap: open the seal of 
 	@[ -n "$$LOG" ] || { echo "Say which log: make reveal LOG=data_samples/mystery_1.mcap" >&2; exit 2; }
 	@$(BIN)/python tests/hidden/mystery.py open "$${LOG%.mcap}.sealed"
 
-bench: bench-reader bench-analyze bench-batch bench-export bench-workbench ## all benchmarks
+bench: bench-reader bench-analyze bench-batch bench-export bench-workbench ## all benchmarks but that on the real recordings
 
 bench-analyze: $(VENV)/.ready-dev ## a whole analysis of a 10-minute log
 	$(BIN)/python tests/bench/analyze.py
