@@ -26,6 +26,7 @@ Flags = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 
 FOLDS = 5
+_LEAST_SHARE = 0.01
 GAP_S = 1.5
 LEAST_GAIN = 0.01
 LEAST_T = 2.5
@@ -100,11 +101,13 @@ def hold_out(fitted: Fitted, metric: Metric, folds: tuple[Fold, ...]) -> Floats:
     if not smooth:
         return held
     jacobian = fitted.jacobian[:, :, smooth]
+    # What acts in a few moments may act in one fold only: the others must not send its number to the moon.
+    hold = _LEAST_SHARE * ((jacobian * metric.weights(fitted.residual)[:, :, None]) ** 2).sum(axis=(0, 1))
     for fold in folds:
         if not fold.test.any() or not fold.train.any():
             continue
         part = type(metric)(metric.scale[fold.train], metric.clip[fold.train])
-        step, _ = solve_step(jacobian[fold.train], fitted.residual[fold.train], part)
+        step, _ = solve_step(jacobian[fold.train], fitted.residual[fold.train], part, hold=hold)
         held[fold.test] = fitted.residual[fold.test] - jacobian[fold.test] @ step
     return held
 

@@ -58,9 +58,16 @@ def polish(problem: Problem, metric: Metric, state: State, iterations: int = _IT
 
 
 def solve_step(
-    jacobian: Floats, residual: Floats, metric: Metric, damping: float = 0.0
+    jacobian: Floats, residual: Floats, metric: Metric, damping: float = 0.0, hold: Floats | float = 0.0
 ) -> tuple[Floats, Floats]:
     """One weighted least squares step.
+
+    Args:
+        jacobian: change of the prediction with each number, shape (n, 3, p).
+        residual: shape (n, 3).
+        metric: cost of residuals.
+        damping: Levenberg-Marquardt damping relative to the diagonal.
+        hold: information that speaks for staying where each number is, shape (p,).
 
     Returns:
         The step, shape (p,), and the normal matrix, shape (p, p).
@@ -70,7 +77,7 @@ def solve_step(
     target = (residual * factor).reshape(-1)
     normal = np.asarray(rows.T @ rows, dtype=np.float64)
     size = np.diag(normal) + 1e-12
-    stiff = normal + np.diag(size * (damping + 1e-9))
+    stiff = normal + np.diag(size * (damping + 1e-9) + hold)
     step = np.asarray(np.linalg.solve(stiff, rows.T @ target), dtype=np.float64)
     return step, normal
 
