@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,27 @@ class Reach:
     turned: Floats
 
 
+Kept = TypeVar("Kept")
+Spot = tuple[Integers, Floats]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What poses of one delay say of every window.
+
+    Attributes:
+        place: of each pose among the cell edges: index and share of the cell, each of shape (m,).
+        frame: turns the map into the frame of the heading half-way, shape (n,).
+        moved: displacement in that frame [m], shape (n,).
+        turned: change of heading [rad], shape (n,).
+    """
+
+    place: Spot
+    frame: Complex
+    moved: Complex
+    turned: Floats
+
+
 class Comparison:
     """One run, one input: what a model predicts against what was measured.
 
@@ -98,6 +119,7 @@ class Comparison:
         self._path = self.nodes.average(run.track.path[self.nodes.poses])
         self._frames: dict[float, Complex] = {}
         self._headings: dict[float, Floats] = {}
+        self._measured: dict[float, Measured] = {}
         base = self._look_around(vehicle)
         self._forward = Forward(series, self.cells, base, encoders=run.wheels, has_gyro=self.has_gyro)
         self._reaching = replace_surroundings(self._forward, self._look_from_horizons(base))
@@ -152,16 +174,17 @@ class Comparison:
         """
         velocity = self.predict_velocity(effects, timing)
         delay = timing.pose_delay_s + self._find_delay(effects)
-        place = self.cells.locate_edges(self._pose_times - delay)
+        seen = self._measure(delay)
         along = (velocity.x + 1j * velocity.y) * self._frame(delay)
-        travelled = self._at_nodes(self.cells.sum_up(along), place)
-        turned = self._at_nodes(self.cells.sum_up(velocity.w), place)
-        heading = self._node_headings(delay)
+        travelled = self._at_nodes(self.cells.sum_up(along), seen.place)
+        turned = self._at_nodes(self.cells.sum_up(velocity.w), seen.place)
         start, end = self.windows.start, self.windows.end
-        frame = np.exp(-0.5j * (heading[start] + heading[end]))
-        gap = frame * ((self._path[end] - self._path[start]) - (travelled[end] - travelled[start]))
-        rest = (heading[end] - heading[start]) - (turned[end] - turned[start])
-        return np.column_stack((gap.real, gap.imag, rest)) / self.windows.span_s[:, None]
+        gap = seen.moved - seen.frame * (travelled[end] - travelled[start])
+        rest = np.empty((start.size, 3))
+        rest[:, 0], rest[:, 1] = gap.real, gap.imag
+        rest[:, 2] = seen.turned - (turned[end] - turned[start])
+        rest /= self.windows.span_s[:, None]
+        return rest
 
     def find_reach(self, effects: Sequence[Effect], timing: Timing) -> Reach:
         """Errors of two-second predictions from a measured state, integrating the model's own yaw.
@@ -171,7 +194,7 @@ class Comparison:
         """
         velocity = self._run(self._reaching, effects, timing)
         delay = timing.pose_delay_s + self._find_delay(effects)
-        place = self.cells.locate_edges(self._pose_times - delay)
+        place = self._find_place(delay)
         edges = self.cells.sum_up(velocity.w)
         own = np.exp(0.5j * (edges[1:] + edges[:-1]))
         travelled = self._at_nodes(self.cells.sum_up((velocity.x + 1j * velocity.y) * own), place)
@@ -198,9 +221,28 @@ class Comparison:
             late -= sum(effect.values["d"] for effect in effects if effect.id == "heading_skew")
         return late
 
-    def _at_nodes(self, edges: Signal, place: Floats) -> Signal:
-        index = np.minimum(place.astype(np.int64), edges.size - 2)
-        values: Signal = edges[index] + (place - index) * (edges[index + 1] - edges[index])
+    def _find_place(self, delay: float) -> Spot:
+        """Where poses lie among the cell edges: the edge before, and how far on in its cell."""
+        place = self.cells.locate_edges(self._pose_times - delay)
+        index = np.minimum(place.astype(np.int64), self.cells.times.size - 1)
+        return index, place - index
+
+    def _measure(self, delay: float) -> Measured:
+        """What the poses say of every window when they are late by ``delay`` [s]."""
+        if delay not in self._measured:
+            heading = self._node_headings(delay)
+            start, end = self.windows.start, self.windows.end
+            frame = np.exp(-0.5j * (heading[start] + heading[end]))
+            moved = frame * (self._path[end] - self._path[start])
+            _forget(self._measured)
+            place = self._find_place(delay)
+            self._measured[delay] = Measured(place, frame, moved, heading[end] - heading[start])
+        return self._measured[delay]
+
+    def _at_nodes(self, edges: Signal, place: Spot) -> Signal:
+        index, beyond = place
+        before = edges[index]
+        values: Signal = before + beyond * (edges[index + 1] - before)
         return self.nodes.average(values)
 
     def _node_headings(self, delay: float) -> Floats:
@@ -314,6 +356,6 @@ def _reset_body(cells: Cells, first: Integers, known: tuple[Integers, Floats]) -
     return Resets(number, first, place, start)
 
 
-def _forget(kept: dict[float, Signal]) -> None:
+def _forget(kept: dict[float, Kept]) -> None:
     while len(kept) > 2:  # noqa: PLR2004 - the value in use and one beside it for derivatives
         kept.pop(next(iter(kept)))
