@@ -64,11 +64,13 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
     known = frozenset().union(*(way.search.arena.kept for way in ways))
     timing = body.search.final.state.timing
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
-    judgements = _rate_ways(ground, source, ways, [*found, *terms], timing)
+    inputs = tuple(dict.fromkeys((source, Input(body.search.way))))
+    judgements = _rate_ways(ground, inputs, [*found, *terms], timing)
     idle = [e for e in _find_idle(found, ways, judgements.get(source.value)) if e.id not in known]
     if idle:
         found = [effect for effect in found if effect not in idle]
-        judgements = _rate_ways(ground, source, ways, [*found, *terms], timing)
+        # From measured wheels the drivetrain's effects were not in it.
+        judgements |= _rate_ways(ground, [source], [*found, *terms], timing)
     judgement = judgements.get(source.value)
     unexplained = leftover.describe(ways)
     described = tuple(
@@ -173,18 +175,13 @@ def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
 
 
 def _rate_ways(
-    ground: Ground,
-    source: Input,
-    ways: Sequence[Explored],
-    effects: Sequence[Effect],
-    timing: Sequence[Timing],
+    ground: Ground, inputs: Sequence[Input], effects: Sequence[Effect], timing: Sequence[Timing]
 ) -> dict[str, Judgement]:
-    """The model judged from its input to the body, and from the measured wheels where they were searched."""
-    inputs = dict.fromkeys((source, Input(ways[0].search.way)))
+    """The model judged from each input to the body."""
     found = {}
-    for one in inputs:
+    for source in inputs:
         try:
-            found[one.value] = rate_effects(ground, one, effects, timing).judgement
+            found[source.value] = rate_effects(ground, source, effects, timing).judgement
         except MotionError:
             continue
     return found
