@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -115,6 +116,7 @@ class WheelProblem:
         self.unit = number_units(self.run, self.times)
         self.live = find_live(self.find_ideal())
         self._seen: dict[tuple[int, float], Floats] = {}
+        self._spans = [locate_windows(comparison) for comparison in self.comparisons]
 
     def find_residuals(self, state: State) -> Floats:
         """See `Problem`; in terms of the ideal velocity of the wheels."""
@@ -124,9 +126,9 @@ class WheelProblem:
             if key not in self._seen:
                 wheels = self.measured[index].predict_velocity((), timing)
                 self._seen = {k: v for k, v in self._seen.items() if k[0] != index}
-                self._seen[key] = average_windows(comparison, wheels)
+                self._seen[key] = average_windows(comparison, wheels, self._spans[index])
             driven = comparison.predict_velocity(state.effects, _NO_DELAY)
-            parts.append(self._seen[key] - average_windows(comparison, driven))
+            parts.append(self._seen[key] - average_windows(comparison, driven, self._spans[index]))
         return np.concatenate(parts)
 
     def find_ideal(self) -> Floats:
@@ -141,24 +143,53 @@ def find_live(ideal: Floats) -> Flags:
     return live
 
 
-def average_windows(comparison: Comparison, velocity: Velocity, late: float = 0.0) -> Floats:
-    """Mean of (x, y, w) over every window, ``late`` seconds earlier, shape (n, 3)."""
+@dataclass(frozen=True)
+class Spans:
+    """Where windows begin and end among the cell edges: edge before, share of the cell, and width [s]."""
+
+    first: Integers
+    into_first: Floats
+    last: Integers
+    into_last: Floats
+    width: Floats
+
+    def average(self, comparison: Comparison, signal: Floats) -> Floats:
+        """Mean of a signal on cells over every window, shape (n,)."""
+        total = comparison.cells.sum_up(signal)
+        end = total[self.last] + self.into_last * (total[self.last + 1] - total[self.last])
+        start = total[self.first] + self.into_first * (total[self.first + 1] - total[self.first])
+        means: Floats = (end - start) / self.width
+        return means
+
+
+def locate_windows(comparison: Comparison, late: float = 0.0) -> Spans:
+    """The windows of a comparison, ``late`` seconds earlier, among its cell edges."""
     cells, times = comparison.cells, comparison.windows.times
-    start = cells.locate_edges(times[:, 0] - late)
-    end = cells.locate_edges(times[:, 1] - late)
-    edges = np.arange(cells.times.size + 1)
-    width = np.maximum((end - start) * cells.step_s, cells.step_s)[:, None]
-    columns = []
-    for signal in (velocity.x, velocity.y, velocity.w):
-        total = np.asarray(cells.sum_up(signal), dtype=np.float64)
-        columns.append(np.interp(end, edges, total) - np.interp(start, edges, total))
-    return np.column_stack(columns) / width
+    start, end = cells.locate_edges(times[:, 0] - late), cells.locate_edges(times[:, 1] - late)
+    top = cells.times.size - 1
+    first, last = np.minimum(start.astype(np.int64), top), np.minimum(end.astype(np.int64), top)
+    width = np.maximum((end - start) * cells.step_s, cells.step_s)
+    return Spans(first, start - first, last, end - last, width)
+
+
+def average_windows(comparison: Comparison, velocity: Velocity, spans: Spans | None = None) -> Floats:
+    """Mean of (x, y, w) over every window, shape (n, 3)."""
+    spans = spans or locate_windows(comparison)
+    y = velocity.y
+    return np.column_stack(
+        (
+            spans.average(comparison, velocity.x),
+            spans.average(comparison, y) if y.any() else np.zeros(spans.first.size),
+            spans.average(comparison, velocity.w),
+        )
+    )
 
 
 def average_lags(comparison: Comparison, velocity: Velocity, lags: int = 9) -> Floats:
     """Means of (x, w) over windows now and earlier, shape (n, lags, 2)."""
-    means = [average_windows(comparison, velocity, 0.25 * lag)[:, [0, 2]] for lag in range(lags)]
-    return np.stack(means, axis=1)
+    spans = [locate_windows(comparison, 0.25 * lag) for lag in range(lags)]
+    means = [[one.average(comparison, signal) for signal in (velocity.x, velocity.w)] for one in spans]
+    return np.moveaxis(np.asarray(means), (0, 1, 2), (1, 2, 0))
 
 
 def differentiate(problem: Problem, state: State, residual: Floats, slots: Sequence[Slot]) -> Floats:
