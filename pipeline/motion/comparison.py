@@ -112,6 +112,13 @@ class Comparison:
         self.cells = make_cells(run, rate_hz)
         self.heading = choose_heading(run, self.cells, heading)
         self.nodes = gather_nodes(run.track, self.cells)
+        if self.nodes.times.size == 0:
+            raise MotionError(
+                "no_poses",
+                "no pose falls into a stretch with a live command",
+                where=run.name,
+                hint="Mend [[interval]], or take all with --interval all.",
+            )
         lead = find_lead(run, self.usual_delay)
         self.windows = join_windows(run, self.cells, self.nodes, lead)
         self.horizons = join_horizons(run, self.cells, self.nodes, lead)

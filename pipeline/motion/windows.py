@@ -111,6 +111,8 @@ def gather_nodes(track: Track, cells: Cells) -> Nodes:
     raster = np.round(since / NODE_S)
     member = usable & (np.abs(since - raster * NODE_S) <= _GATHER_S) & (raster >= 0)
     poses = np.flatnonzero(member)
+    if poses.size == 0:
+        return Nodes(poses, poses, poses, track.times[poses], poses)
     label = piece[poses] * 1_000_000 + raster[poses].astype(np.int64)
     first = np.flatnonzero(np.concatenate(([True], np.diff(label) != 0)))
     count = np.diff(np.append(first, poses.size))

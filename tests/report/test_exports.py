@@ -214,6 +214,21 @@ def test_a_table_out_of_order_is_put_in_order(source: ExportSource, results: Pat
     assert found.equals(source.manifest.read("velocities").select("stamp", "v_x"))
 
 
+def test_a_stretch_without_a_live_command_is_exported_without_the_model(
+    source: ExportSource, results: Path, tmp_path: Path
+) -> None:
+    copy = tmp_path / "results"
+    shutil.copytree(results, copy)
+    (manifest,) = Store(copy).manifests()
+    poses = manifest.read("poses")
+    live = poses["t"] > 0.8 * poses["t"].max()
+    poses.with_columns(active=live).write_parquet(manifest.path("poses"))
+    cut = replace(source, manifest=manifest, stretch_rows=100)
+    found = read_officially(write_derived_log(cut, tmp_path / "cut.mcap"))
+    assert len(found["/slip/velocity/measured"]) == manifest.tables["velocities"].rows
+    assert 0 < len(found["/slip/velocity/model"]) < 0.9 * manifest.tables["velocities"].rows
+
+
 def test_a_model_that_cannot_be_run_leaves_no_file(
     source: ExportSource, results: Path, tmp_path: Path
 ) -> None:
