@@ -135,7 +135,7 @@ def load_run(
     streams = np.unique(np.concatenate(stamps))
     if commands is not None:
         commands = _stop_when_silent(commands, hold_s)
-    steps, barred = _read_steps(tables.get("slip"))
+    steps, barred = _read_steps(tables.get("slip"), streams)
     terrains = tables["poses"]["terrain"] if "terrain" in tables["poses"].columns else None
     run = MotionRun(
         name=name,
@@ -247,8 +247,8 @@ def _stop_when_silent(commands: DriveSeries, hold_s: float | None) -> DriveSerie
     )
 
 
-def _read_steps(slip: pl.DataFrame | None) -> tuple[Floats, Floats]:
-    """Where steps start, and times of samples that must not be scored."""
+def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Floats]:
+    """Where steps start, and times of samples that must not be scored, of all that was recorded."""
     if slip is None or slip.is_empty():
         return np.zeros(0), np.zeros(0)
     leading = "command" if (slip["input"] == "command").any() else "measured"
@@ -257,8 +257,12 @@ def _read_steps(slip: pl.DataFrame | None) -> tuple[Floats, Floats]:
     starts = times[np.concatenate(([True], np.diff(step) != 0))]
     barred = [slip.filter(slip["suspect"])["t"].to_numpy()]
     # Rows are missing where no live command stands beside the motion: such stretches are not scored either.
-    holes = np.flatnonzero(np.diff(times) > 0.2)  # noqa: PLR2004 - four samples at the usual rate
+    # Before the first command nobody knows what was asked.
+    known = np.concatenate(
+        ([min(float(streams[0]), times[0]) - 0.05], times, [max(streams[-1], times[-1]) + 0.05])
+    )
+    holes = np.flatnonzero(np.diff(known) > 0.2)  # noqa: PLR2004 - four samples at the usual rate
     for hole in holes.tolist():
-        barred.append(np.arange(times[hole] + 0.05, times[hole + 1], 0.05))  # noqa: PERF401
+        barred.append(np.arange(known[hole] + 0.05, known[hole + 1], 0.05))  # noqa: PERF401
     barred.append(np.array([times[0] - 1e-3, times[-1] + 1e-3]))
     return starts, np.unique(np.concatenate(barred))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from motion_runs import QUIET, make_scenario, tables_of, vehicle_of
 
 from pipeline.motion import MotionRun, load_run
+from pipeline.motion.comparison import Comparison, Input
 from pipeline.motion.encoders import measure_wheel_delay
 from pipeline.simulate import Imu, simulate_run
 
@@ -43,6 +45,25 @@ def test_good_stamps_and_good_poses_stay_as_they_are(tables: Mapping[str, pl.Dat
     assert run.age_spread_s == 0.0
     assert run.faulty_s == 0.0
     assert np.array_equal(run.track.times, np.sort(tables["poses"]["t"].to_numpy()))
+
+
+def test_poses_at_a_hundred_a_second_do_not_push_each_other_on() -> None:
+    pose = replace(QUIET, rate_hz=102.0)
+    made = simulate_run(make_scenario(SKID, duration_s=120.0, pose=pose, imu=Imu()))
+    stamps = np.sort(made.poses.stamp_s)
+    run = load(tables_of(made, HUSKY))
+    assert run.age_spread_s == 0.0
+    assert np.array_equal(run.track.times, stamps)
+
+
+def test_nothing_is_scored_before_the_first_command(tables: Mapping[str, pl.DataFrame]) -> None:
+    late = float(tables["commands"]["t"][0]) + 20.0
+    after = pl.col("t") >= late
+    slip = pl.DataFrame(
+        {"t": np.arange(late, 240.0, 0.05)},
+    ).with_columns(input=pl.lit("command"), step=pl.lit(0), suspect=pl.lit(value=False))
+    run = load(tables, commands=tables["commands"].filter(after), slip=slip)
+    assert Comparison(run, HUSKY, Input.COMMAND).windows.times.min() > late - 1e-6
 
 
 def test_the_gyro_tells_how_old_each_pose_is(tables: Mapping[str, pl.DataFrame]) -> None:
