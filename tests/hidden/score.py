@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from draw import Answer  # noqa: TC002 - a test helper runs as a script, too
+from draw import Answer  # noqa: TC002 - it runs as a script, too
 
 Json = Mapping[str, object]
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from draw import Answer  # noqa: TC002 - a test helper runs as a script, too
+from draw import Answer  # noqa: TC002 - it runs as a script, too
 
 from pipeline.diagnosis import Recording  # noqa: TC001
 from pipeline.diagnosis.subject import correct_vehicle, load_recording
