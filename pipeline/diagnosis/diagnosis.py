@@ -45,8 +45,8 @@ class Named:
         corrected: whether it is a timing error that was corrected before anything else was judged.
         way: on which way it was found: `command`, `measured` or `wheels`.
         selected: share of resampled recordings in which it is still worth its place.
-        tentative: far more structure stays in its channel than it explains, it lowers no error on its own way,
-            or its interval holds doing nothing.
+        tentative: far more structure stays in its channel than it explains; or it lowers no error on its own
+            way; or its interval holds doing nothing.
     """
 
     id: str
