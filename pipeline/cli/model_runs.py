@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
 
-_TABLES = ("poses", "commands", "wheels", "imu", "slip")
-
 
 def gather_runs(names: Sequence[str], vehicle: Vehicle, out: Path, *, quiet: bool) -> list[MotionRun]:
     """Runs by name of a log or of a stored run.
@@ -29,7 +27,7 @@ def gather_runs(names: Sequence[str], vehicle: Vehicle, out: Path, *, quiet: boo
     Raises:
         SlipError: a log cannot be read, or there is no such run.
     """
-    from pipeline.motion.recording import load_run  # noqa: PLC0415 - heavy
+    from pipeline.report.motion_run import load_motion_run  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     store = Store(out)
@@ -38,18 +36,8 @@ def gather_runs(names: Sequence[str], vehicle: Vehicle, out: Path, *, quiet: boo
         manifest = store.manifest(name) if not Path(name).exists() else None
         if manifest is None:
             manifest = _analyze(name, vehicle, out, quiet=quiet)
-        tables = {table: store.read(manifest.run, table) for table in _TABLES if table in manifest.tables}
-        log = manifest.details.get("log")
-        sha256 = str(log.get("sha256", "")) if isinstance(log, dict) else ""
-        runs.append(load_run(tables, vehicle, name=manifest.run, sha256=sha256, hold_s=_hold_of(manifest)))
+        runs.append(load_motion_run(manifest, vehicle))
     return runs
-
-
-def _hold_of(manifest: Manifest) -> float | None:
-    configuration = manifest.details.get("configuration")
-    command = configuration.get("command") if isinstance(configuration, dict) else None
-    hold = command.get("hold_s") if isinstance(command, dict) else None
-    return float(hold) if isinstance(hold, int | float) else None
 
 
 def _analyze(name: str, vehicle: Vehicle, out: Path, *, quiet: bool) -> Manifest:

@@ -94,19 +94,17 @@ def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
     """A stored run as it is diagnosed, and its vehicle."""
     import msgspec  # noqa: PLC0415 - only for stored runs
 
+    from pipeline.report.motion_run import read_hold  # noqa: PLC0415 - heavy
     from pipeline.vehicles import Vehicle  # noqa: PLC0415 - heavy
 
-    details = manifest.details
-    log, configuration = details.get("log"), details.get("configuration")
-    command = configuration.get("command") if isinstance(configuration, dict) else None
-    hold = command.get("hold_s") if isinstance(command, dict) else None
+    log = manifest.details.get("log")
     recording = _make_recording(
         manifest.run,
         (manifest.tables, manifest.read),
         log if isinstance(log, dict) else {},
-        float(hold) if isinstance(hold, int | float) else None,
+        read_hold(manifest),
     )
-    return msgspec.convert(details["vehicle"], Vehicle), recording
+    return msgspec.convert(manifest.details["vehicle"], Vehicle), recording
 
 
 def _make_recording(

@@ -62,7 +62,7 @@ def make_motion_run(manifest: Manifest, vehicle: Vehicle, tables: Mapping[str, p
         )
     log = manifest.details.get("log")
     sha256 = str(log.get("sha256", "")) if isinstance(log, dict) else ""
-    return load_run(tables, vehicle, name=manifest.run, sha256=sha256, hold_s=_hold_of(manifest))
+    return load_run(tables, vehicle, name=manifest.run, sha256=sha256, hold_s=read_hold(manifest))
 
 
 def load_vehicle(manifest: Manifest) -> Vehicle:
@@ -93,7 +93,8 @@ def choose_source(run: MotionRun, asked: str | None) -> Input:
     return Input.COMMAND if run.commands is not None else Input.MEASURED
 
 
-def _hold_of(manifest: Manifest) -> float | None:
+def read_hold(manifest: Manifest) -> float | None:
+    """How long a command counts [s], as the run was configured; None for the usual time."""
     configuration = manifest.details.get("configuration")
     command = configuration.get("command") if isinstance(configuration, dict) else None
     hold = command.get("hold_s") if isinstance(command, dict) else None

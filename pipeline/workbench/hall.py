@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from pipeline.motion.formula import FormulaEffect
     from pipeline.motion.model_file import ModelFile
+    from pipeline.report.motion_view import MotionView
     from pipeline.store import Manifest
     from pipeline.workbench.bench import Stand
     from pipeline.workbench.desk import Desk
@@ -76,17 +77,13 @@ class Hall:
 
     def draw(self, ask: Ask) -> dict[str, object]:
         """All figures of a desk."""
-        stand, desk, parsed = self._open(ask)
-        model = switch_off(parsed.model, desk.step.off)
-        view = stand.view(model, desk.step.timing, desk.step.ladder, desk.floor or None)
-        return self._album(stand.manifest).draw(view)
+        album, view = self._look(ask)
+        return album.draw(view)
 
     def redraw(self, ask: Ask) -> dict[str, object]:
         """The rows of a desk's figures that a change moves."""
-        stand, desk, parsed = self._open(ask)
-        model = switch_off(parsed.model, desk.step.off)
-        view = stand.view(model, desk.step.timing, desk.step.ladder, desk.floor or None)
-        return self._album(stand.manifest).redraw(view)
+        album, view = self._look(ask)
+        return album.redraw(view)
 
     def format_model(self, run: str, slot: str) -> str:
         """The model file of a desk as text."""
@@ -166,6 +163,12 @@ class Hall:
             "trial": trial.show() if trial is not None else None,
             "slot": file.slot,
         }
+
+    def _look(self, ask: Ask) -> tuple[Album, MotionView]:
+        stand, desk, parsed = self._open(ask)
+        model = switch_off(parsed.model, desk.step.off)
+        view = stand.view(model, desk.step.timing, desk.step.ladder, desk.floor or None)
+        return self._album(stand.manifest), view
 
     def _album(self, manifest: Manifest) -> Album:
         key = (manifest.run, manifest.key)
