@@ -16,6 +16,7 @@ if __name__ == "__main__":
         cost = {
             "own_s": own.ru_utime + own.ru_stime,
             "children_s": children.ru_utime + children.ru_stime,
-            "own_peak_bytes": own.ru_maxrss * 1024,
+            # Linux counts the peak in KiB, macOS in bytes.
+            "own_peak_bytes": own.ru_maxrss * (1 if sys.platform == "darwin" else 1024),
         }
         print(json.dumps(cost), file=sys.stderr)
