@@ -32,7 +32,7 @@ _LEAST_SPREAD = 0.015
 _NOISE = (0.002, 0.02)
 _LONGEST_WAIT = 1.0
 _SHORTEST_STEP = 0.01
-_LEAST_OF_USUAL = 0.1
+_LEAST_OF_USUAL = 0.5
 _HUBER = 3.0
 
 
@@ -162,7 +162,7 @@ def _describe_stamps(track: Track) -> Floats:
 def _take_off(track: Track, ages: Floats) -> Floats:
     """Stamps without the ages, still in order."""
     usual = float(np.median(np.diff(track.times))) if track.times.size > 1 else 0.0
-    # Far below the usual step: poses at 100 Hz must not push each other on.
+    # Below the usual step: poses at 100 Hz must not push each other on.
     count = min(_SHORTEST_STEP, _LEAST_OF_USUAL * usual) * np.arange(ages.size)
     ordered: Floats = np.maximum.accumulate(track.times - ages - count) + count
     return ordered

@@ -32,7 +32,7 @@ _FEWEST = 200
 _FAR = 8.0
 _LEAST_M = 0.25
 _LARGEST_SHARE = 0.05
-_LAGS_S = (-0.3, -0.1, 0.1, 0.3, 0.6, 1.0, 1.6)
+_LAGS_S = (-0.3, -0.1, 0.0, 0.1, 0.3, 0.6, 1.0, 1.6)
 _ROUNDS = 10
 _BINS = 6
 _SAMPLE_S = 0.05
@@ -113,7 +113,7 @@ def _measure_misfit(
     columns = np.column_stack((*along, *across, *beside, *rest))
     gap = np.column_stack([_fit_robustly(columns, part) for part in (moved.real, moved.imag)])
     size = np.hypot(gap[:, 0], gap[:, 1])
-    usual = _spread_by_speed(size, np.abs(along[2]) / span)
+    usual = _spread_by_speed(size, np.abs(along[_LAGS_S.index(0.1)]) / span)
     misfit: Floats = size / np.maximum(_FAR * usual, _LEAST_M)
     return misfit
 

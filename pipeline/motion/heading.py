@@ -31,6 +31,8 @@ _LEAST_TURNING = 0.02
 _GOOD = 0.35
 _ALIGN_S = 3.0
 _HOLE_S = 0.5
+_SILENT_S = 0.25
+_LEAST_COVERED = 0.95
 
 
 class HeadingSource(enum.Enum):
@@ -122,7 +124,7 @@ def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out 
     if run.gyro is None:
         return None
     times, rate = run.gyro
-    if times.size < _FEWEST:
+    if times.size < _FEWEST or _measure_cover(times, run.track.times) < _LEAST_COVERED:
         return None
     first, second = _pair_up(run.track, run)
     if first.size < _FEWEST:
@@ -167,6 +169,13 @@ def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out 
         error = float(np.sqrt(inverse[2, 2] * np.mean(rest[keep] ** 2) * overlap))
     # The poses' own errors are no reason to distrust the sensor's scale by a fraction of a percent.
     return GyroFit(float(scale), float(bias), fit, error, residual)
+
+
+def _measure_cover(times: Floats, at: Floats) -> float:
+    """Share of some moments beside which the gyro spoke: one that fell silent half-way is no heading."""
+    next_one = np.minimum(np.searchsorted(times, at), times.size - 1)
+    nearest = np.minimum(np.abs(times[next_one] - at), np.abs(times[np.maximum(next_one - 1, 0)] - at))
+    return float(np.mean(nearest < _SILENT_S))
 
 
 def _pair_up(track: Track, run: MotionRun) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pipeline.motion.score import Errors
 
 _NOTHING = 1e-3
+_LEAST_SQUARE = 1e-24
 
 
 @dataclass(frozen=True)
@@ -126,14 +127,14 @@ def _rises(new: HeldOut, old: HeldOut) -> bool:
 
 def compare_losses(new: HeldOut, old: HeldOut) -> float:
     """Ratio of two held-out losses, geometric over the channels, so that no scale enters."""
-    from numpy import exp, isfinite, log, mean  # noqa: PLC0415 - names that read well here
+    from numpy import exp, isfinite, log, maximum, mean  # noqa: PLC0415 - names that read well here
 
     known = isfinite(new.residuals).all(axis=1) & isfinite(old.residuals).all(axis=1)
-    squares = [mean(side.residuals[known] ** 2, axis=0) for side in (new, old)]
+    squares = [maximum(mean(side.residuals[known] ** 2, axis=0), _LEAST_SQUARE) for side in (new, old)]
     return float(exp(mean(log(squares[0] / squares[1]))))
 
 
 def _scale_free(fitted: Fitted) -> float:
-    from numpy import log, mean  # noqa: PLC0415 - names that read well here
+    from numpy import log, maximum, mean  # noqa: PLC0415 - names that read well here
 
-    return float(mean(log(mean(fitted.residuals**2, axis=0))))
+    return float(mean(log(maximum(mean(fitted.residuals**2, axis=0), _LEAST_SQUARE))))

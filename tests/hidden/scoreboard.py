@@ -69,7 +69,7 @@ def describe(category: str, played: Sequence[Record]) -> list[str]:
         )
         lines += [f"  {', '.join(f'{name} {count}' for name, count in weak.most_common())}"] if weak else []
         lines.append(_rate(counted, "all that is hidden is named", is_found))
-        lines.append(_rate(counted, "nothing else beside it", lambda r: not has_wrong_name(r)))
+        lines.append(_rate(counted, "nothing else beside it", _has_no_other))
         lines.append(_rate(counted, "exactly right", is_exact))
         lines.append(_rate(counted, "named, or undecided with it", is_narrowed))
         lines.append(_rate(counted, f"error within {_WORSE:g} of the true model's", is_as_good))
@@ -190,6 +190,11 @@ def describe_times(played: Sequence[Record]) -> list[str]:
     ]
     lines.append(f"CPU, medians: {', '.join(parts)}")
     return lines
+
+
+def _has_no_other(record: Record) -> bool:
+    """Whether a log was diagnosed and nothing was named that it does not hide."""
+    return record.outcome == "scored" and not has_wrong_name(record)
 
 
 def _rate(played: Sequence[Record], name: str, test: Test) -> str:
