@@ -28,6 +28,7 @@ _RATE_HZ = 50.0
 _COARSE_HZ = 25.0
 _MOST_CELLS = 20_000
 _FEWEST_WINDOWS = 60
+_STANDING = 0.05
 # A point beside base_link is a shifted centre of rotation: it is searched under that name.
 _TWINS = frozenset({"lever_arm"})
 _DRIVETRAIN = frozenset({Place.COMMAND, Place.DRIVE})
@@ -63,6 +64,11 @@ class Ground:
         return self.commanded if source is Input.COMMAND else self.measured
 
     @property
+    def moves_both_ways(self) -> bool:
+        """Whether a run both drives and turns."""
+        return min(self.largest.speed, self.largest.turn) > _STANDING
+
+    @property
     def sampling_s(self) -> float:
         """Delay that sampled encoders may feign: a little more than half their period."""
         periods = [float(np.median(np.diff(run.wheels.times))) for run in self.runs if run.wheels is not None]
@@ -84,6 +90,10 @@ class Ground:
             if source is Input.MEASURED and effect.place in _DRIVETRAIN:
                 continue
             if effect.id == "heading_skew" and self.has_gyro:
+                continue
+            free = source is Input.MEASURED and self.has_gyro
+            if effect.id == "clock_offset" and free and not self.moves_both_ways:
+                # The encoders' delay is free: only driving and turning at once tell it from the poses'.
                 continue
             found.append(cast("Candidate", effect))
         return tuple(found)

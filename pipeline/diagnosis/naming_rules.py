@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.naming import Search
     from pipeline.motion.effect import Effect
 
-_STANDING = 0.05
 _SKEWED_CLOCK = 0.03
 _HELD_SHARE = 0.2
 
@@ -67,18 +66,13 @@ def read_clocks(ground: Ground, body: Search) -> Clocks:
     known = extra is not None if not ground.has_gyro else all(certain)
     if known and abs(late) >= least:
         clock = find_effect("clock_offset")(d=min(max(late, -1.0), 1.0))
-        if ground.has_gyro and not moves_both_ways(ground):
+        if ground.has_gyro and not ground.moves_both_ways:
             # The gyro dates the heading; only driving and turning at once tie the position's clock to it.
             skew = find_effect("heading_skew")()
             pair = Undecided((clock.id, skew.id), suggest_manoeuvre(clock, skew))
             return Clocks(tuple(found), tuple(rows), (pair,))
         found.append(clock)
     return Clocks(tuple(found), tuple(rows))
-
-
-def moves_both_ways(ground: Ground) -> bool:
-    """Whether a run both drives and turns."""
-    return ground.largest.speed > _STANDING and ground.largest.turn > _STANDING
 
 
 def _held_delay(ground: Ground) -> float:
@@ -109,6 +103,6 @@ def list_equivalents(effect: Effect, ground: Ground) -> tuple[str, ...]:
         alone = not ground.measured and not ground.has_gyro
         if not alone or (effect.id == "clock_offset" and effect.values["d"] < 0.0):
             return ()
-    if effect.id in {"drive_lag", "body_inertia"} and (moves_both_ways(ground) or ground.measured):
+    if effect.id in {"drive_lag", "body_inertia"} and (ground.moves_both_ways or ground.measured):
         return ()
     return effect.equivalent_to

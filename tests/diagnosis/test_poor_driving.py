@@ -81,3 +81,7 @@ def test_encoders_split_no_hairs_between_what_one_circle_makes_alike(tmp_path: P
     assert not found.effects
     told = {name for item in found.undecided for name in item.candidates} | {u.id for u in found.unobservable}
     assert "steering_gain" in told
+
+
+def test_a_straight_does_not_tell_the_clock_of_poses_from_that_of_encoders(tmp_path: Path) -> None:
+    assert not _drive("straight", {}, tmp_path).effects
