@@ -57,7 +57,7 @@ def _create_file(path: Path, data: bytes, finish: Callable[[BinaryIO], None]) ->
 
 
 def sync_files(paths: Sequence[Path]) -> None:
-    """Wait until the disk has files; asked at once, file systems need hardly longer for many than for one.
+    """Wait until the disk has files, and the names in folders; asked for at once, as long as for one of them.
 
     Raises:
         OSError: the disk did not take one of them.
@@ -65,11 +65,14 @@ def sync_files(paths: Sequence[Path]) -> None:
     if not paths:
         return
     with ThreadPoolExecutor(min(len(paths), _SYNCS_AT_ONCE), thread_name_prefix="sync") as pool:
-        for _ in pool.map(_sync_file, paths):
+        for _ in pool.map(_sync_path, paths):
             pass
 
 
-def _sync_file(path: Path) -> None:
+def _sync_path(path: Path) -> None:
+    if path.is_dir():
+        sync_folder(path)
+        return
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

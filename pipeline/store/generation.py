@@ -191,10 +191,8 @@ class Generation:
             manifest = self._describe(details)
             data = encode_manifest(manifest)
             self._draft(self._folder / MARKER, b"")
-            sync_files(self._drafts)
-            for folder in sorted(path for path in self._folder.rglob("*") if path.is_dir()):
-                sync_folder(folder)
-            sync_folder(self._folder)
+            folders = sorted(path for path in self._folder.rglob("*") if path.is_dir())
+            sync_files([*self._drafts, *folders, self._folder])
             self._watch("folder_synced")
             self._folder.rename(manifest.folder)
             self._folder = manifest.folder
