@@ -161,6 +161,7 @@ class Arena:
             self._finish(base.ids, fitted) if fitted.loss < _WORTH * best else self._present(fitted)
             for fitted in tried
         ]
+        entered = [self._simplify(contender) for contender in entered]
         ranked = sorted((c for c in entered if self.is_sound(c)), key=lambda c: c.score)
         self._suggested[key] = ranked
         return ranked
@@ -186,6 +187,17 @@ class Arena:
         if key not in self._finished:
             self._finished[key] = self.enter(fitted.state)
         return self._finished[key]
+
+    def _simplify(self, contender: Contender) -> Contender:
+        """The model with a plain lag for one whose two time constants have become one beside a new effect."""
+        lag = contender.state.find("turn_lag")
+        simpler = next((candidate for candidate in self.candidates if candidate.id == "drive_lag"), None)
+        if lag is None or simpler is None or "turn_lag" in self.kept or "drive_lag" in contender.ids:
+            return contender
+        if is_nameable(lag, self.largest, self.least_delay):
+            return contender
+        tau = 0.5 * (lag.values["tau_mean"] + lag.values["tau_diff"])
+        return self.enter(contender.state.drop(["turn_lag"]).add(simpler(tau=tau)))
 
     def has_room(self, contender: Contender) -> bool:
         """Whether a model leaves more than a saturated fit does in any channel."""

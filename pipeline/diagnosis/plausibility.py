@@ -78,6 +78,7 @@ _APART = 0.08
 _LEAST_APART_S = 0.02
 _LEAST_DEADBAND = 0.02
 _REACHED = 0.99
+_EDGE = 0.15
 _AT_BOUND = 1e-3
 
 
@@ -114,6 +115,8 @@ def _is_itself(effect: Effect, largest: Largest, least_delay: float) -> bool:
         # With equal time constants it is a drive lag.
         apart = abs(fast - slow) > max(_APART * max(fast, slow), least_delay, _LEAST_APART_S)
         return apart and max(fast, slow) > max(_LEAST_APART_S, least_delay)
+    if effect.id == "terrain_change":
+        return _lies_within(effect.values["at_s"], effect.values["at_x"], largest)
     checks = {
         "deadband": lambda v: v["d"] > _LEAST_DEADBAND * largest.speed,
         "acceleration_limit": lambda v: v["limit"] * _LEAST_RAMP_S < largest.wheel,
@@ -126,6 +129,15 @@ def _is_itself(effect: Effect, largest: Largest, least_delay: float) -> bool:
         "wheel_speed_limit": lambda v: v["limit"] <= _REACHED * largest.wheel,
     }
     return effect.id not in checks or bool(checks[effect.id](effect.values))
+
+
+def _lies_within(at_s: float, at_x: float, largest: Largest) -> bool:
+    """Whether a change lies in the run: near its ends it is a wheel radius and a track under another name."""
+    if math.isfinite(at_s):
+        return _EDGE <= at_s / largest.duration <= 1.0 - _EDGE
+    tenths = largest.places
+    low, high = 0.5 * (tenths[1] + tenths[2]), 0.5 * (tenths[-3] + tenths[-2])
+    return not math.isfinite(at_x) or bool(low <= at_x <= high)
 
 
 def _is_at_bound(value: float, parameter: Parameter) -> bool:
