@@ -263,6 +263,7 @@ _LARGEST = Largest(1.0, 1.0, 8.0, 3.0, 120.0, np.zeros(11))
         ("transport_delay", {"d": 0.008}),
         ("lateral_skid", {"c": -0.05}),
         ("heading_skew", {"d": -0.1}),
+        ("terrain_change", {"k_v": 0.9, "k_w": 0.6, "at_s": 2.0}),
         ("turn_lag", {"tau_mean": 0.5, "tau_diff": 0.51}),
         ("turn_droop", {"threshold": 0.01, "gain": 0.5}),
         ("turn_droop", {"threshold": 1.5, "gain": 0.01}),
@@ -279,6 +280,7 @@ def test_what_is_too_small_or_another_in_disguise_is_not_named(name: str, values
     ("name", "values"),
     [
         ("transport_delay", {"d": 0.05}),
+        ("terrain_change", {"k_v": 0.9, "k_w": 0.6, "at_s": 60.0}),
         ("turn_lag", {"tau_mean": 0.3, "tau_diff": 1.0}),
         ("body_speed_limit", {"limit": 0.7}),
     ],
@@ -304,3 +306,10 @@ def test_a_track_is_told_for_the_nominal_radius_where_the_radius_is_undecided() 
 def test_an_effect_out_of_bounds_is_an_error_of_the_model() -> None:
     with pytest.raises(MotionError):
         find_effect("effective_track")(k=-1.0)
+
+
+def test_two_lags_that_have_become_one_make_room_for_what_set_them_apart(tmp_path: Path) -> None:
+    hidden = {"drive_lag": 0.55, "effective_track": 1.56, "deadband": 0.235}
+    found = _diagnose(replace(_SCENE, effects=hidden), tmp_path).runs[0]
+    assert {effect.id for effect in found.effects} == set(hidden)
+    assert not found.undecided
