@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 PATIENCE_S = 60.0
 
-_FLAGS = (
+FLAGS = (
     "--headless",
     "--no-sandbox",
     "--disable-gpu",
@@ -28,8 +28,6 @@ _FLAGS = (
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
-    "--disable-extensions",
-    "--remote-debugging-pipe",
 )
 # Chromium reads its orders from file 3 and answers on file 4.
 _LAUNCHER = """
@@ -59,7 +57,13 @@ class Chrome:
         self._from, answers = os.pipe()
         command = [sys.executable, "-c", _LAUNCHER, str(orders), str(answers), str(BROWSER)]
         self._process = subprocess.Popen(
-            [*command, *_FLAGS, f"--user-data-dir={folder}"],
+            [
+                *command,
+                *FLAGS,
+                "--disable-extensions",
+                "--remote-debugging-pipe",
+                f"--user-data-dir={folder}",
+            ],
             pass_fds=(orders, answers),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

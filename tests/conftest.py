@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+from chrome import BROWSER, Chrome
 from hypothesis import settings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 # A busy machine is slow, not wrong: properties are checked, not timed.
 settings.register_profile("untimed", deadline=None)
@@ -34,3 +39,13 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where pictures of pages are kept: SLIP_PICTURES, or the tests' own folder."""
     kept = os.environ.get("SLIP_PICTURES")
     return Path(kept).resolve() if kept else tmp_path_factory.mktemp("pictures")
+
+
+@pytest.fixture
+def chrome(tmp_path: Path) -> Iterator[Chrome]:
+    """A browser with one page; the test is left out, saying so, where there is none."""
+    if BROWSER is None:
+        pytest.skip("no Chromium here to look at the pages with (`make browser` installs one)")
+    browser = Chrome(tmp_path / "profile")
+    yield browser
+    browser.close()

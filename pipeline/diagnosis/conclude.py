@@ -181,7 +181,7 @@ def _rate_ways(
     found = {}
     for source in inputs:
         try:
-            found[source.value] = rate_effects(ground, source, effects, timing).judgement
+            found[source.value] = rate_effects(ground, source, effects, timing)
         except MotionError:
             continue
     return found

@@ -172,9 +172,8 @@ def locate_windows(comparison: Comparison, late: float = 0.0) -> Spans:
     return Spans(first, start - first, last, end - last, width)
 
 
-def average_windows(comparison: Comparison, velocity: Velocity, spans: Spans | None = None) -> Floats:
+def average_windows(comparison: Comparison, velocity: Velocity, spans: Spans) -> Floats:
     """Mean of (x, y, w) over every window, shape (n, 3)."""
-    spans = spans or locate_windows(comparison)
     y = velocity.y
     return np.column_stack(
         (

@@ -2,35 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pipeline.motion import HeadingSource, Input, Model, Problem, Timing
-from pipeline.motion.workshop import Judgement, judge_model
+from pipeline.motion.workshop import judge_model
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.diagnosis.ground import Ground
     from pipeline.motion.effect import Effect
+    from pipeline.motion.workshop import Judgement
 
 _RATE_HZ = 50.0
 
 
-@dataclass(frozen=True)
-class Rating:
-    """A model judged on runs.
-
-    Attributes:
-        judgement: ladder, estimates and floor.
-    """
-
-    judgement: Judgement
-
-
 def rate_effects(
     ground: Ground, source: Input, effects: Sequence[Effect], timing: Sequence[Timing]
-) -> Rating:
+) -> Judgement:
     """Judge a model of these effects.
 
     Args:
@@ -49,4 +39,4 @@ def rate_effects(
         skew = known["heading_skew"].values["d"]
         timing = [replace(one, pose_delay_s=one.pose_delay_s - skew) for one in timing]
     problem = Problem(ground.runs, ground.vehicle, source, heading=heading, timing=timing, rate_hz=_RATE_HZ)
-    return Rating(judge_model(problem, Model(ground.vehicle, tuple(effects))))
+    return judge_model(problem, Model(ground.vehicle, tuple(effects)))

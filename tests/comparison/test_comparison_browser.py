@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, cast
 
 import pytest
-from chrome import BROWSER, Chrome
 from comparison_store import Run, write_run
 
 from pipeline.cli.app import main
 from pipeline.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
+
+    from chrome import Chrome
 
 DRAWN = "document.documentElement?.dataset.drawn === 'yes'"
 CUT = """[...document.querySelectorAll('.table')].filter((box) => box.scrollWidth > box.clientWidth + 1)
@@ -27,15 +27,6 @@ OVERLAPS = """(() => {
       found.push([one, other]);
   return found;
 })()"""
-
-
-@pytest.fixture
-def chrome(tmp_path: Path) -> Iterator[Chrome]:
-    if BROWSER is None:
-        pytest.skip("no Chromium here to look at the pages with (`make browser` installs one)")
-    browser = Chrome(tmp_path / "profile")
-    yield browser
-    browser.close()
 
 
 @pytest.fixture

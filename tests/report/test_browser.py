@@ -6,13 +6,13 @@ import base64
 import hashlib
 import json
 import queue
-import shutil
 import subprocess
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import TYPE_CHECKING
 
 import pytest
+from chrome import BROWSER, FLAGS
 from report_synthesis import make_report
 
 from pipeline.report import render_report
@@ -21,18 +21,7 @@ from pipeline.report.figures import list_figures
 if TYPE_CHECKING:
     from pathlib import Path
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-FLAGS = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--window-size=1400,1000",
-]
+WINDOW = "--window-size=1400,1000"
 PHONE, LAPTOP = 390, 1280
 PATIENCE_S = 40.0
 
@@ -118,7 +107,13 @@ def look_at(page: str, folder: Path, width: int) -> dict[str, object]:
         frame = FRAME.format(width=width, listener=f"http://127.0.0.1:{server.server_port}/")
         (folder / "frame.html").write_text(frame, encoding="utf-8")
         browser = subprocess.Popen(
-            [str(BROWSER), *FLAGS, f"--user-data-dir={folder / 'profile'}", (folder / "frame.html").as_uri()],
+            [
+                str(BROWSER),
+                *FLAGS,
+                WINDOW,
+                f"--user-data-dir={folder / 'profile'}",
+                (folder / "frame.html").as_uri(),
+            ],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )

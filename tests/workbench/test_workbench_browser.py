@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
-from chrome import BROWSER, Chrome
 from workbench_server import RUN, Workbench
 
 from pipeline.job.analyze import analyze_log
@@ -19,22 +18,13 @@ from pipeline.simulate import simulate_case
 from pipeline.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from chrome import Chrome
 
 PHONE, LAPTOP = 390, 1280
 START = 1_700_000_000_000_000_000
 EVIL = "<img src=x onerror=\"window.pwned='yes'\"><script>window.pwned='yes'</script>"
 SHOWN = "document.querySelector('.pane')?.dataset.drawn"
 ERROR = "Number(document.querySelector('.number.r .value').textContent)"
-
-
-@pytest.fixture
-def chrome(tmp_path: Path) -> Iterator[Chrome]:
-    if BROWSER is None:
-        pytest.skip("no Chromium here to look at the workbench with (`make browser` installs one)")
-    browser = Chrome(tmp_path / "profile")
-    yield browser
-    browser.close()
 
 
 def look_for_trouble(chrome: Chrome) -> None:
