@@ -17,7 +17,7 @@ class Commands(Table):
     """One row a command message, held until the next one or until it is stale."""
 
     NAME: ClassVar[str] = "commands"
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     t = fields.seconds()
     stamp = fields.stamp()
@@ -28,6 +28,9 @@ class Commands(Table):
     steering = fields.body("rad", "commanded steering angle (Ackermann), left positive", nullable=True)
     body_x = fields.body("m/s", "commanded forward speed where the command is a Twist", nullable=True)
     body_w = fields.body("rad/s", "commanded yaw rate where the command is a Twist", nullable=True)
+    left_aligned = fields.number("rad/s", "speed of the left wheels after corrections", nullable=True)
+    right_aligned = fields.number("rad/s", "speed of the right wheels after corrections", nullable=True)
+    speed_aligned = fields.body("m/s", "speed after corrections (Ackermann)", nullable=True)
     active = fields.flag("inside an interval in which commands are live")
 
     @dy.rule()

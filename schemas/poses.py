@@ -17,7 +17,7 @@ class Poses(Table):
     """One row a pose message of base_link in a fixed frame."""
 
     NAME: ClassVar[str] = "poses"
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     t = fields.seconds()
     stamp = fields.stamp()
@@ -30,6 +30,10 @@ class Poses(Table):
     q_y = fields.number("1", "quaternion of base_link", frame="map")
     q_z = fields.number("1", "quaternion of base_link", frame="map")
     q_w = fields.number("1", "quaternion of base_link", frame="map")
+    latency = fields.number(
+        "s", "how much older than other poses this one is: it belongs to t - latency", frame="log clock"
+    )
+    outlier = fields.flag("the localization is at fault here: left out of medians and of comparisons")
     held = fields.flag("repeats the pose before it: an old estimate sampled again")
     active = fields.flag("inside an interval in which commands are live")
 

@@ -12,7 +12,7 @@ class Velocities(Table):
     """One row a step of the uniform grid inside a segment."""
 
     NAME: ClassVar[str] = "velocities"
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     t = fields.seconds()
     stamp = fields.stamp()
@@ -27,3 +27,4 @@ class Velocities(Table):
     v_y = fields.body("m/s", "body velocity to the left")
     v_w = fields.body("rad/s", "yaw rate: of the pose, or of the gyro with `--yaw imu`")
     v_w_imu = fields.body("rad/s", "yaw rate of the gyro, sign, scale and bias corrected", nullable=True)
+    outlier = fields.flag("the localization is at fault here")

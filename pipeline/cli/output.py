@@ -21,6 +21,7 @@ LOSSY = 3
 _DOING = {
     "read": "reading the log",
     "extract": "extracting commands and poses",
+    "align": "putting clocks and scales right",
     "velocity": "differentiating poses",
     "slip": "computing slip",
     "aggregate": "aggregating",

@@ -328,8 +328,8 @@ def _as_json(
                 "run": comparison.run.name,
                 "pose_delay_s": timing.pose_delay_s,
                 "wheel_delay_s": timing.wheel_delay_s,
-                "age_spread_s": comparison.run.age_spread_s,
-                "faulty_s": comparison.run.faulty_s,
+                "latency_spread_s": comparison.run.alignment.latency_spread_s,
+                "outlier_s": comparison.run.alignment.outlier_s,
             }
             for comparison, timing in zip(problem.comparisons, fitted.state.timing, strict=True)
         ],

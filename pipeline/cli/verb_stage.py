@@ -17,7 +17,7 @@ def register(app: App) -> None:
 
 
 def stage(  # noqa: D417 - the shared choices document themselves
-    name: Literal["extract", "velocity", "slip", "aggregate"],
+    name: Literal["extract", "align", "velocity", "slip", "aggregate"],
     log: Annotated[str, Parameter(help="a log, or the name of a run that has results")],
     /,
     *,

@@ -13,6 +13,8 @@ Indices = NDArray[np.int64]
 
 _FEWEST_POINTS = 4
 _BLOCK = 4096
+_SHORTEST_HOLD = 0.5
+_PERIODS = 5.0
 
 
 def make_grid(start: float, end: float, rate: float) -> Floats:
@@ -26,6 +28,25 @@ def hold_indices(at: Floats, times: Floats) -> Indices:
     """Index of the last sample at or before each query time; -1 before the first sample."""
     # Stamps pass through nanoseconds and seconds: a sample at the very query time must count as known.
     return np.searchsorted(times, at + 1e-7, side="right").astype(np.int64) - 1
+
+
+def nearest_indices(at: Floats, times: Floats) -> Indices:
+    """Index of the sample nearest to each query time; ``times`` of shape (n,), n >= 1, increasing."""
+    after = np.clip(np.searchsorted(times, at), 1, max(times.size - 1, 1))
+    after = np.minimum(after, times.size - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(times[after] - at < at - times[before], after, before).astype(np.int64)
+
+
+def usual_hold(stamps: Floats) -> float:
+    """How long a controller holds its last command where nobody says: five periods, at least half a second.
+
+    Args:
+        stamps: of the commands [s], shape (n,).
+    """
+    # Two topics, one a side, come in pairs of nearly equal stamps: the median period would be next to none.
+    period = float(np.quantile(np.diff(stamps), 0.75)) if stamps.size > 1 else 0.0
+    return max(_SHORTEST_HOLD, _PERIODS * period)
 
 
 def differentiate_locally(at: Floats, times: Floats, values: Floats, window: float) -> Floats:

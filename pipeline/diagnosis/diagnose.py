@@ -14,7 +14,7 @@ from pipeline.diagnosis.excitation import find_unobservable
 from pipeline.diagnosis.ground import prepare
 from pipeline.diagnosis.naming import Search, search_body, search_wheels
 from pipeline.diagnosis.naming_rules import Clocks, read_clocks
-from pipeline.diagnosis.subject import FATAL, correct_vehicle, load_recording
+from pipeline.diagnosis.subject import FATAL, load_recording
 from pipeline.diagnosis.undecided import find_undecided
 from pipeline.diagnosis.unexplained import (
     Explainable,
@@ -79,8 +79,9 @@ def diagnose_runs(
     leading = "command" if "command" in inputs else "measured"
     if fatal:
         return Diagnosis(tuple(conclude.refuse(recording, leading, recordings) for recording in recordings))
-    vehicle = correct_vehicle(recordings, vehicle)
-    ground = prepare([load_recording(recording, vehicle) for recording in recordings], vehicle)
+    runs = [load_recording(recording, vehicle) for recording in recordings]
+    vehicle = runs[0].correct_vehicle(vehicle)
+    ground = prepare(runs, vehicle)
     known = () if model is None else model.effects
     if not ground.compare(Input(leading)):
         other = "measured" if leading == "command" else "command"

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.diagnosis.errors import DiagnosisError
 from pipeline.diagnosis.problem import BodyProblem, WheelProblem
 from pipeline.diagnosis.screen import Largest
-from pipeline.diagnosis.timing import LEAST_DELAY, YawDelay, measure_yaw_delay
+from pipeline.diagnosis.timing import LEAST_DELAY, YawDelay
 from pipeline.motion.catalogue import list_effects
 from pipeline.motion.comparison import Comparison, Input
 from pipeline.motion.effect import Place
@@ -136,7 +136,7 @@ def prepare(runs: Sequence[MotionRun], vehicle: Vehicle) -> Ground:
     delays = []
     for comparison in leading:
         gyro = comparison.heading.gyro
-        delays.append(None if gyro is None else measure_yaw_delay(comparison.run, gyro))
+        delays.append(None if gyro is None else YawDelay(gyro.yaw_delay_s, gyro.delay_error_s))
     return Ground(tuple(runs), vehicle, commanded, measured, tuple(delays), _measure_largest(runs, vehicle))
 
 

@@ -170,8 +170,7 @@ def _write_outputs(
 
         progress("report")
         tables = {name: generation.read_table(name) for name in generation.table_names}
-        hold_s = work.subject.configuration.command.hold_s
-        motion = view_diagnosis(tables, work.subject.vehicle, diagnosis or {}, hold_s=hold_s)
+        motion = view_diagnosis(tables, work.vehicle, diagnosis or {})
         peers = find_peers(Store(options.out), summary)
         report = RunReport(summary, tables, diagnosis or {}, motion, peers)
         if options.report:
@@ -200,7 +199,7 @@ def _details(work: Work, log: Mapping[str, JSON], sha256: str) -> dict[str, JSON
         "stages": stages,
         "inputs": list(work.options.inputs),
         "configuration": _configuration(work),
-        "vehicle": msgspec.to_builtins(work.subject.vehicle),
+        "vehicle": msgspec.to_builtins(work.vehicle),
         "terrain": work.subject.terrain,
         "dataset": work.subject.dataset,
         "versions": cast("JSON", versions()),

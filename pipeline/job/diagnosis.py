@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 STAGE = "diagnosis"
 DIAGNOSIS = "diagnosis.json"
 VERSION = 2
-_TABLES = ("poses", "commands", "wheels", "imu", "slip", "findings")
+_TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
 
 
 def key_diagnosis(keys: Mapping[str, str]) -> str:
@@ -75,10 +75,9 @@ def _diagnose(work: Work) -> dict[str, JSON]:
         work.run,
         (generation.table_names, generation.read_table),
         {"sha256": work.sha256, "path": str(subject.path)},
-        subject.configuration.command.hold_s,
     )
     try:
-        diagnosis = diagnose_runs([recording], subject.vehicle, inputs=work.options.inputs)
+        diagnosis = diagnose_runs([recording], work.vehicle, inputs=work.options.inputs)
     except SlipError as error:
         # A log too poor to diagnose has its slip all the same.
         finding = {"id": error.code, "severity": "warning", "text": str(error), "where": "diagnosis"}
@@ -94,7 +93,6 @@ def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
     """A stored run as it is diagnosed, and its vehicle."""
     import msgspec  # noqa: PLC0415 - only for stored runs
 
-    from pipeline.report.motion_run import read_hold  # noqa: PLC0415 - heavy
     from pipeline.vehicles import Vehicle  # noqa: PLC0415 - heavy
 
     log = manifest.details.get("log")
@@ -102,7 +100,6 @@ def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
         manifest.run,
         (manifest.tables, manifest.read),
         log if isinstance(log, dict) else {},
-        read_hold(manifest),
     )
     return msgspec.convert(manifest.details["vehicle"], Vehicle), recording
 
@@ -111,7 +108,6 @@ def _make_recording(
     run: str,
     tables: tuple[Iterable[str], Callable[[str], pl.DataFrame]],
     log: Mapping[str, JSON],
-    hold_s: float | None,
 ) -> Recording:
     """The tables that a diagnosis reads, with where they came from."""
     from pipeline.diagnosis import Recording  # noqa: PLC0415 - heavy
@@ -122,5 +118,4 @@ def _make_recording(
         {name: read(name) for name in names if name in _TABLES},
         sha256=str(log.get("sha256", "")),
         path=str(log.get("path", "")),
-        hold_s=hold_s,
     )

@@ -19,9 +19,11 @@ if TYPE_CHECKING:
 
     from pipeline.job.subject import Subject
 
-VERSIONS: Mapping[str, int] = {"extract": 2, "velocity": 1, "slip": 2, "aggregate": 1}
+VERSIONS: Mapping[str, int] = {"extract": 2, "align": 1, "velocity": 2, "slip": 3, "aggregate": 1}
+EXTRACTED = ("commands", "wheels", "poses", "imu")
 TABLES: Mapping[str, tuple[str, ...]] = {
-    "extract": ("commands", "wheels", "poses", "imu"),
+    "extract": EXTRACTED,
+    "align": (*EXTRACTED, "alignments"),
     "velocity": ("velocities",),
     "slip": ("slip", "windows"),
     "aggregate": ("aggregates",),
@@ -47,6 +49,7 @@ def key_stages(
             "use_intervals": plain["use_intervals"],
             "limits": pose_limits,
         },
+        "align": {},
         "velocity": plain["velocity"],
         "slip": {"slip": plain["slip"], "inputs": inputs, "model": model},
         "aggregate": {},

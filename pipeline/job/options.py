@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 INPUTS = ("command", "measured")
-STAGES = ("extract", "velocity", "slip", "aggregate")
+STAGES = ("extract", "align", "velocity", "slip", "aggregate")
 FigureFormat = Literal["svg", "pdf", "png"]
 
 

@@ -46,17 +46,15 @@ def add_model(
     vehicle: Vehicle,
     *,
     length: float,
-    hold_s: float | None,
 ) -> pl.DataFrame:
     """Table `slip` with the velocity of a model and the modulus of what is left of it.
 
     Args:
         slip: table `slip`, its columns for a model empty.
-        tables: `poses`, `commands`, `wheels`, `imu`, as far as the log has them.
+        tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, as far as the log has them.
         path: the model file.
         vehicle: of the run; the model must be of its kind.
         length: length scale L [m] of the modulus.
-        hold_s: how long a command counts.
 
     Raises:
         MotionError: the model file is wrong.
@@ -73,7 +71,7 @@ def add_model(
             where=str(path),
             hint="Give a model of this vehicle.",
         )
-    run = load_run({**tables, "slip": slip}, model.vehicle, name=str(path), hold_s=hold_s)
+    run = load_run({**tables, "slip": slip}, model.vehicle, name=str(path))
     parts = []
     for name in slip["input"].unique(maintain_order=True):
         part = slip.filter(pl.col("input") == name)

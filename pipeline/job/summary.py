@@ -56,7 +56,7 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
         "held_poses": work.contexts["extract"].get("held_poses"),
         "timing": {
             "clocks": work.contexts["extract"].get("clocks"),
-            "gyro": work.contexts["velocity"].get("gyro"),
+            "gyro": work.contexts["align"].get("gyro"),
         },
         "quarantined": work.contexts["extract"].get("quarantined"),
         "topics": _describe_topics(work),

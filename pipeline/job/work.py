@@ -6,18 +6,22 @@ A stage whose key has not changed is not computed: its tables and findings are t
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+import msgspec
 import polars as pl
 
-from pipeline.job.keys import TABLES
+from pipeline.job.keys import EXTRACTED, TABLES
 from pipeline.job.options import STAGES
 from pipeline.job.relative import add_model
 from pipeline.logs import LogData, Loss, read_topics
+from pipeline.motion.recording import Alignment, read_alignment
 from pipeline.stages import aggregate, checks, slip, velocity
+from pipeline.stages.align import align_tables
 from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.finding import Finding, tabulate_findings
+from pipeline.store.tables import check_table
 from pipeline.vehicles import DriveForm
 from schemas import contract_of
 
@@ -25,6 +29,8 @@ if TYPE_CHECKING:
     from pipeline.job.options import Options
     from pipeline.job.subject import Subject
     from pipeline.store import JSON, Generation, Manifest, TableReport
+    from pipeline.store.tables import CheckedTable
+    from pipeline.vehicles import Vehicle
 
 Progress = Callable[[str], None]
 
@@ -63,11 +69,26 @@ class Work:
     contexts: dict[str, Mapping[str, JSON]] = field(default_factory=dict)
     findings: list[pl.DataFrame] = field(default_factory=list)
     computed: list[str] = field(default_factory=list)
+    _extracted: dict[str, CheckedTable] = field(default_factory=dict)
+
+    @property
+    def alignment(self) -> Alignment:
+        """How the run was put right; there once it is aligned."""
+        return read_alignment(self.generation.read_table("alignments"))
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The vehicle, with the controller's track multiplier that the run shows once it is aligned."""
+        if "alignments" not in self.generation.table_names:
+            return self.subject.vehicle
+        multiplier = self.alignment.track_multiplier
+        return msgspec.structs.replace(self.subject.vehicle, controller_track_multiplier=multiplier)
 
     def run_stages(self) -> None:
         """Run every stage up to the last one asked for, reusing what has not changed."""
         stages: Mapping[str, Callable[[], StageOutcome]] = {
             "extract": self._extract,
+            "align": self._align,
             "velocity": self._velocity,
             "slip": self._slip,
             "aggregate": self._aggregate,
@@ -83,11 +104,14 @@ class Work:
             self.contexts[stage] = outcome.context
             self.computed.append(stage)
             self._keep_findings(stage, outcome.findings)
+        for table in self._extracted.values():
+            self.generation.write_checked(table)
         self.write("findings", pl.concat(self.findings))
 
     def _take_over(self, stage: str, before: Manifest) -> None:
         for table in TABLES[stage]:
-            if table in before.tables:
+            # What was extracted is taken over as it was aligned, or is aligned anew.
+            if table in before.tables and (stage != "extract" or self.options.through == "extract"):
                 self.generation.reuse_table(table)
         self.contexts[stage] = stored_contexts(before).get(stage, {})
         self.findings.append(before.read("findings").filter(pl.col("stage") == stage))
@@ -123,9 +147,12 @@ class Work:
         made = extract_tables(
             data, subject.sources, subject.configuration, subject.vehicle, where=str(subject.path)
         )
-        reports = {
-            name: self.write(name, frame) for name, frame in made.tables.items() if not frame.is_empty()
+        self._extracted = {
+            name: check_table(name, self._identify(name, as_recorded(name, frame)))
+            for name, frame in made.tables.items()
+            if not frame.is_empty()
         }
+        reports = {name: checked.report for name, checked in self._extracted.items()}
         broken = {name: report for name, report in reports.items() if report.quarantined}
         found = [
             Finding(
@@ -153,31 +180,59 @@ class Work:
         }
         return StageOutcome((*made.findings, *found, *notes), context)
 
-    def _velocity(self) -> StageOutcome:
-        settings = self.subject.configuration.velocity
-        made = velocity.compute_velocities(
-            self._read("poses"), self._read("imu"), settings, where=str(self.subject.path)
+    def _align(self) -> StageOutcome:
+        previous = self.generation.previous
+        if not self._extracted and previous is not None:
+            self._extracted = {
+                name: check_table(name, as_recorded(name, previous.read(name)))
+                for name in EXTRACTED
+                if name in previous.tables
+            }
+        source = self.subject.sources.command
+        made = align_tables(
+            {name: checked.valid for name, checked in self._extracted.items()},
+            self.subject.vehicle,
+            hold_s=self.subject.configuration.command.hold_s,
+            body_commanded=source is not None and source.form in {DriveForm.BODY, DriveForm.BODY_SIGNALS},
+            where=str(self.subject.path),
         )
-        self.write("velocities", made.table)
-        gyro = None if made.gyro is None else {
-            "usable": made.gyro.usable,
-            "sign": made.gyro.sign,
-            "scale": round(made.gyro.size, 6),
-            "bias_radps": round(made.gyro.bias, 6),
-            "pose_delay_s": round(made.gyro.pose_delay_s, 4),
-            "correlation": round(made.gyro.correlation, 4),
+        for name, checked in self._extracted.items():
+            aligned = self._identify(name, made.tables[name])
+            self.generation.write_checked(replace(checked, valid=aligned))
+        self._extracted = {}
+        self.write("alignments", made.tables["alignments"])
+        fit = made.alignment.gyro
+        gyro = None if fit is None else {
+            "usable": True,
+            "sign": -1 if fit.signed_scale < 0.0 else 1,
+            "scale": round(abs(fit.signed_scale), 6),
+            "bias_radps": round(fit.bias, 6),
+            "pose_delay_s": round(fit.yaw_delay_s, 4),
+            "residual": round(fit.residual, 4),
         }  # fmt: skip
         return StageOutcome(made.findings, {"gyro": gyro})
 
+    def _velocity(self) -> StageOutcome:
+        made = velocity.compute_velocities(
+            self._read("poses"),
+            self._read("imu"),
+            self.alignment.gyro,
+            self.subject.configuration.velocity,
+            where=str(self.subject.path),
+        )
+        self.write("velocities", made.table)
+        return StageOutcome(made.findings)
+
     def _slip(self) -> StageOutcome:
-        subject = self.subject
+        subject, vehicle = self.subject, self.vehicle
         velocities = self._read("velocities")
         made = slip.compute_slip(
             velocities,
             self._read("commands"),
             self._read("wheels"),
-            vehicle=subject.vehicle,
+            vehicle=vehicle,
             configuration=subject.configuration,
+            hold_s=self.alignment.hold_s,
             inputs=self.options.inputs,
             where=str(subject.path),
         )
@@ -186,22 +241,21 @@ class Work:
         self.write("windows", made.windows)
         command = subject.sources.command
         body = command is not None and command.form in {DriveForm.BODY, DriveForm.BODY_SIGNALS}
-        samples = checks.gather_samples(velocities, made.slip, body_commanded=body)
-        return StageOutcome((*made.findings, *checks.run_checks(samples, subject.vehicle)))
+        samples = checks.gather_samples(velocities, made.inputs, made.cut, body_commanded=body)
+        return StageOutcome((*made.findings, *checks.run_checks(samples, vehicle)))
 
     def _set_against_model(self, table: pl.DataFrame) -> pl.DataFrame:
         """Table `slip` with the velocity of the model that was given, as it is without one."""
         path, configuration = self.options.model, self.subject.configuration
         if path is None:
             return table
-        read = {name: self._read(name) for name in ("poses", "commands", "wheels", "imu")}
+        read = {name: self._read(name) for name in TABLES["align"]}
         return add_model(
             table,
             {name: frame for name, frame in read.items() if not frame.is_empty()},
             path,
-            self.subject.vehicle,
+            self.vehicle,
             length=configuration.slip.length_scale_m,
-            hold_s=configuration.command.hold_s,
         )
 
     def _aggregate(self) -> StageOutcome:
@@ -209,11 +263,22 @@ class Work:
             self._read("slip"),
             self._read("windows"),
             self._read("velocities"),
-            vehicle=self.subject.vehicle,
+            vehicle=self.vehicle,
             length=self.subject.configuration.slip.length_scale_m,
         )
         self.write("aggregates", made)
         return StageOutcome(())
+
+
+def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:
+    """An extracted table before it is aligned: nothing is corrected yet."""
+    if table == "poses":
+        return frame.with_columns(pl.lit(0.0).alias("latency"), pl.lit(value=False).alias("outlier"))
+    if table == "commands":
+        return frame.with_columns(
+            pl.col(name).alias(f"{name}_aligned") for name in ("left", "right", "speed")
+        )
+    return frame
 
 
 def read_subject(subject: Subject, sha256: str | None = None) -> LogData:

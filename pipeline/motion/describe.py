@@ -118,11 +118,12 @@ def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:
     """What was put right or left out of the poses before anything was compared; empty where nothing was."""
     lines = []
     for run in runs:
-        if run.age_spread_s > 0.0:
-            lines.append(f"{run.name}: ages of poses vary by {run.age_spread_s:.2g} s, put right by the gyro")
-        if run.faulty_s > 0.0:
+        spread, outlier_s = run.alignment.latency_spread_s, run.alignment.outlier_s
+        if spread > 0.0:
+            lines.append(f"{run.name}: latencies of poses vary by {spread:.2g} s, put right by the gyro")
+        if outlier_s > 0.0:
             lines.append(
-                f"{run.name}: {run.faulty_s:.3g} s left out, the localization goes where the wheels did not"
+                f"{run.name}: {outlier_s:.3g} s left out, the localization goes where the wheels did not"
             )
     return lines
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import timegrid
+from pipeline.motion.recording import GyroFit
 
 if TYPE_CHECKING:
     from pipeline.motion.cells import Cells
@@ -27,6 +28,9 @@ _LARGEST_DELAY = 0.7
 _DELAY_STEP = 0.01
 _FEWEST = 40
 _REFINEMENTS = 4
+_REWEIGHTED = 3
+_UNIT_S = 10.0
+_LARGEST_STEP_S = 0.05
 _LEAST_TURNING = 0.02
 _GOOD = 0.35
 _ALIGN_S = 3.0
@@ -40,30 +44,6 @@ class HeadingSource(enum.Enum):
 
     AUTO = "auto"
     POSE = "pose"
-
-
-@dataclass(frozen=True)
-class GyroFit:
-    """Yaw rate = signed_scale * gyro + bias.
-
-    Attributes:
-        signed_scale: negative where the gyro turns the other way.
-        bias: [rad/s].
-        yaw_delay_s: how late the reported heading is against the gyro.
-        delay_error_s: standard error of that delay.
-        residual: robust spread of what is left over that of the turning itself.
-    """
-
-    signed_scale: float
-    bias: float
-    yaw_delay_s: float
-    delay_error_s: float
-    residual: float
-
-    def turn(self, times: Floats, rate: Floats) -> Floats:
-        """Angle that the gyro has turned by [rad], of its own rate [rad/s] at times [s], shape (n,)."""
-        angle: Floats = self.signed_scale * timegrid.integrate_rate(times, rate) + self.bias * times
-        return angle
 
 
 @dataclass(frozen=True)
@@ -83,9 +63,9 @@ class Heading:
 
 
 def choose_heading(run: MotionRun, cells: Cells, source: HeadingSource) -> Heading:
-    """Check the gyro against the poses and choose."""
+    """The gyro's heading where it agrees with the poses, else the poses' own."""
     track = run.track
-    fit = fit_gyro(run) if source is HeadingSource.AUTO else None
+    fit = run.gyro_fit if source is HeadingSource.AUTO else None
     if fit is None or run.gyro is None:
         return Heading(None, np.zeros(0), track.heading)
     times, rate = run.gyro
@@ -150,25 +130,53 @@ def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out 
     residual = loss / float(np.sqrt(np.mean(np.minimum(np.abs(turned), 3.0 * spread) ** 2)))
     if residual > _GOOD or not 0.5 < abs(scale) < 2.0:  # noqa: PLR2004 - no gyro is that wrong
         return None
-    fit, error = best, 0.0
-    # Gauss-Newton on scale, bias and delay together; the turning rate is the slope over the delay.
-    for _ in range(_REFINEMENTS):
-        gyro = np.interp(end - fit, times, angle) - np.interp(start - fit, times, angle)
-        late, early = fit + _DELAY_STEP, fit - _DELAY_STEP
-        ahead = np.interp(end - late, times, angle) - np.interp(start - late, times, angle)
-        behind = np.interp(end - early, times, angle) - np.interp(start - early, times, angle)
-        slope = scale * (ahead - behind) / (2.0 * _DELAY_STEP)
-        rest = turned - scale * gyro - bias * (end - start)
-        keep = np.abs(rest) <= 3.0 * loss
-        design = np.column_stack((gyro, end - start, slope))[keep]
-        step, *_ = np.linalg.lstsq(design, rest[keep], rcond=None)
-        scale, bias, fit = scale + step[0], bias + step[1], fit + float(np.clip(step[2], -0.05, 0.05))
-        # Windows overlap: one in a window's length is independent of the last.
-        overlap = max(_WINDOW_S / max(float(np.median(np.diff(start))), 1e-3), 1.0)
-        inverse = np.linalg.inv(design.T @ design + 1e-12 * np.eye(3))
-        error = float(np.sqrt(inverse[2, 2] * np.mean(rest[keep] ** 2) * overlap))
+    refined = _refine((times, angle), (start, end), turned, (scale, bias, best))
     # The poses' own errors are no reason to distrust the sensor's scale by a fraction of a percent.
-    return GyroFit(float(scale), float(bias), fit, error, residual)
+    return GyroFit(*refined, residual)
+
+
+def _refine(
+    gyro: tuple[Floats, Floats],
+    span: tuple[Floats, Floats],
+    turned: Floats,
+    values: tuple[float, float, float],
+) -> tuple[float, float, float, float]:
+    """Scale, bias and delay by robust Gauss-Newton steps; and the delay's standard error.
+
+    Args:
+        gyro: times [s] and integrated rate [rad], each of shape (m,).
+        span: start and end of every window [s], each of shape (n,).
+        turned: change of the reported heading over every window [rad], shape (n,).
+        values: scale, bias [rad/s] and delay [s] to start from.
+    """
+    (times, angle), (start, end) = gyro, span
+    scale, bias, delay = values
+
+    def turn(late: float) -> Floats:
+        change: Floats = np.interp(end - late, times, angle) - np.interp(start - late, times, angle)
+        return change
+
+    error = np.inf
+    unit = np.unique((start // _UNIT_S).astype(np.int64), return_inverse=True)[1]
+    for _ in range(_REFINEMENTS):
+        # The turning rate is the slope over the delay.
+        slope = scale * (turn(delay + _DELAY_STEP) - turn(delay - _DELAY_STEP)) / (2.0 * _DELAY_STEP)
+        design = np.column_stack((turn(delay), end - start, slope))
+        target = turned - design[:, :2] @ np.array([scale, bias])
+        weight, step = np.ones(target.size), np.zeros(3)
+        for _ in range(_REWEIGHTED):
+            rows = design * weight[:, None]
+            step = np.linalg.lstsq(rows.T @ design, rows.T @ target, rcond=None)[0]
+            rest = np.abs(target - design @ step)
+            spread = 1.4826 * float(np.median(rest)) + 1e-9
+            weight = np.minimum(1.0, 3.0 * spread / np.maximum(rest, 1e-12))
+        scale, bias = scale + float(step[0]), bias + float(step[1])
+        delay += float(np.clip(step[2], -_LARGEST_STEP_S, _LARGEST_STEP_S))
+        bread = np.linalg.pinv((design * weight[:, None]).T @ design)
+        pulls = np.zeros((int(unit.max()) + 1, 3))
+        np.add.at(pulls, unit, design * ((target - design @ step) * weight)[:, None])
+        error = float(np.sqrt(max((bread @ (pulls.T @ pulls) @ bread)[2, 2], 0.0)))
+    return scale, bias, delay, error
 
 
 def _measure_cover(times: Floats, at: Floats) -> float:

@@ -1,18 +1,20 @@
-"""One run as arrays, ready for models: commands, wheels, poses, gyro, and which stretches count."""
+"""One run as arrays, ready for models: commands, wheels, poses, gyro, and which stretches count.
+
+This is the only place where stored tables become a run. What is wrong with a recording was put right when it
+was aligned (stage `align`); nothing is corrected here.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import rigid, segments
-from pipeline.motion.ages import put_in_time
+from pipeline.core import rigid, segments, timegrid
 from pipeline.motion.errors import MotionError
-from pipeline.motion.faults import bar_faults
-from pipeline.motion.ideal import invert_differential
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,11 +27,20 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 
-_SHORTEST_HOLD = 0.5
-_PERIODS = 5.0
 _DEAD = 1e-9
 _LONGEST_WAIT = 1.5
 _ROLLS = 0.3
+_NUMBERS = (
+    "hold_time",
+    "gyro_scale",
+    "gyro_bias",
+    "heading_delay",
+    "heading_delay_error",
+    "gyro_residual",
+    "recorded_modulus_command",
+    "recorded_modulus_measured",
+)
+_INPUTS = ("command", "measured")
 
 
 @dataclass(frozen=True)
@@ -66,6 +77,53 @@ class Track:
 
 
 @dataclass(frozen=True)
+class GyroFit:
+    """Yaw rate = signed_scale * gyro + bias.
+
+    Attributes:
+        signed_scale: negative where the gyro turns the other way.
+        bias: [rad/s].
+        yaw_delay_s: how late the reported heading is against the gyro.
+        delay_error_s: standard error of that delay, from stretches of ten seconds.
+        residual: robust spread of what is left over that of the turning itself.
+    """
+
+    signed_scale: float
+    bias: float
+    yaw_delay_s: float
+    delay_error_s: float
+    residual: float
+
+    def turn(self, times: Floats, rate: Floats) -> Floats:
+        """Angle that the gyro has turned by [rad], of its own rate [rad/s] at times [s], shape (n,)."""
+        angle: Floats = self.signed_scale * timegrid.integrate_rate(times, rate) + self.bias * times
+        return angle
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How the clocks, scales and signs of a recording were put right.
+
+    Attributes:
+        hold_s: how long after its last command the controller stops; None without commands.
+        command_scale: by which the recorded command was multiplied.
+        track_multiplier: by which the controller multiplies the track width.
+        gyro: how the gyro fits the poses; None without a good one.
+        latency_spread_s: standard deviation of the latencies that were taken off the poses.
+        outlier_s: time in which the localization goes where the wheels did not, beside bad stretches.
+        recorded_moduli: median slip modulus with L = 1 m by input before anything was put right [m/s].
+    """
+
+    hold_s: float | None = None
+    command_scale: float = 1.0
+    track_multiplier: float = 1.0
+    gyro: GyroFit | None = None
+    latency_spread_s: float = 0.0
+    outlier_s: float = 0.0
+    recorded_moduli: Mapping[str, float | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class MotionRun:
     """One run.
 
@@ -81,9 +139,7 @@ class MotionRun:
         step_starts: where command steps begin [s].
         barred: times [s] of samples in bad stretches or without a live command.
         duration_s: length of the run.
-        age_spread_s: by how much the ages of the poses varied before they were put in time (see `ages`);
-            zero where they were not.
-        faulty_s: time barred because the localization was at fault (see `faults`), beside the bad stretches.
+        alignment: how the recording was put right.
     """
 
     name: str
@@ -97,30 +153,52 @@ class MotionRun:
     step_starts: Floats
     barred: Floats
     duration_s: float
-    age_spread_s: float = 0.0
-    faulty_s: float = 0.0
+    alignment: Alignment
+
+    @property
+    def gyro_fit(self) -> GyroFit | None:
+        """How the gyro fits the poses; None without a good one."""
+        return self.alignment.gyro
+
+    def correct_vehicle(self, vehicle: Vehicle) -> Vehicle:
+        """A vehicle with the controller's track multiplier that this recording shows."""
+        return msgspec.structs.replace(vehicle, controller_track_multiplier=self.alignment.track_multiplier)
 
 
 def load_run(
-    tables: Mapping[str, pl.DataFrame],
-    vehicle: Vehicle,
-    *,
-    name: str,
-    sha256: str = "",
-    hold_s: float | None = None,
+    tables: Mapping[str, pl.DataFrame], vehicle: Vehicle, *, name: str, sha256: str = ""
 ) -> MotionRun:
-    """Make a run of its tables.
+    """Make a run of its aligned tables.
 
     Args:
-        tables: `poses`, `commands`, `wheels`, `imu`, and `slip` (for steps and bad stretches); those that the
-            log lacks may be missing or empty.
+        tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, and `slip` (for steps and stretches
+            without a live command); those that the log lacks may be missing or empty.
         vehicle: geometry.
         name: of the run.
         sha256: of the recording.
-        hold_s: how long after its last command the controller stops; by default five periods, at least 0.5 s.
 
     Raises:
-        MotionError: ``no_poses``, fewer than ten poses carry information.
+        MotionError: ``not_aligned``, the tables are of an earlier version; ``no_poses``, fewer than ten poses
+            carry information.
+    """
+    table = tables.get("alignments")
+    if table is None or table.is_empty():
+        raise MotionError(
+            "not_aligned",
+            "the results were made by an earlier version, before recordings were aligned",
+            where=name,
+            hint="Analyze the log again with --force.",
+        )
+    return make_run(tables, vehicle, read_alignment(table), name=name, sha256=sha256)
+
+
+def make_run(
+    tables: Mapping[str, pl.DataFrame], vehicle: Vehicle, alignment: Alignment, *, name: str, sha256: str = ""
+) -> MotionRun:
+    """As `load_run`, with an alignment that is being made.
+
+    Raises:
+        MotionError: ``no_poses``.
     """
     commands = _read_drive(tables.get("commands"), vehicle)
     wheels = _read_drive(tables.get("wheels"), vehicle)
@@ -133,11 +211,11 @@ def load_run(
         gyro = _distinct(imu["t"].to_numpy(), imu["rate_z"].to_numpy())
     stamps = [tables["poses"]["t"].to_numpy(), *(d.times for d in (commands, wheels) if d is not None)]
     streams = np.unique(np.concatenate(stamps))
-    if commands is not None:
-        commands = _stop_when_silent(commands, hold_s)
+    if commands is not None and alignment.hold_s is not None:
+        commands = _stop_when_silent(commands, alignment.hold_s)
     steps, barred = _read_steps(tables.get("slip"), streams)
     terrains = tables["poses"]["terrain"] if "terrain" in tables["poses"].columns else None
-    run = MotionRun(
+    return MotionRun(
         name=name,
         sha256=sha256,
         terrain=str(terrains[0]) if terrains is not None else "unknown",
@@ -149,8 +227,55 @@ def load_run(
         step_starts=steps,
         barred=barred,
         duration_s=float(streams[-1]),
+        alignment=alignment,
     )
-    return bar_faults(put_in_time(run), vehicle)
+
+
+def read_alignment(table: pl.DataFrame) -> Alignment:
+    """The one row of table `alignments`."""
+    row = table.row(0, named=True)
+    gyro = None
+    if row["gyro_scale"] is not None:
+        gyro = GyroFit(
+            row["gyro_scale"],
+            row["gyro_bias"],
+            row["heading_delay"],
+            row["heading_delay_error"],
+            row["gyro_residual"],
+        )
+    return Alignment(
+        row["hold_time"],
+        row["command_scale"],
+        row["track_multiplier"],
+        gyro,
+        row["latency_spread"],
+        row["outlier_time"],
+        {name: row[f"recorded_modulus_{name}"] for name in _INPUTS},
+    )
+
+
+def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
+    """Table `alignments` of one run, without the run's columns."""
+    import polars as pl  # noqa: PLC0415 - only where tables are written
+
+    fit = alignment.gyro
+    known = fit is not None and np.isfinite(fit.delay_error_s)
+    return pl.DataFrame(
+        {
+            "hold_time": [alignment.hold_s],
+            "command_scale": [alignment.command_scale],
+            "track_multiplier": [alignment.track_multiplier],
+            "gyro_scale": [fit.signed_scale if fit and known else None],
+            "gyro_bias": [fit.bias if fit and known else None],
+            "heading_delay": [fit.yaw_delay_s if fit and known else None],
+            "heading_delay_error": [fit.delay_error_s if fit and known else None],
+            "gyro_residual": [fit.residual if fit and known else None],
+            "latency_spread": [alignment.latency_spread_s],
+            "outlier_time": [alignment.outlier_s],
+            **{f"recorded_modulus_{name}": [alignment.recorded_moduli.get(name)] for name in _INPUTS},
+        },
+        schema_overrides=dict.fromkeys(_NUMBERS, pl.Float64),
+    )
 
 
 def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> Track:
@@ -199,8 +324,11 @@ def _unroll(piece: pl.DataFrame) -> Track:
     heading = yaw[0] + np.concatenate(([0.0], np.cumsum(turn[:, 2])))
     along = (moved[:, 0] + 1j * moved[:, 1]) * np.exp(0.5j * (heading[:-1] + heading[1:]))
     path = position[0, 0] + 1j * position[0, 1] + np.concatenate(([0.0], np.cumsum(along)))
+    times = piece["t"].to_numpy()
+    if "latency" in piece.columns:
+        times = times - piece["latency"].to_numpy()
     return Track(
-        times=piece["t"].to_numpy(),
+        times=times,
         segment=piece["segment"].to_numpy().astype(np.int64),
         path=path,
         heading=heading,
@@ -214,13 +342,16 @@ def _read_drive(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | N
     if table is None or table.is_empty():
         return None
     times = table["t"].to_numpy()
+    aligned = "left_aligned" in table.columns
+
+    def read(name: str) -> Floats:
+        return table[f"{name}_aligned" if aligned else name].to_numpy()
+
     if vehicle.kind == "ackermann":
-        axle = table["speed"].to_numpy() / vehicle.wheel_radius_m
+        axle = read("speed") / vehicle.wheel_radius_m
         left, right, steering = axle, axle, table["steering"].to_numpy()
     else:
-        left, right, steering = table["left"].to_numpy(), table["right"].to_numpy(), np.zeros(times.size)
-        if table["left"].null_count():
-            left, right = invert_differential(table["body_x"].to_numpy(), table["body_w"].to_numpy(), vehicle)
+        left, right, steering = read("left"), read("right"), np.zeros(times.size)
     kept = np.isfinite(left) & np.isfinite(right) & np.isfinite(steering)
     kept &= np.concatenate((np.diff(times) > 0.0, [True]))
     if kept.sum() < 2:  # noqa: PLR2004 - one value is no series
@@ -233,10 +364,8 @@ def _distinct(times: Floats, values: Floats) -> tuple[Floats, Floats]:
     return times[kept], values[kept]
 
 
-def _stop_when_silent(commands: DriveSeries, hold_s: float | None) -> DriveSeries:
+def _stop_when_silent(commands: DriveSeries, hold_s: float) -> DriveSeries:
     times = commands.times
-    if hold_s is None:
-        hold_s = max(_SHORTEST_HOLD, _PERIODS * float(np.median(np.diff(times))))
     silent = np.flatnonzero(np.diff(times, append=np.inf) > hold_s)
     at = silent + 1
     return DriveSeries(

@@ -21,16 +21,14 @@ def view_diagnosis(
     tables: Mapping[str, pl.DataFrame],
     vehicle: Vehicle,
     diagnosis: Mapping[str, object],
-    *,
-    hold_s: float | None = None,
 ) -> MotionView | None:
     """What the named model says of the run.
 
     Args:
-        tables: of the run: `poses` and `commands` or `wheels`, better with `imu`, `slip` and `velocities`.
+        tables: of the run: `poses`, `alignments` and `commands` or `wheels`, better with `imu`, `slip` and
+            `velocities`.
         vehicle: geometry.
         diagnosis: the JSON object of one run of ``slip diagnose --json``.
-        hold_s: how long after its last command the controller stops; by default as `load_run` has it.
 
     Returns:
         Rows to draw; None where nothing was named, or the run is too poor for a model.
@@ -40,7 +38,7 @@ def view_diagnosis(
         return None
     source = Input.MEASURED if diagnosis.get("input") == Input.MEASURED.value else Input.COMMAND
     try:
-        run = load_run(tables, vehicle, name=str(diagnosis.get("run", "")), hold_s=hold_s)
+        run = load_run(tables, vehicle, name=str(diagnosis.get("run", "")))
         problem = Problem([run], vehicle, source)
         state = fit_model(problem, model).state
     except MotionError:

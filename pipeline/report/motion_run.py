@@ -17,11 +17,19 @@ if TYPE_CHECKING:
     from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
 
-_DRIVE = ("t", "left", "right", "speed", "steering", "body_x", "body_w")
+_WHEELS = ("t", "left", "right", "speed", "steering")
 COLUMNS: Mapping[str, tuple[str, ...]] = {
-    "poses": ("t", "segment", "x", "y", "z", "q_x", "q_y", "q_z", "q_w", "held", "active", "terrain"),
-    "commands": _DRIVE,
-    "wheels": _DRIVE,
+    "poses": (
+        *("t", "segment", "x", "y", "z", "q_x", "q_y", "q_z", "q_w"),
+        *("latency", "held", "active", "terrain"),
+    ),
+    "alignments": (
+        *("hold_time", "command_scale", "track_multiplier", "gyro_scale", "gyro_bias", "heading_delay"),
+        *("heading_delay_error", "gyro_residual", "latency_spread", "outlier_time"),
+        *("recorded_modulus_command", "recorded_modulus_measured"),
+    ),
+    "commands": ("t", "left_aligned", "right_aligned", "speed_aligned", "steering"),
+    "wheels": _WHEELS,
     "imu": ("t", "rate_z"),
     "slip": ("t", "input", "step", "suspect"),
 }
@@ -62,7 +70,7 @@ def make_motion_run(manifest: Manifest, vehicle: Vehicle, tables: Mapping[str, p
         )
     log = manifest.details.get("log")
     sha256 = str(log.get("sha256", "")) if isinstance(log, dict) else ""
-    return load_run(tables, vehicle, name=manifest.run, sha256=sha256, hold_s=read_hold(manifest))
+    return load_run(tables, vehicle, name=manifest.run, sha256=sha256)
 
 
 def load_vehicle(manifest: Manifest) -> Vehicle:
@@ -91,11 +99,3 @@ def choose_source(run: MotionRun, asked: str | None) -> Input:
     if asked is not None:
         return Input(asked)
     return Input.COMMAND if run.commands is not None else Input.MEASURED
-
-
-def read_hold(manifest: Manifest) -> float | None:
-    """How long a command counts [s], as the run was configured; None for the usual time."""
-    configuration = manifest.details.get("configuration")
-    command = configuration.get("command") if isinstance(configuration, dict) else None
-    hold = command.get("hold_s") if isinstance(command, dict) else None
-    return float(hold) if isinstance(hold, int | float) else None

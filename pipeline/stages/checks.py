@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.stages.delays import estimate_delay
 from pipeline.stages.finding import Finding
 from pipeline.stages.samples import Samples, gather_samples
-from pipeline.stages.trust import check_independence, check_live_commands
+from pipeline.stages.trust import check_live_commands
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,9 +31,6 @@ _PATH_OF_MOTION = 5.0
 _LIVE = 0.02
 _FEWEST = 100
 _FEWEST_LIVE = 20
-_FEWEST_STEPS = 6
-_SCALED = 0.18
-_DISAGREES = 0.2
 _SKEW = 0.05
 _SURE = 5.0
 
@@ -44,9 +41,7 @@ def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     if stuck:
         return stuck
     checks: tuple[Callable[[Samples, Vehicle], list[Finding]], ...] = (
-        check_independence,
         check_live_commands,
-        check_command_scale,
         check_limits,
         check_delays,
     )
@@ -109,61 +104,6 @@ def _gain_on(velocity: Floats, ideal: Floats) -> float:
     if live.sum() < _FEWEST_LIVE:
         return 0.0
     return float(np.sum(velocity[live] * ideal[live]) / np.sum(ideal[live] ** 2))
-
-
-def check_command_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
-    """Steady commanded wheel speeds against measured ones: a wrong scale, or a controller's own track width.
-
-    Only the slower half of the steps counts: there nothing saturates, and a wrong scale is the same in all.
-    """
-    if samples.measured is None or samples.command is None:
-        return []
-    both = (
-        np.isfinite(samples.measured).all(axis=1) & np.isfinite(samples.command).all(axis=1) & samples.steady
-    )
-    if not both.any():
-        return []
-    asked, got = _average_steps(samples.step[both], samples.command[both], samples.measured[both])
-    forward = _slow_ratio(asked[:, 0], got[:, 0])
-    turning = _slow_ratio(asked[:, 2], got[:, 2])
-    if forward is None:
-        return []
-    if abs(np.log(forward)) > _SCALED:
-        text = (
-            f"in slow steady steps the wheels turn {forward:.2f} times as fast as commanded: "
-            "the recorded command is scaled wrongly (another vehicle's wheel radius, or a unit)"
-        )
-        return [Finding("command_scale", "warning", text, where="command", value=forward)]
-    if turning is None or not samples.body_commanded or np.log(turning / forward) < _SCALED:
-        return []
-    multiplier = turning / forward * vehicle.controller_track_multiplier
-    text = (
-        f"in slow steady turns the wheels differ {turning / forward:.2f} times as much as the command asks "
-        f"with the nominal track width: set vehicle.controller_track_multiplier = {multiplier:.3g}"
-    )
-    return [Finding("controller_multiplier", "warning", text, where="command", value=multiplier)]
-
-
-def _average_steps(step: NDArray[np.int32], command: Floats, measured: Floats) -> tuple[Floats, Floats]:
-    """Mean command and mean measured wheels of every command step, each of shape (steps, 3)."""
-    _, label, count = np.unique(step, return_inverse=True, return_counts=True)
-    means = [
-        np.stack([np.bincount(label, values[:, i]) / count for i in range(3)], axis=-1)
-        for values in (command, measured)
-    ]
-    return means[0], means[1]
-
-
-def _slow_ratio(asked: Floats, got: Floats) -> float | None:
-    """Median ratio of measured to asked over the slower half of the steps; None where they disagree."""
-    size = np.abs(asked)
-    slow = (size > max(0.1 * float(size.max()), _LIVE)) & (size < 0.5 * float(size.max()))
-    if slow.sum() < _FEWEST_STEPS:
-        return None
-    ratio = got[slow] / asked[slow]
-    middle = float(np.median(ratio))
-    spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
-    return middle if middle > _LIVE and spread < _DISAGREES * middle else None
 
 
 def check_limits(samples: Samples, vehicle: Vehicle) -> list[Finding]:

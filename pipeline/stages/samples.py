@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.stages.slip import Ideal, Steps
 
 Floats = NDArray[np.float64]
 
@@ -42,32 +48,34 @@ class Samples:
     body_commanded: bool
 
 
-def gather_samples(velocities: pl.DataFrame, slip: pl.DataFrame, *, body_commanded: bool) -> Samples:
-    """Arrange the tables of a run for the checks."""
+def gather_samples(
+    velocities: pl.DataFrame, inputs: Mapping[str, Ideal], cut: Steps, *, body_commanded: bool
+) -> Samples:
+    """Arrange what is known of a run on its grid for the checks.
+
+    Args:
+        velocities: table `velocities`.
+        inputs: ideal velocities by input.
+        cut: command steps.
+        body_commanded: whether the command was a body command.
+    """
+    counts = np.zeros(velocities.height, dtype=bool)
     ideals: dict[str, Floats | None] = {"command": None, "measured": None}
-    steady = np.zeros(velocities.height, dtype=bool)
-    step = np.full(velocities.height, -1, dtype=np.int32)
-    stamps = velocities["stamp"].to_numpy()
-    for name in ideals:
-        part = slip.filter(pl.col("input") == name)
-        if part.is_empty():
-            continue
-        values = np.full((velocities.height, 3), np.nan)
-        place = np.searchsorted(stamps, part["stamp"].to_numpy())
-        values[place] = part.select("f_x", "f_y", "f_w").to_numpy()
-        steady[place] |= ~part["transitory"].to_numpy()
-        step[place] = part["step"].to_numpy()
-        ideals[name] = values
-    gyro = velocities["v_w_imu"].cast(pl.Float64).fill_null(np.nan).to_numpy()
+    for name, ideal in inputs.items():
+        kept = np.isfinite(ideal.velocity).all(axis=1) & ideal.active
+        if kept.any():
+            ideals[name] = np.where(kept[:, None], ideal.velocity, np.nan)
+            counts |= kept
+    gyro = velocities["v_w_imu"] if "v_w_imu" in velocities.columns else pl.Series([None] * counts.size)
     return Samples(
         velocities["t"].to_numpy(),
         velocities["segment"].to_numpy(),
-        steady,
-        step,
+        counts & ~cut.transitory,
+        np.where(counts, cut.step, -1),
         velocities.select("x", "y").to_numpy(),
         velocities["yaw"].to_numpy(),
         velocities.select("v_x", "v_y", "v_w").to_numpy(),
-        gyro,
+        gyro.cast(pl.Float64).fill_null(np.nan).to_numpy(),
         ideals["command"],
         ideals["measured"],
         body_commanded,

@@ -14,10 +14,9 @@ from pipeline.motion.ideal import predict_ackermann, predict_differential
 from pipeline.stages import steps
 from pipeline.stages.errors import StageError
 from pipeline.stages.finding import Finding
-from pipeline.stages.stretches import find_bad_stretches
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.vehicles import Configuration, Vehicle
 
@@ -26,17 +25,18 @@ Flags = NDArray[np.bool_]
 
 WINDOW_S = 2.0
 PUBLISHED_SAMPLES = 40
-_SHORTEST_HOLD = 0.5
 _LONGEST_WHEEL_GAP = 0.25
 _PERIODS = 5.0
 
 
 @dataclass(frozen=True)
 class SlipResult:
-    """Tables `slip` and `windows`, and what was noticed."""
+    """Tables `slip` and `windows`, all inputs and steps on the grid, and what was noticed."""
 
     slip: pl.DataFrame
     windows: pl.DataFrame
+    inputs: Mapping[str, Ideal]
+    cut: Steps
     findings: tuple[Finding, ...] = field(default=())
 
 
@@ -62,6 +62,7 @@ def compute_slip(
     *,
     vehicle: Vehicle,
     configuration: Configuration,
+    hold_s: float | None,
     inputs: Sequence[str],
     where: str,
 ) -> SlipResult:
@@ -69,10 +70,11 @@ def compute_slip(
 
     Args:
         velocities: table `velocities`.
-        commands: table `commands`; may be empty.
+        commands: table `commands`, aligned; may be empty.
         wheels: table `wheels`; may be empty.
         vehicle: for the ideal model.
-        configuration: length scale, transitory span, hold time.
+        configuration: length scale, transitory span.
+        hold_s: how long a command counts; None without commands.
         inputs: `command`, `measured`, or both.
         where: the run, for error messages.
 
@@ -80,13 +82,8 @@ def compute_slip(
         StageError: none of the asked inputs gives a single sample.
     """
     times = velocities["t"].to_numpy()
-    known: dict[str, Ideal] = {}
-    if not commands.is_empty():
-        known["command"] = hold_commands(times, commands, vehicle, configuration.command.hold_s)
-    if not wheels.is_empty():
-        known["measured"] = interpolate_wheels(times, wheels, vehicle)
-    whole = known
-    known = {name: ideal for name, ideal in whole.items() if np.isfinite(ideal.velocity[ideal.active]).any()}
+    whole = read_inputs(times, commands, wheels, vehicle, hold_s)
+    known = keep_known(whole)
     found = {name: ideal for name, ideal in known.items() if name in inputs}
     if not found:
         if whole and not any(ideal.active.any() for ideal in whole.values()):
@@ -102,37 +99,79 @@ def compute_slip(
             where=where,
             hint="Name the command in run.toml ([command] topic = ...); `slip inspect` lists the topics.",
         )
-    # The steps are the command's whatever was asked for, so that both inputs have the same windows.
-    leading = known.get("command") or known["measured"]
     length = configuration.slip.length_scale_m
-    changes = steps.find_changes(times, leading.velocity, length)
-    step = steps.number_steps(times, velocities["segment"].to_numpy(), changes)
-    transitory = steps.mark_transitory(times, changes, configuration.slip.transitory_s)
+    cut = cut_steps(velocities, known, length, configuration.slip.transitory_s)
     base = velocities.select("t", "stamp", "segment", "v_x", "v_y", "v_w").with_columns(
-        step=pl.Series(step), transitory=pl.Series(transitory)
+        step=pl.Series(cut.step), transitory=pl.Series(cut.transitory)
     )
-    suspect, findings = find_bad_stretches(
-        velocities, {name: ideal.velocity for name, ideal in known.items()}, step
-    )
-    findings += _describe_stale(times, found)
+    suspect = velocities["outlier"].to_numpy()
+    findings = _describe_stale(times, found)
     parts = [_tabulate(base, name, ideal, suspect, length) for name, ideal in found.items()]
     slip = pl.concat(parts)
     windows = pl.concat([cut_windows(part, configuration.velocity.rate_hz) for part in parts])
-    return SlipResult(slip, windows, tuple(findings))
+    return SlipResult(slip, windows, known, cut, tuple(findings))
 
 
-def hold_commands(times: Floats, commands: pl.DataFrame, vehicle: Vehicle, hold: float | None) -> Ideal:
+@dataclass(frozen=True)
+class Steps:
+    """Command steps of a run on its grid.
+
+    Attributes:
+        step: number of the step of each sample, shape (n,).
+        transitory: within the transitory span after a change of the command, shape (n,).
+    """
+
+    step: NDArray[np.int32]
+    transitory: Flags
+
+
+def read_inputs(
+    times: Floats, commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle, hold_s: float | None
+) -> dict[str, Ideal]:
+    """Ideal velocities of every input there is, by name."""
+    known: dict[str, Ideal] = {}
+    if not commands.is_empty() and hold_s is not None:
+        known["command"] = hold_commands(times, commands, vehicle, hold_s)
+    if not wheels.is_empty():
+        known["measured"] = interpolate_wheels(times, wheels, vehicle)
+    return known
+
+
+def keep_known(inputs: Mapping[str, Ideal]) -> dict[str, Ideal]:
+    """The inputs that are known at some time that counts."""
+    return {name: ideal for name, ideal in inputs.items() if np.isfinite(ideal.velocity[ideal.active]).any()}
+
+
+def cut_steps(
+    velocities: pl.DataFrame, known: Mapping[str, Ideal], length: float, transitory_s: float
+) -> Steps:
+    """Command steps; the measured wheels' only where there is no command, whatever was asked for.
+
+    Args:
+        velocities: table `velocities`.
+        known: at least one input.
+        length: length scale L [m].
+        transitory_s: span after a change [s].
+    """
+    times = velocities["t"].to_numpy()
+    leading = known.get("command") or known["measured"]
+    changes = steps.find_changes(times, leading.velocity, length)
+    return Steps(
+        steps.number_steps(times, velocities["segment"].to_numpy(), changes),
+        steps.mark_transitory(times, changes, transitory_s),
+    )
+
+
+def hold_commands(times: Floats, commands: pl.DataFrame, vehicle: Vehicle, hold: float) -> Ideal:
     """Ideal velocities of the last command at each time, for as long as it counts.
 
     Args:
         times: grid [s].
         commands: table `commands`, sorted by time.
         vehicle: for the ideal model.
-        hold: how long a command counts [s]; by default five periods, at least half a second.
+        hold: how long a command counts [s].
     """
     stamps = commands["t"].to_numpy()
-    if hold is None:
-        hold = max(_SHORTEST_HOLD, _PERIODS * _usual_period(stamps))
     index = timegrid.hold_indices(times, stamps)
     known = index >= 0
     last = np.maximum(index, 0)
@@ -158,9 +197,12 @@ def interpolate_wheels(times: Floats, wheels: pl.DataFrame, vehicle: Vehicle) ->
 
 
 def _predict(drive: pl.DataFrame, vehicle: Vehicle) -> Floats:
+    def read(name: str) -> Floats:
+        return drive[f"{name}_aligned" if "left_aligned" in drive.columns else name].to_numpy()
+
     if vehicle.kind == "ackermann":
-        return predict_ackermann(drive["speed"].to_numpy(), drive["steering"].to_numpy(), vehicle)
-    return predict_differential(drive["left"].to_numpy(), drive["right"].to_numpy(), vehicle)
+        return predict_ackermann(read("speed"), drive["steering"].to_numpy(), vehicle)
+    return predict_differential(read("left"), read("right"), vehicle)
 
 
 def _usual_period(stamps: Floats) -> float:

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from pipeline.core import rigid, segments, timegrid
 from pipeline.stages.errors import StageError
 from pipeline.stages.finding import Finding
-from pipeline.stages.gyro import GyroCheck, fit_gyro, rate_of_gyro
+from pipeline.stages.gyro import smooth_gyro
 
 if TYPE_CHECKING:
+    from pipeline.motion.recording import GyroFit
     from pipeline.vehicles.configuration import VelocitySection
 
 Floats = NDArray[np.float64]
@@ -29,51 +30,38 @@ _SHORTEST_SPAN = 0.5
 
 @dataclass(frozen=True)
 class VelocityResult:
-    """Velocities, what was noticed, and how the gyro fits the poses (None without one)."""
+    """Velocities, and what was noticed."""
 
     table: pl.DataFrame
     findings: tuple[Finding, ...] = field(default=())
-    gyro: GyroCheck | None = None
 
 
 def compute_velocities(
-    poses: pl.DataFrame, imu: pl.DataFrame, settings: VelocitySection, *, where: str
+    poses: pl.DataFrame,
+    imu: pl.DataFrame,
+    gyro: GyroFit | None,
+    settings: VelocitySection,
+    *,
+    where: str,
 ) -> VelocityResult:
-    """Differentiate poses into body velocities.
+    """Differentiate aligned poses into body velocities.
 
     Args:
-        poses: table `poses`.
+        poses: table `poses`, aligned.
         imu: table `imu`; may be empty.
+        gyro: how the gyro fits the poses; None without a good one.
         settings: grid rate [Hz], width of the fit [s], whose yaw rate to use.
         where: the run, for error messages.
 
     Raises:
         StageError: no segment is long enough, or the gyro is asked for and there is no usable one.
     """
-    pieces, skipped = [], 0
-    for piece in poses.sort("segment", "t").partition_by("segment", maintain_order=True):
-        made = _differentiate_segment(piece, settings)
-        if made is None:
-            skipped += 1
-        else:
-            pieces.append(made)
-    if not pieces:
-        raise StageError(
-            "no_segment",
-            "the poses hold no stretch of half a second without a gap or a jump",
-            where=where,
-            hint="Check the pose topic with `slip inspect`; or widen velocity.gap_s, velocity.jump_m.",
-        )
+    table, skipped = differentiate_poses(poses, settings, where=where)
     findings = []
     if skipped:
         text = f"{skipped} segments are shorter than {_SHORTEST_SPAN} s or hold one pose: left out"
         findings.append(Finding("short_segments", "info", text, count=skipped))
-    table = pl.concat(pieces)
-    fit = None
-    if not imu.is_empty():
-        fit, more = fit_gyro(table, imu, settings.window_s)
-        findings += more
-    rate = rate_of_gyro(table["t"].to_numpy(), imu, fit, settings.window_s) if fit and fit.usable else None
+    rate = None if gyro is None else smooth_gyro(table["t"].to_numpy(), imu, gyro, settings.window_s)
     column = (
         pl.Series("v_w_imu", rate, dtype=pl.Float64).fill_nan(None)
         if rate is not None
@@ -93,17 +81,50 @@ def compute_velocities(
             text = f"the gyro is silent in {silent} time steps: the poses' yaw rate stands in there"
             findings.append(Finding("imu_gap", "warning", text, where="imu", count=silent))
         table = table.with_columns(pl.coalesce(pl.col("v_w_imu"), pl.col("v_w")).alias("v_w"))
-    return VelocityResult(table, tuple(findings), fit)
+    return VelocityResult(table, tuple(findings))
+
+
+def differentiate_poses(
+    poses: pl.DataFrame, settings: VelocitySection, *, where: str
+) -> tuple[pl.DataFrame, int]:
+    """Body velocities on the uniform grid of every segment, without a gyro's.
+
+    Args:
+        poses: table `poses`; where it is not aligned yet its stamps stand as they are.
+        settings: grid rate [Hz] and width of the fit [s].
+        where: the run, for error messages.
+
+    Returns:
+        Table `velocities` but for `v_w_imu`, and how many segments were too short.
+
+    Raises:
+        StageError: ``no_segment``.
+    """
+    pieces = [
+        _differentiate_segment(piece, settings)
+        for piece in poses.sort("segment", "t").partition_by("segment", maintain_order=True)
+    ]
+    made = [piece for piece in pieces if piece is not None]
+    if not made:
+        raise StageError(
+            "no_segment",
+            "the poses hold no stretch of half a second without a gap or a jump",
+            where=where,
+            hint="Check the pose topic with `slip inspect`; or widen velocity.gap_s, velocity.jump_m.",
+        )
+    return pl.concat(made), len(pieces) - len(made)
 
 
 def _differentiate_segment(piece: pl.DataFrame, settings: VelocitySection) -> pl.DataFrame | None:
     """Velocities of one segment; None when it is too short."""
     times = piece["t"].to_numpy()
     fresh = segments.select_fresh_poses(times, piece["held"].to_numpy())
-    fresh = fresh[np.diff(times[fresh], prepend=-np.inf) > 0.0]
+    aligned = times - piece["latency"].to_numpy() if "latency" in piece.columns else times
+    # Latencies leave the order as it is, up to rounding.
+    fresh = fresh[np.diff(np.maximum.accumulate(aligned[fresh]), prepend=-np.inf) > 0.0]
     if fresh.size < 2:  # noqa: PLR2004 - one pose has no velocity
         return None
-    kept = times[fresh]
+    kept = aligned[fresh]
     # The grid spans the whole segment, repeats included: a vehicle may stand at its end.
     if times[-1] - times[0] < _SHORTEST_SPAN:
         return None
@@ -118,6 +139,7 @@ def _differentiate_segment(piece: pl.DataFrame, settings: VelocitySection) -> pl
     velocity = timegrid.differentiate_locally(inside, kept, odometer, settings.window_s)
     at, attitude = rigid.interpolate_poses(inside, kept, position, quaternion)
     roll, pitch, yaw = rigid.euler_from_quaternions(attitude)
+    outlier = piece["outlier"].to_numpy() if "outlier" in piece.columns else np.zeros(times.size, dtype=bool)
     stamp = piece["stamp"][0] + np.round((grid - times[0]) * 1e9).astype(np.int64)
     return pl.DataFrame(
         {
@@ -129,5 +151,6 @@ def _differentiate_segment(piece: pl.DataFrame, settings: VelocitySection) -> pl
             "pitch": pitch,
             "yaw": rigid.unwrap_yaw(yaw),
             **{name: velocity[:, i] for i, name in enumerate(("v_x", "v_y", "v_w"))},
+            "outlier": outlier[timegrid.nearest_indices(grid, times)],
         }
     )

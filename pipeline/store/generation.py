@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.store.manifest import JSON
+    from pipeline.store.tables import CheckedTable
 
 STEPS = (
     "opened",
@@ -89,13 +90,24 @@ class Generation:
         Raises:
             StoreError: ``wrong_columns``, ``no_such_table``, ``written_twice``, or the disk refuses.
         """
-        from pipeline.store.tables import QUARANTINE, check_table  # noqa: PLC0415 - heavy
+        from pipeline.store.tables import check_table  # noqa: PLC0415 - heavy
 
-        checked = check_table(name, frame)
-        entry = self._write(f"{name}.parquet", checked.valid)
-        if checked.broken is not None:
+        return self.write_checked(check_table(name, frame))
+
+    def write_checked(self, checked: CheckedTable) -> TableReport:
+        """Write a table that was held against its contract.
+
+        Raises:
+            StoreError: ``written_twice``, or the disk refuses.
+        """
+        from pipeline.store.tables import QUARANTINE  # noqa: PLC0415 - heavy
+
+        name = checked.contract.name
+        valid, rest = checked.encode()
+        entry = self._write(f"{name}.parquet", valid)
+        if rest is not None:
             broken = f"{QUARANTINE}{name}.parquet"
-            self._files[broken] = self._write(broken, checked.broken)
+            self._files[broken] = self._write(broken, rest)
         self._tables[name] = TableEntry(
             file=f"{name}.parquet",
             rows=checked.report.rows,

@@ -237,13 +237,14 @@ class Store:
         from pipeline.store.tables import QUARANTINE, check_table  # noqa: PLC0415 - heavy
 
         checked = check_table(name, frame)
+        valid, broken = checked.encode()
         quarantine = self.root / f"{QUARANTINE}{name}.parquet"
         with self._lock(self.root), name_disk_errors(self.root):
-            replace_file(self.root / f"{name}.parquet", checked.valid)
-            if checked.broken is None:
+            replace_file(self.root / f"{name}.parquet", valid)
+            if broken is None:
                 quarantine.unlink(missing_ok=True)
             else:
-                replace_file(quarantine, checked.broken)
+                replace_file(quarantine, broken)
         return checked.report
 
     def write_results_text(self, name: str, text: str) -> Path:

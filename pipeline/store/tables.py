@@ -33,19 +33,24 @@ _ABOUT_BROKEN_RULES = {"description": "rules of the contract that the row breaks
 
 @dataclass(frozen=True, kw_only=True)
 class CheckedTable:
-    """A frame split by its contract, ready to be written.
+    """A frame split by its contract.
 
     Attributes:
         contract: the contract it was held against.
-        valid: Parquet bytes of the rows that keep it.
-        broken: Parquet bytes of the rows that break it, with `BROKEN_RULES`; None when there are none.
+        valid: the rows that keep it.
+        broken: the rows that break it, with `BROKEN_RULES`; None when there are none.
         report: the counts.
     """
 
     contract: Contract
-    valid: bytes
-    broken: bytes | None
+    valid: pl.DataFrame
+    broken: pl.DataFrame | None
     report: TableReport
+
+    def encode(self) -> tuple[bytes, bytes | None]:
+        """Parquet bytes of the rows that keep the contract, and of those that break it."""
+        broken = None if self.broken is None else encode_parquet(self.contract, self.broken)
+        return encode_parquet(self.contract, self.valid), broken
 
 
 def find_contract(name: str) -> Contract:
@@ -107,8 +112,8 @@ def check_table(name: str, frame: pl.DataFrame) -> CheckedTable:
     )
     return CheckedTable(
         contract=contract,
-        valid=encode_parquet(contract, valid),
-        broken=encode_parquet(contract, name_broken_rules(failure)) if len(failure) else None,
+        valid=valid,
+        broken=name_broken_rules(failure) if len(failure) else None,
         report=report,
     )
 

@@ -29,6 +29,7 @@ WORDS = {
     "upload": "taking the log in",
     "read": "reading the log",
     "extract": "extracting commands and poses",
+    "align": "putting clocks and scales right",
     "velocity": "differentiating poses",
     "slip": "computing slip",
     "aggregate": "aggregating",

@@ -58,7 +58,8 @@ def main() -> None:
             sys.stdout.write(
                 f"{case.log}, {case.source.value}: {reached.windows} windows, "
                 f"ideal {reached.t_before_m:.3f} m {reached.r_before_rad:.3f} rad, "
-                f"ages vary {run.age_spread_s:.3f} s, faults {run.faulty_s:.1f} s of {run.duration_s:.0f} s\n"
+                f"latencies vary {run.alignment.latency_spread_s:.3f} s, "
+                f"outliers {run.alignment.outlier_s:.1f} s of {run.duration_s:.0f} s\n"
                 f"  {describe_values(reached)}\n"
                 f"  {'':<18}{'x':>8}{'y':>8}{'w':>8}{'T':>8}{'R':>8}{'R turns':>8}\n"
             )

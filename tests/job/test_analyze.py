@@ -19,7 +19,7 @@ from pipeline.simulate import simulate_case
 from pipeline.stages import StageError
 from pipeline.store import Store
 
-STAGES = ("extract", "velocity", "slip", "aggregate")
+STAGES = ("extract", "align", "velocity", "slip", "aggregate")
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,8 @@ def test_a_log_becomes_tables_a_summary_and_a_report(log: Path, out: Path) -> No
 
     assert outcome.computed == STAGES
     assert set(outcome.manifest.tables) == {
-        "commands", "wheels", "poses", "imu", "velocities", "slip", "windows", "aggregates", "findings"
+        "commands", "wheels", "poses", "imu", "alignments",
+        "velocities", "slip", "windows", "aggregates", "findings",
     }  # fmt: skip
     assert json.loads(outcome.manifest.path("summary.json").read_text())["run"] == outcome.manifest.run
     assert "<html" in outcome.manifest.path("report.html").read_text()[:200]
@@ -118,7 +119,7 @@ def test_a_stage_alone_writes_its_tables_and_no_later_ones(log: Path, out: Path)
     assert set(extracted.manifest.tables) == {"commands", "wheels", "poses", "imu", "findings"}
 
     velocity = analyze(log, out, through="velocity")
-    assert velocity.computed == ("velocity",)
+    assert velocity.computed == ("align", "velocity")
     assert "velocities" in velocity.manifest.tables
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from pipeline.core.segments import find_held, find_jumps, number_segments
 from pipeline.motion import MotionRun, load_run
 from pipeline.motion.ideal import invert_differential
 from pipeline.simulate import Disturbance, PoseSensor, Scenario, SimulatedRun, simulate_run
+from pipeline.stages.align import align_tables
 from pipeline.stages.slip import compute_slip
 from pipeline.stages.velocity import compute_velocities
 from pipeline.vehicles import Configuration, Vehicle, find_preset
@@ -43,18 +45,27 @@ def tables_of(made: SimulatedRun, vehicle: Vehicle) -> dict[str, pl.DataFrame]:
     tables = {"poses": _poses(made), "commands": _commands(made, vehicle)}
     tables["wheels"] = _wheels(made, vehicle)
     tables["imu"] = _imu(made)
+    return align(tables, vehicle)
+
+
+def align(tables: Mapping[str, pl.DataFrame], vehicle: Vehicle) -> dict[str, pl.DataFrame]:
     configuration = Configuration()
-    velocities = compute_velocities(tables["poses"], tables["imu"], configuration.velocity, where="simulated")
+    made = align_tables(tables, vehicle, hold_s=None, body_commanded=False, where="simulated")
+    found = dict(made.tables)
+    velocities = compute_velocities(
+        found["poses"], found["imu"], made.alignment.gyro, configuration.velocity, where="simulated"
+    )
     slip = compute_slip(
         velocities.table,
-        tables["commands"],
-        tables["wheels"],
-        vehicle=vehicle,
+        found["commands"],
+        found["wheels"],
+        vehicle=made.vehicle,
         configuration=configuration,
+        hold_s=made.alignment.hold_s,
         inputs=("command", "measured"),
         where="simulated",
     )
-    return tables | {"slip": slip.slip}
+    return found | {"slip": slip.slip}
 
 
 def _frame(times: np.ndarray, columns: dict[str, np.ndarray]) -> pl.DataFrame:

@@ -43,4 +43,4 @@ def test_steps_of_the_command_are_no_faults_of_the_localization() -> None:
     car = vehicle_of("ackermann_car")
     steps = Program("drive_steps", speed_scale=0.6, turn_scale=0.6)
     scene = make_scenario({}, vehicle=VEHICLES["car"], program=steps, pose=QUIET, imu=Imu())
-    assert load_run(tables_of(simulate_run(scene), car), car, name="car").faulty_s == 0.0
+    assert load_run(tables_of(simulate_run(scene), car), car, name="car").alignment.outlier_s == 0.0

@@ -63,10 +63,12 @@ WHO = {"run": "r", "dataset": "d", "vehicle": "v", "terrain": "t"}
 TIMES = {"t": 0.0, "stamp": 1, "log_time": 1}
 POSE = {
     **WHO, **TIMES, "segment": 0, "x": 0.0, "y": 0.0, "z": 0.0,
-    "q_x": 0.0, "q_y": 0.0, "q_z": 0.0, "q_w": 1.0, "held": False, "active": True,
+    "q_x": 0.0, "q_y": 0.0, "q_z": 0.0, "q_w": 1.0, "latency": 0.0, "outlier": False, "held": False, "active": True,
 }  # fmt: skip
 DRIVE = {**WHO, **TIMES, "left": 1.0, "right": 1.0, "speed": None, "steering": None, "active": True}
-COMMAND = {**DRIVE, "body_x": None, "body_w": None}
+COMMAND = {
+    **DRIVE, "body_x": None, "body_w": None, "left_aligned": 1.0, "right_aligned": 1.0, "speed_aligned": None
+}  # fmt: skip
 SLIP = {
     **WHO, "input": "command", "t": 0.0, "stamp": 1, "segment": 0, "step": 0, "transitory": False,
     "f_x": 1.0, "f_y": 0.0, "f_w": 0.5, "v_x": 0.8, "v_y": 0.0, "v_w": 0.5,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
+from pipeline.job.work import as_recorded
 from pipeline.logs import open_log, read_topics
 from pipeline.simulate import (
     Disturbance,
@@ -21,11 +22,12 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
+from pipeline.stages.align import Aligned, align_tables
 from pipeline.stages.checks import gather_samples, run_checks
 from pipeline.stages.extract import Extracted, extract_tables, list_wanted
 from pipeline.stages.slip import SlipResult, compute_slip
 from pipeline.stages.velocity import VelocityResult, compute_velocities
-from pipeline.vehicles import Configuration, DriveForm, Sources, Vehicle, choose_sources, resolve_vehicle
+from pipeline.vehicles import Configuration, DriveForm, Sources, choose_sources, resolve_vehicle
 from pipeline.vehicles.loading import convert
 from schemas import contract_of
 
@@ -63,7 +65,7 @@ class Taken:
 
     sources: Sources
     configuration: Configuration
-    vehicle: Vehicle
+    aligned: Aligned
     extracted: Extracted
     motion: VelocityResult
     result: SlipResult
@@ -110,7 +112,7 @@ def take(
     *,
     inputs: Sequence[str] = ("command", "measured"),
 ) -> Taken:
-    """Take a log through extract, velocity, slip and the checks."""
+    """Take a log through extract, align, velocity, slip and the checks."""
     index = open_log(log)
     configuration = convert(settings or {}, "test")
     recorded = index.metadata.get("deployment", {}).get("vehicle")
@@ -119,21 +121,29 @@ def take(
     types = {channel.topic: channel.type_name for channel in index.channels}
     data = read_topics(index, list_wanted(sources, types))
     extracted = extract_tables(data, sources, configuration, vehicle, where=log.name)
-    tables = {name: keep_good_rows(name, frame) for name, frame in extracted.tables.items()}
-    motion = compute_velocities(tables["poses"], tables["imu"], configuration.velocity, where=log.name)
+    body = sources.command is not None and sources.command.form is DriveForm.BODY
+    raw = {name: keep_good_rows(name, as_recorded(name, frame)) for name, frame in extracted.tables.items()}
+    aligned = align_tables(
+        raw, vehicle, hold_s=configuration.command.hold_s, body_commanded=body, where=log.name
+    )
+    tables = aligned.tables
+    motion = compute_velocities(
+        tables["poses"], tables["imu"], aligned.alignment.gyro, configuration.velocity, where=log.name
+    )
     result = compute_slip(
         motion.table,
         tables["commands"],
         tables["wheels"],
-        vehicle=vehicle,
+        vehicle=aligned.vehicle,
         configuration=configuration,
+        hold_s=aligned.alignment.hold_s,
         inputs=inputs,
         where=log.name,
     )
-    body = sources.command is not None and sources.command.form is DriveForm.BODY
-    samples = gather_samples(motion.table, result.slip, body_commanded=body)
-    findings = (*extracted.findings, *motion.findings, *result.findings, *run_checks(samples, vehicle))
-    return Taken(sources, configuration, vehicle, extracted, motion, result, findings)
+    samples = gather_samples(motion.table, result.inputs, result.cut, body_commanded=body)
+    checked = run_checks(samples, aligned.vehicle)
+    findings = (*extracted.findings, *aligned.findings, *motion.findings, *result.findings, *checked)
+    return Taken(sources, configuration, aligned, extracted, motion, result, findings)
 
 
 def keep_good_rows(table: str, frame: pl.DataFrame) -> pl.DataFrame:

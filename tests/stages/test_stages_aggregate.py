@@ -15,7 +15,9 @@ from pipeline.stages.aggregate import aggregate_run
 
 def aggregate(taken: Taken, length: float = 1.0) -> pl.DataFrame:
     result = taken.result
-    return aggregate_run(result.slip, result.windows, taken.velocities, vehicle=taken.vehicle, length=length)
+    return aggregate_run(
+        result.slip, result.windows, taken.velocities, vehicle=taken.aligned.vehicle, length=length
+    )
 
 
 def row(frame: pl.DataFrame, name: str, subset: str = "all") -> dict[str, float]:
@@ -62,7 +64,9 @@ def test_medians_and_root_mean_squares_are_those_of_the_tables(drive: TakeThroug
 def test_suspect_samples_are_left_out_of_medians(drive: TakeThrough) -> None:
     taken = drive(FIELD)
     half = taken.result.slip.with_columns(suspect=pl.col("t") > 30.0)
-    found = aggregate_run(half, taken.result.windows, taken.velocities, vehicle=taken.vehicle, length=1.0)
+    found = aggregate_run(
+        half, taken.result.windows, taken.velocities, vehicle=taken.aligned.vehicle, length=1.0
+    )
     kept = half.filter((pl.col("t") <= 30.0) & (pl.col("input") == "measured"))
     assert row(found, "measured")["samples"] == kept.height
     assert row(found, "measured")["median_modulus"] == kept["modulus"].median()
@@ -90,7 +94,7 @@ def test_a_run_without_windows_has_no_window_norm(drive: TakeThrough) -> None:
         taken.result.slip.head(30),
         taken.result.windows.head(0),
         taken.velocities,
-        vehicle=taken.vehicle,
+        vehicle=taken.aligned.vehicle,
         length=1.0,
     )
     assert row(found, "command")["median_window_norm"] is None

@@ -3,20 +3,19 @@
 A localization that was lost jumps back, waits and catches up, or reports a way that is turned against the
 heading. Every displacement over half a second, its direction and its length, is compared with a robust model
 of the whole run: a regression on the wheels, late and multiplied, wide enough to hold every effect of the
-catalogue. What is eight times as far off as is usual at that speed, and a quarter of a metre, is not compared
-with any model, up to a twentieth of the run. How much that is stands in `MotionRun.faulty_s`.
+catalogue. What is eight times as far off as is usual at that speed, and a quarter of a metre, is an outlier,
+up to a twentieth of the run.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import timegrid
-from pipeline.motion.heading import align_heading, fit_gyro, has_barred, mark_barred
+from pipeline.motion.heading import align_heading, has_barred, mark_barred
 
 if TYPE_CHECKING:
     from pipeline.motion.recording import DriveSeries, MotionRun
@@ -35,39 +34,38 @@ _LARGEST_SHARE = 0.05
 _LAGS_S = (-0.3, -0.1, 0.0, 0.1, 0.3, 0.6, 1.0, 1.6)
 _ROUNDS = 10
 _BINS = 6
-_SAMPLE_S = 0.05
+SAMPLE_S = 0.05
 
 
-def bar_faults(run: MotionRun, vehicle: Vehicle) -> MotionRun:
-    """A run in which stretches where the localization is at fault are barred.
+def find_outliers(run: MotionRun, vehicle: Vehicle) -> Floats:
+    """Times at which the localization is at fault [s], twenty a second.
 
-    Without measured wheels nothing says where the vehicle cannot have gone: the run stays as it is.
+    Without measured wheels nothing says where the vehicle cannot have gone: there are none.
     """
+    none = np.zeros(0)
     if run.wheels is None:
-        return run
+        return none
     first, last = _pair_up(run)
     if first.size < _FEWEST:
-        return run
+        return none
     off = _measure_misfit(run, run.wheels, vehicle, first, last)
     begin, end = run.track.times[first], run.track.times[last]
     live = np.diff(run.track.times)[run.track.active[1:]]
     most = _LARGEST_SHARE * float(live[live < _LONGEST_S].sum())
     faulty = off > 1.0
-    if not faulty.any():
-        return run
     grid = _fill(begin[faulty], end[faulty])
     # More than a twentieth is no exception: then only the worst of it counts as fault.
-    while grid.size * _SAMPLE_S > most:
+    while grid.size * SAMPLE_S > most:
         faulty &= off > np.quantile(off[faulty], 0.1)
         grid = _fill(begin[faulty], end[faulty])
-    return replace(run, barred=np.union1d(run.barred, grid), faulty_s=float(grid.size * _SAMPLE_S))
+    return grid
 
 
 def _fill(begin: Floats, end: Floats) -> Floats:
     """Times all through some intervals, twenty a second."""
-    first, last = np.floor(begin / _SAMPLE_S), np.ceil(end / _SAMPLE_S)
+    first, last = np.floor(begin / SAMPLE_S), np.ceil(end / SAMPLE_S)
     ticks = [np.arange(a, b + 1) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
-    times: Floats = np.unique(np.concatenate(ticks)) * _SAMPLE_S if ticks else np.zeros(0)
+    times: Floats = np.unique(np.concatenate(ticks)) * SAMPLE_S if ticks else np.zeros(0)
     return times
 
 
@@ -120,7 +118,7 @@ def _measure_misfit(
 
 def _choose_heading(run: MotionRun) -> tuple[Floats, float]:
     """Heading at the poses: the gyro's where there is a good one; and how late the poses are [s]."""
-    gyro = fit_gyro(run)
+    gyro = run.gyro_fit
     if gyro is None or run.gyro is None:
         return run.track.heading, 0.0
     times, rate = run.gyro

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from pipeline.motion.heading import align_heading, fit_gyro, mark_barred
 
 if TYPE_CHECKING:
-    from pipeline.motion.heading import GyroFit
-    from pipeline.motion.recording import MotionRun, Track
+    from pipeline.motion.recording import GyroFit, MotionRun, Track
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -55,27 +54,29 @@ class _Seen:
     telling: Flags
 
 
-def put_in_time(run: MotionRun) -> MotionRun:
-    """A run whose poses stand at the moments they belong to, but for the delay that all share.
+def estimate_latency(run: MotionRun) -> tuple[Floats, float]:
+    """Latency of every pose of a run's track beside the one that all share, and how much it varies.
 
-    Nothing changes without a gyro that agrees with the poses, with little turning, or where the ages of the
+    It is zero without a gyro that agrees with the poses, with little turning, or where the ages of the
     poses vary by less than 15 ms: then the stamps are as good as the gyro can tell.
+
+    Returns:
+        Latencies [s] in the order of the poses, shape (n,), and their standard deviation in turns [s].
     """
     track, ages = run.track, np.zeros(run.track.times.size)
-    spread = 0.0
+    nothing, spread = (np.zeros(ages.size), 0.0), 0.0
     for _ in range(_ROUNDS):
         moved = replace(run, track=replace(track, times=_take_off(track, ages)))
         gyro = fit_gyro(moved)
         if gyro is None:
-            return run
+            return nothing
         seen = _look(run, moved.track, gyro, ages)
         if seen.telling.sum() < _FEWEST:
-            return run
+            return nothing
         ages, spread = _estimate(track, seen)
         if spread < _LEAST_SPREAD:
-            return run
-    times = _take_off(track, ages)
-    return replace(run, track=replace(track, times=times), age_spread_s=spread)
+            return nothing
+    return track.times - _take_off(track, ages), spread
 
 
 def _look(run: MotionRun, track: Track, gyro: GyroFit, ages: Floats) -> _Seen:

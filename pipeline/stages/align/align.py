@@ -1,0 +1,232 @@
+"""From extracted tables to aligned ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from pipeline.core import timegrid
+from pipeline.motion.errors import MotionError
+from pipeline.motion.heading import fit_gyro
+from pipeline.motion.ideal import invert_differential
+from pipeline.motion.recording import Alignment, MotionRun, make_run, tabulate_alignment
+from pipeline.stages.align.command_scale import CommandScale, measure_command_scale
+from pipeline.stages.align.outliers import SAMPLE_S, find_outliers
+from pipeline.stages.align.pose_latency import estimate_latency
+from pipeline.stages.align.stretches import find_bad_stretches
+from pipeline.stages.finding import Finding
+from pipeline.stages.gyro import describe_gyro
+from pipeline.stages.samples import Samples, gather_samples
+from pipeline.stages.slip import Ideal, cut_steps, keep_known, read_inputs
+from pipeline.stages.trust import check_independence
+from pipeline.stages.velocity import differentiate_poses
+from pipeline.vehicles.configuration import VelocitySection
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.vehicles import Vehicle
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+_BESIDE = 0.6
+# Alignment looks at a run on a grid of its own, so that no setting of the later stages changes it.
+_GRID = VelocitySection()
+_LENGTH_M = 1.0
+_TRANSITORY_S = 2.0
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """A run put right.
+
+    Attributes:
+        tables: those given with the columns of their corrections, and `alignments`.
+        alignment: the same as numbers.
+        vehicle: with the controller's track multiplier that the recording shows.
+        findings: what was noticed.
+    """
+
+    tables: Mapping[str, pl.DataFrame]
+    alignment: Alignment
+    vehicle: Vehicle
+    findings: tuple[Finding, ...]
+
+
+def align_tables(
+    tables: Mapping[str, pl.DataFrame],
+    vehicle: Vehicle,
+    *,
+    hold_s: float | None,
+    body_commanded: bool,
+    where: str,
+) -> Aligned:
+    """Put a run right.
+
+    Args:
+        tables: `poses`, `commands`, `wheels`, `imu` as extracted; those that the log lacks may be missing.
+        vehicle: as configured.
+        hold_s: how long a command counts; by default `timegrid.usual_hold`.
+        body_commanded: whether the command is a body command, which the controller turns into wheel speeds.
+        where: the run, for error messages.
+
+    Raises:
+        StageError: ``no_segment``, the poses hold no stretch that can be differentiated.
+    """
+    commands, wheels = tables.get("commands", pl.DataFrame()), tables.get("wheels", pl.DataFrame())
+    hold = None
+    if not commands.is_empty():
+        hold = timegrid.usual_hold(commands["t"].to_numpy()) if hold_s is None else hold_s
+    velocities, _ = differentiate_poses(tables["poses"], _GRID, where=where)
+    known = keep_known(read_inputs(velocities["t"].to_numpy(), commands, wheels, vehicle, hold))
+    grid = _Grid(velocities, known, np.zeros(velocities.height, dtype=bool), pl.DataFrame())
+    scale = CommandScale(1.0, vehicle.controller_track_multiplier)
+    findings: list[Finding] = []
+    if known:
+        cut = cut_steps(velocities, known, _LENGTH_M, _TRANSITORY_S)
+        bad, findings = find_bad_stretches(
+            velocities, {name: ideal.velocity for name, ideal in known.items()}, cut.step
+        )
+        grid = _Grid(velocities, known, bad, _tabulate_steps(velocities, known, cut.step, bad))
+        samples = gather_samples(velocities, known, cut, body_commanded=body_commanded)
+        scale = measure_command_scale(samples, vehicle)
+        independent = check_independence(samples, vehicle)
+        findings += [*scale.findings, *independent]
+        grid = replace(grid, recorded=_measure_moduli(samples, bad), is_localization=not independent)
+    corrected = {**tables, "commands": _correct_commands(commands, vehicle, scale)}
+    aligned_vehicle = msgspec.structs.replace(vehicle, controller_track_multiplier=scale.track_multiplier)
+    alignment = Alignment(hold, scale.scale, scale.track_multiplier, recorded_moduli=grid.recorded)
+    poses, alignment = _align_poses(corrected, aligned_vehicle, alignment, grid, where)
+    imu = tables.get("imu")
+    if imu is not None and not imu.is_empty():
+        findings += describe_gyro(alignment.gyro, velocities["v_w"].to_numpy())
+    findings += _describe_poses(alignment)
+    made = {**corrected, "poses": poses, "alignments": tabulate_alignment(alignment)}
+    return Aligned(made, alignment, aligned_vehicle, tuple(findings))
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """A run on its grid as it was recorded.
+
+    Attributes:
+        velocities: table `velocities`.
+        inputs: ideal velocities by input.
+        bad: in a stretch in which the localization reports what no vehicle does, shape (n,).
+        steps: columns of table `slip` that say where steps begin and what must not be scored.
+        recorded: median slip modulus with L = 1 m by input [m/s].
+        is_localization: whether the poses are more than integrated wheels, so that a clock can be told.
+    """
+
+    velocities: pl.DataFrame
+    inputs: Mapping[str, Ideal]
+    bad: Flags
+    steps: pl.DataFrame
+    recorded: Mapping[str, float | None] = field(default_factory=dict)
+    is_localization: bool = True
+
+
+def _tabulate_steps(
+    velocities: pl.DataFrame, known: Mapping[str, Ideal], step: NDArray[np.int32], bad: Flags
+) -> pl.DataFrame:
+    parts = []
+    for name, ideal in known.items():
+        kept = np.isfinite(ideal.velocity).all(axis=1) & ideal.active
+        part = velocities.select("t").with_columns(
+            pl.lit(name).alias("input"), pl.Series("step", step), pl.Series("suspect", bad)
+        )
+        parts.append(part.filter(pl.Series(kept)))
+    return pl.concat(parts)
+
+
+def _measure_moduli(samples: Samples, bad: Flags) -> dict[str, float | None]:
+    """Median slip modulus with L = 1 m of every input [m/s], as recorded."""
+    found: dict[str, float | None] = {}
+    for name, ideal in (("command", samples.command), ("measured", samples.measured)):
+        if ideal is not None:
+            modulus = np.linalg.norm(ideal - samples.velocity, axis=1)
+            kept = np.isfinite(modulus) & ~bad
+            found[name] = float(np.median(modulus[kept])) if kept.any() else None
+    return found
+
+
+def _correct_commands(commands: pl.DataFrame, vehicle: Vehicle, scale: CommandScale) -> pl.DataFrame:
+    """Table `commands` with what the drive was told once scale and track multiplier are right."""
+    if commands.is_empty():
+        return commands
+    columns = {
+        name: commands[name].cast(pl.Float64).to_numpy()
+        if name in commands.columns
+        else np.full(commands.height, np.nan)
+        for name in ("left", "right", "speed", "body_x", "body_w")
+    }
+    left, right = columns["left"], columns["right"]
+    if scale.track_multiplier != vehicle.controller_track_multiplier:
+        there = msgspec.structs.replace(vehicle, controller_track_multiplier=scale.track_multiplier)
+        left, right = invert_differential(columns["body_x"], columns["body_w"], there)
+    aligned = {"left_aligned": left, "right_aligned": right, "speed_aligned": columns["speed"]}
+    return commands.with_columns(
+        pl.Series(name, scale.scale * values, dtype=pl.Float64).fill_nan(None)
+        for name, values in aligned.items()
+    )
+
+
+def _align_poses(
+    tables: Mapping[str, pl.DataFrame], vehicle: Vehicle, alignment: Alignment, grid: _Grid, where: str
+) -> tuple[pl.DataFrame, Alignment]:
+    """Table `poses` with latencies and outliers, and the alignment with the gyro's part."""
+    poses = tables["poses"]
+    times = poses["t"].to_numpy()
+    latency, outlier = np.zeros(times.size), _spread_to_poses(grid, times)
+    try:
+        run = make_run({**tables, "slip": grid.steps}, vehicle, alignment, name=where)
+    except MotionError:
+        # A log that is too poor for a model has its slip all the same.
+        columns = (pl.Series("latency", latency), pl.Series("outlier", outlier))
+        return poses.with_columns(columns), alignment
+    raw = run.track.times
+    if not grid.is_localization:
+        columns = (pl.Series("latency", latency), pl.Series("outlier", outlier))
+        return poses.with_columns(columns), _with_gyro(run).alignment
+    own, spread = estimate_latency(run)
+    run = replace(run, track=replace(run.track, times=raw - own))
+    run = _with_gyro(run)
+    at_fault = find_outliers(run, vehicle)
+    if at_fault.size:
+        near = np.abs(at_fault[timegrid.nearest_indices(times, at_fault)] - times) <= _BESIDE * SAMPLE_S
+        outlier |= near
+        run = _with_gyro(replace(run, barred=np.union1d(run.barred, at_fault)))
+    for segment in np.unique(run.track.segment).tolist():
+        rows, known = poses["segment"].to_numpy() == segment, run.track.segment == segment
+        latency[rows] = np.interp(times[rows], raw[known], own[known])
+    alignment = replace(run.alignment, latency_spread_s=spread, outlier_s=float(at_fault.size * SAMPLE_S))
+    return poses.with_columns(pl.Series("latency", latency), pl.Series("outlier", outlier)), alignment
+
+
+def _with_gyro(run: MotionRun) -> MotionRun:
+    return replace(run, alignment=replace(run.alignment, gyro=fit_gyro(run)))
+
+
+def _spread_to_poses(grid: _Grid, times: Floats) -> Flags:
+    """Whether the sample of the grid nearest to each pose is in a bad stretch, shape (m,)."""
+    if not grid.bad.any():
+        return np.zeros(times.size, dtype=bool)
+    found: Flags = grid.bad[timegrid.nearest_indices(times, grid.velocities["t"].to_numpy())]
+    return found
+
+
+def _describe_poses(alignment: Alignment) -> list[Finding]:
+    findings = []
+    if alignment.latency_spread_s > 0.0:
+        text = f"the latency of poses varies by {alignment.latency_spread_s:.2g} s: put right by the gyro"
+        findings.append(Finding("pose_latency", "info", text, where="pose", value=alignment.latency_spread_s))
+    if alignment.outlier_s > 0.0:
+        text = f"{alignment.outlier_s:.3g} s left out: there the localization goes where the wheels did not"
+        findings.append(Finding("pose_outliers", "info", text, where="pose", value=alignment.outlier_s))
+    return findings
