@@ -81,6 +81,7 @@ def _describe(manifest: Manifest) -> list[str]:
     for stage, entry in _part(details, "stages").items():
         key = entry.get("key") if isinstance(entry, dict) else ""
         lines.append(f"  {stage:<13}{key}")
+    lines += _describe_alignment(manifest)
     lines.append("tables")
     for table, stored in sorted(manifest.tables.items()):
         quarantined = f", {stored.quarantined} in quarantine" if stored.quarantined else ""
@@ -88,6 +89,27 @@ def _describe(manifest: Manifest) -> list[str]:
         lines.append(f"  {table:<13}{stored.rows} rows{quarantined}    {contract}    {stored.sha256[:16]}")
     lines.append("configuration")
     lines.append("  " + encoder.dumps(_without_defaults(_part(details, "configuration"))))
+    return lines
+
+
+def _describe_alignment(manifest: Manifest) -> list[str]:
+    """What was put right before anything was computed, and the slip before and after."""
+    if not {"alignments", "aggregates"} <= set(manifest.tables):
+        return []
+    row = manifest.read("alignments").row(0, named=True)
+    lines = ["put right      (table alignments; latency, outlier and *_aligned stand in poses and commands)"]
+    for name, value in row.items():
+        if isinstance(value, float) and not name.startswith("recorded_modulus"):
+            lines.append(f"  {name:<20}{value:.6g}")
+    aggregates = manifest.read("aggregates")
+    for name in ("command", "measured"):
+        before = row[f"recorded_modulus_{name}"]
+        after = aggregates.filter((aggregates["input"] == name) & (aggregates["subset"] == "all"))
+        if before is not None and not after.is_empty():
+            now = after["median_modulus"][0]
+            lines.append(
+                f"  slip on {name:<12}{before:.4g} m/s as recorded, {now:.4g} m/s put right (medians)"
+            )
     return lines
 
 

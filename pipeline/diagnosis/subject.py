@@ -25,8 +25,8 @@ class Recording:
 
     Attributes:
         name: of the run.
-        tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, `slip`, `findings`; those that the log lacks
-            may miss.
+        tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, `slip`, `findings`; those that the
+            log lacks may miss.
         sha256: of the recording.
         path: of the log.
     """

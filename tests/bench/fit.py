@@ -50,7 +50,11 @@ def load(log: Path, folder: Path) -> tuple[MotionRun, Vehicle]:
     manifest = analyze_log(log, Options(out=folder, report=False)).manifest
     vehicle = msgspec.convert(manifest.details["vehicle"], Vehicle)
     store = Store(folder)
-    names = [name for name in ("poses", "commands", "wheels", "imu", "slip") if name in manifest.tables]
+    names = [
+        name
+        for name in ("poses", "alignments", "commands", "wheels", "imu", "slip")
+        if name in manifest.tables
+    ]
     return load_run(
         {name: store.read(manifest.run, name) for name in names}, vehicle, name=manifest.run
     ), vehicle

@@ -15,7 +15,7 @@ from pathlib import Path
 from draw import Answer  # noqa: TC002 - it runs as a script, too
 
 from pipeline.diagnosis import Recording  # noqa: TC001
-from pipeline.diagnosis.subject import correct_vehicle, load_recording
+from pipeline.diagnosis.subject import load_recording
 from pipeline.motion import (
     Effect,
     HeadingSource,
@@ -94,11 +94,11 @@ def check_models(vehicle: Vehicle, recording: Recording, told: Json, answer: Ans
         told: what the diagnosis said of it.
         answer: what was hidden.
     """
-    vehicle = correct_vehicle([recording], vehicle)
     entries = [item for item in _list(told, "effects") if isinstance(item, Mapping)]
     named = [_restore(entry) for entry in entries]
     ids = set(answer.effects) | {effect.id for effect in named}
     run = load_recording(recording, vehicle)
+    vehicle = run.correct_vehicle(vehicle)
     try:
         problem = Problem(
             [run],

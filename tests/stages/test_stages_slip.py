@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stage_logs import FIELD, PLAIN, TakeThrough, rms, slope
 
+from pipeline.core.timegrid import usual_hold
 from pipeline.motion.ideal import (
     invert_ackermann,
     invert_differential,
@@ -190,6 +191,7 @@ def test_without_any_input_there_is_nothing_to_compare() -> None:
             pl.DataFrame(),
             vehicle=HUSKY,
             configuration=convert({}, "test"),
+            hold_s=None,
             inputs=("command",),
             where="a.mcap",
         )
@@ -212,7 +214,7 @@ def test_a_command_is_held_until_the_next_one_or_until_it_is_stale() -> None:
 def test_a_pair_of_topics_at_2_hz_is_held_for_its_own_period() -> None:
     stamps = np.sort(np.concatenate((np.arange(20) * 0.5, np.arange(20) * 0.5 + 1e-4)))
     commands = make_drive(stamps.tolist(), [1.0] * 40)
-    found = hold_commands(np.arange(0.1, 9.4, 0.05), commands, HUSKY, None)
+    found = hold_commands(np.arange(0.1, 9.4, 0.05), commands, HUSKY, usual_hold(stamps))
     assert not found.stale.any()
 
 

@@ -207,9 +207,9 @@ def test_trap_6_the_sign_of_the_gyro_is_checked_and_corrected(drive: TakeThrough
 def test_trap_6_scale_and_bias_of_the_gyro_are_found_and_taken_off(drive: TakeThrough) -> None:
     taken = drive(replace(FIELD, imu=Imu(scale=0.8, bias_radps=0.05)))
     assert taken.finding("imu_scale").value == pytest.approx(1.25, rel=0.01)
-    assert taken.motion.gyro is not None
+    assert taken.aligned.alignment.gyro is not None
     # Poses = scale x gyro + bias: an offset of 0.05 in the gyro is one of -0.0625 in the poses.
-    assert taken.motion.gyro.bias == pytest.approx(-0.0625, abs=2e-3)
+    assert taken.aligned.alignment.gyro.bias == pytest.approx(-0.0625, abs=2e-3)
     assert rms(taken.velocities["v_w_imu"] - taken.velocities["v_w"]) < 0.03
 
 
@@ -222,14 +222,14 @@ def test_trap_6_a_gyro_that_measures_something_else_is_not_used(drive: TakeThrou
 def test_trap_6_without_turning_the_gyro_cannot_be_checked(drive: TakeThrough) -> None:
     taken = drive(replace(FIELD, program=Program("straight")))
     assert "imu_unchecked" in taken.ids()
-    assert taken.motion.gyro is None
+    assert taken.aligned.alignment.gyro is None
 
 
 @pytest.mark.parametrize("late", [-0.1, 0.0, 0.2, 0.35])
 def test_trap_15_how_late_the_poses_are_against_the_gyro_is_told(drive: TakeThrough, late: float) -> None:
     taken = drive(replace(FIELD, effects={"drive_lag": 0.3, "clock_offset": late}))
-    assert taken.motion.gyro is not None
-    assert taken.motion.gyro.pose_delay_s == pytest.approx(late, abs=0.02)
+    assert taken.aligned.alignment.gyro is not None
+    assert taken.aligned.alignment.gyro.yaw_delay_s == pytest.approx(late, abs=0.02)
     assert ("pose_delay" in taken.ids()) == (abs(late) > 0.05)
 
 

@@ -207,7 +207,7 @@ def make_windowed_poses(steps: int = 5, *, speed: float = 1.0) -> pl.DataFrame:
 
 
 def test_trap_20_steps_with_holes_between_are_segments_of_their_own() -> None:
-    made = compute_velocities(make_windowed_poses(), pl.DataFrame(), SETTINGS, where="x").table
+    made = compute_velocities(make_windowed_poses(), pl.DataFrame(), None, SETTINGS, where="x").table
     assert made["segment"].n_unique() == 5
     assert made.group_by("segment").len()["len"].to_list() == [120] * 5
     # Across a hole the vehicle did not move: a line drawn there would slow it down.
