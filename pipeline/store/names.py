@@ -12,6 +12,7 @@ import re
 import unicodedata
 from pathlib import PurePosixPath
 
+from pipeline.core.paths import is_taken_for_dots
 from pipeline.store.errors import StoreError
 
 LONGEST_PART = 120
@@ -92,7 +93,7 @@ def _encode_part(part: str) -> str:
         _encode_character(character) if _is_unsafe(character, at, last) else character
         for at, character in enumerate(normal)
     )
-    if encoded.casefold() in _RESERVED:
+    if encoded.casefold() in _RESERVED or (encoded and is_taken_for_dots(encoded)):
         encoded = _encode_character(encoded[0]) + encoded[1:]
     if normal == part and len(encoded.encode()) <= LONGEST_PART:
         return encoded or "%"
