@@ -1,7 +1,7 @@
 """Names from outside as paths: of objects, of members of a recording, in manifests, from a browser.
 
-Whoever writes such a name decides where a file is read or written, unless it is held inside the folder that it
-belongs to. Every such name goes through `resolve_inside`.
+Whoever writes such a name decides where a file is read or written, unless it is held inside the folder that
+it belongs to. Every such name goes through `resolve_inside`.
 """
 
 from __future__ import annotations
@@ -44,15 +44,28 @@ def resolve_inside(root: AnyPath, name: str, *, follow_links: bool = False) -> A
             character or a part that is or may be taken for ``.`` or ``..``, is too long for a file, or a link
             leads out of the folder.
     """
-    problem = _find_problem(name)
-    if problem:
-        raise _outside(root, name, problem)
+    check_name(name, where=str(root))
     path = root / name
     if len(os.fsencode(path)) > _LONGEST_PATH:
-        raise _outside(root, name, "is too long")
+        raise _outside(str(root), name, "is too long")
     if not follow_links and _has_link(root, name) and not path.resolve().is_relative_to(root.resolve()):
-        raise _outside(root, name, "is a link that leads out of its folder")
+        raise _outside(str(root), name, "is a link that leads out of its folder")
     return path
+
+
+def check_name(name: str, *, where: str) -> None:
+    """Refuse what `resolve_inside` refuses whatever there is on the disk.
+
+    Args:
+        name: as of `resolve_inside`.
+        where: what to name in the error.
+
+    Raises:
+        PathError: ``path_outside``.
+    """
+    problem = _find_problem(name)
+    if problem:
+        raise _outside(where, name, problem)
 
 
 def _find_problem(name: str) -> str:
@@ -61,19 +74,18 @@ def _find_problem(name: str) -> str:
         sizes = [len(part.encode()) for part in name.split("/")]
     except UnicodeEncodeError:
         return "is no valid Unicode"
-    folded = _fold(name)
     if _CONTROL.search(name) or "\\" in name:
         return "has a control character or a backslash in it"
-    if 0 in sizes or _ABSOLUTE.match(folded):
+    if 0 in sizes or _ABSOLUTE.match(_fold(name)):
         return "is empty, absolute or has an empty part"
-    if any(part and is_taken_for_dots(part) for part in _SEPARATORS.split(folded)):
+    if may_lead_out(name):
         return "leads out of its folder"
     return "is too long" if max(sizes) > _LONGEST_PART else ""
 
 
-def is_taken_for_dots(part: str) -> bool:
-    """Whether a part of a path may be taken for ``.`` or ``..``: by systems that drop spaces, or read look-alikes."""
-    return not _fold(part).strip(". ")
+def may_lead_out(name: str) -> bool:
+    """Whether a part of a name is ``.`` or ``..``, or is where spaces or look-alikes do not count."""
+    return any(part and not part.strip(". ") for part in _SEPARATORS.split(_fold(name)))
 
 
 def _fold(name: str) -> str:
@@ -93,11 +105,11 @@ def _has_link(root: Path, name: str) -> bool:
     return False
 
 
-def _outside(root: Path, name: str, problem: str) -> PathError:
+def _outside(where: str, name: str, problem: str) -> PathError:
     shown = name if len(name) <= _SHOWN else f"{name[:_SHOWN]}..."
     return PathError(
         "path_outside",
         f"the name {shown!r} {problem}",
-        where=str(root),
+        where=where,
         hint="It comes from outside and is not used; get the data from a source that you trust",
     )

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from pipeline.core.paths import PathError, resolve_inside
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.part import catalog_file
 from pipeline.logs.remote import to_location
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from pipeline.logs.records import ChannelRecord, SchemaRecord
     from pipeline.logs.scan import Catalog
     from pipeline.logs.spans import Span
+
+
+_LONGEST_SHOWN = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,10 +176,12 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
     listing = path / "metadata.yaml"
     here = sorted(path.glob("*.mcap"), key=_split_number)
     if listing.is_file():
-        named = [path / name for name in _listed_files(listing.read_text("utf-8", "replace"))]
-        named = [file for file in named if file.suffix == ".mcap"]
-        found = [file for file in named if file.is_file()] or here
-        missing = [file.name for file in named if not file.is_file()]
+        listed = [
+            name for name in _listed_files(listing.read_text("utf-8", "replace")) if name.endswith(".mcap")
+        ]
+        named = {name: _find_listed(path, name) for name in listed}
+        found = [file for file in named.values() if file is not None] or here
+        missing = [_show(name) for name, file in named.items() if file is None]
         if found:
             losses = [
                 Loss("missing_part", f"{name} of the recording is not in its folder") for name in missing
@@ -193,6 +199,22 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
             "Unpack them: zstd -d --rm *.mcap.zstd",
         )
     raise LogError("not_a_recording", what, where=str(path), hint=hint)
+
+
+def _find_listed(folder: Path, name: str) -> Path | None:
+    """A file of a recording by the name that its listing gives; None where it is not in the folder."""
+    try:
+        # The parts of a recording are often links, made by those who keep their logs elsewhere.
+        file = resolve_inside(folder, name, follow_links=True)
+    except PathError:
+        return None
+    return file if file.is_file() else None
+
+
+def _show(name: str) -> str:
+    """A listed name for a message, which whoever wrote the listing chose."""
+    plain = name.rpartition("/")[2]
+    return plain if plain.isprintable() and len(plain) <= _LONGEST_SHOWN else repr(name[:_LONGEST_SHOWN])
 
 
 def _split_number(file: Path) -> tuple[str, int]:

@@ -63,7 +63,7 @@ def scan_table(table: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.L
     for manifest in manifests:
         entry = manifest.tables.get(table.removeprefix(QUARANTINE))
         if entry is not None and (table in manifest.tables or f"{table}.parquet" in manifest.files):
-            path = manifest.folder / f"{table}.parquet"
+            path = manifest.path(table)
             (current if entry.contract_version == present else others).append(path)
     if (root / f"{table}.parquet").exists():
         others.append(root / f"{table}.parquet")

@@ -20,6 +20,7 @@ from moto.server import ThreadedMotoServer
 from pipeline.batch import Pruning
 from pipeline.batch.recordings import find_recordings
 from pipeline.batch.verification import verify_results
+from pipeline.cli import main
 from pipeline.logs import (
     LogError,
     LogWriter,
@@ -159,7 +160,9 @@ def list_published(store: fsspec.AbstractFileSystem, out: str) -> dict[str, byte
     """Every table and text that people read, by its path in the results."""
     store.invalidate_cache()
     start = len(out.removeprefix("s3://")) + 1
-    names = [name for name in store.find(out) if not name[start:].startswith("batch/")]
+    names = [
+        name for name in store.find(out) if not name[start:].startswith("batch/") and "/." not in name[start:]
+    ]
     return {name[start:]: store.cat_file(name) for name in names}
 
 
@@ -245,3 +248,35 @@ def test_a_bucket_that_is_not_there_is_said(
     assert caught.value.code == "no_object_store"
     outcome = batch(season / "a.mcap", tmp_path / "mirror", address="s3://nowhere/results")
     assert outcome.lines[0].code == "store_unreachable"
+
+
+def test_a_bucket_of_a_stranger_writes_nothing_outside_of_its_mirror(
+    bucket: fsspec.AbstractFileSystem,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / ".bashrc").write_text("precious")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home / ".cache"))
+    monkeypatch.setenv("HOME", str(home))
+    # Of the mirror in ~/.cache/slip/results/<hash> everything above is within reach.
+    upload(
+        bucket,
+        {
+            "results/batch/logs/../../../../../../.bashrc": b"evil",
+            "results/runs/../../../../../.config/manifest.json": b"evil",
+        },
+    )
+    out = f"{BUCKET}/results"
+    for arguments in (("status", out), ("verify", out), ("query", "SELECT 1", "--out", out)):
+        with pytest.raises(SystemExit) as ended:
+            main(list(arguments))
+        assert ended.value.code == 1
+        said = capsys.readouterr().err.splitlines()
+        assert len(said) == 1
+        assert out in said[0]
+    found = {path.relative_to(home).as_posix() for path in home.rglob("*") if path.is_file()}
+    assert found == {".bashrc"}
+    assert (home / ".bashrc").read_text() == "precious"

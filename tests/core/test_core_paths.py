@@ -40,9 +40,7 @@ ROOT = Path("/results/here")
 def test_a_name_stays_inside_or_is_refused(name: str) -> None:
     try:
         path = resolve_inside(ROOT, name)
-    except PathError as error:
-        assert error.code == "path_outside"
-        assert "\n" not in str(error)
+    except PathError:
         return
     read_as = {name, unicodedata.normalize("NFKC", name), unicodedata.normalize("NFC", name)}
     for text in read_as:
@@ -66,12 +64,15 @@ def test_names_that_lead_elsewhere_are_refused(name: str) -> None:
     if name == ". ./x":
         # A part of its own with a space in its middle is an odd name, but a name.
         assert resolve_inside(ROOT, "a. .b/x") == ROOT / "a. .b/x"
-    with pytest.raises(PathError):
+    with pytest.raises(PathError) as caught:
         resolve_inside(ROOT, name)
+    assert caught.value.code == "path_outside"
+    assert len(str(caught.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize(
-    "name", ["a", "runs/2026-07/husky 3/manifest.json", "é/Ωmega.mcap", "a..b", ".hidden", "x" * 255, "10:32/a"]
+    "name",
+    ["a", "runs/2026-07/husky 3/manifest.json", "é/Ωmega.mcap", "a..b", ".hidden", "x" * 255, "10:32/a"],
 )
 def test_plain_names_are_what_they_say(name: str) -> None:
     assert resolve_inside(ROOT, name) == ROOT / name

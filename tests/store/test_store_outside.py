@@ -15,14 +15,14 @@ from pipeline.store import Mirror, Store, StoreError
 fsspec = pytest.importorskip("fsspec", reason="the extra s3 is not installed")
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
 RUN = "2026/husky"
 ADDRESS = "memory://field/results"
 
 OUTSIDE = [
-    "batch/logs/../../../victim/.bashrc/x.json",
-    "batch/logs/../../victim/bashrc.json",
+    "batch/logs/../../../victim/bashrc",
+    "batch/logs/../../../victim/bashrc.json",
     "runs/../../victim/manifest.json",
     "runs/a/../../../victim/manifest.json",
     "runs//etc/manifest.json",
@@ -37,7 +37,16 @@ OUTSIDE = [
 ]
 """Keys that look like objects of results and lead, or might lead, elsewhere."""
 
-OTHERS = ["..", ".bashrc", ".lock", "mirror.json", "C:", "\uff0e\uff0e", "latest\\x", "runs/a/b/c/d/manifest.json"]
+OTHERS = [
+    "..",
+    ".bashrc",
+    ".lock",
+    "mirror.json",
+    "C:",
+    "\uff0e\uff0e",
+    "latest\\x",
+    "runs/a/b/c/d/manifest.json",
+]
 """Keys that are no objects of results."""
 
 
@@ -51,15 +60,12 @@ def bucket() -> Iterator[fsspec.AbstractFileSystem]:
 
 @pytest.fixture
 def place(tmp_path: Path) -> Path:
-    """A folder with something precious in it, and a mirror beside it that has links to it."""
+    """A folder with something precious in it, beside which the mirror will stand."""
     victim = tmp_path / "victim"
     victim.mkdir()
     (victim / "bashrc").write_text("precious")
     (victim / "bashrc.json").write_text("precious")
     (victim / "manifest.json").write_text("precious")
-    for folder in ("runs", "batch/logs"):
-        (tmp_path / "mirror" / folder).mkdir(parents=True)
-        (tmp_path / "mirror" / folder / "link").symlink_to(victim)
     return tmp_path
 
 
@@ -83,6 +89,10 @@ def put(objects: fsspec.AbstractFileSystem, name: str, data: bytes) -> None:
 def test_an_object_whose_name_leads_elsewhere_is_refused(
     bucket: fsspec.AbstractFileSystem, place: Path, name: str
 ) -> None:
+    if "link" in name:
+        link = place / "mirror" / name.rpartition("/")[0]
+        link.parent.mkdir(parents=True)
+        link.symlink_to(place / "victim")
     before = look(place)
     put(bucket, name, b'{"evil": 1}')
     with pytest.raises(StoreError) as caught:
@@ -130,37 +140,50 @@ def test_a_run_is_fetched_as_it_was_written(
     assert damaged in caught.value.where
 
 
-def edit(path: Path, change: Callable[[dict[str, object]], None]) -> None:
+def edit(path: Path, changes: dict[str, object]) -> None:
     """Change a manifest as somebody would who knows how it is made: as one of before there were checksums."""
     content = json.loads(path.read_text())
-    content.pop("checksum", None)
-    change(content)
-    path.write_text(json.dumps(content))
+    del content["checksum"]
+    path.write_text(json.dumps(content | changes))
 
 
 ENTRY = {"bytes": 1, "sha256": "0" * 64}
 TABLE = {**ENTRY, "file": "slip.parquet", "rows": 1, "quarantined": 0, "contract_version": 1, "rules": {}}
-ELSEWHERE = ["../../../victim/x", "/etc/passwd", "C:x", "a\\..\\..\\x", "\uff0e\uff0e/x", "a/../../x", "", ".", ".."]
+ELSEWHERE = [
+    "../../../victim/x",
+    "/etc/passwd",
+    "C:x",
+    "a\\..\\..\\x",
+    "\uff0e\uff0e/x",
+    "a/../../x",
+    "",
+    ".",
+    "..",
+]
 
 
-@pytest.mark.parametrize("name", ELSEWHERE, ids=ascii)
 @pytest.mark.parametrize("field", ["folder", "key", "earlier", "files", "table", "table's file"])
-def test_a_manifest_names_nothing_outside_of_its_run(store: Store, field: str, name: str) -> None:
+def test_a_manifest_names_nothing_outside_of_its_run(store: Store, field: str) -> None:
     manifest = write_generation(store, RUN, "k", 1)
-    changes: dict[str, dict[str, object]] = {
-        "folder": {"folder": name},
-        "key": {"key": name},
-        "earlier": {"earlier": [name]},
-        "files": {"files": {name: ENTRY}},
-        "table": {"tables": {name: {**TABLE, "file": f"{name}.parquet"}}},
-        "table's file": {"tables": {"slip": {**TABLE, "file": name}}},
-    }
-    edit(manifest.folder.parent / "manifest.json", lambda content: content.update(changes[field]))
-    for look_at in (store.manifests, lambda: store.manifest(RUN), lambda: store.prune(0)):
-        with pytest.raises(StoreError) as caught:
-            look_at()
-        assert caught.value.code == "manifest_damaged"
-    assert [problem.code for problem in store.verify()] == ["manifest_damaged"]
+    path = manifest.folder.parent / "manifest.json"
+    whole = path.read_bytes()
+    for name in ELSEWHERE:
+        changes: dict[str, dict[str, object]] = {
+            "folder": {"folder": name},
+            "key": {"key": name},
+            "earlier": {"earlier": [name]},
+            "files": {"files": {name: ENTRY}},
+            "table": {"tables": {name: {**TABLE, "file": f"{name}.parquet"}}},
+            "table's file": {"tables": {"slip": {**TABLE, "file": name}}},
+        }
+        edit(path, changes[field])
+        for look_at in (store.manifests, lambda: store.manifest(RUN), lambda: store.prune(0)):
+            with pytest.raises(StoreError) as caught:
+                look_at()
+            assert caught.value.code == "manifest_damaged"
+        assert [problem.code for problem in store.verify()] == ["manifest_damaged"]
+        path.write_bytes(whole)
+    assert store.verify() == ()
 
 
 @pytest.mark.parametrize("what", ["folder", "file"])
@@ -181,7 +204,7 @@ def test_a_link_in_a_run_leads_nowhere_outside(store: Store, tmp_path: Path, wha
 def test_a_run_stands_in_its_own_folder_only(store: Store, run: str) -> None:
     """Whatever runs are called, their names come to be names of files: of exports, and of pages."""
     manifest = write_generation(store, RUN, "k", 1)
-    edit(manifest.folder.parent / "manifest.json", lambda content: content.update(run=run))
+    edit(manifest.folder.parent / "manifest.json", {"run": run})
     with pytest.raises(StoreError):
         store.manifests()
     assert [error.code for error in store.survey().errors] == ["name_clash"] if run else True
@@ -192,8 +215,8 @@ def test_notes_of_strange_content_are_no_notes(store: Store) -> None:
     notes = store.notes("batch/logs")
     path = notes.path_of("x")
     path.parent.mkdir(parents=True)
-    for content in ("[]", "null", "{", '"x"', "[" * 100_000, "\udcff".encode("utf-8", "surrogatepass").decode("latin-1")):
-        path.write_text(content)
+    for content in (b"[]", b"null", b"{", b'"x"', b"[" * 100_000, b'{"a": "\xed\xb3\xbf"}'):
+        path.write_bytes(content)
         assert notes.read("x") is None
         assert list(notes.read_all()) == []
     path.unlink()
