@@ -62,13 +62,15 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> Plan:
     """
     ledger = Ledger(store).read_all()
     manifests = {manifest.run: manifest for manifest in store.survey().manifests}
+    asked_again = {run for run, manifest in manifests.items() if store.is_asked_again(manifest)}
     hasher = BasisHasher(request.options)
     items = [_look_at(path, hasher, ledger) for path in paths]
     settled: list[Entry] = []
     open_items: list[Item] = []
     for item in items:
         entry = item.before
-        if entry is not None and _is_settled(item, entry, manifests, request):
+        is_asked_again = entry is not None and entry.run in asked_again
+        if entry is not None and not is_asked_again and _is_settled(item, entry, manifests, request):
             settled.append(entry)
         else:
             open_items.append(item)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -78,6 +78,8 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
     run = options.run or name_run(path, sha256, store)
     keys = key_stages(run, sha256, subject, options.inputs, hash_model(options.model))
     current = store.manifest(run)
+    if current is not None and store.is_asked_again(current):
+        options = replace(options, force=True)
     twin = _find_twin(path, sha256, current)
     if current is not None and not options.force and _is_done(current, keys, options):
         return Outcome(_read_summary(current, options), current, (), twin)

@@ -12,15 +12,15 @@ from __future__ import annotations
 
 import hashlib
 import os
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
 from pipeline.store.errors import StoreError, name_disk_errors
 from pipeline.store.files import make_folder, replace_file
-from pipeline.store.listing import ABSENT, encode_entry, entry_name, make_entry
+from pipeline.store.listing import ABSENT, encode_entry, entry_name, is_run_manifest, make_entry
 from pipeline.store.manifest import MANIFEST, MARKER, hash_bytes
-from pipeline.store.manifest_file import encode_manifest, load_manifest
+from pipeline.store.manifest_file import encode_manifest, load_manifest, parse_manifest
 from pipeline.store.names import encode_run, is_file_name, place_inside
 from pipeline.store.notes import LOG_NOTES
 from pipeline.store.results import RUNS, Store
@@ -187,6 +187,27 @@ class Mirror:
     def examine(self) -> Examination:
         """As `verify`, with what cannot be judged."""
         return examine_files(self)
+
+    def put_on_list(self, name: str) -> None:
+        """As `Store.put_on_list`.
+
+        Raises:
+            StoreError: as `pull_index`.
+        """
+        data = self.read(name)
+        if data is not None:
+            manifest = parse_manifest(data, self._hold(name).parent) if is_run_manifest(name) else None
+            self._publish(name, data, manifest)
+
+    def remove(self, name: str) -> None:
+        """As `Store.remove`.
+
+        Raises:
+            StoreError: as `pull_index`.
+        """
+        with self._name_errors(), suppress(FileNotFoundError):
+            self._objects.rm([self._place(name)])
+        self._hold(name).unlink(missing_ok=True)
 
     def names(self) -> Collection[str]:
         """Every name in the results on the store.

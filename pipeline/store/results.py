@@ -12,14 +12,22 @@ from pipeline.store.files import (
     make_folder,
     remove_folder,
     remove_leftovers,
+    replace_file,
     temporary_beside,
     write_new_file,
 )
 from pipeline.store.generation import Generation
 from pipeline.store.homes import point_latest, remove_orphans
-from pipeline.store.listing import replace_listed
+from pipeline.store.listing import (
+    LIST,
+    encode_entry,
+    entry_name,
+    is_run_manifest,
+    make_entry,
+    replace_listed,
+)
 from pipeline.store.locks import hold_lock
-from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes
+from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes, hash_file
 from pipeline.store.manifest_file import encode_manifest, load_manifest
 from pipeline.store.names import check_file_name, check_home, check_key, encode_run, name_clash, place_inside
 from pipeline.store.notes import AGAIN_NOTES, Notes
@@ -225,6 +233,29 @@ class Store:
         """Whether exactly this generation is to be made again."""
         note = self.notes(AGAIN_NOTES).read(manifest.run)
         return note is not None and note.get("folder") == manifest.folder.name
+
+    def put_on_list(self, name: str) -> None:
+        """Have a manifest, or a file over all runs, on the list as it is.
+
+        Raises:
+            StoreError: ``locked``, or the disk refuses.
+        """
+        path = place_inside(self.root, name)
+        with self._lock(path.parent), name_disk_errors(path):
+            manifest = load_manifest(path.parent) if is_run_manifest(name) else None
+            entry = make_entry(name, hash_file(path), manifest=manifest)
+            make_folder(self.root / LIST)
+            replace_file(self.root / entry_name(name), encode_entry(entry))
+
+    def remove(self, name: str) -> None:
+        """Remove a file that nobody can use any more: a damaged manifest, entry or note.
+
+        Raises:
+            StoreError: ``locked``, or the disk refuses.
+        """
+        path = place_inside(self.root, name)
+        with self._lock(path.parent if is_run_manifest(name) else self.root), name_disk_errors(path):
+            path.unlink(missing_ok=True)
 
     def prune(self, keep: int) -> tuple[Path, ...]:
         """Remove all but the newest ``keep`` generations of every run that are not current.

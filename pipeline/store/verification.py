@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 from pipeline.store.errors import StoreError
@@ -35,12 +35,14 @@ class Problem:
         code: ``file_missing``, ``file_damaged``, ``manifest_damaged``, ``manifest_swapped``, ``run_missing``,
             ``not_listed``, ``name_clash``, ``old_generation``, ``list_damaged``, ``note_damaged``, ...
         what: what is wrong, one sentence without a full stop.
+        home: folder of the run in the results; empty for a file that belongs to none.
     """
 
     run: str
     path: Path
     code: str
     what: str
+    home: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +135,8 @@ class _Examiner:
         listed = {name for name in self._entries if is_run_manifest(name)}
         there = {name for name in self._names if is_run_manifest(name)}
         for name in sorted((there | listed) - {f"{folder}/{MANIFEST}" for folder in self._folders}):
-            problems += self._examine_run(name)
+            home = name.removesuffix(f"/{MANIFEST}")
+            problems += [replace(problem, home=home) for problem in self._examine_run(name)]
         plain = {name for name in self._names if is_file_name(name) and "/" not in name and name != _SEEN}
         for name in sorted(plain | (set(self._entries) - listed)):
             problems += self._examine_plain(name)
@@ -177,11 +180,11 @@ class _Examiner:
                 if not problems or not (self._has_newer_entry(name) or self._files.read(name) != data):
                     return problems
             except OSError as error:
-                return [self._problem(self._place_of(name), name, "disk_error", _say(error))]
+                return [self._problem(_place_of(name), name, "disk_error", _say(error))]
             del self._unlisted[unlisted:]
 
     def _judge_run(self, name: str, data: bytes | None, entry: Entry | None) -> list[Problem]:
-        run = self._place_of(name)
+        run = _place_of(name)
         if data is None:
             if entry is None or ABSENT in entry.sha256:
                 return []
@@ -291,13 +294,10 @@ class _Examiner:
     def _problem(self, run: str, name: str, code: str, what: str) -> Problem:
         return Problem(run=run, path=self._files.place(name), code=code, what=what)
 
-    @staticmethod
-    def _home(name: str) -> str:
-        return name.rpartition("/")[0]
 
-    def _place_of(self, name: str) -> str:
-        """Folder of a run below the folder of all runs."""
-        return self._home(name).removeprefix(f"{RUNS}/")
+def _place_of(name: str) -> str:
+    """Folder of a run below the folder of all runs, by the name of its manifest."""
+    return name.removeprefix(f"{RUNS}/").removesuffix(f"/{MANIFEST}")
 
 
 def _say(error: OSError) -> str:
