@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from pipeline.cli.choices import Choices, build_options
+from pipeline.cli.model_trust import TrustCode, trust_named
 from pipeline.cli.output import describe_error, exit_code, print_error, print_json, print_lines, show_progress
 from pipeline.core.errors import SlipError
 from pipeline.job.options import FigureFormat, Options
@@ -33,6 +34,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     report: Annotated[bool, Parameter(negative="--no-report")] = True,
     figures: FigureFormat | None = None,
     model: Path | None = None,
+    trust_code: TrustCode = False,
     force: bool = False,
     json: bool = False,
     quiet: bool = False,
@@ -43,11 +45,13 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         diagnosis: name what is missing from the model.
         report: write report.html.
         model: a model file to compute slip relative to as well.
+        trust_code: trust the Python that the model file names, now and later.
         figures: also write the figures in this format, for papers.
         force: compute again what is already there.
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
+    trust_named(model, wanted=trust_code)
     options = build_options(
         choices, report=report, diagnosis=diagnosis, figures=figures, force=force, model=model
     )

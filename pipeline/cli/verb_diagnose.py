@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from pipeline.cli.choices import Choices, build_options
+from pipeline.cli.model_trust import TrustCode, open_model
 from pipeline.cli.output import describe_error, exit_code, print_error, print_json, print_lines, show_progress
 from pipeline.core.errors import SlipError
 
@@ -32,6 +33,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     model: Annotated[
         Path | None, Parameter(help="what is known already: say what is missing beyond it")
     ] = None,
+    trust_code: TrustCode = False,
     apply: Annotated[Path | None, Parameter(help="write the proposed model to this file")] = None,
     json: bool = False,
     quiet: bool = False,
@@ -39,11 +41,12 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     """Name what is missing from the model, from one run or from several of one vehicle jointly.
 
     Args:
+        trust_code: trust the Python that the model file names, now and later.
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
     options = build_options(choices)
-    known = _read_model(model)
+    known = None if model is None else open_model(model, trust_code=trust_code)
     gathered, errors, lossy = _gather(logs, options, quiet=quiet or json)
     diagnoses: list[Diagnosis] = []
     for vehicle, recordings in gathered.values():
@@ -56,21 +59,14 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     if apply is not None:
         _apply([run.proposal for run in runs], apply, quiet=quiet or json)
     if json:
-        print_json({"runs": [run.to_json() for run in runs], "errors": errors})
+        left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
+        print_json({"runs": [run.to_json() for run in runs], "errors": errors, **left_out})
     elif not quiet:
         from pipeline.diagnosis.words import describe  # noqa: PLC0415 - only for people
 
         for diagnosis in diagnoses:
             print_lines(describe(diagnosis).split("\n"))
     return exit_code(errors, lossy=lossy)
-
-
-def _read_model(path: Path | None) -> ModelFile | None:
-    if path is None:
-        return None
-    from pipeline.motion import read_model  # noqa: PLC0415 - heavy
-
-    return read_model(path)
 
 
 def _gather(

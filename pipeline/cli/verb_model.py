@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
+from pipeline.cli.model_trust import TrustCode, open_model, trust, trusted, untrust
 from pipeline.cli.output import CLEAN, print_json, print_lines, say
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ class On:
         Parameter(help="what the model is fed with (default: as last time, else measured wheels if there)"),
     ] = None
     out: Annotated[Path, Parameter(help="results folder")] = Path("results")
+    trust_code: TrustCode = False
     json: Annotated[bool, Parameter(help="print one JSON object", negative="")] = False
     quiet: Annotated[bool, Parameter(help="print no progress and no table", negative="")] = False
 
@@ -43,7 +45,7 @@ Spoken = Annotated[On, Parameter(name="*")]
 def register(app: App) -> None:
     """Add the verb and its own verbs."""
     model = App(name="model", help="Make, show, change, fit, compare and export a motion model.")
-    for command in (new, show, add, drop, fit, compare, export):
+    for command in (new, show, add, drop, fit, compare, export, trust, untrust, trusted):
         model.command(command)
     app.command(model)
 
@@ -86,19 +88,19 @@ def new(
     return CLEAN
 
 
-def show(model: Path, /, *, json: bool = False) -> int:
+def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -> int:
     """Show a model: its effects, values, intervals, and what they were fitted on.
 
     Args:
         model: the model file.
+        trust_code: trust the Python that the model file names, now and later.
         json: print one JSON object.
     """
     from pipeline.motion.describe import describe_parameters, parameters_as_json  # noqa: PLC0415 - heavy
     from pipeline.motion.export import export_json  # noqa: PLC0415
     from pipeline.motion.intervals import NOTHING  # noqa: PLC0415
-    from pipeline.motion.model_file import read_model  # noqa: PLC0415
 
-    file = read_model(model)
+    file = open_model(model, trust_code=trust_code)
     if json:
         sys.stdout.write(export_json(file))
         return CLEAN
@@ -122,16 +124,12 @@ def add(  # noqa: D417 - the shared options document themselves
         model: the model file.
         effects: ids of effects, as `slip effects` lists them.
     """
-    from pipeline.motion.catalogue import find_effect, load_effects  # noqa: PLC0415 - heavy
-    from pipeline.motion.model_file import read_model  # noqa: PLC0415
+    from pipeline.motion.catalogue import find_effect  # noqa: PLC0415 - heavy
 
-    file = read_model(model)
-    own = {
-        name: kind for text in file.effect_files for name, kind in load_effects(model.parent / text).items()
-    }
+    file = open_model(model, trust_code=spoken.trust_code)
     changed = file.model
     for name in effects:
-        changed = changed + find_effect(name, own)()
+        changed = changed + find_effect(name, file.own)()
     return _change(model, file, replace(file, model=changed), spoken)
 
 
@@ -144,9 +142,7 @@ def drop(  # noqa: D417 - the shared options document themselves
         model: the model file.
         effects: ids of effects that the model has.
     """
-    from pipeline.motion.model_file import read_model  # noqa: PLC0415 - heavy
-
-    file = read_model(model)
+    file = open_model(model, trust_code=spoken.trust_code)
     changed = file.model
     for name in effects:
         changed = changed - name
@@ -168,9 +164,7 @@ def fit(  # noqa: D417 - the shared options document themselves
         predict: logs or runs that the fit must not see, to be predicted with it.
         afresh: forget the values there are and search anew.
     """
-    from pipeline.motion.model_file import read_model  # noqa: PLC0415 - heavy
-
-    file = read_model(model)
+    file = open_model(model, trust_code=spoken.trust_code)
     changed = file
     if afresh:
         neutral = [effect.change(**{p.name: p.neutral for p in effect.parameters}) for effect in file.model]
@@ -187,13 +181,14 @@ def compare(  # noqa: D417 - the shared options document themselves
         model: a model file.
         other: another one.
     """
-    from pipeline.motion.model_file import read_model  # noqa: PLC0415 - heavy
-    from pipeline.motion.transfer import carry_over  # noqa: PLC0415
+    from pipeline.motion.transfer import carry_over  # noqa: PLC0415 - heavy
     from pipeline.motion.workshop import choose_input  # noqa: PLC0415
 
     rows: list[tuple[str, Transfer]] = []
+    left_out: list[str] = []
     for path in (model, other):
-        file = read_model(path)
+        file = open_model(path, trust_code=spoken.trust_code)
+        left_out += file.warnings
         runs = _gather(spoken, file, spoken.on)
         source = choose_input(runs, spoken.input or _last_input(file))
         rows += [
@@ -201,7 +196,8 @@ def compare(  # noqa: D417 - the shared options document themselves
         ]
     warnings = [item.warning for _, item in rows if item.warning]
     if spoken.json:
-        print_json({"compared": [_transfer_as_json(name, item) for name, item in rows], "warnings": warnings})
+        compared = [_transfer_as_json(name, item) for name, item in rows]
+        print_json({"compared": compared, "warnings": [*left_out, *warnings]})
     elif not spoken.quiet:
         print_lines(_describe_transfers(rows))
         _warn(warnings)
@@ -214,6 +210,7 @@ def export(  # noqa: D417 - the options document themselves
     *,
     to: Literal["ros2_control", "json", "python"],
     out: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
+    trust_code: TrustCode = False,
 ) -> int:
     """Export a model to what people run.
 
@@ -222,14 +219,13 @@ def export(  # noqa: D417 - the options document themselves
         to: controller and nav2 parameters, JSON, or a Python function without dependencies.
     """
     from pipeline.motion import export as exports  # noqa: PLC0415 - heavy
-    from pipeline.motion.model_file import read_model  # noqa: PLC0415
 
     write = {
         "ros2_control": exports.export_ros2_control,
         "json": exports.export_json,
         "python": exports.export_python,
     }[to]
-    text = write(read_model(model))
+    text = write(open_model(model, trust_code=trust_code))
     if out is None:
         sys.stdout.write(text)
     else:
@@ -241,11 +237,13 @@ def _change(
     path: Path, before: ModelFile, after: ModelFile, spoken: On, *, predict: Sequence[str] = ()
 ) -> int:
     """Judge a model before and after a change, fit it, write its file, and print."""
-    from pipeline.motion.model_text import write_model  # noqa: PLC0415 - heavy
+    from pipeline.motion.model_text import format_model, write_model  # noqa: PLC0415 - heavy
     from pipeline.motion.problem import Problem  # noqa: PLC0415
     from pipeline.motion.transfer import carry_over  # noqa: PLC0415
     from pipeline.motion.workshop import choose_input, judge_model, note_fit  # noqa: PLC0415
 
+    # What was left out would be lost from the file: that is said before a long fit, not after it.
+    format_model(after)
     runs = _gather(spoken, after, spoken.on)
     source = choose_input(runs, spoken.input or _last_input(before))
     problem = Problem(runs, after.model.vehicle, source)
@@ -260,7 +258,7 @@ def _change(
     carried = carry_over(written.model, others, source, fitted_on=terrains) if others else []
     warnings = [item.warning for item in carried if item.warning]
     if spoken.json:
-        print_json(_as_json(path, old, new_one, after.model, carried, warnings))
+        print_json(_as_json(path, old, new_one, after.model, carried, [*before.warnings, *warnings]))
     elif not spoken.quiet:
         lines = _describe(old, new_one, after.model)
         if carried:

@@ -181,19 +181,19 @@ class Work:
             inputs=self.options.inputs,
             where=str(subject.path),
         )
-        table = self._set_against_model(made.slip)
+        table, left_out = self._set_against_model(made.slip)
         self.write("slip", table)
         self.write("windows", made.windows)
         command = subject.sources.command
         body = command is not None and command.form in {DriveForm.BODY, DriveForm.BODY_SIGNALS}
         samples = checks.gather_samples(velocities, made.slip, body_commanded=body)
-        return StageOutcome((*made.findings, *checks.run_checks(samples, subject.vehicle)))
+        return StageOutcome((*made.findings, *left_out, *checks.run_checks(samples, subject.vehicle)))
 
-    def _set_against_model(self, table: pl.DataFrame) -> pl.DataFrame:
+    def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
         """Table `slip` with the velocity of the model that was given, as it is without one."""
         path, configuration = self.options.model, self.subject.configuration
         if path is None:
-            return table
+            return table, ()
         read = {name: self._read(name) for name in ("poses", "commands", "wheels", "imu")}
         return add_model(
             table,

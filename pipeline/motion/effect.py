@@ -191,6 +191,13 @@ class Effect(ABC):
             parameter = self.parameter(name)
             low, high = parameter.bounds
             neutral = value == parameter.neutral or (math.isnan(value) and math.isnan(parameter.neutral))
+            if not neutral and not math.isfinite(value):
+                raise MotionError(
+                    "out_of_bounds",
+                    f"{name} = {value:g} is no finite number",
+                    where=f"{self.id}.{name}",
+                    hint="Give a value inside the bounds.",
+                )
             if not neutral and not low <= value <= high:
                 unit = "" if parameter.unit == "1" else f" {parameter.unit}"
                 raise MotionError(

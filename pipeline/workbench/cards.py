@@ -33,13 +33,17 @@ def show_desk(desk: Desk, file: ModelFile) -> dict[str, object]:
     return {
         "run": desk.run,
         "input": desk.input,
-        "said": step.said,
+        "said": "; ".join((step.said, *file.warnings)),
         "by_hand": step.by_hand,
         "ideal": _errors(step.ladder[0]),
         "errors": _errors(step.ladder[-1]),
         "before": _errors(before.ladder[-1]) if before is not None else None,
         "floor": _errors(desk.floor) if desk.floor else None,
-        "effects": [show_effect(file, name, step.off, step.without.get(name)) for name in step.order],
+        "effects": [
+            show_effect(file, name, step.off, step.without.get(name))
+            for name in step.order
+            if name not in file.left_out
+        ],
         "undo": desk.steps[desk.at].said if desk.at > 0 else None,
         "redo": desk.steps[desk.at + 1].said if desk.at + 1 < len(desk.steps) else None,
         "history": [each.said for each in desk.steps[: desk.at + 1]][-_LATEST:],

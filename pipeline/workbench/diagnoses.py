@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from typing import TYPE_CHECKING
 
+from pipeline.core.interpreter import slip_command
 from pipeline.job.diagnosis import DIAGNOSIS
 from pipeline.store.files import make_folder, replace_file
 from pipeline.store.names import encode_run
@@ -44,7 +44,7 @@ def write_diagnosis(results: Path, manifest: Manifest) -> None:
     Raises:
         WorkbenchError: ``diagnosis_failed``.
     """
-    command = [sys.executable, "-m", "pipeline", "diagnose", "--out", str(results.resolve()), "--json"]
+    command = slip_command("diagnose", "--out", str(results.resolve()), "--json")
     try:
         done = subprocess.run(  # noqa: S603 - our own program, its words as separate arguments
             [*command, "--", manifest.run],

@@ -24,6 +24,7 @@ from pipeline.batch.errors import BatchError
 from pipeline.batch.executors import Blame, Settings
 from pipeline.batch.memory import MemoryWatchdog
 from pipeline.batch.work import work_safely
+from pipeline.core.interpreter import keep_current_folder_out
 
 if TYPE_CHECKING:
     from pipeline.batch.work import Report, Task
@@ -62,6 +63,7 @@ class LocalExecutor:
         # Spawned processes take the environment over; more threads than cores only get in each other's way.
         for variable in THREAD_VARIABLES:
             os.environ.setdefault(variable, "1")
+        keep_current_folder_out()
         self._workers: list[_Worker] = []
         self._ended: list[_Worker] = []
         self._watchdog = MemoryWatchdog(settings.memory_bytes)
