@@ -26,12 +26,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from pipeline.batch.work import Report, Task
     from pipeline.motion.formula import FormulaEffect
     from pipeline.motion.model_file import ModelFile
     from pipeline.report.motion_view import MotionView
     from pipeline.store import Manifest
     from pipeline.workbench.bench import Stand
     from pipeline.workbench.desk import Desk
+    from pipeline.workbench.limits import Limits
+    from pipeline.workbench.places import Places
     from pipeline.workbench.requests import Ask
 
 _MOST_ALBUMS = 6
@@ -42,14 +45,24 @@ class Hall:
 
     Args:
         results: the results folder.
-        most_bytes: the largest log that is taken in.
+        limits: what logs and the work on them may cost.
         diagnosis: whether a dropped log is diagnosed too.
+        places: what the page is not told.
+        work: what the worker process does with a task; importable by its name there.
     """
 
-    def __init__(self, results: Path, most_bytes: int, *, diagnosis: bool) -> None:
+    def __init__(
+        self,
+        results: Path,
+        limits: Limits,
+        *,
+        diagnosis: bool,
+        places: Places,
+        work: Callable[[Task], Report] | None = None,
+    ) -> None:
         self.results = results
         self.store = Store(results)
-        self.jobs = Jobs(results, most_bytes, diagnosis=diagnosis)
+        self.jobs = Jobs(results, limits, diagnosis=diagnosis, places=places, work=work)
         self._bench = Bench()
         self._trials = Trials()
         self._albums: OrderedDict[tuple[str, str], Album] = OrderedDict()

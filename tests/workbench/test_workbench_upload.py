@@ -5,14 +5,15 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
-from workbench_server import Workbench
+from workbench_server import LIMITS, TOKEN, Workbench
 
 from pipeline.logs import LogWriter
-from pipeline.workbench.jobs import clean_name
+from pipeline.workbench.uploads import clean_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,7 +24,7 @@ START = 1_700_000_000_000_000_000
 
 @pytest.fixture
 def empty(tmp_path: Path) -> Iterator[Workbench]:
-    server = Workbench(tmp_path / "results", most_bytes=20_000_000)
+    server = Workbench(tmp_path / "results", limits=replace(LIMITS, log_bytes=20_000_000))
     yield server
     server.close()
 
@@ -84,7 +85,7 @@ def test_a_connection_that_breaks_leaves_nothing(empty: Workbench) -> None:
     with socket.create_connection(("127.0.0.1", empty.port)) as line:
         head = (
             f"POST /api/upload?name=x.mcap HTTP/1.1\r\nHost: 127.0.0.1:{empty.port}\r\n"
-            f"Origin: http://127.0.0.1:{empty.port}\r\nContent-Length: 1000000\r\n\r\n"
+            f"Origin: {empty.origin}\r\nCookie: slip-{empty.port}={TOKEN}\r\nContent-Length: 1000000\r\n\r\n"
         )
         line.sendall(head.encode() + b"x" * 1000)
     end = time.monotonic() + 10.0
