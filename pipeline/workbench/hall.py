@@ -15,7 +15,7 @@ from pipeline.workbench.bench import Bench
 from pipeline.workbench.cards import list_catalogue, show_desk
 from pipeline.workbench.desk import DeskFile, switch_off
 from pipeline.workbench.diagnoses import read_diagnosis
-from pipeline.workbench.errors import WorkbenchError
+from pipeline.workbench.errors import WorkbenchError, evaluating
 from pipeline.workbench.formulas import make_formula
 from pipeline.workbench.jobs import Jobs
 from pipeline.workbench.live import Album
@@ -77,26 +77,30 @@ class Hall:
         manifest = find_run(self.store, ask.run)
         file = DeskFile(self.results, ask.run, ask.slot)
         stand = self._bench.stand(manifest, self._input_of(ask, file, manifest))
-        with stand.lock:
+        with stand.lock, evaluating(ask.run):
             desk = work.open_desk(file, stand)
             if ask.action == "preview":
                 return self._preview(file, stand, desk, ask)
             changed = work.learn_floor(
                 self._change(file, stand, desk, ask), read_diagnosis(self.results, manifest)
             )
+            # A step that cannot be shown is not kept.
+            shown = self._show(file, stand, changed)
             if changed is not desk:
                 file.write(changed)
-            return self._show(file, stand, changed)
+            return shown
 
     def draw(self, ask: Ask) -> dict[str, object]:
         """All figures of a desk."""
         album, view = self._look(ask)
-        return album.draw(view)
+        with evaluating(ask.run):
+            return album.draw(view)
 
     def redraw(self, ask: Ask) -> dict[str, object]:
         """The rows of a desk's figures that a change moves."""
         album, view = self._look(ask)
-        return album.redraw(view)
+        with evaluating(ask.run):
+            return album.redraw(view)
 
     def format_model(self, run: str, slot: str) -> str:
         """The model file of a desk as text."""
@@ -121,7 +125,7 @@ class Hall:
         manifest = find_run(self.store, ask.run)
         file = DeskFile(self.results, ask.run, ask.slot)
         stand = self._bench.stand(manifest, self._input_of(ask, file, manifest))
-        with stand.lock:
+        with stand.lock, evaluating(ask.run):
             desk = work.open_desk(file, stand)
         return stand, desk, file.parse(desk.step.model)
 
@@ -145,8 +149,8 @@ class Hall:
             "set": lambda: work.set_value(file, stand, desk, ask.effect, {ask.parameter: ask.value}),
             "lock": lambda: work.lock_value(file, desk, ask.effect, ask.parameter),
             "fit": lambda: work.fit_desk(file, stand, desk),
-            "undo": lambda: desk.move(-1),
-            "redo": lambda: desk.move(1),
+            "undo": lambda: work.move(file, desk, -1),
+            "redo": lambda: work.move(file, desk, 1),
             "try": lambda: self._begin_trial(file, stand, desk),
         }
         return changes[ask.action]()
@@ -180,7 +184,8 @@ class Hall:
     def _look(self, ask: Ask) -> tuple[Album, MotionView]:
         stand, desk, parsed = self._open(ask)
         model = switch_off(parsed.model, desk.step.off)
-        view = stand.view(model, desk.step.timing, desk.step.ladder, desk.floor or None)
+        with evaluating(ask.run):
+            view = stand.view(model, desk.step.timing, desk.step.ladder, desk.floor or None)
         return self._album(stand.manifest), view
 
     def _album(self, manifest: Manifest) -> Album:

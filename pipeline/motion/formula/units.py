@@ -8,7 +8,7 @@ from fractions import Fraction
 
 from pipeline.motion.errors import MotionError
 
-_TOKEN = re.compile(r"\s*(?:([A-Za-z]+|1)(?:\s*(?:\^|\*\*)\s*(-?\d+))?|([*/]))\s*")
+_TOKEN = re.compile(r"\s*(?:([A-Za-z]+|1)(?:\s*(?:\^|\*\*)\s*(-?\d{1,3}))?|([*/]))\s*")
 
 
 @dataclass(frozen=True)
