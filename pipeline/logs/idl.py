@@ -20,8 +20,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 _SEPARATOR: Final = re.compile(r"^={3,}[ \t\r]*$", re.MULTILINE)
-_COMMENT: Final = re.compile(r"//[^\n]*|/\*.*?\*/|^\s*#[^\n]*|^IDL:[^\n]*", re.MULTILINE | re.DOTALL)
-_TOKEN: Final = re.compile(r'"(?:[^"\\]|\\.)*"|\'(?:[^\'\\]|\\.)*\'|::|[A-Za-z_][\w]*|[\d.]+[\w.+-]*|\S')
+# What is never closed reaches to the end, so that every character is looked at once.
+_TOKEN: Final = re.compile(
+    r"//[^\n]*|/\*(?:.*?\*/|.*)|^[^\S\n]*#[^\n]*|^IDL:[^\n]*"
+    r'|("(?:[^"\\]|\\.)*+(?:"|\Z|\\)|\'(?:[^\'\\]|\\.)*+(?:\'|\Z|\\)|::|[A-Za-z_]\w*|[\d.]+[\w.+-]*|\S)',
+    re.MULTILINE | re.DOTALL,
+)
 _NUMBERS: Final = {
     "boolean": "bool",
     "octet": "uint8",
@@ -55,13 +59,8 @@ def parse_idl(name: str, text: str) -> Structure:
 
 
 def _split_tokens(text: str) -> list[str]:
-    strings: list[str] = []
-
-    def hide(match: re.Match[str]) -> str:
-        strings.append(match[0])
-        return '""'
-
-    return _TOKEN.findall(_COMMENT.sub(" ", re.sub(r'"(?:[^"\\]|\\.)*"', hide, text)))
+    # Comments are no tokens, and nobody reads what strings say.
+    return ['""' if token.startswith('"') else token for token in _TOKEN.findall(text) if token]
 
 
 class _Reader:

@@ -224,7 +224,7 @@ def _split_number(file: Path) -> tuple[str, int]:
 
 def _listed_files(text: str) -> list[str]:
     """Entries of ``relative_file_paths`` in a rosbag2 ``metadata.yaml``."""
-    block = re.search(r"^\s*relative_file_paths:\s*\n((?:\s*-\s.*\n?)*)", text, re.MULTILINE)
+    block = re.search(r"^[ \t]*relative_file_paths:[ \t]*\r?\n((?:\s*-\s.*\n?)*)", text, re.MULTILINE)
     if block is None:
         return []
     entries = [line.strip()[1:].strip() for line in block[1].splitlines() if line.strip()]

@@ -19,7 +19,7 @@ _KILOMETRE = 1000.0
 _MOST_PLACES = 3
 _EARLIEST_YEAR = 2000
 _MOST_COLUMNS = 3
-_MARKUP = re.compile("<[^>]*>")
+_MARKUP = re.compile("<[^<>]*>")
 
 
 def escape(text: object) -> str:

@@ -33,12 +33,14 @@ def show_desk(desk: Desk, file: ModelFile) -> dict[str, object]:
     return {
         "run": desk.run,
         "input": desk.input,
-        "said": "; ".join((step.said, *file.warnings)),
+        "said": step.said,
         "by_hand": step.by_hand,
         "ideal": _errors(step.ladder[0]),
         "errors": _errors(step.ladder[-1]),
-        "before": _errors(before.ladder[-1]) if before is not None else None,
+        "before": _errors(before.ladder[-1]) if before is not None and before.ladder else None,
         "floor": _errors(desk.floor) if desk.floor else None,
+        # What the loader of models left out, and why.
+        "warnings": list(file.warnings),
         "effects": [
             show_effect(file, name, step.off, step.without.get(name))
             for name in step.order
