@@ -128,6 +128,7 @@ def list_parts(folder: Path, names: Iterable[str], *, is_listed: bool) -> list[s
 
 def _find_remote(target: RemotePath) -> Iterator[Path]:
     """Recordings under a prefix, or the one at an address; objects are there whole or not at all."""
+    target.refresh()
     base, _, pattern = str(target).partition("*")
     if not pattern and target.is_file():
         yield target

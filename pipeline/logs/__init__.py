@@ -4,6 +4,7 @@ Reading is columnar and as fast as inflating the chunks; what is damaged is told
 read. Nothing here knows what the numbers mean.
 """
 
+from pipeline.logs.buckets import FETCHED
 from pipeline.logs.columns import Ragged, RaggedStrings, Strings
 from pipeline.logs.definitions import bundled_types, definition_text, field_names
 from pipeline.logs.errors import LogError, Loss
@@ -15,6 +16,7 @@ from pipeline.logs.transforms import TransformBuffer, TransformSeries, wanted_tr
 from pipeline.logs.writer import LogWriter
 
 __all__ = [
+    "FETCHED",
     "ChannelInfo",
     "LogData",
     "LogError",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.part import catalog_file
 from pipeline.logs.remote import to_location
-from pipeline.logs.source import count_fetched, hash_sources, open_source
+from pipeline.logs.source import count_fetched, hash_sources, open_source, version_of
 from pipeline.logs.workers import usable_threads
 
 if TYPE_CHECKING:
@@ -58,6 +58,7 @@ class Part:
         numbers: the recording's channel number for each of the file's own.
         data_end: where the data section ends, None when unknown.
         data_crc: checksum of the data section, 0 when there is none.
+        version: of an object on a store, None for a file.
     """
 
     path: Path
@@ -67,6 +68,7 @@ class Part:
     numbers: Mapping[int, int]
     data_end: int | None = None
     data_crc: int = 0
+    version: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,12 +144,16 @@ def open_log(path: str | os.PathLike[str]) -> LogIndex:
     location = to_location(path)
     files, losses = find_parts(location)
     catalogs: list[tuple[Path, int, Catalog]] = []
+    versions: list[str | None] = []
     fetched = 0
     for file in files:
         with open_source(file) as source:
             catalogs.append((file, source.size, catalog_file(source, threads=usable_threads())))
+            versions.append(version_of(source))
             fetched += count_fetched([source])
-    return replace(_merge(location, catalogs, losses), fetched_bytes=fetched)
+    index = _merge(location, catalogs, losses)
+    parts = tuple(replace(part, version=each) for part, each in zip(index.parts, versions, strict=True))
+    return replace(index, parts=parts, fetched_bytes=fetched)
 
 
 def hash_log(path: str | os.PathLike[str]) -> str:

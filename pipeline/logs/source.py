@@ -120,13 +120,22 @@ class FileSource:
         self.close()
 
 
-def open_source(path: Path) -> OpenSource:
+def open_source(path: Path, version: str | None = None) -> OpenSource:
     """Open a file or an object.
 
+    Args:
+        path: the file or object.
+        version: of an object, what `version_of` told when it was opened before; another one is refused.
+
     Raises:
-        LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``.
+        LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``, ``log_changed``.
     """
-    return RemoteSource(path) if isinstance(path, RemotePath) else FileSource(path)
+    return RemoteSource(path, version) if isinstance(path, RemotePath) else FileSource(path)
+
+
+def version_of(source: ByteSource) -> str | None:
+    """Which version of an object is open; None for a file."""
+    return source.version if isinstance(source, RemoteSource) else None
 
 
 def count_fetched(sources: Sequence[ByteSource]) -> int:
