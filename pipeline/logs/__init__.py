@@ -4,7 +4,7 @@ Reading is columnar and as fast as inflating the chunks; what is damaged is told
 read. Nothing here knows what the numbers mean.
 """
 
-from pipeline.logs.buckets import FETCHED
+from pipeline.logs.buckets import FETCHED, open_store
 from pipeline.logs.columns import Ragged, RaggedStrings, Strings
 from pipeline.logs.definitions import bundled_types, definition_text, field_names
 from pipeline.logs.errors import LogError, Loss
@@ -37,6 +37,7 @@ __all__ = [
     "hash_log",
     "join_channels",
     "open_log",
+    "open_store",
     "read_topics",
     "to_location",
     "wanted_transforms",
