@@ -1,8 +1,8 @@
 """Several robots in one log: told by their namespaces, so that one's command never meets another's pose.
 
 Namespaces belong to several robots when they hold drives and poses between them and are called alike but
-for a number or letter (``robot1``, ``robot2``), are called after vehicles (``husky``, ``warthog``), or hold the
-same topics (``alice/cmd_vel``, ``alice/odom``, ``bob/cmd_vel``, ``bob/odom``). Anything else, such as
+for a number or letter (``robot1``, ``robot2``), are called after vehicles (``husky``, ``warthog``), or hold
+the same topics (``alice/cmd_vel``, ``alice/odom``, ``bob/cmd_vel``, ``bob/odom``). Anything else, such as
 ``controller`` beside ``mapping``, is one robot.
 """
 
@@ -87,8 +87,8 @@ def choose_robot(
         "several_robots",
         f"the log holds several robots ({names}), and {why}",
         where=where,
-        hint=f'Name one of its topics in run.toml, for example [pose] topic = "{told}" (and [command], [wheels], '
-        "[imu] where they stand elsewhere)",
+        hint=f'Name one of its topics in run.toml, for example [pose] topic = "{told}" '
+        "(and [command], [wheels], [imu] where they stand elsewhere)",
     )
 
 
