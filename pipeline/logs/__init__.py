@@ -11,7 +11,7 @@ from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.index import ChannelInfo, LogIndex, hash_log, open_log
 from pipeline.logs.join import join_channels
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, read_topics
-from pipeline.logs.remote import RemotePath, to_location
+from pipeline.logs.remote import RemotePath, spell_location, to_location
 from pipeline.logs.transforms import TransformBuffer, TransformSeries, wanted_transforms
 from pipeline.logs.writer import LogWriter
 
@@ -39,6 +39,7 @@ __all__ = [
     "open_log",
     "open_store",
     "read_topics",
+    "spell_location",
     "to_location",
     "wanted_transforms",
 ]

@@ -14,6 +14,7 @@ import threading
 from datetime import UTC, datetime
 from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING, Final, cast
+from urllib.parse import quote_from_bytes, unquote_to_bytes
 
 from pipeline.logs.buckets import (
     VersionChangedError,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from pipeline.logs.buckets import Info
 
 _SCHEME = re.compile(r"^([a-z][a-z0-9+]+):/+")
+_LOCAL: Final = "file://"
 _TAIL: Final = 1 << 15
 """A log's index stands at its end: one request fetches the end at once."""
 
@@ -152,7 +154,22 @@ def to_location(path: str | os.PathLike[str]) -> Path:
     if isinstance(path, RemotePath):
         return path
     text = os.fspath(path)
+    if text.startswith(_LOCAL):
+        return Path(os.fsdecode(unquote_to_bytes(text.removeprefix(_LOCAL))))
     return RemotePath(text) if _SCHEME.match(text) else Path(path)
+
+
+def spell_location(path: Path) -> str:
+    """A path as text that every table can hold; `to_location` leads back to it.
+
+    File names are bytes. Those that are no UTF-8 are spelt as an address, ``file:///logs/caf%E9.mcap``.
+    """
+    text = str(path)
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return _LOCAL + quote_from_bytes(os.fsencode(path))
+    return text
 
 
 class RemoteSource:
