@@ -13,6 +13,7 @@ from cyclopts import App, CycloptsError
 import pipeline.cli
 from pipeline.cli.output import FAILED, USAGE, print_error
 from pipeline.core.errors import SlipError
+from pipeline.core.quiet import silence_warnings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -47,6 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # Results must not depend on how many threads a library takes, and short jobs lose time with more.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
+    silence_warnings()
     try:
         code = build_app()(arguments, exit_on_error=False)
     except CycloptsError:

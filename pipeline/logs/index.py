@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.part import catalog_file
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from pipeline.logs.records import ChannelRecord, SchemaRecord
     from pipeline.logs.scan import Catalog
     from pipeline.logs.spans import Span
+
+
+_MAX_LISTING: Final = 4 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +181,13 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
     listing = path / "metadata.yaml"
     here = sorted(path.glob("*.mcap"), key=_split_number)
     if listing.is_file():
+        if listing.stat().st_size > _MAX_LISTING:
+            raise LogError(
+                "not_a_recording",
+                f"metadata.yaml holds {listing.stat().st_size / 1e6:.0f} MB, which no listing of files does",
+                where=str(listing),
+                hint="Put it back from where it was recorded, or remove it: the files are then found by name",
+            )
         named = [path / name for name in _listed_files(listing.read_text("utf-8", "replace"))]
         named = [file for file in named if file.suffix == ".mcap"]
         found = [file for file in named if file.is_file()] or here
@@ -208,7 +218,8 @@ def _split_number(file: Path) -> tuple[str, int]:
 
 def _listed_files(text: str) -> list[str]:
     """Entries of ``relative_file_paths`` in a rosbag2 ``metadata.yaml``."""
-    block = re.search(r"^\s*relative_file_paths:\s*\n((?:\s*-\s.*\n?)*)", text, re.MULTILINE)
+    entry = r"(?:[ \t\r]*\n)*+[ \t]*-[ \t].*\n?"
+    block = re.search(rf"^[ \t]*relative_file_paths:[ \t\r]*\n((?:{entry})*)", text, re.MULTILINE)
     if block is None:
         return []
     entries = [line.strip()[1:].strip() for line in block[1].splitlines() if line.strip()]
