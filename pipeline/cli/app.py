@@ -14,6 +14,7 @@ import pipeline.cli
 from pipeline.cli.output import FAILED, USAGE, print_error
 from pipeline.core.errors import SlipError
 from pipeline.core.interpreter import keep_current_folder_out
+from pipeline.core.quiet import silence_warnings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -49,6 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     keep_current_folder_out()
+    silence_warnings()
     try:
         code = build_app()(arguments, exit_on_error=False)
     except CycloptsError:

@@ -20,6 +20,7 @@ from pipeline.job.relative import hash_model
 from pipeline.job.subject import Subject, describe_subject, name_run
 from pipeline.job.summary import summarize_run
 from pipeline.job.work import Progress, Work, read_subject, stored_contexts, stored_keys
+from pipeline.logs import spell_location, to_location
 from pipeline.store import JSON, LogIdentities, Manifest, Store, see_log
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ def _find_twin(path: Path, sha256: str, current: Manifest | None) -> str:
     log = current.details.get("log") if current is not None else None
     if not isinstance(log, dict) or log.get("sha256") != sha256:
         return ""
-    recorded = Path(str(log.get("path")))
+    recorded = to_location(str(log.get("path")))
     return str(recorded) if recorded != path.resolve() and recorded.exists() else ""
 
 
@@ -139,7 +140,7 @@ def _is_done(manifest: Manifest, keys: Mapping[str, str], options: Options) -> b
 def _describe_log(subject: Subject, sha256: str, work: Work) -> dict[str, JSON]:
     losses = work.contexts["extract"].get("losses", [])
     return {
-        "path": str(subject.path.resolve()),
+        "path": spell_location(subject.path.resolve()),
         "sha256": sha256,
         "bytes": subject.index.size_bytes,
         "duration_s": round(subject.index.duration_s, 6),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pipeline.job.errors import JobError
-from pipeline.logs import LogIndex, open_log
+from pipeline.logs import LogIndex, open_log, spell_location
 from pipeline.vehicles import (
     Configuration,
     Sources,
@@ -93,8 +94,12 @@ def _require_sources(sources: Sources, index: LogIndex, options: Options) -> Non
 
 
 def name_plainly(path: Path) -> str:
-    """Name of the run of a log where no other run has it: folder/stem."""
-    return f"{path.parent.name}/{path.stem}" if path.parent.name else path.stem
+    r"""Name of the run of a log where no other run has it: folder/stem.
+
+    Bytes of a file name that are no UTF-8 are spelt ``\xe9`` in it.
+    """
+    name = f"{path.parent.name}/{path.stem}" if path.parent.name else path.stem
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def name_run(path: Path, sha256: str, store: Store) -> str:
@@ -111,7 +116,7 @@ def name_run(path: Path, sha256: str, store: Store) -> str:
                 return known.run
         return plain
     before = _log_of(manifest.details)
-    if before.get("sha256") == sha256 or before.get("path") == str(absolute):
+    if before.get("sha256") == sha256 or before.get("path") == spell_location(absolute):
         return plain
     return f"{plain}-{sha256[:8]}"
 

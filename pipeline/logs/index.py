@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from pipeline.core.paths import PathError, resolve_inside
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.part import catalog_file
 from pipeline.logs.remote import to_location
-from pipeline.logs.source import count_fetched, hash_sources, open_source
+from pipeline.logs.source import count_fetched, hash_sources, open_source, version_of
 from pipeline.logs.workers import usable_threads
 
 if TYPE_CHECKING:
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from pipeline.logs.spans import Span
 
 
-_LONGEST_SHOWN = 100
+_LONGEST_SHOWN: Final = 100
+_MAX_LISTING: Final = 4 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +63,7 @@ class Part:
         numbers: the recording's channel number for each of the file's own.
         data_end: where the data section ends, None when unknown.
         data_crc: checksum of the data section, 0 when there is none.
+        version: of an object on a store, None for a file.
     """
 
     path: Path
@@ -71,6 +73,7 @@ class Part:
     numbers: Mapping[int, int]
     data_end: int | None = None
     data_crc: int = 0
+    version: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,12 +149,16 @@ def open_log(path: str | os.PathLike[str]) -> LogIndex:
     location = to_location(path)
     files, losses = find_parts(location)
     catalogs: list[tuple[Path, int, Catalog]] = []
+    versions: list[str | None] = []
     fetched = 0
     for file in files:
         with open_source(file) as source:
             catalogs.append((file, source.size, catalog_file(source, threads=usable_threads())))
+            versions.append(version_of(source))
             fetched += count_fetched([source])
-    return replace(_merge(location, catalogs, losses), fetched_bytes=fetched)
+    index = _merge(location, catalogs, losses)
+    parts = tuple(replace(part, version=each) for part, each in zip(index.parts, versions, strict=True))
+    return replace(index, parts=parts, fetched_bytes=fetched)
 
 
 def hash_log(path: str | os.PathLike[str]) -> str:
@@ -176,6 +183,13 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
     listing = path / "metadata.yaml"
     here = sorted(path.glob("*.mcap"), key=_split_number)
     if listing.is_file():
+        if listing.stat().st_size > _MAX_LISTING:
+            raise LogError(
+                "not_a_recording",
+                f"metadata.yaml holds {listing.stat().st_size / 1e6:.0f} MB, which no listing of files does",
+                where=str(listing),
+                hint="Put it back from where it was recorded, or remove it: the files are then found by name",
+            )
         listed = [
             name for name in _listed_files(listing.read_text("utf-8", "replace")) if name.endswith(".mcap")
         ]
@@ -224,7 +238,8 @@ def _split_number(file: Path) -> tuple[str, int]:
 
 def _listed_files(text: str) -> list[str]:
     """Entries of ``relative_file_paths`` in a rosbag2 ``metadata.yaml``."""
-    block = re.search(r"^[ \t]*relative_file_paths:[ \t]*\r?\n((?:\s*-\s.*\n?)*)", text, re.MULTILINE)
+    entry = r"(?:[ \t\r]*\n)*+[ \t]*-[ \t].*\n?"
+    block = re.search(rf"^[ \t]*relative_file_paths:[ \t\r]*\n((?:{entry})*)", text, re.MULTILINE)
     if block is None:
         return []
     entries = [line.strip()[1:].strip() for line in block[1].splitlines() if line.strip()]

@@ -130,7 +130,7 @@ def read_topics(
     notes = list(index.notes)
     jobs = _choose_channels(index, wanted, losses, notes)
     with ExitStack() as stack:
-        sources = [stack.enter_context(open_source(part.path)) for part in index.parts]
+        sources = [stack.enter_context(open_source(part.path, part.version)) for part in index.parts]
         beside = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="hash"))
         digest = None if sha256 is not None else beside.submit(hash_sources, sources)
         unchecked = walked = 0

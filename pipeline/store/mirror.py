@@ -383,15 +383,14 @@ def _default_folder(address: str) -> Path:
 
 
 def _open_objects(address: str) -> _Objects:
-    try:
-        from fsspec.core import url_to_fs  # noqa: PLC0415 - an extra
+    from pipeline.logs import LogError, open_store  # noqa: PLC0415 - only where results are on an object store
 
-        objects, _ = url_to_fs(address)
-    except (ImportError, ValueError) as error:
+    try:
+        return cast("_Objects", open_store(address))
+    except LogError as error:
         raise StoreError(
             "no_object_store",
-            f"the store of the results cannot be reached ({error})",
+            f"the store of the results cannot be reached ({error.what})",
             where=address,
             hint="pip install 'slip-pipeline[s3]', and use an s3:// address",
         ) from None
-    return cast("_Objects", objects)

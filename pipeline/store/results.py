@@ -195,19 +195,23 @@ class Store:
 
         return scan_table(table, root=self.root, manifests=self._select(partition))
 
-    def query(self, sql: str, partition: Partition | None = None) -> pl.DataFrame:
+    def query(
+        self, sql: str, partition: Partition | None = None, *, allow_files: bool = False
+    ) -> pl.DataFrame:
         """Answer SQL over all tables by name.
 
         Args:
             sql: the question.
             partition: the runs to look at, as for `scan`.
+            allow_files: whether the question may open files and addresses that are none of the results.
 
         Raises:
-            StoreError: ``bad_query``, or a manifest is damaged.
+            StoreError: ``bad_query``, ``files_not_allowed``, or a manifest is damaged.
         """
         from pipeline.store.queries import answer_query  # noqa: PLC0415 - heavy
 
-        return answer_query(sql, root=self.root, manifests=self._select(partition))
+        manifests = self._select(partition)
+        return answer_query(sql, root=self.root, manifests=manifests, allow_files=allow_files)
 
     def _select(self, partition: Partition | None) -> tuple[Manifest, ...]:
         manifests = self.manifests()

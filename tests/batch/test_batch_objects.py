@@ -13,9 +13,8 @@ from batch_tools import batch, counts, read_tables
 pytest.importorskip("s3fs", reason="the extra s3 is not installed")
 pytest.importorskip("moto", reason="moto is not installed")
 
-import fsspec
 import numpy as np
-from moto.server import ThreadedMotoServer
+from object_store import BUCKET, upload
 
 from pipeline.batch import Pruning
 from pipeline.batch.recordings import find_recordings
@@ -35,42 +34,7 @@ from pipeline.store import Mirror, Partition, Store, StoreError
 from pipeline.store import mirror as mirror_room
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-BUCKET = "s3://field"
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[str]:
-    place = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    place.start()
-    host, port = place.get_host_and_port()
-    yield f"http://{host}:{port}"
-    place.stop()
-
-
-@pytest.fixture
-def bucket(server: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[fsspec.AbstractFileSystem]:
-    """An empty bucket; whoever uses `s3://` in this test, or in a process it starts, gets to it."""
-    for name, value in {
-        "AWS_ENDPOINT_URL": server,
-        "AWS_ACCESS_KEY_ID": "a",
-        "AWS_SECRET_ACCESS_KEY": "b",
-        "AWS_DEFAULT_REGION": "us-east-1",
-    }.items():
-        monkeypatch.setenv(name, value)
-    fsspec.get_filesystem_class("s3").clear_instance_cache()
-    store = fsspec.filesystem("s3", listings_expiry_time=60)
-    store.mkdir(BUCKET)
-    yield store
-    store.rm(BUCKET, recursive=True)
-    fsspec.get_filesystem_class("s3").clear_instance_cache()
-
-
-def upload(store: fsspec.AbstractFileSystem, files: dict[str, Path | bytes]) -> None:
-    for key, content in files.items():
-        store.pipe_file(f"{BUCKET}/{key}", content if isinstance(content, bytes) else content.read_bytes())
-    store.invalidate_cache()
+    import fsspec
 
 
 def test_a_log_is_read_as_if_it_were_here(bucket: fsspec.AbstractFileSystem, season: Path) -> None:

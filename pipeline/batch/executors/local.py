@@ -25,6 +25,7 @@ from pipeline.batch.executors import Blame, Settings
 from pipeline.batch.memory import MemoryWatchdog
 from pipeline.batch.work import work_safely
 from pipeline.core.interpreter import keep_current_folder_out
+from pipeline.core.quiet import silence_warnings
 
 if TYPE_CHECKING:
     from pipeline.batch.work import Report, Task
@@ -286,7 +287,8 @@ def describe_exit(code: int | None) -> str:
 
 
 def prepare_worker(parent: int) -> None:
-    """End this process when the batch that it works for is killed."""
+    """End this process when the batch that it works for is killed, and keep it quiet."""
+    silence_warnings()
     threading.Thread(target=_die_with, args=(parent,), name="parent", daemon=True).start()
 
 
