@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader bench-real bench-workbench browser check clean compare format inspect lock map samples \
+.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader bench-real bench-workbench browser check clean compare damage format inspect lock map samples \
 	serve test test-long trend
 
 help: ## print this list
@@ -105,6 +105,9 @@ bench-workbench: $(VENV)/.ready-dev ## answers of the workbench on a 10-minute l
 
 bench-reader: $(VENV)/.ready-dev ## reading a 1 GB log: ours, its peers, and the bound
 	$(BIN)/python tests/bench/reader.py
+
+damage: $(VENV)/.ready-dev ## every byte of small logs damaged, and what the reader makes of it [ARGS="--step 7"]
+	$(BIN)/python tests/bench/damage.py $$ARGS
 
 browser: ## install Debian's Chromium, for the tests that look at the report and the workbench
 	apt-get update && apt-get install --yes --no-install-recommends chromium

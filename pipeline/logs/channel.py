@@ -171,13 +171,26 @@ class ChannelBuffer:
         self._pending = []
         self._pending_bytes = 0
 
-    def finish(self) -> tuple[Ints, Ints, Ints]:
-        """Decode what is left: log and publish times [ns] and numbers of the good rows, by log time."""
-        self._flush()
+    @property
+    def count(self) -> int:
+        """Messages so far."""
+        return self._count
+
+    def times(self) -> tuple[Ints, Ints]:
+        """Log and publish times [ns] of all messages in the order of the file."""
         empty = np.empty(0, dtype=np.int64)
-        log = np.concatenate([empty, *self._log])
-        publish = np.concatenate([empty, *self._publish])
+        return np.concatenate([empty, *self._log]), np.concatenate([empty, *self._publish])
+
+    def finish(self, repeated: Ints) -> tuple[Ints, Ints, Ints]:
+        """Decode what is left: log and publish times [ns] and numbers of the good rows, by log time.
+
+        Args:
+            repeated: numbers of the messages that are left out because they stand there before.
+        """
+        self._flush()
+        log, publish = self.times()
         good = np.ones(log.size, dtype=np.bool_)
+        good[repeated] = False
         for rejected in self.decoder.rejected:
             good[rejected.rows] = False
         rows = np.flatnonzero(good)

@@ -129,6 +129,11 @@ def open_source(path: Path) -> OpenSource:
     return RemoteSource(path) if isinstance(path, RemotePath) else FileSource(path)
 
 
+def is_fetched(source: ByteSource) -> bool:
+    """Whether every byte has to come from an object store."""
+    return isinstance(source, RemoteSource)
+
+
 def count_fetched(sources: Sequence[ByteSource]) -> int:
     """Bytes that were fetched from object stores."""
     return sum(source.fetched for source in sources if isinstance(source, RemoteSource))

@@ -2,8 +2,8 @@
 
     python tests/bench/damage.py [--step 1] [--json table.json]
 
-Each byte is changed in three ways: one bit flipped, all bits inverted, and set to 0x00 (0xFF where it was 0x00
-already). What is read is compared with the undamaged log: every message with its topic, times and fields, and
+Each byte is changed in three ways: one bit flipped, all bits inverted, and set to 0x00 (0xFF where it was
+0x00 already). What is read is compared with the undamaged log: every message with its topic, times and fields, and
 the metadata. It fails where a checksum covers the byte and something else was returned without a word.
 """
 
@@ -14,6 +14,7 @@ import json
 import sys
 import tempfile
 from collections import Counter
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -87,7 +88,7 @@ def find_cover(content: bytes, options: Mapping[str, object]) -> list[str]:
     """
     cover = [NO_CHECKSUM] * len(content)
     starts = record_starts(content)
-    ends = dict(zip(starts, starts[1:], strict=False))
+    ends = dict(pairwise(starts))
     data_end = next(start for start in starts if content[start] == 0x0F)
     has_data, has_crcs = bool(options.get("enable_data_crcs")), options.get("enable_crcs", True)
 
@@ -190,7 +191,12 @@ def main() -> int:
                     continue
                 print(f"{name:27s} {cover:11s} {pattern:9s}" + "".join(f"{each:17d}" for each in numbers))
                 rows.append(
-                    {"log": name, "cover": cover, "pattern": pattern, **dict(zip(OUTCOMES, numbers, strict=True))}
+                    {
+                        "log": name,
+                        "cover": cover,
+                        "pattern": pattern,
+                        **dict(zip(OUTCOMES, numbers, strict=True)),
+                    }
                 )
                 silent += numbers[-1] if cover != NO_CHECKSUM else 0
         unseen = {key[1]: count for key, count in counts.items() if key[0] == "silent in record"}
