@@ -276,7 +276,7 @@ def _spans_with(part: Part, own: set[int]) -> list[Span]:
 def _find_repeated(
     parts: Sequence[tuple[Part, ByteSource]], jobs: Mapping[int, _Job], threads: int
 ) -> dict[int, Ints]:
-    """By channel, numbers of the messages that stand in the recording before, with the same times and bytes."""
+    """By channel, numbers of the messages that stand in the recording before, byte for byte."""
     suspects = {number: share_times(*job.buffer.times()) for number, job in jobs.items()}
     suspects = {number: rows for number, rows in suspects.items() if rows.size}
     if not suspects:

@@ -1,7 +1,7 @@
 """Messages that stand in a recording more than once: doubled chunks, ranges that were copied into the file.
 
-Two messages of one channel are the same when all bytes of their records are: number, times, content. Where no two share
-their times, which is nearly always so, nothing is read for it.
+Two messages of one channel are the same when all bytes of their records are: number, times, content. Where
+no two share their times, which is nearly always so, nothing is read for it.
 """
 
 from __future__ import annotations

@@ -28,8 +28,8 @@ _MAX_SIDE_RECORD: Final = 1 << 26
 class Catalog:
     """What is known of a file.
 
-    ``metadata`` and ``attachments`` keep the order of the file, ``side_records`` are their places, lengths and
-    names; ``counts`` are messages by channel number.
+    ``metadata`` and ``attachments`` keep the order of the file, ``side_records`` are their places, lengths
+    and names; ``counts`` are messages by channel number.
     """
 
     profile: str = ""

@@ -153,26 +153,41 @@ def load_span(
     if span.kind is SpanKind.LOOSE:
         messages = locate_messages(blob, None)
         return Loaded(blob, messages, _damage_losses(span, messages, len(blob)), unchecked=True)
-    stored: Buffer = b""
     try:
         head, losses = _open_chunk(span, blob)
-        if span.start_ns is None and head.start_ns <= head.end_ns:
-            span = replace(span, start_ns=head.start_ns, end_ns=head.end_ns)
-        stored = blob[head.body : head.body + head.compressed_size]
-        if span.kind is SpanKind.CUT_CHUNK:
-            return _load_start(span, head, stored, "the file ends inside it")
-        entries = _read_entries(blob[span.length :])
-        unchecked = head.crc == 0 and not holds_own_checksum(stored, head.compression)
-        if unchecked and entries and wanted:
-            needed = _needed_size(span, entries, wanted)
-            if needed is not None and needed < head.uncompressed_size * _WORTHWHILE:
-                return _load_prefix(span, head, stored, entries, needed)
-        chunk = _inflate_checked(span, head, stored, file_holds, losses)
+    except _SpanError as error:
+        return _lost(span, error.kind, error.reason)
+    if span.start_ns is None and head.start_ns <= head.end_ns:
+        span = replace(span, start_ns=head.start_ns, end_ns=head.end_ns)
+    stored = blob[head.body : head.body + head.compressed_size]
+    try:
+        return _load_chunk(span, blob, head, losses, file_holds, wanted)
     except _SpanError as error:
         if not _is_unwritten(source, span, stored):
             return _lost(span, error.kind, error.reason)
-        written = memoryview(bytes(stored).rstrip(b"\0"))
-        return _load_start(span, head, written, f"its last {len(stored) - len(written)} bytes are zero")
+    written = memoryview(bytes(stored).rstrip(b"\0"))
+    return _load_start(span, head, written, f"its last {len(stored) - len(written)} bytes are zero")
+
+
+def _load_chunk(
+    span: Span,
+    blob: memoryview,
+    head: rec.ChunkHead,
+    losses: list[Loss],
+    file_holds: FileCheck,
+    wanted: AbstractSet[int] | None,
+) -> Loaded:
+    """Inflate and check a chunk whose head is known; ``losses`` are those of its head."""
+    stored = blob[head.body : head.body + head.compressed_size]
+    if span.kind is SpanKind.CUT_CHUNK:
+        return _load_start(span, head, stored, "the file ends inside it")
+    entries = _read_entries(blob[span.length :])
+    unchecked = head.crc == 0 and not holds_own_checksum(stored, head.compression)
+    if unchecked and entries and wanted:
+        needed = _needed_size(span, entries, wanted)
+        if needed is not None and needed < head.uncompressed_size * _WORTHWHILE:
+            return _load_prefix(span, head, stored, entries, needed)
+    chunk = _inflate_checked(span, head, stored, file_holds, losses)
     messages = locate_messages(chunk, entries)
     losses += _damage_losses(span, messages, len(chunk))
     if unchecked:
@@ -373,11 +388,11 @@ def _damage_losses(span: Span, messages: Messages, size: int) -> list[Loss]:
 
 
 def _compare_times(span: Span, head: rec.ChunkHead, messages: Messages) -> list[Loss]:
-    """What contradicts itself in a chunk that no checksum covers: its head tells the times of its messages."""
+    """What contradicts itself in a chunk that no checksum covers: its head tells its messages' times."""
     log_time = messages.log_time
     if not log_time.size or (head.start_ns <= int(log_time.min()) and int(log_time.max()) <= head.end_ns):
         return []
-    reason = "messages lie outside the times that its head tells: one of the two is damaged, both were kept"
+    reason = "messages lie outside the times that its head tells: one is damaged, both were kept"
     return [_loss(span, "contradiction", reason, bytes_lost=0)]
 
 

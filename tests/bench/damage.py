@@ -3,8 +3,9 @@
     python tests/bench/damage.py [--step 1] [--json table.json]
 
 Each byte is changed in three ways: one bit flipped, all bits inverted, and set to 0x00 (0xFF where it was
-0x00 already). What is read is compared with the undamaged log: every message with its topic, times and fields, and
-the metadata. It fails where a checksum covers the byte and something else was returned without a word.
+0x00 already). What is read is compared with the undamaged log: every message with its topic, times and
+fields, and the metadata. It fails where a checksum covers the byte and something else was returned without a
+word.
 """
 
 from __future__ import annotations

@@ -7,8 +7,10 @@ import zlib
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_files import (
     START,
@@ -444,9 +446,6 @@ def test_a_log_without_checksums_is_called_unchecked(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 def test_a_checksum_inside_the_compression_is_used(tmp_path: Path, compression: str) -> None:
-    import lz4.frame
-    import zstandard
-
     path = tmp_path / "log.mcap"
     truth = write_official(path, enable_crcs=False, compression=CompressionType.NONE, chunk_size=1 << 20)
     content = path.read_bytes()
