@@ -217,9 +217,12 @@ class _Extraction:
                     spans += find_spans_of_state(times, said, section)
             values = " or ".join(repr(section.equals or DEFAULT_INTERVAL[1]) for section in asked)
             if not spans:
+                said_so = f"{source.topic} never says {values}"
+                if self.data.losses:
+                    said_so = f"what is left of {source.topic} does not say {values}{self._blame_damage()}"
                 raise StageError(
                     "no_interval",
-                    f"{source.topic} never says {values}, so that no command counts",
+                    f"{said_so}, so that no command counts",
                     where=self.where,
                     hint="Set another `equals` in [[interval]], or take everything with --interval all.",
                 )
@@ -283,10 +286,16 @@ class _Extraction:
     def _time_columns(self, times: Floats, stamp: Stamps, log_time: Stamps) -> dict[str, NDArray[np.generic]]:
         return {"t": times, "stamp": stamp, "log_time": log_time}
 
+    def _blame_damage(self) -> str:
+        """What was lost of the log, for sentences about what is not there; empty where nothing was."""
+        losses = self.data.losses
+        more = f" and {len(losses) - 1} more" if len(losses) > 1 else ""
+        return f" (the log is damaged: {losses[0].text}{more})" if losses else ""
+
     def _nothing(self, role: str, topic: str) -> StageError:
         return StageError(
             f"no_{role}",
-            f"the topic {topic!r} chosen as {role} has no readable message",
+            f"the topic {topic!r} chosen as {role} has no readable message{self._blame_damage()}",
             where=self.where,
             hint=f"Choose another with {role}.topic in run.toml; `slip inspect` lists what there is.",
         )
