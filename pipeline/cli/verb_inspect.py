@@ -82,6 +82,8 @@ def _as_json(seen: Inspection) -> dict[str, object]:
 
 
 def _describe(seen: Inspection) -> list[str]:
+    from pipeline.logs import shorten  # noqa: PLC0415 - heavy
+
     index = seen.index
     packing = "compression " + (", ".join(name or "none" for name in index.compressions) or "none")
     lines = [
@@ -95,7 +97,9 @@ def _describe(seen: Inspection) -> list[str]:
     lines += [f"  lost    {loss.text}" for loss in seen.losses]
     lines += [f"  note    {note}" for note in seen.notes]
     for name, record in index.metadata.items():
-        lines.append(f"metadata  {name}: " + ", ".join(f"{key} = {value}" for key, value in record.items()))
+        lines.append(
+            f"metadata  {name}: " + ", ".join(f"{key} = {shorten(value)}" for key, value in record.items())
+        )
     lines += ["", *_describe_topics(seen.topics), ""]
     lines.append(f"vehicle   {seen.vehicle.name if seen.vehicle else 'unknown'}")
     if seen.sources is not None:

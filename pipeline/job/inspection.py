@@ -114,7 +114,7 @@ def _measure_topic(
 
 def _choose(index: LogIndex, configuration: Configuration) -> tuple[Vehicle | None, Sources | None, str]:
     """Vehicle and sources as an analysis would choose them; a problem is told, not raised."""
-    recorded = index.metadata.get("deployment", {}).get("vehicle")
+    recorded = index.deployment.get("vehicle")
     problem, vehicle = "", None
     try:
         vehicle = resolve_vehicle(configuration.vehicle, recorded=recorded, where=str(index.path))

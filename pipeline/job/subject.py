@@ -55,7 +55,7 @@ def describe_subject(path: Path, options: Options) -> Subject:
     configuration = load_configuration(
         path, given=options.config, fleet=options.fleet, overrides=options.overrides
     )
-    recorded = index.metadata.get("deployment", {})
+    recorded = index.deployment
     if not index.channels:
         raise JobError(
             "log_without_messages",

@@ -7,7 +7,7 @@ read. Nothing here knows what the numbers mean.
 from pipeline.logs.columns import Ragged, RaggedStrings, Strings
 from pipeline.logs.definitions import bundled_types, definition_text, field_names
 from pipeline.logs.errors import LogError, Loss
-from pipeline.logs.index import ChannelInfo, LogIndex, hash_log, open_log
+from pipeline.logs.index import ChannelInfo, LogIndex, hash_log, open_log, shorten
 from pipeline.logs.join import join_channels
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, read_topics
 from pipeline.logs.remote import RemotePath, to_location
@@ -36,6 +36,7 @@ __all__ = [
     "join_channels",
     "open_log",
     "read_topics",
+    "shorten",
     "to_location",
     "wanted_transforms",
 ]

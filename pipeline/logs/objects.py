@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import Rejected
 from pipeline.logs.columns import Ragged, RaggedStrings
 from pipeline.logs.errors import LogError
@@ -47,6 +48,7 @@ class ObjectDecoder:
         self._several: set[str] = set()
         self.rejected: list[Rejected] = []
         self.notes: tuple[str, ...] = ()
+        self.shortened: dict[str, int] = {}
 
     def decode(self, ids: Ints, block: Block) -> None:
         """Decode a block; ``ids`` are the numbers of its rows in the channel."""
@@ -62,13 +64,19 @@ class ObjectDecoder:
                     if several:
                         self._several.add(path)
                     if value is not None:
-                        leaves[path].append(value)
+                        leaves[path].append(self._shorten(path, value))
                 self._rows[row] = leaves
             except (ValueError, RecursionError):
                 wrong.append(position)
         if wrong:
             lost = int(block.size[wrong].sum())
             self.rejected.append(Rejected("undecodable", "the payload cannot be parsed", ids[wrong], lost))
+
+    def _shorten(self, path: str, value: Leaf) -> Leaf:
+        if not isinstance(value, str) or len(value) <= MAX_TEXT:
+            return value
+        self.shortened[path] = self.shortened.get(path, 0) + 1
+        return f"{value[:MAX_TEXT]} (cut, of {len(value)} characters)"
 
     def columns(self, rows: Ints) -> dict[str, Column]:
         """Columns of the given rows, in their order.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer
 from pipeline.logs.codecs import decoder_for
 from pipeline.logs.coverage import Coverage, DataSection, count_missing, find_contradictions
@@ -316,6 +317,11 @@ def _finish(job: _Job, repeated: Mapping[int, Ints]) -> tuple[TopicColumns, list
         start, end = job.buffer.times_of(rejected.rows)
         text = f"{rejected.rows.size} messages of {job.info.topic}: {rejected.reason}"
         losses.append(Loss(rejected.kind, text, rejected.bytes, 0, start, end))
+    for field_path, count in job.recipe.decoder.shortened.items():
+        text = (
+            f"{count} strings in {field_path} of {job.info.topic} are longer than {MAX_TEXT} bytes: cut there"
+        )
+        losses.append(Loss("long_string", text))
     columns = TopicColumns(
         job.info.topic,
         job.info.id,
