@@ -6,6 +6,8 @@ Messages become nested values first, then columns of their leaf fields.
 from __future__ import annotations
 
 import json
+import math
+import sys
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 
 Value: TypeAlias = "float | str | bool | list[Value] | dict[str, Value] | None"
 Leaf: TypeAlias = "float | str | bool"
+_LARGEST_INTEGER = 1 << 63
 _TIMES = {"nanos": "nanosec", "seconds": "sec", "nsec": "nanosec", "secs": "sec", "nsecs": "nanosec"}
 
 
@@ -64,7 +67,7 @@ class ObjectDecoder:
                     if several:
                         self._several.add(path)
                     if value is not None:
-                        leaves[path].append(self._shorten(path, value))
+                        leaves[path].append(self._bound(path, value))
                 self._rows[row] = leaves
             except (ValueError, RecursionError):
                 wrong.append(position)
@@ -72,7 +75,9 @@ class ObjectDecoder:
             lost = int(block.size[wrong].sum())
             self.rejected.append(Rejected("undecodable", "the payload cannot be parsed", ids[wrong], lost))
 
-    def _shorten(self, path: str, value: Leaf) -> Leaf:
+    def _bound(self, path: str, value: Leaf) -> Leaf:
+        if isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
+            return math.copysign(math.inf, value) if abs(value) > sys.float_info.max else float(value)
         if not isinstance(value, str) or len(value) <= MAX_TEXT:
             return value
         self.shortened[path] = self.shortened.get(path, 0) + 1

@@ -14,7 +14,7 @@ from pipeline.logs.channel import ChannelBuffer
 from pipeline.logs.codecs import decoder_for
 from pipeline.logs.coverage import Coverage, DataSection, count_missing, find_contradictions
 from pipeline.logs.errors import LogError, Loss
-from pipeline.logs.fields import STAMPS, derive_columns
+from pipeline.logs.fields import STAMPS, derive_columns, join_stamp
 from pipeline.logs.index import LogIndex, open_log
 from pipeline.logs.loading import load_spans
 from pipeline.logs.payloads import gather_payloads
@@ -340,7 +340,7 @@ def _header_time(leaves: Mapping[str, Column]) -> Ints | None:
         seconds, nanoseconds = leaves.get(f"{prefix}sec"), leaves.get(f"{prefix}nanosec")
         if not isinstance(seconds, np.ndarray) or not isinstance(nanoseconds, np.ndarray):
             continue
-        if np.isfinite(seconds).all() and np.isfinite(nanoseconds).all():
-            stamp: Ints = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
+        stamp = join_stamp(seconds, nanoseconds)
+        if stamp is not None:
             return stamp
     return None

@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from stage_logs import FIELD, record, take
 
@@ -16,6 +17,7 @@ from pipeline.logs.reader import Wanted
 from pipeline.simulate import Recording
 
 CHUNK, DATA_END = 6, 15
+ABSURD = (np.inf, -np.inf, np.nan, 1e308, -1e308, 5e-324, 1e200)
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +87,30 @@ def test_a_state_that_damage_took_is_not_said_never_to_be_said(tmp_path: Path, w
         take(path, {"interval": [state]})
     assert "the log is damaged" in str(caught.value)
     assert "never says" not in str(caught.value)
+
+
+@pytest.mark.parametrize("step", [3, 101])
+def test_absurd_numbers_are_said_and_warn_nobody(tmp_path: Path, whole: bytes, step: int) -> None:
+    """Tests turn every warning of numpy into an error."""
+    path, hostile = tmp_path / "log.mcap", tmp_path / "hostile.mcap"
+    path.write_bytes(whole)
+    index = open_log(path)
+    with LogWriter(hostile) as log:
+        for name, values in index.metadata_records:
+            log.metadata(name, values)
+        for columns in read_topics(index, [Wanted(topic) for topic in index.topics()]).topics:
+            fields = {}
+            for name, column in columns.fields.items():
+                if isinstance(column, np.ndarray) and column.dtype.kind == "f":
+                    column = column.copy()  # noqa: PLW2901
+                    column[::step] = np.resize(ABSURD, column[::step].shape)
+                if not name.startswith("header.stamp"):
+                    fields[name] = column
+            log.write_columns(
+                columns.topic, columns.type_name, columns.log_time, fields, header_time=columns.header_time
+            )
+    found = take(hostile)
+    assert "absurd_values" in found.ids()
+    told = [finding for finding in found.findings if finding.id == "absurd_values"]
+    assert {finding.where for finding in told} >= {"/mapping/icp_odom"}
+    assert np.isfinite(found.slip("command")["g_x"].drop_nulls().to_numpy()).all()

@@ -6,7 +6,7 @@ written all the same: the store moves them to quarantine, where they can be look
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline.logs import join_channels
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract import localization, reading
+from pipeline.stages.extract.absurd import remove_absurd
 from pipeline.stages.extract.clocks import Recorded, TopicClock, align_clocks
 from pipeline.stages.extract.drive import (
     Drive,
@@ -93,19 +94,19 @@ class _Extraction:
     def __init__(
         self, data: LogData, sources: Sources, configuration: Configuration, vehicle: Vehicle, where: str
     ) -> None:
-        self.data = data
+        topics, self.findings = remove_absurd(data.topics)
+        self.data = replace(data, topics=topics)
         self.sources = sources
         self.configuration = configuration
         self.vehicle = vehicle
         self.where = where
-        self.findings: list[Finding] = []
         self.columns = {
             topic: found
-            for topic in dict.fromkeys(columns.topic for columns in data.topics)
+            for topic in dict.fromkeys(columns.topic for columns in topics)
             if (found := self._join_channels(topic)) is not None
         }
         pose = sources.pose
-        self.chain = chain_poses(data.topics, pose, where) if pose and pose.from_transforms else None
+        self.chain = chain_poses(topics, pose, where) if pose and pose.from_transforms else None
         self.clocks = self._align()
         self.start_ns = self._find_start()
 
