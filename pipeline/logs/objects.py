@@ -77,7 +77,8 @@ class ObjectDecoder:
 
     def _bound(self, path: str, value: Leaf) -> Leaf:
         if isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
-            return math.copysign(math.inf, value) if abs(value) > sys.float_info.max else float(value)
+            largest = sys.float_info.max
+            return float(value) if -largest <= value <= largest else math.inf * (1 if value > 0 else -1)
         if not isinstance(value, str) or len(value) <= MAX_TEXT:
             return value
         self.shortened[path] = self.shortened.get(path, 0) + 1
