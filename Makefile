@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader bench-real bench-workbench browser check clean compare damage-season format fuzz inspect lock map samples \
+.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader bench-real bench-workbench browser check clean compare damage damage-season format fuzz inspect lock map samples \
 	serve test test-long trend
 
 help: ## print this list
@@ -113,6 +113,8 @@ fuzz: $(VENV)/.ready-dev ## damaged files for every part of the program, for MIN
 	@set -- tests/fuzz/fuzz_*.py; each=$$(awk "BEGIN { print $${MINUTES:-60} / $$# }"); failed=0; \
 	for script; do echo "$$script for $$each minutes"; $(BIN)/python "$$script" --minutes "$$each" || failed=1; done; \
 	exit $$failed
+damage: $(VENV)/.ready-dev ## every byte of small logs damaged, and what the reader makes of it [ARGS="--step 7"]
+	$(BIN)/python tests/bench/damage.py $$ARGS
 
 browser: ## install Debian's Chromium, for the tests that look at the report and the workbench
 	apt-get update && apt-get install --yes --no-install-recommends chromium

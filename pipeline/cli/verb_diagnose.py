@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from pipeline.cli.choices import Choices, build_options
+from pipeline.cli.memory_limit import limited_memory
 from pipeline.cli.model_trust import TrustCode, open_model
 from pipeline.cli.output import describe_error, exit_code, print_error, print_json, print_lines, show_progress
 from pipeline.core.errors import SlipError
@@ -35,6 +36,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     ] = None,
     trust_code: TrustCode = False,
     apply: Annotated[Path | None, Parameter(help="write the proposed model to this file")] = None,
+    memory: str | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -42,19 +44,30 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
 
     Args:
         trust_code: trust the Python that the model file names, now and later.
+        memory: most memory, for example 2GB (default: 80 % of the machine's).
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
     options = build_options(choices)
     known = None if model is None else open_model(model, trust_code=trust_code)
-    gathered, errors, lossy = _gather(logs, options, quiet=quiet or json)
     diagnoses: list[Diagnosis] = []
-    for vehicle, recordings in gathered.values():
-        try:
-            diagnoses.append(_judge(recordings, vehicle, options, known, quiet=quiet or json))
-        except SlipError as error:
-            print_error(error)
-            errors.append(describe_error(recordings[0].path, error))
+    at_work = [""]
+
+    def conclude(error: SlipError) -> None:
+        if json:
+            runs = [run for diagnosis in diagnoses for run in diagnosis.runs]
+            told = describe_error(at_work[0], error)
+            print_json({"runs": [run.to_json() for run in runs], "errors": [told]})
+
+    with limited_memory(memory, lambda: at_work[0], conclude):
+        gathered, errors, lossy = _gather(logs, options, at_work, quiet=quiet or json)
+        for vehicle, recordings in gathered.values():
+            at_work[0] = recordings[0].path
+            try:
+                diagnoses.append(_judge(recordings, vehicle, options, known, quiet=quiet or json))
+            except SlipError as error:
+                print_error(error)
+                errors.append(describe_error(recordings[0].path, error))
     runs = [run for diagnosis in diagnoses for run in diagnosis.runs]
     if apply is not None:
         _apply([run.proposal for run in runs], apply, quiet=quiet or json)
@@ -70,15 +83,16 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
 
 
 def _gather(
-    logs: list[str], options: Options, *, quiet: bool
+    logs: list[str], options: Options, at_work: list[str], *, quiet: bool
 ) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], bool]:
-    """Recordings by vehicle; an error costs one log."""
+    """Recordings by vehicle; an error costs one log. ``at_work`` is told which log it is."""
     from pipeline.job.diagnosis import read_recording  # noqa: PLC0415 - heavy
 
     gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
     errors: list[dict[str, str]] = []
     lossy = False
     for log in logs:
+        at_work[0] = log
         try:
             manifest, losses = _find(log, options, quiet=quiet)
             vehicle, recording = read_recording(manifest)

@@ -146,6 +146,7 @@ def _describe_log(subject: Subject, sha256: str, work: Work) -> dict[str, JSON]:
         "duration_s": round(subject.index.duration_s, 6),
         "complete": not losses,
         "losses": losses,
+        "unchecked": work.contexts["extract"].get("unchecked"),
         "fetched_bytes": work.contexts["extract"].get("fetched_bytes"),
     }
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from pipeline.job.subject import Subject
 
-VERSIONS: Mapping[str, int] = {"extract": 2, "velocity": 1, "slip": 2, "aggregate": 1}
+VERSIONS: Mapping[str, int] = {"extract": 3, "velocity": 1, "slip": 2, "aggregate": 1}
 TABLES: Mapping[str, tuple[str, ...]] = {
     "extract": ("commands", "wheels", "poses", "imu"),
     "velocity": ("velocities",),

@@ -139,6 +139,17 @@ class Work:
             for name, report in broken.items()
         ]
         notes = [Finding("log_note", "info", note, where="log") for note in data.notes]
+        notes += [Finding("log_unchecked", "info", data.unchecked, where="log")] if data.unchecked else []
+        notes += [
+            Finding(
+                "repeated_messages",
+                "warning",
+                f"{count} messages of {topic} stand in the log again, byte for byte: each was counted once",
+                where=topic,
+                count=count,
+            )
+            for topic, count in data.repeated.items()
+        ]
         held = made.tables["poses"]["held"] if not made.tables["poses"].is_empty() else pl.Series([0])
         context: dict[str, JSON] = {
             "start_ns": made.start_ns,
@@ -150,6 +161,7 @@ class Work:
             },
             "fetched_bytes": data.fetched_bytes or None,
             "losses": [describe_loss(loss, data.index.start_ns) for loss in data.losses],
+            "unchecked": data.unchecked or None,
         }
         return StageOutcome((*made.findings, *found, *notes), context)
 

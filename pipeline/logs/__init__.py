@@ -8,7 +8,7 @@ from pipeline.logs.buckets import FETCHED, open_store
 from pipeline.logs.columns import Ragged, RaggedStrings, Strings
 from pipeline.logs.definitions import bundled_types, definition_text, field_names
 from pipeline.logs.errors import LogError, Loss
-from pipeline.logs.index import ChannelInfo, LogIndex, hash_log, open_log
+from pipeline.logs.index import ChannelInfo, LogIndex, hash_log, open_log, shorten
 from pipeline.logs.join import join_channels
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, read_topics
 from pipeline.logs.remote import RemotePath, spell_location, to_location
@@ -39,6 +39,7 @@ __all__ = [
     "open_log",
     "open_store",
     "read_topics",
+    "shorten",
     "spell_location",
     "to_location",
     "wanted_transforms",

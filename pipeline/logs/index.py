@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 _LONGEST_SHOWN: Final = 100
 _MAX_LISTING: Final = 4 << 20
+_LONGEST_NAME: Final = 200
+"""Characters of a name that tables and sentences repeat."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +129,11 @@ class LogIndex:
         return not self.losses
 
     @property
+    def deployment(self) -> dict[str, str]:
+        """What the metadata record of this name tells, vehicle and terrain, in names of bearable length."""
+        return {key: shorten(text) for key, text in self.metadata.get("deployment", {}).items()}
+
+    @property
     def message_count(self) -> int:
         """Messages of all channels."""
         return sum(channel.message_count for channel in self.channels)
@@ -134,6 +141,13 @@ class LogIndex:
     def topics(self) -> tuple[str, ...]:
         """Names of all topics, sorted."""
         return tuple(sorted({channel.topic for channel in self.channels}))
+
+
+def shorten(name: str) -> str:
+    """A name that a log gives as it can be repeated in every row; what is left out is said."""
+    if len(name) <= _LONGEST_NAME:
+        return name
+    return f"{name[:_LONGEST_NAME]} (cut, of {len(name)} characters)"
 
 
 def open_log(path: str | os.PathLike[str]) -> LogIndex:

@@ -149,6 +149,11 @@ def version_of(source: ByteSource) -> str | None:
     return source.version if isinstance(source, RemoteSource) else None
 
 
+def is_fetched(source: ByteSource) -> bool:
+    """Whether every byte has to come from an object store."""
+    return isinstance(source, RemoteSource)
+
+
 def count_fetched(sources: Sequence[ByteSource]) -> int:
     """Bytes that were fetched from object stores."""
     return sum(source.fetched for source in sources if isinstance(source, RemoteSource))

@@ -472,7 +472,7 @@ def test_a_chunk_without_checksum_is_read_up_to_the_last_wanted_message(tmp_path
     data = read_topics(path, [Wanted("/x")])
     assert data.of("/x")[0].fields["data"].tolist() == list(range(50))
     assert not data.losses
-    assert any("no checksum" in note for note in data.notes)
+    assert "no checksum" in data.unchecked
 
 
 def test_the_index_tells_what_a_log_holds(tmp_path: Path) -> None:
@@ -489,3 +489,18 @@ def test_the_index_tells_what_a_log_holds(tmp_path: Path) -> None:
     assert {channel.type_name for channel in index.channels} == {FLOAT, JOINTS, TEXT}
     assert isinstance(read_topics(path, [Wanted("/joints")]).topics[0].fields["name"], RaggedStrings)
     assert io.BytesIO(path.read_bytes()).read(5) == b"\x89MCAP"
+
+
+def test_absurd_stamps_and_numbers_in_json_warn_nobody(tmp_path: Path) -> None:
+    """Tests turn every warning of numpy into an error."""
+    path = tmp_path / "log.mcap"
+    seconds = ["1e308", "NaN", "-Infinity", "1" * 400, "-9223372036854775808", "5"]
+    encoded = [
+        f'{{"header": {{"stamp": {{"sec": {text}, "nanosec": {text}}}}}, "x": {text}}}'.encode()
+        for text in seconds
+    ]
+    write_channels(path, [("/json", "T", "jsonschema", b"{}", "json", encoded)])
+    columns = read_one(path, "/json")
+    assert columns.header_time is None
+    assert columns.fields["x"][3] == np.inf
+    assert columns.fields["x"][5] == 5.0

@@ -143,7 +143,7 @@ def test_a_disk_that_fills_up_is_one_sentence_and_leaves_nothing(
 
     def open_full(path: Path, *words: str) -> object:
         # Every write to this one says: no space left on device.
-        return Path("/dev/full").open("wb", 0) if path.name == "log.mcap" else opened(path, *words)  # type: ignore[call-overload]  # noqa: SIM115
+        return Path("/dev/full").open("wb", 0) if path.name == "log.mcap" else opened(path, *words)  # type: ignore[call-overload]
 
     monkeypatch.setattr(Path, "open", open_full)
     status, _, body = empty.request("POST", "/api/upload?name=x.mcap", b"x" * 100_000)
