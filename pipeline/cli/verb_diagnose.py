@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
 from pipeline.cli.choices import Choices, build_options
-from pipeline.cli.output import describe_error, exit_code, print_error, print_json, print_lines, show_progress
+from pipeline.cli.output import (
+    describe_error,
+    exit_code,
+    print_error,
+    print_json,
+    print_lines,
+    say,
+    show_progress,
+)
 from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
     from pipeline.diagnosis import Diagnosis, Recording
+    from pipeline.job.geometry import Owner
     from pipeline.job.options import Options
     from pipeline.motion import ModelFile
-    from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
 
 
@@ -31,6 +39,10 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
     model: Annotated[
         Path | None, Parameter(help="what is known already: say what is missing beyond it")
+    ] = None,
+    vehicle_of: Annotated[
+        Literal["model", "run"] | None,
+        Parameter(help="whose geometry counts where the run is of another vehicle than --model"),
     ] = None,
     apply: Annotated[Path | None, Parameter(help="write the proposed model to this file")] = None,
     json: bool = False,
@@ -48,7 +60,8 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     diagnoses: list[Diagnosis] = []
     for vehicle, recordings in gathered.values():
         try:
-            diagnoses.append(_judge(recordings, vehicle, options, known, quiet=quiet or json))
+            agreed = vehicle if known is None else _agree(known, vehicle, recordings, vehicle_of)
+            diagnoses.append(_judge(recordings, agreed, options, known, quiet=quiet or json))
         except SlipError as error:
             print_error(error)
             errors.append(describe_error(recordings[0].path, error))
@@ -78,36 +91,34 @@ def _gather(
 ) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], bool]:
     """Recordings by vehicle; an error costs one log."""
     from pipeline.job.diagnosis import read_recording  # noqa: PLC0415 - heavy
+    from pipeline.job.stored import open_run  # noqa: PLC0415 - heavy
 
     gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
     errors: list[dict[str, str]] = []
     lossy = False
     for log in logs:
         try:
-            manifest, losses = _find(log, options, quiet=quiet)
-            vehicle, recording = read_recording(manifest)
+            with (
+                show_progress(Path(log).name, quiet=quiet) as progress,
+                open_run(log, options, progress) as opened,
+            ):
+                vehicle, recording = read_recording(opened.manifest)
         except SlipError as error:
             print_error(error)
             errors.append(describe_error(log, error))
             continue
-        lossy |= losses
+        if opened.note and not quiet:
+            say(f"slip: {opened.note}")
+        lossy |= opened.lossy
         gathered.setdefault(repr(vehicle), (vehicle, []))[1].append(recording)
     return gathered, errors, lossy
 
 
-def _find(log: str, options: Options, *, quiet: bool) -> tuple[Manifest, bool]:
-    """A log is taken through the stages first; a stored run is read."""
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
+def _agree(known: ModelFile, vehicle: Vehicle, recordings: list[Recording], owner: Owner | None) -> Vehicle:
+    from pipeline.job.geometry import agree_on_vehicle  # noqa: PLC0415 - heavy
 
-    if not Path(log).exists() and not Path(log).suffix:
-        from pipeline.job.lookup import find_run  # noqa: PLC0415 - heavy
-
-        return find_run(log, Store(options.out)), False
-    from pipeline.job.analyze import analyze_log  # noqa: PLC0415 - heavy
-
-    with show_progress(Path(log).name, quiet=quiet) as progress:
-        outcome = analyze_log(Path(log), options, progress)
-    return outcome.manifest, outcome.lossy
+    runs = {one.name: (vehicle, one.find_value("controller_multiplier")) for one in recordings}
+    return agree_on_vehicle(known.model.vehicle, runs, owner)
 
 
 def _judge(
@@ -125,7 +136,7 @@ def _judge(
         progress("diagnosis")
         return diagnose_runs(
             recordings,
-            vehicle if known is None else known.model.vehicle,
+            vehicle,
             inputs=options.inputs,
             model=None if known is None else known.model,
         )

@@ -32,6 +32,10 @@ class On:
         Literal["command", "measured"] | None,
         Parameter(help="what the model is fed with (default: as last time, else measured wheels if there)"),
     ] = None
+    vehicle_of: Annotated[
+        Literal["model", "run"] | None,
+        Parameter(help="whose geometry counts where the run is of another vehicle (default: ask)"),
+    ] = None
     out: Annotated[Path, Parameter(help="results folder")] = Path("results")
     json: Annotated[bool, Parameter(help="print one JSON object", negative="")] = False
     quiet: Annotated[bool, Parameter(help="print no progress and no table", negative="")] = False
@@ -194,7 +198,7 @@ def compare(  # noqa: D417 - the shared options document themselves
     rows: list[tuple[str, Transfer]] = []
     for path in (model, other):
         file = read_model(path)
-        runs = _gather(spoken, file, spoken.on)
+        file, runs = _gather(spoken, file, spoken.on)
         source = choose_input(runs, spoken.input or _last_input(file))
         rows += [
             (str(path), item) for item in carry_over(file.model, runs, source, fitted_on=_terrains(file))
@@ -246,17 +250,18 @@ def _change(
     from pipeline.motion.transfer import carry_over  # noqa: PLC0415
     from pipeline.motion.workshop import choose_input, judge_model, note_fit  # noqa: PLC0415
 
-    runs = _gather(spoken, after, spoken.on)
+    after, gathered = _gather(spoken, after, [*spoken.on, *predict])
+    runs, others = gathered[: len(spoken.on)], gathered[len(spoken.on) :]
     source = choose_input(runs, spoken.input or _last_input(before))
     problem = Problem(runs, after.model.vehicle, source)
-    old = judge_model(problem, before.model, per_run=before.per_run)
+    model_before = replace(before.model, vehicle=after.model.vehicle)
+    old = judge_model(problem, model_before, per_run=before.per_run)
     new_one = old
     if after.model.effects != before.model.effects:
         new_one = judge_model(problem, after.model, per_run=after.per_run)
     written = note_fit(after, new_one)
     write_model(written, path)
     terrains = [run.terrain for run in runs]
-    others = _gather(spoken, after, predict)
     carried = carry_over(written.model, others, source, fitted_on=terrains) if others else []
     warnings = [item.warning for item in carried if item.warning]
     if spoken.json:
@@ -270,10 +275,13 @@ def _change(
     return CLEAN
 
 
-def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> list[MotionRun]:
+def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFile, list[MotionRun]]:
+    """Runs, and the file with the vehicle whose geometry counts."""
     from pipeline.cli.model_runs import gather_runs  # noqa: PLC0415 - heavy
 
-    return gather_runs(names, file.model.vehicle, spoken.out, quiet=spoken.quiet or spoken.json)
+    quiet = spoken.quiet or spoken.json
+    vehicle, runs = gather_runs(names, file.model.vehicle, spoken.vehicle_of, spoken.out, quiet=quiet)
+    return replace(file, model=replace(file.model, vehicle=vehicle)), runs
 
 
 def _last_input(file: ModelFile) -> str | None:
