@@ -14,9 +14,8 @@ from pipeline.cli.output import CLEAN, print_json, print_lines, say
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.motion.model import Model
+    from pipeline.motion.inputs import InputChoice
     from pipeline.motion.model_file import ModelFile
-    from pipeline.motion.problem import Problem
     from pipeline.motion.recording import MotionRun
     from pipeline.motion.score import Errors
     from pipeline.motion.transfer import Transfer
@@ -191,23 +190,31 @@ def compare(  # noqa: D417 - the shared options document themselves
         model: a model file.
         other: another one.
     """
-    from pipeline.motion.model_file import read_model  # noqa: PLC0415 - heavy
+    from pipeline.motion.inputs import choose_input  # noqa: PLC0415 - heavy
+    from pipeline.motion.model_file import read_model  # noqa: PLC0415
     from pipeline.motion.transfer import carry_over  # noqa: PLC0415
-    from pipeline.motion.workshop import choose_input  # noqa: PLC0415
 
+    files = [_gather(spoken, read_model(path), spoken.on) for path in (model, other)]
+    # Both are fed with the same, or their errors could not be compared.
+    last = {_last_input(file) for file, _ in files}
+    effects = [effect for file, _ in files for effect in file.model]
+    chosen = choose_input(files[0][1], spoken.input, effects, last=last.pop() if len(last) == 1 else None)
     rows: list[tuple[str, Transfer]] = []
-    for path in (model, other):
-        file = read_model(path)
-        file, runs = _gather(spoken, file, spoken.on)
-        source = choose_input(runs, spoken.input or _last_input(file))
-        rows += [
-            (str(path), item) for item in carry_over(file.model, runs, source, fitted_on=_terrains(file))
-        ]
-    warnings = [item.warning for _, item in rows if item.warning]
+    for path, (file, runs) in zip((model, other), files, strict=True):
+        carried = carry_over(file.model, runs, chosen.source, fitted_on=_terrains(file))
+        rows += [(str(path), item) for item in carried]
+    warnings = [text for text in (chosen.warning, *(item.warning for _, item in rows)) if text]
     if spoken.json:
-        print_json({"compared": [_transfer_as_json(name, item) for name, item in rows], "warnings": warnings})
+        print_json(
+            {
+                "input": chosen.source.value,
+                "input_reason": chosen.reason,
+                "compared": [_transfer_as_json(name, item) for name, item in rows],
+                "warnings": warnings,
+            }
+        )
     elif not spoken.quiet:
-        print_lines(_describe_transfers(rows))
+        print_lines([f"on {chosen.source.value} ({chosen.reason})", *_describe_transfers(rows)])
         _warn(warnings)
     return CLEAN
 
@@ -245,15 +252,16 @@ def _change(
     path: Path, before: ModelFile, after: ModelFile, spoken: On, *, predict: Sequence[str] = ()
 ) -> int:
     """Judge a model before and after a change, fit it, write its file, and print."""
-    from pipeline.motion.model_text import write_model  # noqa: PLC0415 - heavy
+    from pipeline.motion.inputs import choose_input  # noqa: PLC0415 - heavy
+    from pipeline.motion.model_text import write_model  # noqa: PLC0415
     from pipeline.motion.problem import Problem  # noqa: PLC0415
     from pipeline.motion.transfer import carry_over  # noqa: PLC0415
-    from pipeline.motion.workshop import choose_input, judge_model, note_fit  # noqa: PLC0415
+    from pipeline.motion.workshop import judge_model, note_fit  # noqa: PLC0415
 
     after, gathered = _gather(spoken, after, [*spoken.on, *predict])
     runs, others = gathered[: len(spoken.on)], gathered[len(spoken.on) :]
-    source = choose_input(runs, spoken.input or _last_input(before))
-    problem = Problem(runs, after.model.vehicle, source)
+    chosen = choose_input(runs, spoken.input, after.model, last=_last_input(before))
+    problem = Problem(runs, after.model.vehicle, chosen.source)
     model_before = replace(before.model, vehicle=after.model.vehicle)
     old = judge_model(problem, model_before, per_run=before.per_run)
     new_one = old
@@ -262,12 +270,12 @@ def _change(
     written = note_fit(after, new_one)
     write_model(written, path)
     terrains = [run.terrain for run in runs]
-    carried = carry_over(written.model, others, source, fitted_on=terrains) if others else []
-    warnings = [item.warning for item in carried if item.warning]
+    carried = carry_over(written.model, others, chosen.source, fitted_on=terrains) if others else []
+    warnings = [text for text in (chosen.warning, *(item.warning for item in carried)) if text]
     if spoken.json:
-        print_json(_as_json(path, old, new_one, after.model, carried, warnings))
+        print_json(_as_json(path, old, new_one, chosen, carried, warnings))
     elif not spoken.quiet:
-        lines = _describe(old, new_one, after.model)
+        lines = _describe(old, new_one, chosen)
         if carried:
             lines += ["", *_describe_transfers([(str(path), item) for item in carried])]
         print_lines(lines)
@@ -298,7 +306,7 @@ def _as_json(
     path: Path,
     old: Judgement,
     new_one: Judgement,
-    model: Model,
+    chosen: InputChoice,
     carried: Sequence[Transfer],
     warnings: Sequence[str],
 ) -> Mapping[str, object]:
@@ -307,6 +315,7 @@ def _as_json(
         errors_as_json,
         ladder_as_json,
         parameters_as_json,
+        step_as_json,
     )
     from pipeline.motion.score import measure_by_terrain  # noqa: PLC0415
 
@@ -314,12 +323,14 @@ def _as_json(
     floor = _choose_floor(old, new_one)
     return {
         "model": str(path),
-        "input": problem.source.value,
+        "input": chosen.source.value,
+        "input_reason": chosen.reason,
         "runs": list(problem.names),
         "ladder_before": ladder_as_json(old.ladder, floor),
         "ladder": ladder_as_json(new_one.ladder, floor),
+        "step": step_as_json(old.whole, new_one.whole),
         "idle": list(new_one.ladder.idle),
-        "not_fitted": _list_asleep(problem, model),
+        "not_fitted": list(chosen.idle),
         "by_run": {
             name: errors_as_json(errors)
             for name, errors in zip(problem.names, new_one.whole.held_out.by_run, strict=True)
@@ -361,33 +372,28 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
     }
 
 
-def _describe(old: Judgement, new_one: Judgement, model: Model) -> list[str]:
+def _describe(old: Judgement, new_one: Judgement, chosen: InputChoice) -> list[str]:
     from pipeline.motion.describe import (  # noqa: PLC0415 - heavy
         describe_ladder,
         describe_parameters,
         describe_recordings,
+        describe_step,
         parameters_as_json,
     )
 
     runs = ", ".join(new_one.problem.names)
     floor = _choose_floor(old, new_one)
-    source = new_one.problem.source.value
-    lines = [f"on {source} of {runs}"]
+    lines = [f"on {chosen.source.value} of {runs} ({chosen.reason})"]
     lines += describe_recordings([comparison.run for comparison in new_one.problem.comparisons])
     if old is not new_one:
         lines += ["", "before", *describe_ladder(old.ladder, floor), "", "after"]
     lines += describe_ladder(new_one.ladder, floor)
-    asleep = _list_asleep(new_one.problem, model)
-    if asleep:
-        lines.append(f"not fitted, acts between command and wheels:  {', '.join(asleep)} (--input command)")
+    if old is not new_one:
+        lines += describe_step(old.whole, new_one.whole)
+    if chosen.warning:
+        lines.append(chosen.warning)
     parameters = parameters_as_json(new_one.fitted.model, new_one.estimates)
     return [*lines, "", "parameters", *describe_parameters(parameters)]
-
-
-def _list_asleep(problem: Problem, model: Model) -> list[str]:
-    """Effects of a model that the input leaves nothing to do: with measured wheels, those before them."""
-    acting = {effect.id for effect in problem.active_effects(model)}
-    return [effect.id for effect in model if effect.id not in acting]
 
 
 def _choose_floor(old: Judgement, new_one: Judgement) -> Errors:

@@ -121,6 +121,7 @@ class RunDiagnosis:
     Attributes:
         run: its name.
         input: what the model is fed with: `command` or `measured`.
+        input_reason: why; empty where nothing was fitted.
         joint: names of all runs that were judged together.
         effects: what is missing.
         undecided: explanations that are as good as each other.
@@ -141,6 +142,7 @@ class RunDiagnosis:
 
     run: str
     input: str
+    input_reason: str = ""
     joint: tuple[str, ...] = ()
     effects: tuple[Named, ...] = ()
     undecided: tuple[Undecided, ...] = ()
@@ -163,6 +165,7 @@ class RunDiagnosis:
         return {
             "run": self.run,
             "input": self.input,
+            "input_reason": self.input_reason or None,
             "joint_with": [name for name in self.joint if name != self.run],
             "effects": [effect.to_json() for effect in self.effects],
             "undecided": [
