@@ -13,6 +13,7 @@ from cyclopts import App, CycloptsError
 import pipeline.cli
 from pipeline.cli.output import FAILED, USAGE, print_error
 from pipeline.core.errors import SlipError
+from pipeline.core.version import read_version
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,6 +32,7 @@ def build_app() -> App:
         help=HELP,
         # Plain text: a Markdown renderer takes longer to load than all the rest.
         help_format="plaintext",
+        version=read_version,
         version_flags=["--version"],
         result_action="return_value",
         # Ctrl-C comes back to `main`, which says what became of the results.
