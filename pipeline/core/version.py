@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import tomllib
 from pathlib import Path
 
 PACKAGE = "slip-pipeline"
@@ -11,6 +9,10 @@ PACKAGE = "slip-pipeline"
 
 def read_version() -> str:
     """The version that the installed package says; in a checkout that is not installed, the declared one."""
+    # Every call of the program passes here, and few ask for the version.
+    import importlib.metadata  # noqa: PLC0415
+    import tomllib  # noqa: PLC0415
+
     try:
         return importlib.metadata.version(PACKAGE)
     except importlib.metadata.PackageNotFoundError:

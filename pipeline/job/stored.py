@@ -52,7 +52,7 @@ def open_run(text: str, options: Options, progress: Progress) -> Iterator[Opened
 
     Args:
         text: name of a run, or path of a log.
-        options: what the user chose; its inputs do not matter to tables that are stored.
+        options: what the user chose.
         progress: told the name of each stage that is computed.
 
     Raises:
@@ -139,6 +139,7 @@ def _is_changed(path: Path, stored: Manifest, options: Options, *, asked: bool) 
         "vehicle": msgspec.to_builtins(subject.vehicle),
         "terrain": subject.terrain,
         "dataset": subject.dataset,
+        "inputs": options.inputs,
     }
     return any(stored.details.get(key) != value for key, value in json.loads(json.dumps(now)).items())
 

@@ -157,6 +157,13 @@ def test_a_diagnosis_with_other_choices_leaves_the_stored_run(
     assert hash_tree(out) == before
 
 
+def test_what_a_diagnosis_stores_does_not_depend_on_its_input(tmp_path: Path, analyzed: Path) -> None:
+    log = analyzed / "field" / "wide.mcap"
+    for name in ("command", "measured"):
+        assert slip("diagnose", log, "--out", tmp_path / name, "--input", name, "--quiet") == 0
+    assert hash_tree(tmp_path / "command" / "runs") == hash_tree(tmp_path / "measured" / "runs")
+
+
 def test_a_changed_configuration_is_said_and_the_stored_run_is_read(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
