@@ -15,6 +15,7 @@ from pipeline.cli.output import FAILED, USAGE, print_error
 from pipeline.core.errors import SlipError
 from pipeline.core.interpreter import keep_current_folder_out
 from pipeline.core.quiet import silence_warnings
+from pipeline.core.version import read_version
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,6 +34,7 @@ def build_app() -> App:
         help=HELP,
         # Plain text: a Markdown renderer takes longer to load than all the rest.
         help_format="plaintext",
+        version=read_version,
         version_flags=["--version"],
         result_action="return_value",
         # Ctrl-C comes back to `main`, which says what became of the results.

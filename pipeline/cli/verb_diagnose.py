@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
 from pipeline.cli.choices import Choices, build_options
 from pipeline.cli.memory_limit import limited_memory
 from pipeline.cli.model_trust import TrustCode, open_model
-from pipeline.cli.output import describe_error, exit_code, print_error, print_json, print_lines, show_progress
+from pipeline.cli.output import (
+    describe_error,
+    exit_code,
+    print_error,
+    print_json,
+    print_lines,
+    say,
+    show_progress,
+)
 from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
     from pipeline.diagnosis import Diagnosis, Recording
+    from pipeline.job.geometry import Owner
     from pipeline.job.options import Options
     from pipeline.motion import ModelFile
-    from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
 
 
@@ -35,6 +44,10 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         Path | None, Parameter(help="what is known already: say what is missing beyond it")
     ] = None,
     trust_code: TrustCode = False,
+    vehicle_of: Annotated[
+        Literal["model", "run"] | None,
+        Parameter(help="whose geometry counts where the run is of another vehicle than --model"),
+    ] = None,
     apply: Annotated[Path | None, Parameter(help="write the proposed model to this file")] = None,
     memory: str | None = None,
     json: bool = False,
@@ -64,7 +77,8 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         for vehicle, recordings in gathered.values():
             at_work[0] = recordings[0].path
             try:
-                diagnoses.append(_judge(recordings, vehicle, options, known, quiet=quiet or json))
+                agreed = vehicle if known is None else _agree(known, vehicle, recordings, vehicle_of)
+                diagnoses.append(_judge(recordings, agreed, options, known, quiet=quiet or json))
             except SlipError as error:
                 print_error(error)
                 errors.append(describe_error(recordings[0].path, error))
@@ -87,6 +101,8 @@ def _gather(
 ) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], bool]:
     """Recordings by vehicle; an error costs one log. ``at_work`` is told which log it is."""
     from pipeline.job.diagnosis import read_recording  # noqa: PLC0415 - heavy
+    from pipeline.job.options import INPUTS  # noqa: PLC0415
+    from pipeline.job.stored import open_run  # noqa: PLC0415 - heavy
 
     gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
     errors: list[dict[str, str]] = []
@@ -94,30 +110,28 @@ def _gather(
     for log in logs:
         at_work[0] = log
         try:
-            manifest, losses = _find(log, options, quiet=quiet)
-            vehicle, recording = read_recording(manifest)
+            with (
+                show_progress(Path(log).name, quiet=quiet) as progress,
+                # What a run is stored with does not depend on what is asked about it.
+                open_run(log, replace(options, inputs=INPUTS), progress) as opened,
+            ):
+                vehicle, recording = read_recording(opened.manifest)
         except SlipError as error:
             print_error(error)
             errors.append(describe_error(log, error))
             continue
-        lossy |= losses
+        if opened.note and not quiet:
+            say(f"slip: {opened.note}")
+        lossy |= opened.lossy
         gathered.setdefault(repr(vehicle), (vehicle, []))[1].append(recording)
     return gathered, errors, lossy
 
 
-def _find(log: str, options: Options, *, quiet: bool) -> tuple[Manifest, bool]:
-    """A log is taken through the stages first; a stored run is read."""
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
+def _agree(known: ModelFile, vehicle: Vehicle, recordings: list[Recording], owner: Owner | None) -> Vehicle:
+    from pipeline.job.geometry import agree_on_vehicle  # noqa: PLC0415 - heavy
 
-    if not Path(log).exists() and not Path(log).suffix:
-        from pipeline.job.lookup import find_run  # noqa: PLC0415 - heavy
-
-        return find_run(log, Store(options.out)), False
-    from pipeline.job.analyze import analyze_log  # noqa: PLC0415 - heavy
-
-    with show_progress(Path(log).name, quiet=quiet) as progress:
-        outcome = analyze_log(Path(log), options, progress)
-    return outcome.manifest, outcome.lossy
+    runs = {one.name: (vehicle, one.find_value("controller_multiplier")) for one in recordings}
+    return agree_on_vehicle(known.model.vehicle, runs, owner)
 
 
 def _judge(
@@ -135,7 +149,7 @@ def _judge(
         progress("diagnosis")
         return diagnose_runs(
             recordings,
-            vehicle if known is None else known.model.vehicle,
+            vehicle,
             inputs=options.inputs,
             model=None if known is None else known.model,
         )

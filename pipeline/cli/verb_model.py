@@ -15,9 +15,8 @@ from pipeline.cli.output import CLEAN, print_json, print_lines, say
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.motion.model import Model
+    from pipeline.motion.inputs import InputChoice
     from pipeline.motion.model_file import ModelFile
-    from pipeline.motion.problem import Problem
     from pipeline.motion.recording import MotionRun
     from pipeline.motion.score import Errors
     from pipeline.motion.transfer import Transfer
@@ -32,6 +31,10 @@ class On:
     input: Annotated[
         Literal["command", "measured"] | None,
         Parameter(help="what the model is fed with (default: as last time, else measured wheels if there)"),
+    ] = None
+    vehicle_of: Annotated[
+        Literal["model", "run"] | None,
+        Parameter(help="whose geometry counts where the run is of another vehicle (default: ask)"),
     ] = None
     out: Annotated[Path, Parameter(help="results folder")] = Path("results")
     trust_code: TrustCode = False
@@ -181,25 +184,32 @@ def compare(  # noqa: D417 - the shared options document themselves
         model: a model file.
         other: another one.
     """
-    from pipeline.motion.transfer import carry_over  # noqa: PLC0415 - heavy
-    from pipeline.motion.workshop import choose_input  # noqa: PLC0415
+    from pipeline.motion.inputs import choose_input  # noqa: PLC0415 - heavy
+    from pipeline.motion.transfer import carry_over  # noqa: PLC0415
 
+    opened = [open_model(path, trust_code=spoken.trust_code) for path in (model, other)]
+    left_out = [text for file in opened for text in file.warnings]
+    files = [_gather(spoken, file, spoken.on) for file in opened]
+    # Both are fed with the same, or their errors could not be compared.
+    last = {_last_input(file) for file, _ in files}
+    effects = [effect for file, _ in files for effect in file.model]
+    chosen = choose_input(files[0][1], spoken.input, effects, last=last.pop() if len(last) == 1 else None)
     rows: list[tuple[str, Transfer]] = []
-    left_out: list[str] = []
-    for path in (model, other):
-        file = open_model(path, trust_code=spoken.trust_code)
-        left_out += file.warnings
-        runs = _gather(spoken, file, spoken.on)
-        source = choose_input(runs, spoken.input or _last_input(file))
-        rows += [
-            (str(path), item) for item in carry_over(file.model, runs, source, fitted_on=_terrains(file))
-        ]
-    warnings = [item.warning for _, item in rows if item.warning]
+    for path, (file, runs) in zip((model, other), files, strict=True):
+        carried = carry_over(file.model, runs, chosen.source, fitted_on=_terrains(file))
+        rows += [(str(path), item) for item in carried]
+    warnings = [text for text in (chosen.warning, *(item.warning for _, item in rows)) if text]
     if spoken.json:
-        compared = [_transfer_as_json(name, item) for name, item in rows]
-        print_json({"compared": compared, "warnings": [*left_out, *warnings]})
+        print_json(
+            {
+                "input": chosen.source.value,
+                "input_reason": chosen.reason,
+                "compared": [_transfer_as_json(name, item) for name, item in rows],
+                "warnings": [*left_out, *warnings],
+            }
+        )
     elif not spoken.quiet:
-        print_lines(_describe_transfers(rows))
+        print_lines([f"on {chosen.source.value} ({chosen.reason})", *_describe_transfers(rows)])
         _warn(warnings)
     return CLEAN
 
@@ -237,30 +247,32 @@ def _change(
     path: Path, before: ModelFile, after: ModelFile, spoken: On, *, predict: Sequence[str] = ()
 ) -> int:
     """Judge a model before and after a change, fit it, write its file, and print."""
-    from pipeline.motion.model_text import format_model, write_model  # noqa: PLC0415 - heavy
+    from pipeline.motion.inputs import choose_input  # noqa: PLC0415 - heavy
+    from pipeline.motion.model_text import format_model, write_model  # noqa: PLC0415
     from pipeline.motion.problem import Problem  # noqa: PLC0415
     from pipeline.motion.transfer import carry_over  # noqa: PLC0415
-    from pipeline.motion.workshop import choose_input, judge_model, note_fit  # noqa: PLC0415
+    from pipeline.motion.workshop import judge_model, note_fit  # noqa: PLC0415
 
     # What was left out would be lost from the file: that is said before a long fit, not after it.
     format_model(after)
-    runs = _gather(spoken, after, spoken.on)
-    source = choose_input(runs, spoken.input or _last_input(before))
-    problem = Problem(runs, after.model.vehicle, source)
-    old = judge_model(problem, before.model, per_run=before.per_run)
+    after, gathered = _gather(spoken, after, [*spoken.on, *predict])
+    runs, others = gathered[: len(spoken.on)], gathered[len(spoken.on) :]
+    chosen = choose_input(runs, spoken.input, after.model, last=_last_input(before))
+    problem = Problem(runs, after.model.vehicle, chosen.source)
+    model_before = replace(before.model, vehicle=after.model.vehicle)
+    old = judge_model(problem, model_before, per_run=before.per_run)
     new_one = old
     if after.model.effects != before.model.effects:
         new_one = judge_model(problem, after.model, per_run=after.per_run)
     written = note_fit(after, new_one)
     write_model(written, path)
     terrains = [run.terrain for run in runs]
-    others = _gather(spoken, after, predict)
-    carried = carry_over(written.model, others, source, fitted_on=terrains) if others else []
-    warnings = [item.warning for item in carried if item.warning]
+    carried = carry_over(written.model, others, chosen.source, fitted_on=terrains) if others else []
+    warnings = [text for text in (chosen.warning, *(item.warning for item in carried)) if text]
     if spoken.json:
-        print_json(_as_json(path, old, new_one, after.model, carried, [*before.warnings, *warnings]))
+        print_json(_as_json(path, old, new_one, chosen, carried, [*before.warnings, *warnings]))
     elif not spoken.quiet:
-        lines = _describe(old, new_one, after.model)
+        lines = _describe(old, new_one, chosen)
         if carried:
             lines += ["", *_describe_transfers([(str(path), item) for item in carried])]
         print_lines(lines)
@@ -268,10 +280,13 @@ def _change(
     return CLEAN
 
 
-def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> list[MotionRun]:
+def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFile, list[MotionRun]]:
+    """Runs, and the file with the vehicle whose geometry counts."""
     from pipeline.cli.model_runs import gather_runs  # noqa: PLC0415 - heavy
 
-    return gather_runs(names, file.model.vehicle, spoken.out, quiet=spoken.quiet or spoken.json)
+    quiet = spoken.quiet or spoken.json
+    vehicle, runs = gather_runs(names, file.model.vehicle, spoken.vehicle_of, spoken.out, quiet=quiet)
+    return replace(file, model=replace(file.model, vehicle=vehicle)), runs
 
 
 def _last_input(file: ModelFile) -> str | None:
@@ -288,7 +303,7 @@ def _as_json(
     path: Path,
     old: Judgement,
     new_one: Judgement,
-    model: Model,
+    chosen: InputChoice,
     carried: Sequence[Transfer],
     warnings: Sequence[str],
 ) -> Mapping[str, object]:
@@ -297,6 +312,7 @@ def _as_json(
         errors_as_json,
         ladder_as_json,
         parameters_as_json,
+        step_as_json,
     )
     from pipeline.motion.score import measure_by_terrain  # noqa: PLC0415
 
@@ -304,12 +320,14 @@ def _as_json(
     floor = _choose_floor(old, new_one)
     return {
         "model": str(path),
-        "input": problem.source.value,
+        "input": chosen.source.value,
+        "input_reason": chosen.reason,
         "runs": list(problem.names),
         "ladder_before": ladder_as_json(old.ladder, floor),
         "ladder": ladder_as_json(new_one.ladder, floor),
+        "step": step_as_json(old.whole, new_one.whole),
         "idle": list(new_one.ladder.idle),
-        "not_fitted": _list_asleep(problem, model),
+        "not_fitted": list(chosen.idle),
         "by_run": {
             name: errors_as_json(errors)
             for name, errors in zip(problem.names, new_one.whole.held_out.by_run, strict=True)
@@ -351,33 +369,28 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
     }
 
 
-def _describe(old: Judgement, new_one: Judgement, model: Model) -> list[str]:
+def _describe(old: Judgement, new_one: Judgement, chosen: InputChoice) -> list[str]:
     from pipeline.motion.describe import (  # noqa: PLC0415 - heavy
         describe_ladder,
         describe_parameters,
         describe_recordings,
+        describe_step,
         parameters_as_json,
     )
 
     runs = ", ".join(new_one.problem.names)
     floor = _choose_floor(old, new_one)
-    source = new_one.problem.source.value
-    lines = [f"on {source} of {runs}"]
+    lines = [f"on {chosen.source.value} of {runs} ({chosen.reason})"]
     lines += describe_recordings([comparison.run for comparison in new_one.problem.comparisons])
     if old is not new_one:
         lines += ["", "before", *describe_ladder(old.ladder, floor), "", "after"]
     lines += describe_ladder(new_one.ladder, floor)
-    asleep = _list_asleep(new_one.problem, model)
-    if asleep:
-        lines.append(f"not fitted, acts between command and wheels:  {', '.join(asleep)} (--input command)")
+    if old is not new_one:
+        lines += describe_step(old.whole, new_one.whole)
+    if chosen.warning:
+        lines.append(chosen.warning)
     parameters = parameters_as_json(new_one.fitted.model, new_one.estimates)
     return [*lines, "", "parameters", *describe_parameters(parameters)]
-
-
-def _list_asleep(problem: Problem, model: Model) -> list[str]:
-    """Effects of a model that the input leaves nothing to do: with measured wheels, those before them."""
-    acting = {effect.id for effect in problem.active_effects(model)}
-    return [effect.id for effect in model if effect.id not in acting]
 
 
 def _choose_floor(old: Judgement, new_one: Judgement) -> Errors:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
-import platform
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import msgspec
 
+from pipeline.core.version import read_version
 from pipeline.job.diagnosis import diagnose_work, has_diagnosis, key_diagnosis
 from pipeline.job.keys import hash_json, key_stages
 from pipeline.job.options import STAGES
 from pipeline.job.peers import find_peers
+from pipeline.job.provenance import list_versions
 from pipeline.job.relative import hash_model
 from pipeline.job.subject import Subject, describe_subject, name_run
 from pipeline.job.summary import summarize_run
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 
 SUMMARY = "summary.json"
 REPORT = "report.html"
-_PACKAGES = ("slip-pipeline", "mcap", "mcap-ros2-support", "numpy", "polars", "pyarrow")
 
 
 @dataclass(frozen=True)
@@ -163,7 +161,8 @@ def _write_outputs(
     summary["diagnosis"] = diagnosis
     summary["report"] = REPORT if options.report else None
     summary["provenance"] = {
-        "versions": versions(),
+        "version": read_version(),
+        "versions": list_versions(work),
         "keys": dict(work.keys),
         "configuration": _configuration(work),
     }
@@ -207,24 +206,13 @@ def _details(work: Work, log: Mapping[str, JSON], sha256: str) -> dict[str, JSON
         "vehicle": msgspec.to_builtins(work.subject.vehicle),
         "terrain": work.subject.terrain,
         "dataset": work.subject.dataset,
-        "versions": cast("JSON", versions()),
+        "versions": cast("JSON", list_versions(work)),
     }
 
 
 def _configuration(work: Work) -> JSON:
     plain: JSON = msgspec.to_builtins(work.subject.configuration)
     return plain
-
-
-def versions() -> dict[str, str]:
-    """Versions of what computes the numbers."""
-    return dict(_look_up_versions())
-
-
-@cache
-def _look_up_versions() -> Mapping[str, str]:
-    found = {name: importlib.metadata.version(name) for name in _PACKAGES}
-    return {"python": platform.python_version(), **found}
 
 
 def _read_summary(manifest: Manifest, options: Options) -> dict[str, JSON]:

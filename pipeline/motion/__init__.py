@@ -31,6 +31,7 @@ from pipeline.motion.ideal import (
     predict_ackermann,
     predict_differential,
 )
+from pipeline.motion.inputs import InputChoice, choose_input
 from pipeline.motion.intervals import Estimate, Estimates, estimate_intervals
 from pipeline.motion.ladder import Ladder, Rung, climb
 from pipeline.motion.model import Model
@@ -59,6 +60,7 @@ __all__ = [
     "HeadingSource",
     "HeldOut",
     "Input",
+    "InputChoice",
     "KinematicEffect",
     "Ladder",
     "LinearEffect",
@@ -78,6 +80,7 @@ __all__ = [
     "Transfer",
     "Weights",
     "carry_over",
+    "choose_input",
     "climb",
     "estimate_floor",
     "estimate_intervals",

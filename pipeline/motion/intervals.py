@@ -114,8 +114,6 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
         half = wide * float(errors[index])
         if needs_search(number):
             half = _widen(problem, fitted, number)
-        low, high = number.bounds
-        margin = 1e-6 * (abs(low) + abs(high)) if np.isfinite(low + high) else 0.0
         items.append(
             Estimate(
                 number,
@@ -123,11 +121,18 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
                 value - half,
                 value + half,
                 float(errors[index]),
-                at_bound=not low + margin < value < high - margin,
+                at_bound=stands_at_bound(value, number.bounds),
                 observable=bool(observable[index]),
             )
         )
     return Estimates(tuple(items), correlation, pieces)
+
+
+def stands_at_bound(value: float, bounds: tuple[float, float]) -> bool:
+    """Whether a number stopped because it may go no further."""
+    low, high = bounds
+    margin = 1e-6 * (abs(low) + abs(high)) if np.isfinite(low + high) else 0.0
+    return not low + margin < value < high - margin
 
 
 def _carry_delays(problem: Problem, fitted: Fitted, total: Floats, rows: Integers, size: Floats) -> Floats:

@@ -58,3 +58,6 @@ def test_the_wheel_analyzes_a_log_in_a_bare_environment(wheel: Path, tmp_path: P
 
     assert done.returncode == 0, done.stderr
     assert "husky_a200" in done.stdout
+    asked = [str(environment / "bin" / "slip"), "--version"]
+    said = subprocess.run(asked, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert f"-{said.stdout.strip()}-" in wheel.name

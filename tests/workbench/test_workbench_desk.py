@@ -131,6 +131,19 @@ def test_a_saved_model_is_a_model_file(workbench: Workbench) -> None:
     assert b"effective_track" in body
 
 
+def test_working_on_a_model_leaves_the_run_byte_for_byte(workbench: Workbench) -> None:
+    home = workbench.results / "runs"
+    before = {path: path.read_bytes() for path in home.rglob("*") if path.is_file()}
+
+    workbench.get("/api/runs")
+    for action, more in (("open", {}), ("add", {"effect": "effective_track"}), ("undo", {})):
+        workbench.desk(RUN, action, **more)
+    workbench.post("/api/rows", run=RUN)
+    workbench.post("/api/save", run=RUN)
+    assert workbench.request("GET", "/report?run=field%2Fhidden")[0] == 200
+    assert {path: path.read_bytes() for path in home.rglob("*") if path.is_file()} == before
+
+
 def test_a_formula_is_parsed_with_its_units_and_never_run(workbench: Workbench) -> None:
     typed = {"effect": "my_track", "channel": "v_w", "formula": "c * w0", "parameters": "c [1] -0.9 .. 0.5"}
     opened = workbench.desk(RUN)
