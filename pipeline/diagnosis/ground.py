@@ -15,6 +15,7 @@ from pipeline.motion.catalogue import list_effects
 from pipeline.motion.comparison import Comparison, Input
 from pipeline.motion.effect import Place
 from pipeline.motion.forward import Timing
+from pipeline.motion.signals import name_inputs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -155,14 +156,8 @@ def _measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
         series = run.commands or run.wheels
         if series is None:
             continue
-        radius = vehicle.wheel_radius_m
-        forward = np.abs(0.5 * radius * (series.left + series.right))
-        if vehicle.kind == "ackermann":
-            around = forward * np.abs(np.tan(series.steering)) / (vehicle.wheelbase_m or 1.0)
-        else:
-            track = (vehicle.track_width_m or 1.0) * vehicle.controller_track_multiplier
-            around = np.abs(radius * (series.right - series.left) / track)
-        speed, turn = max(speed, float(forward.max())), max(turn, float(around.max()))
+        forward, _, around = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
+        speed, turn = max(speed, float(np.abs(forward).max())), max(turn, float(np.abs(around).max()))
         wheel = max(wheel, float(np.abs(series.left).max()), float(np.abs(series.right).max()))
         difference = max(difference, float(np.abs(series.right - series.left).max()))
     places = np.concatenate([run.track.place[run.track.active, 0] for run in runs])

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 from pipeline.motion.errors import MotionError
+from pipeline.vehicles.kinematics import list_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -90,7 +91,7 @@ class Parameter:
 
 DIFFERENTIAL = ("differential",)
 ACKERMANN = ("ackermann",)
-ANY = ("differential", "ackermann")
+ANY = list_kinds()
 
 
 class Effect(ABC):

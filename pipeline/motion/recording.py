@@ -12,7 +12,6 @@ from pipeline.core import rigid, segments
 from pipeline.motion.ages import put_in_time
 from pipeline.motion.errors import MotionError
 from pipeline.motion.faults import bar_faults
-from pipeline.motion.ideal import invert_differential
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -214,13 +213,15 @@ def _read_drive(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | N
     if table is None or table.is_empty():
         return None
     times = table["t"].to_numpy()
-    if vehicle.kind == "ackermann":
+    if vehicle.kinematics.has_inputs("speed", "steering"):
         axle = table["speed"].to_numpy() / vehicle.wheel_radius_m
         left, right, steering = axle, axle, table["steering"].to_numpy()
     else:
         left, right, steering = table["left"].to_numpy(), table["right"].to_numpy(), np.zeros(times.size)
         if table["left"].null_count():
-            left, right = invert_differential(table["body_x"].to_numpy(), table["body_w"].to_numpy(), vehicle)
+            forward, turning = table["body_x"].to_numpy(), table["body_w"].to_numpy()
+            asked = vehicle.kinematics.inverse((forward, np.zeros_like(forward), turning), vehicle)
+            left, right = asked["left"], asked["right"]
     kept = np.isfinite(left) & np.isfinite(right) & np.isfinite(steering)
     kept &= np.concatenate((np.diff(times) > 0.0, [True]))
     if kept.sum() < 2:  # noqa: PLR2004 - one value is no series

@@ -10,7 +10,6 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import timegrid
-from pipeline.motion.ideal import predict_ackermann, predict_differential
 from pipeline.stages import steps
 from pipeline.stages.errors import StageError
 from pipeline.stages.finding import Finding
@@ -158,9 +157,9 @@ def interpolate_wheels(times: Floats, wheels: pl.DataFrame, vehicle: Vehicle) ->
 
 
 def _predict(drive: pl.DataFrame, vehicle: Vehicle) -> Floats:
-    if vehicle.kind == "ackermann":
-        return predict_ackermann(drive["speed"].to_numpy(), drive["steering"].to_numpy(), vehicle)
-    return predict_differential(drive["left"].to_numpy(), drive["right"].to_numpy(), vehicle)
+    kinematics = vehicle.kinematics
+    inputs = {quantity.name: drive[quantity.name].to_numpy() for quantity in kinematics.inputs}
+    return np.stack(kinematics.forward(inputs, vehicle), axis=-1)
 
 
 def _usual_period(stamps: Floats) -> float:

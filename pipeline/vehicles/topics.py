@@ -199,7 +199,7 @@ class _Chooser:
 
     def _drive_candidates(self, *, commanded: bool) -> Iterable[tuple[float, DriveSource]]:
         """Candidates with their rank: wheel commands before body commands, since the drive received them."""
-        ackermann = self.vehicle.kind == "ackermann"
+        ackermann = self.vehicle.kinematics.has_inputs("speed", "steering")
         for topic in self.of_type(JOINTS):
             says_command = bool(_COMMANDED.search(topic.lower()))
             if says_command == commanded:

@@ -23,7 +23,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / done.stdout.split()[-1]
 
 
-def test_the_wheel_carries_presets_contracts_and_the_page(wheel: Path) -> None:
+def test_the_wheel_carries_presets_contracts_and_pages(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
 
     for folder, pattern in (
@@ -31,6 +31,8 @@ def test_the_wheel_carries_presets_contracts_and_the_page(wheel: Path) -> None:
         ("schemas", "*.py"),
         ("pipeline/report", "page.*"),
         ("pipeline/report", "*.js"),
+        ("pipeline/report/templates", "**/*.html"),
+        ("pipeline/batch", "catalogue.*"),
         ("pipeline/workbench", "page.*"),
         ("pipeline/workbench", "*.js"),
     ):
