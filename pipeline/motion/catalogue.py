@@ -9,13 +9,15 @@ import inspect
 import pkgutil
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import Effect
+from pipeline.motion.effect import Effect, find_late
 from pipeline.motion.errors import MotionError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
     from types import ModuleType
+
+    from pipeline.motion.effect import Late
 
 EffectClass = type[Effect]
 
@@ -52,6 +54,23 @@ def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> Effe
         where=name,
         hint=f"Did you mean {' or '.join(near[:3])}? `slip effects` lists them all.",
     )
+
+
+def find_late_effect(late: Late) -> EffectClass:
+    """The effect of the folder that makes this late.
+
+    Raises:
+        MotionError: ``unknown_effect``, there is none.
+    """
+    found = find_late(list_effects(), late)
+    if found is None:
+        raise MotionError(
+            "unknown_effect",
+            f"no effect says that {late.value}",
+            where=late.name,
+            hint="Give one of the folder `effects` that `late`.",
+        )
+    return found
 
 
 def load_effects(path: Path) -> dict[str, EffectClass]:
