@@ -182,6 +182,10 @@ def describe_effect(effect: type[Effect] | Effect) -> str:
     lines.append(f"shown by      {', '.join(need.value for need in effect.needs)}")
     if effect.equivalent_to:
         lines.append(f"same as       {', '.join(effect.equivalent_to)} ({effect.equivalent_when})")
+    if effect.contains:
+        lines.append(f"contains      {', '.join(effect.contains)}")
+    if effect.parts:
+        lines.append(f"searched as   {', '.join(part.effect for part in effect.parts)}")
     if effect.confused_with:
         lines.append(f"looks like    {', '.join(effect.confused_with)}")
     return "\n".join(lines)
@@ -193,7 +197,7 @@ def _describe_sizes(parameter: Parameter) -> list[str]:
     lines = []
     if parameter.least is not None:
         least = parameter.least
-        lines.append(f"named from {least.size:g}{unit} off neutral on: for less, {least.reason}")
+        lines.append(f"too small below {least.size:g}{unit} off neutral: {least.reason}")
     if parameter.plausible is not None:
         range_ = parameter.plausible
         lines.append(f"vehicles show {range_.low:g} to {range_.high:g}{unit}: {range_.source}")

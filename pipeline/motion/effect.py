@@ -87,7 +87,7 @@ class Least:
 
 STAMPS = "stamps are off by as much"
 MOUNTING = "sensors are mounted no better"
-DATA_SHEET = "it is within what a data sheet allows"
+DATA_SHEET = "a data sheet allows as much"
 
 
 @dataclass(frozen=True)
