@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import timegrid
+from pipeline.motion.evidence import LEAST_DELAY_S
 from pipeline.motion.heading import has_barred
 
 if TYPE_CHECKING:
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-LEAST_DELAY = 0.012
 _WINDOW_S = 0.5
 _UNIT_S = 10.0
 _SURE = 4.0
@@ -39,7 +39,7 @@ class YawDelay:
     @property
     def is_certain(self) -> bool:
         """Whether it is a delay beyond doubt."""
-        return abs(self.seconds) >= LEAST_DELAY and abs(self.seconds) > _SURE * self.error
+        return abs(self.seconds) >= LEAST_DELAY_S and abs(self.seconds) > _SURE * self.error
 
 
 def measure_yaw_delay(run: MotionRun, fit: GyroFit) -> YawDelay:

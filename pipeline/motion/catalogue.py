@@ -10,13 +10,15 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import Effect
+from pipeline.motion.effect import Effect, find_late
 from pipeline.motion.errors import MotionError
 from pipeline.motion.trust import hash_code
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
+
+    from pipeline.motion.effect import Late
 
 EffectClass = type[Effect]
 
@@ -53,6 +55,23 @@ def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> Effe
         where=name,
         hint=f"Did you mean {' or '.join(near[:3])}? `slip effects` lists them all.",
     )
+
+
+def find_late_effect(late: Late) -> EffectClass:
+    """The effect of the folder that makes this late.
+
+    Raises:
+        MotionError: ``unknown_effect``, there is none.
+    """
+    found = find_late(list_effects(), late)
+    if found is None:
+        raise MotionError(
+            "unknown_effect",
+            f"no effect says that {late.value}",
+            where=late.name,
+            hint="Give one of the folder `effects` that `late`.",
+        )
+    return found
 
 
 @functools.lru_cache(maxsize=64)

@@ -13,7 +13,7 @@ from pipeline.motion.ladder import list_rises
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.motion.effect import Effect
+    from pipeline.motion.effect import Effect, Parameter
     from pipeline.motion.intervals import Estimates
     from pipeline.motion.ladder import Ladder, Rung
     from pipeline.motion.model import Model
@@ -214,12 +214,32 @@ def describe_effect(effect: type[Effect] | Effect) -> str:
             f"parameter     {parameter.name} [{parameter.unit}]: {parameter.about}; {low:g} to {high:g}, "
             f"neutral {parameter.neutral:g}, usually about {parameter.typical:g}{how}"
         )
+        lines += [f"{'':<14}{text}" for text in _describe_sizes(parameter)]
     lines.append(f"shown by      {', '.join(need.value for need in effect.needs)}")
     if effect.equivalent_to:
         lines.append(f"same as       {', '.join(effect.equivalent_to)} ({effect.equivalent_when})")
+    if effect.contains:
+        lines.append(f"contains      {', '.join(effect.contains)}")
+    if effect.parts:
+        lines.append(f"searched as   {', '.join(part.effect for part in effect.parts)}")
     if effect.confused_with:
         lines.append(f"looks like    {', '.join(effect.confused_with)}")
     return "\n".join(lines)
+
+
+def _describe_sizes(parameter: Parameter) -> list[str]:
+    """What is too small to be named, and what vehicles show."""
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    lines = []
+    if parameter.least is not None:
+        least = parameter.least
+        lines.append(f"too small below {least.size:g}{unit} off neutral: {least.reason}")
+    if parameter.plausible is not None:
+        range_ = parameter.plausible
+        lines.append(f"vehicles show {range_.low:g} to {range_.high:g}{unit}: {range_.source}")
+    if parameter.one_sign:
+        lines.append("named where it is positive: the other sign is no physics")
+    return lines
 
 
 def list_pages(effects: Sequence[type[Effect]]) -> list[str]:

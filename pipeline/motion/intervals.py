@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.motion.effect import Late, find_late
 from pipeline.motion.problem import Free, needs_search
 from pipeline.motion.robust import weigh_system
 
@@ -143,7 +144,7 @@ def _carry_delays(problem: Problem, fitted: Fitted, total: Floats, rows: Integer
     scaled = total[np.ix_(rows, rows)] / np.outer(size[rows], size[rows]) + 1e-9 * np.eye(rows.size)
     for run, comparison in enumerate(problem.comparisons):
         gyro = comparison.heading.gyro
-        if gyro is None or "clock_offset" in fitted.model:
+        if gyro is None or find_late(fitted.model, Late.POSES) is not None:
             continue
         delay = Free("", "pose_delay_s", run, (-1.0, 1.0), _DELAY_STEP)
         column = problem.differentiate(fitted.state, [delay], fitted.residuals)

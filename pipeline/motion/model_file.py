@@ -236,7 +236,11 @@ class _Reader:
         name = table.get("id")
         if not isinstance(name, str) or not name:
             raise self._error(
-                "model_invalid", "an effect needs an id", 'Write id = "effective_track".', at, ""
+                "model_invalid",
+                "an effect needs an id",
+                "Write id = and one of those that `slip effects` lists.",
+                at,
+                "",
             )
         self._check_names(at, name, table)
         formulas = {key: table[key] for key in CHANNELS if isinstance(table.get(key), str)}
