@@ -8,7 +8,7 @@ BIN    := $(VENV)/bin
 OUT    ?= results
 
 # Values reach the shell through its environment, so that a path may hold spaces and quotes.
-export LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT SCORES
+export LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT SCORES MINUTES
 
 # Exit code 3 means done, but the log had losses: they are on the screen, and make has not failed.
 FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see above)" >&2 || exit $$code; }
@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader bench-real bench-workbench browser check clean compare format inspect lock map samples \
+.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader bench-real bench-workbench browser check clean compare damage damage-season format fuzz inspect lock map samples \
 	serve test test-long trend
 
 help: ## print this list
@@ -105,6 +105,16 @@ bench-workbench: $(VENV)/.ready-dev ## answers of the workbench on a 10-minute l
 
 bench-reader: $(VENV)/.ready-dev ## reading a 1 GB log: ours, its peers, and the bound
 	$(BIN)/python tests/bench/reader.py
+
+damage-season: $(VENV)/.ready-dev ## what becomes of each kind of odd entry in a season of logs
+	$(BIN)/python tests/batch/damage_season.py
+
+fuzz: $(VENV)/.ready-dev ## damaged files for every part of the program, for MINUTES=60 in all; finds are kept in fuzz_finds
+	@set -- tests/fuzz/fuzz_*.py; each=$$(awk "BEGIN { print $${MINUTES:-60} / $$# }"); failed=0; \
+	for script; do echo "$$script for $$each minutes"; $(BIN)/python "$$script" --minutes "$$each" || failed=1; done; \
+	exit $$failed
+damage: $(VENV)/.ready-dev ## every byte of small logs damaged, and what the reader makes of it [ARGS="--step 7"]
+	$(BIN)/python tests/bench/damage.py $$ARGS
 
 browser: ## install Debian's Chromium, for the tests that look at the report and the workbench
 	apt-get update && apt-get install --yes --no-install-recommends chromium

@@ -1,4 +1,4 @@
-"""Parameters of the effects fitted to a run."""
+"""Parameters of the effects that the diagnosis of a run named."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from schemas.slip import INPUTS
 
 
 class Parameters(Table):
-    """One row a parameter of an effect that was fitted to the run."""
+    """One row a parameter of an effect that is missing from the ideal model, as in `diagnosis.json`."""
 
     NAME: ClassVar[str] = "parameters"
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})
     effect = dy.String(min_length=1, metadata={"description": "id of the effect"})
@@ -24,3 +24,4 @@ class Parameters(Table):
     low = fields.number("1", "lower end of its 95 % interval", nullable=True)
     high = fields.number("1", "upper end of it", nullable=True)
     unit = fields.text("unit of value, low and high")
+    at_bound = fields.flag("it stopped at a bound of the search: the interval says little")

@@ -1,4 +1,4 @@
-"""A watchdog over the memory of worker processes: better one log lost than the machine."""
+"""A watchdog over the memory of workers or of this process: better one log lost than the machine."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ import os
 import signal
 import subprocess
 import threading
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
 
 _PERIOD_S = 0.05
 _PROC = Path("/proc/self/task")
@@ -49,6 +53,31 @@ class MemoryWatchdog:
                     self._killed[pid] = held
                     with suppress(ProcessLookupError):
                         os.kill(pid, signal.SIGKILL)
+
+
+@contextmanager
+def limit_memory(limit_bytes: int, give_up: Callable[[int], None]) -> Iterator[None]:
+    """Watch over the memory of this process itself.
+
+    Args:
+        limit_bytes: most that it may hold.
+        give_up: told what it holds when that is more, on a thread of its own; it ends the process.
+    """
+    done = threading.Event()
+
+    def watch() -> None:
+        while not done.wait(_PERIOD_S if _PROC.exists() else _SLOW_PERIOD_S):
+            held = read_memory(os.getpid())
+            if held > limit_bytes:
+                give_up(held)
+
+    watcher = threading.Thread(target=watch, name="own memory", daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        done.set()
+        watcher.join()
 
 
 def list_children() -> list[int]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from pipeline.batch.basis import BasisHasher
 from pipeline.batch.ledger import Entry, Ledger
 from pipeline.batch.naming import KnownRun, assign_names, list_doubtful
-from pipeline.logs import LogError, hash_log
+from pipeline.core.errors import SlipError
+from pipeline.logs import LogError, hash_log, to_location
 from pipeline.store import LogIdentities, LogSighting, Manifest, Store, see_log
 
 if TYPE_CHECKING:
@@ -62,13 +64,15 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> Plan:
     """
     ledger = Ledger(store).read_all()
     manifests = {manifest.run: manifest for manifest in store.survey().manifests}
+    asked_again = {run for run, manifest in manifests.items() if store.is_asked_again(manifest)}
     hasher = BasisHasher(request.options)
     items = [_look_at(path, hasher, ledger) for path in paths]
     settled: list[Entry] = []
     open_items: list[Item] = []
     for item in items:
         entry = item.before
-        if entry is not None and _is_settled(item, entry, manifests, request):
+        is_asked_again = entry is not None and entry.run in asked_again
+        if entry is not None and not is_asked_again and _is_settled(item, entry, manifests, request):
             settled.append(entry)
         else:
             open_items.append(item)
@@ -86,11 +90,12 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> Plan:
 
 
 def _look_at(path: Path, hasher: BasisHasher, ledger: Mapping[str, Entry]) -> Item:
-    try:
+    # What cannot be looked at is worked on all the same: that says what is wrong with it.
+    log, basis = LogSighting(path=str(path), size=0, mtime_ns=0, inode=0, seen_ns=0), ""
+    with suppress(OSError, SlipError):
         log = see_log(path)
-    except OSError:
-        log = LogSighting(path=str(path), size=0, mtime_ns=0, inode=0, seen_ns=0)
-    return Item(path=path, log=log, basis=hasher.hash_basis(path), before=ledger.get(log.path))
+        basis = hasher.hash_basis(path)
+    return Item(path=path, log=log, basis=basis, before=ledger.get(log.path))
 
 
 def _is_settled(item: Item, entry: Entry, manifests: Mapping[str, Manifest], request: Request) -> bool:
@@ -112,7 +117,7 @@ def _name_items(
 ) -> list[Item]:
     identities = LogIdentities(store)
     logs = _list_logs(manifests)
-    runs = {str(log.get("path")): run for run, log in logs.items()}
+    runs = {_path_of(log): run for run, log in logs.items()}
     runs |= {item.log.path: item.before.run for item in items if item.before and item.before.run in manifests}
     new = {item.path: item.log.size for item in open_items if item.log.path not in runs}
     looks = {item.log.path: item for item in items}
@@ -137,7 +142,7 @@ def _know_run(
     sizes: Collection[int],
 ) -> KnownRun:
     size = log.get("bytes")
-    item = looks.get(str(log.get("path")))
+    item = looks.get(_path_of(log))
     # Only a run that a new log could be a copy of is worth another look.
     is_alike = item is not None and (not isinstance(size, int) or size in sizes)
     content = _hash_logs([item.path], identities).get(item.path) if is_alike and item is not None else None
@@ -152,6 +157,10 @@ def _know_run(
 def _list_logs(manifests: Mapping[str, Manifest]) -> dict[str, Mapping[str, object]]:
     details = ((run, manifest.details.get("log")) for run, manifest in manifests.items())
     return {run: log for run, log in details if isinstance(log, dict)}
+
+
+def _path_of(log: Mapping[str, object]) -> str:
+    return str(to_location(str(log.get("path"))))
 
 
 def _hash_logs(paths: Sequence[Path], identities: LogIdentities) -> dict[Path, str]:

@@ -42,6 +42,11 @@ def refresh_pools(store: Store) -> bool:
     return written
 
 
+def forget_pools(store: Store) -> None:
+    """Have the tables and pages over all runs made again by the next batch."""
+    store.notes(_NOTES).remove(_NOTE)
+
+
 def load_libraries() -> None:
     """Load what pooling needs, for whoever has time to do so before."""
     import scipy.special  # noqa: F401, PLC0415 - intervals of pooled runs
@@ -54,7 +59,7 @@ def refresh_remote_pools(mirror: Mirror) -> None:
     """As `refresh_pools`, for results on an object store, with the runs that other machines have added."""
     mirror.pull_index()
     mirror.pull_tables(("aggregates",), mirror.store.manifests())
-    mirror.store.notes(_NOTES).remove(_NOTE)
+    forget_pools(mirror.store)
     refresh_pools(mirror.store)
     for name in (*POOLED, "quarantine_datasets.parquet"):
         mirror.push_file(name)

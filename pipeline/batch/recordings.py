@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import fnmatch
-import glob
 import os
 import re
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.batch.errors import BatchError
+from pipeline.batch.folders import Folder, Looker, Skipped
 from pipeline.logs import RemotePath
 
 if TYPE_CHECKING:
@@ -22,6 +24,12 @@ LISTING = "metadata.yaml"
 _MAGIC = b"\x89MCAP0\r\n"
 _GLOB = re.compile(r"[*?\[]")
 
+PATIENCE_S = 30.0
+"""Longest time for one look at a file or folder: a mount that is gone does not answer."""
+
+_LONGEST_LOOK_S = 5.0
+"""Time between two looks at logs whose last change lies in the future."""
+
 
 @dataclass(frozen=True)
 class Found:
@@ -30,28 +38,40 @@ class Found:
     Attributes:
         recordings: files, and folders of split recordings, absolute, sorted.
         growing: recordings that are still being written.
+        skipped: what was left out, and why: folders that cannot be read, pipes, links to nothing.
     """
 
     recordings: tuple[Path, ...]
     growing: tuple[Path, ...] = field(default=())
+    skipped: tuple[Skipped, ...] = field(default=())
 
 
-def find_recordings(targets: Sequence[str], *, settle_s: float) -> Found:
+def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: float = PATIENCE_S) -> Found:
     """Find the recordings that are meant.
 
     Args:
         targets: an MCAP file; a folder, searched to its depths; a glob such as ``2026/**/*.mcap``; or
             ``@list.txt``, a text file with one of these a line (``#`` begins a comment).
-        settle_s: a recording without a proper end that changed within this time is still being written [s].
+        settle_s: a recording without a proper end that changed within this time is still being written [s];
+            one that changed in the future is, if it grows between two looks.
+        patience_s: longest time for one look at a file or folder [s].
 
     Raises:
         BatchError: ``logs_not_found``, ``list_unreadable``.
+        LogError: ``log_unreadable``, an object store does not answer.
     """
+    looker = Looker(patience_s)
     found: set[Path] = set()
     for target in _expand_lists(targets):
-        found |= set(_find_in(target))
-    growing = {path for path in found if _is_growing(path, settle_s)}
-    return Found(tuple(sorted(found - growing)), tuple(sorted(growing)))
+        found |= set(_find_in(target, looker))
+    growing = _find_growing(found, settle_s, looker)
+    silent = {each.path for each in looker.skipped}
+    skipped = {each.path: each for each in looker.skipped}
+    return Found(
+        tuple(sorted(found - growing - silent)),
+        tuple(sorted(growing - silent)),
+        tuple(skipped[path] for path in sorted(skipped)),
+    )
 
 
 def _expand_lists(targets: Iterable[str]) -> Iterator[str]:
@@ -75,23 +95,24 @@ def _expand_lists(targets: Iterable[str]) -> Iterator[str]:
             yield str(path.parent / Path(line).expanduser())
 
 
-def _find_in(target: str) -> Iterator[Path]:
+def _find_in(target: str, looker: Looker) -> Iterator[Path]:
     if "://" in target:
         yield from _find_remote(RemotePath(target))
         return
     path = Path(target).expanduser()
-    if path.is_file():
-        yield path.resolve()
-    elif path.is_dir():
-        yield from _walk(path.resolve())
+    before = len(looker.skipped)
+    place = looker.ask(path, lambda: Path(os.path.realpath(path)))
+    if place is not None and looker.ask(place, place.is_file):
+        yield place
+    elif place is not None and looker.ask(place, place.is_dir):
+        for folder in looker.walk(place):
+            yield from _list_recordings(folder)
     elif _GLOB.search(target):
-        for match in sorted(glob.glob(str(path), recursive=True)):  # noqa: PTH207 - knows absolute patterns
-            inside = Path(match).resolve()
-            if inside.is_dir():
-                yield from _walk(inside)
-            elif inside.suffix == SUFFIX:
-                yield _parent_recording(inside) or inside
-    else:
+        for match in looker.expand(path):
+            yield from _find_match(match, looker)
+    elif place is not None and looker.ask(place, place.exists):
+        looker.skip(place, "it is a pipe, a socket or a device, and no file")
+    elif len(looker.skipped) == before:
         raise BatchError(
             "logs_not_found",
             "there is no such file or folder",
@@ -100,16 +121,21 @@ def _find_in(target: str) -> Iterator[Path]:
         )
 
 
-def _walk(top: Path) -> Iterator[Path]:
-    for place, folders, names in os.walk(top, followlinks=True):
-        # Hidden names are those of copies under way and of caches.
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        folder = Path(place)
-        logs = sorted(name for name in names if name.endswith(SUFFIX) and not name.startswith("."))
-        parts = set(list_parts(folder, logs, is_listed=LISTING in names))
-        if parts:
-            yield folder.resolve()
-        yield from ((folder / name).resolve() for name in logs if name not in parts)
+def _find_match(match: Path, looker: Looker) -> Iterator[Path]:
+    """Recordings that a file or folder stands for, which a glob has met."""
+    if looker.ask(match, match.is_dir):
+        for folder in looker.walk(match):
+            yield from _list_recordings(folder)
+    elif match.suffix == SUFFIX and looker.ask(match, match.is_file):
+        yield looker.ask(match, lambda: _parent_recording(match) or match) or match
+
+
+def _list_recordings(folder: Folder) -> Iterator[Path]:
+    logs = [name for name in folder.files if name.endswith(SUFFIX)]
+    parts = set(list_parts(folder.path, logs, is_listed=LISTING in folder.files))
+    if parts:
+        yield folder.path
+    yield from (folder.files[name] for name in logs if name not in parts)
 
 
 def list_parts(folder: Path, names: Iterable[str], *, is_listed: bool) -> list[str]:
@@ -128,6 +154,7 @@ def list_parts(folder: Path, names: Iterable[str], *, is_listed: bool) -> list[s
 
 def _find_remote(target: RemotePath) -> Iterator[Path]:
     """Recordings under a prefix, or the one at an address; objects are there whole or not at all."""
+    target.refresh()
     base, _, pattern = str(target).partition("*")
     if not pattern and target.is_file():
         yield target
@@ -154,21 +181,48 @@ def _parent_recording(log: Path) -> Path | None:
     return folder if list_parts(folder, [log.name], is_listed=listed) else None
 
 
-def _is_growing(path: Path, settle_s: float) -> bool:
-    """Whether a recorder or a copy is still writing it: no proper end, and changed a moment ago."""
-    if isinstance(path, RemotePath):
-        return False
-    try:
-        files = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
-        touched = max((file.stat().st_mtime for file in files), default=0.0)
-        if time.time() - touched > settle_s:
-            return False
+def _find_growing(found: Iterable[Path], settle_s: float, looker: Looker) -> set[Path]:
+    """Recordings that a recorder or a copy is still writing: no proper end, and changed a moment ago."""
+    growing: set[Path] = set()
+    ahead: dict[Path, int | None] = {}
+    for path in found:
+        if isinstance(path, RemotePath):
+            continue
+        age_s = looker.ask(path, partial(_tell_age, path, settle_s))
+        if age_s is not None and age_s < 0.0:
+            ahead[path] = looker.ask(path, partial(_measure, path))
+        elif age_s is not None:
+            growing.add(path)
+    if ahead and settle_s > 0.0:
+        # A clock that was wrong says nothing of when it was written: whether it grows does.
+        time.sleep(min(settle_s, _LONGEST_LOOK_S))
+        growing |= {path for path, size in ahead.items() if looker.ask(path, partial(_measure, path)) != size}
+    return growing
+
+
+def _tell_age(path: Path, settle_s: float) -> float | None:
+    """Seconds since the last change of a recording without a proper end; None where that is long ago."""
+    # What vanished or cannot be read is left to whoever analyzes it, and says so.
+    with suppress(OSError):
+        files = _list_files(path)
+        age_s = time.time() - max((file.stat().st_mtime for file in files), default=0.0)
+        if age_s > settle_s:
+            return None
         # The recorder of a split recording writes the listing last of all.
         unlisted = path.is_dir() and not (path / LISTING).is_file()
-        return unlisted or not all(_ends_well(file) for file in files)
-    except OSError:
-        # It vanished or cannot be read: whoever analyzes it will say so.
-        return False
+        if unlisted or not all(_ends_well(file) for file in files):
+            return age_s
+    return None
+
+
+def _measure(path: Path) -> int:
+    with suppress(OSError):
+        return sum(file.stat().st_size for file in _list_files(path))
+    return 0
+
+
+def _list_files(path: Path) -> list[Path]:
+    return sorted(file for file in path.glob(f"*{SUFFIX}") if file.is_file()) if path.is_dir() else [path]
 
 
 def _ends_well(file: Path) -> bool:

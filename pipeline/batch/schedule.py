@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-import shlex
+import unicodedata
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -58,12 +58,18 @@ def print_units(nightly: Nightly, system: System) -> str:
     Args:
         nightly: what is to run when.
         system: ``systemd`` for a service and its timer, ``cron`` for lines of a crontab.
+
+    Raises:
+        BatchError: ``bad_word``, a path or an argument that neither can hold.
     """
+    for word in (*_command(nightly), str(nightly.folder), str(nightly.lock)):
+        _require_one_line(word)
     return _print_systemd(nightly) if system == "systemd" else _print_cron(nightly)
 
 
 def _print_systemd(nightly: Nightly) -> str:
     # A service is never started twice, and the lock also keeps batches out that were started by hand.
+    # The folder ends in a slash because a backslash or a space at the end of a line would not be its own.
     words = ["/usr/bin/flock", "--nonblock", "--conflict-exit-code", "0", str(nightly.lock)]
     command = " ".join(_quote_systemd(word) for word in [*words, *_command(nightly)])
     return f"""\
@@ -73,7 +79,7 @@ Description=slip: bring results up to date with the logs
 
 [Service]
 Type=oneshot
-WorkingDirectory={_escape_systemd(str(nightly.folder))}
+WorkingDirectory={_escape_systemd(str(nightly.folder))}/
 ExecStart={command}
 # Exit code 3: done, but a log had losses, which the journal names.
 SuccessExitStatus=3
@@ -106,11 +112,9 @@ WantedBy=timers.target
 
 
 def _print_cron(nightly: Nightly) -> str:
-    inner = " ".join(shlex.quote(word) for word in _command(nightly))
-    flock = f"flock --nonblock --conflict-exit-code 0 {shlex.quote(str(nightly.lock))}"
-    line = f"cd {shlex.quote(str(nightly.folder))} && {flock} {inner} 2>&1 | logger --tag slip-batch"
-    # In a crontab a bare percent sign ends the command.
-    line = line.replace("%", r"\%")
+    inner = " ".join(_quote_cron(word) for word in _command(nightly))
+    flock = f"flock --nonblock --conflict-exit-code 0 {_quote_cron(str(nightly.lock))}"
+    line = f"cd {_quote_cron(str(nightly.folder))} && {flock} {inner} 2>&1 | logger --tag slip-batch"
     return f"""\
 # crontab -e
 SHELL=/bin/sh
@@ -124,6 +128,29 @@ PATH=/usr/local/bin:/usr/bin:/bin
 
 def _command(nightly: Nightly) -> list[str]:
     return [*nightly.program, "batch", *nightly.arguments]
+
+
+def _require_one_line(word: str) -> None:
+    """Neither a unit nor a crontab can hold a control character in one line, nor a name that is no UTF-8."""
+    if any(unicodedata.category(character) in {"Cc", "Cs"} for character in word):
+        raise BatchError(
+            "bad_word",
+            f"{word!r} holds a line break or another character that cannot stand in a unit or a crontab",
+            hint="Rename the file or folder",
+        )
+
+
+def _quote_cron(word: str) -> str:
+    r"""A word of a crontab's command, the same to every cron and to the shell behind it.
+
+    A bare percent sign ends the command; some crons take the backslash before it away, some leave it: it
+    stands outside of quotes, where the shell takes it away. Some crons make one backslash of two, so never do
+    two stand side by side.
+    """
+    if re.fullmatch(r"[A-Za-z0-9_@+=:,./-]+", word):
+        return word
+    single = word.replace("'", "'\"'\"'").replace("\\", "\\''").replace("%", "'\\%'")
+    return f"'{single}'"
 
 
 def _escape_systemd(text: str) -> str:

@@ -45,7 +45,8 @@ class Line:
     Attributes:
         path: the recording.
         run: name of its run.
-        state: one of `STATES`, or ``growing``, ``left`` for a log that was not begun.
+        state: one of `STATES`, or ``growing``, ``left`` for a log that was not begun, ``skipped`` for what
+            could not be looked at: a folder that may not be read, a pipe.
         code: of the error.
         reason: why it failed, or what was lost.
         hint: what to do.
@@ -100,8 +101,8 @@ class Outcome:
 
     @property
     def has_losses(self) -> bool:
-        """Whether a log with results had losses."""
-        return any(line.lossy for line in self.lines)
+        """Whether a log with results had losses, or something could not be looked at."""
+        return any(line.lossy or line.state == "skipped" for line in self.lines)
 
 
 def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = work_on) -> Outcome:
@@ -137,9 +138,10 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
         crew.dismiss()
     problems, removed = _tidy_up(store, mirror, request)
     growing = [Line(path=str(path), state="growing", reason="still being written") for path in found.growing]
-    lines = [*_describe_plan(plan), *map(_describe_report, result.reports), *_describe_left(result), *growing]
+    skipped = [Line(path=str(each.path), state="skipped", reason=each.reason) for each in found.skipped]
+    lines = [*_describe_plan(plan), *map(_describe_report, result.reports), *_describe_left(result)]
     return Outcome(
-        lines=tuple(sorted(lines, key=lambda line: line.path)),
+        lines=tuple(sorted((*lines, *growing, *skipped), key=lambda line: line.path)),
         seconds=time.monotonic() - started,
         problems=problems,
         removed=removed,

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from pipeline.batch.repair import repair_results
 from pipeline.core.errors import SlipError
 from pipeline.logs import hash_log, to_location
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from pipeline.batch.repair import Repair
     from pipeline.store import Mirror, Problem, Store
 
 
@@ -40,12 +42,16 @@ class Verification:
         logs: problems of logs.
         gone: logs that have been moved away since: no damage, but nothing to compute the run from again.
         checked: runs looked at.
+        unlisted: names in the results whose right content nothing tells: written before there was a list.
+        repairs: what was done, or can be done, about the problems of files; empty where it was not asked for.
     """
 
     files: tuple[Problem, ...]
     logs: tuple[LogProblem, ...]
     gone: tuple[LogProblem, ...]
     checked: int
+    unlisted: tuple[str, ...] = ()
+    repairs: tuple[Repair, ...] = ()
 
     @property
     def is_clean(self) -> bool:
@@ -54,17 +60,24 @@ class Verification:
 
 
 def verify_results(
-    store: Store, *, logs: bool, tell: Callable[[str], None], mirror: Mirror | None = None
+    store: Store,
+    *,
+    logs: bool,
+    tell: Callable[[str], None],
+    mirror: Mirror | None = None,
+    repair: bool = False,
 ) -> Verification:
-    """Hash all files of the results again, and the logs if wanted.
+    """Read all files of the results again, and the logs if wanted.
 
     Args:
         store: the results.
         logs: whether to read the logs, which takes as long as the disk needs for them.
         tell: told the name of each run whose log is about to be read.
         mirror: the mirror that the store is, if the results are on an object store.
+        repair: whether to have made again what can be.
     """
-    files = store.verify() if mirror is None else mirror.verify()
+    examination = store.examine() if mirror is None else mirror.examine()
+    repairs = repair_results(store, examination, mirror) if repair else ()
     manifests = store.survey().manifests
     found: list[LogProblem] = []
     for manifest in manifests if logs else ():
@@ -74,15 +87,19 @@ def verify_results(
             problem = _check_log(manifest.run, str(log.get("path")), str(log.get("sha256")))
             found += [] if problem is None else [problem]
     return Verification(
-        files=files,
+        files=examination.problems,
         logs=tuple(problem for problem in found if problem.code != "log_gone"),
         gone=tuple(problem for problem in found if problem.code == "log_gone"),
         checked=len(manifests),
+        unlisted=examination.unlisted,
+        repairs=repairs,
     )
 
 
 def _check_log(run: str, path: str, sha256: str) -> LogProblem | None:
-    if not to_location(path).exists():
+    location = to_location(path)
+    # Results may be a stranger's: of what stands under that path, only files are opened.
+    if not (location.is_file() or location.is_dir()):
         return LogProblem(run=run, path=path, code="log_gone", what="the log is not there any more")
     try:
         content = hash_log(path)

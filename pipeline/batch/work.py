@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.batch.ledger import Entry, Ledger
 from pipeline.core.errors import SlipError
+from pipeline.logs import FETCHED
 from pipeline.store import Mirror, Store
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ def work_on(task: Task) -> Report:
     """Analyze one log and note the outcome in the ledger; raises nothing that a log can cause."""
     mirror = None if task.address is None else Mirror(task.address, task.options.out)
     store = Store(task.options.out)
-    started = time.monotonic()
+    started, fetched = time.monotonic(), FETCHED.total
     entry = Entry(log=task.log, basis=task.basis, state="failed", run=task.options.run or "")
     is_new = False
     try:
@@ -92,7 +93,12 @@ def work_on(task: Task) -> Report:
         entry = replace(entry, code=error.code, reason=f"{where}{error.what}", hint=error.hint)
     except Exception as error:  # noqa: BLE001 - one log must not cost the others
         entry = _describe_surprise(entry, error)
-    entry = replace(entry, seconds=round(time.monotonic() - started, 3), peak_bytes=_peak_bytes())
+    entry = replace(
+        entry,
+        seconds=round(time.monotonic() - started, 3),
+        peak_bytes=_peak_bytes(),
+        fetched_bytes=FETCHED.total - fetched,
+    )
     Ledger(store, mirror).write(entry)
     return Report(entry=entry, is_new=is_new, rss_bytes=read_rss())
 
@@ -104,7 +110,13 @@ def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bo
     if mirror is not None:
         mirror.pull_run(entry.run)
     before = Store(task.options.out).manifest(entry.run) if entry.run else None
-    outcome = analyze_log(task.path, task.options)
+    try:
+        outcome = analyze_log(task.path, task.options)
+    except SlipError as error:
+        if error.code != "log_changed":
+            raise
+        # An object that was overwritten while it was read is most likely whole now.
+        outcome = analyze_log(task.path, task.options)
     if mirror is not None:
         mirror.push_run(outcome.manifest)
     done = replace(
@@ -113,17 +125,9 @@ def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bo
         run=outcome.manifest.run,
         key=outcome.manifest.key,
         reason=_describe_losses(outcome),
-        fetched_bytes=_count_fetched(outcome),
         has_report=REPORT in outcome.manifest.files,
     )
     return done, before is None or before.folder != outcome.manifest.folder
-
-
-def _count_fetched(outcome: Outcome) -> int:
-    from pipeline.job.work import stored_contexts  # noqa: PLC0415 - heavy
-
-    fetched = stored_contexts(outcome.manifest).get("extract", {}).get("fetched_bytes")
-    return fetched if isinstance(fetched, int) and "extract" in outcome.computed else 0
 
 
 def _describe_losses(outcome: Outcome) -> str:

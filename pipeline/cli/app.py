@@ -13,6 +13,9 @@ from cyclopts import App, CycloptsError
 import pipeline.cli
 from pipeline.cli.output import FAILED, USAGE, print_error
 from pipeline.core.errors import SlipError
+from pipeline.core.interpreter import keep_current_folder_out
+from pipeline.core.quiet import silence_warnings
+from pipeline.core.version import read_version
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,6 +34,7 @@ def build_app() -> App:
         help=HELP,
         # Plain text: a Markdown renderer takes longer to load than all the rest.
         help_format="plaintext",
+        version=read_version,
         version_flags=["--version"],
         result_action="return_value",
         # Ctrl-C comes back to `main`, which says what became of the results.
@@ -47,6 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # Results must not depend on how many threads a library takes, and short jobs lose time with more.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
+    keep_current_folder_out()
+    silence_warnings()
     try:
         code = build_app()(arguments, exit_on_error=False)
     except CycloptsError:

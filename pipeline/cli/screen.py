@@ -53,6 +53,7 @@ def _describe_head(summary: Summary) -> list[str]:
     losses = cast("Sequence[Mapping[str, object]]", log.get("losses") or [])
     gaps = [f for f in _findings(summary) if f["id"] == "pose_gap"]
     state = "complete" if not losses else "with losses"
+    state += f" (unchecked: {log['unchecked']})" if log.get("unchecked") else ""
     holes = _describe_gaps(gaps[0]) if gaps else ""
     segments = cast("int", summary["segments"])
     head.append(_row("log", f"{state}{holes}, {segments} segment{'s' if segments != 1 else ''}"))

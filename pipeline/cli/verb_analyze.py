@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from pipeline.cli.choices import Choices, build_options
+from pipeline.cli.memory_limit import limited_memory
+from pipeline.cli.model_trust import TrustCode, trust_named
 from pipeline.cli.output import describe_error, exit_code, print_error, print_json, print_lines, show_progress
 from pipeline.core.errors import SlipError
 from pipeline.job.options import FigureFormat, Options
@@ -33,7 +35,9 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     report: Annotated[bool, Parameter(negative="--no-report")] = True,
     figures: FigureFormat | None = None,
     model: Path | None = None,
+    trust_code: TrustCode = False,
     force: bool = False,
+    memory: str | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -43,20 +47,38 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         diagnosis: name what is missing from the model.
         report: write report.html.
         model: a model file to compute slip relative to as well.
+        trust_code: trust the Python that the model file names, now and later.
         figures: also write the figures in this format, for papers.
         force: compute again what is already there.
+        memory: most memory, for example 2GB (default: 80 % of the machine's).
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
+    trust_named(model, wanted=trust_code)
     options = build_options(
         choices, report=report, diagnosis=diagnosis, figures=figures, force=force, model=model
     )
-    outcomes, errors = _analyze_all(logs, options, quiet=quiet or json)
+    outcomes: list[Outcome] = []
+    errors: list[dict[str, str]] = []
+
+    def name_log() -> str:
+        return str(logs[min(len(outcomes) + len(errors), len(logs) - 1)])
+
+    def conclude(error: SlipError) -> None:
+        if json:
+            _print_json(outcomes, [*errors, describe_error(name_log(), error)])
+
+    with limited_memory(memory, name_log, conclude):
+        _analyze_all(logs, options, outcomes, errors, quiet=quiet or json)
     if json:
-        print_json({"runs": [_as_json(outcome) for outcome in outcomes], "errors": errors})
+        _print_json(outcomes, errors)
     elif not quiet:
         _print_outcomes(outcomes)
     return exit_code(errors, lossy=any(outcome.lossy for outcome in outcomes))
+
+
+def _print_json(outcomes: list[Outcome], errors: list[dict[str, str]]) -> None:
+    print_json({"runs": [_as_json(outcome) for outcome in outcomes], "errors": errors})
 
 
 def _as_json(outcome: Outcome) -> dict[str, object]:
@@ -64,16 +86,19 @@ def _as_json(outcome: Outcome) -> dict[str, object]:
 
 
 def _analyze_all(
-    logs: list[Path], options: Options, *, quiet: bool
-) -> tuple[list[Outcome], list[dict[str, str]]]:
-    """Analyze one log after the other; an error costs one log."""
+    logs: list[Path],
+    options: Options,
+    outcomes: list[Outcome],
+    errors: list[dict[str, str]],
+    *,
+    quiet: bool,
+) -> None:
+    """Analyze one log after the other into outcomes and errors; an error costs one log."""
     if options.report:
         _warm_report()
     from pipeline.job.analyze import analyze_log, update_datasets  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    outcomes: list[Outcome] = []
-    errors: list[dict[str, str]] = []
     for log in logs:
         try:
             with show_progress(log.name, quiet=quiet) as progress:
@@ -83,7 +108,6 @@ def _analyze_all(
             errors.append(describe_error(str(log), error))
     if any(outcome.computed for outcome in outcomes):
         update_datasets(Store(options.out))
-    return outcomes, errors
 
 
 def _warm_report() -> None:

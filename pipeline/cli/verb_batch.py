@@ -25,7 +25,12 @@ _WORDS = (
     ("failed", "failed"),
     ("quarantined", "quarantined"),
 )
-_EXPLAINED = (("lossy", "with losses"), ("failed", "failed"), ("quarantined", "quarantined"))
+_EXPLAINED = (
+    ("lossy", "with losses"),
+    ("failed", "failed"),
+    ("quarantined", "quarantined"),
+    ("skipped", "left out"),
+)
 
 
 def register(app: App) -> None:
@@ -125,6 +130,7 @@ def _as_json(outcome: Outcome) -> dict[str, object]:
         **outcome.counts,
         "growing": sum(line.state == "growing" for line in outcome.lines),
         "left": sum(line.state == "left" for line in outcome.lines),
+        "skipped": sum(line.state == "skipped" for line in outcome.lines),
         "seconds": round(outcome.seconds, 3),
         "removed_generations": outcome.removed,
         "logs": [asdict(line) for line in outcome.lines],
@@ -137,7 +143,7 @@ def describe_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     lines = [f"{word:<14}{outcome.counts[state]:>6}" for state, word in _WORDS]
     if is_search and not outcome.lines:
         lines.append("no recording was found; they are files that end in .mcap")
-    for state, word in (("growing", "being written"), ("left", "not begun")):
+    for state, word in (("growing", "being written"), ("left", "not begun"), ("skipped", "left out")):
         count = sum(line.state == state for line in outcome.lines)
         lines += [f"{word:<14}{count:>6}"] if count else []
     fetched = sum(line.fetched_bytes for line in outcome.lines)

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
 from pipeline.cli.choices import Choices, build_options
-from pipeline.cli.output import describe_error, exit_code, print_error, print_json, print_lines, show_progress
+from pipeline.cli.memory_limit import limited_memory
+from pipeline.cli.model_trust import TrustCode, open_model
+from pipeline.cli.output import (
+    describe_error,
+    exit_code,
+    print_error,
+    print_json,
+    print_lines,
+    say,
+    show_progress,
+)
 from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
     from pipeline.diagnosis import Diagnosis, Recording
+    from pipeline.job.geometry import Owner
     from pipeline.job.options import Options
     from pipeline.motion import ModelFile
-    from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
 
 
@@ -32,31 +43,51 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     model: Annotated[
         Path | None, Parameter(help="what is known already: say what is missing beyond it")
     ] = None,
+    trust_code: TrustCode = False,
+    vehicle_of: Annotated[
+        Literal["model", "run"] | None,
+        Parameter(help="whose geometry counts where the run is of another vehicle than --model"),
+    ] = None,
     apply: Annotated[Path | None, Parameter(help="write the proposed model to this file")] = None,
+    memory: str | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
     """Name what is missing from the model, from one run or from several of one vehicle jointly.
 
     Args:
+        trust_code: trust the Python that the model file names, now and later.
+        memory: most memory, for example 2GB (default: 80 % of the machine's).
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
     options = build_options(choices)
-    known = _read_model(model)
-    gathered, errors, lossy = _gather(logs, options, quiet=quiet or json)
+    known = None if model is None else open_model(model, trust_code=trust_code)
     diagnoses: list[Diagnosis] = []
-    for vehicle, recordings in gathered.values():
-        try:
-            diagnoses.append(_judge(recordings, vehicle, options, known, quiet=quiet or json))
-        except SlipError as error:
-            print_error(error)
-            errors.append(describe_error(recordings[0].path, error))
+    at_work = [""]
+
+    def conclude(error: SlipError) -> None:
+        if json:
+            runs = [run for diagnosis in diagnoses for run in diagnosis.runs]
+            told = describe_error(at_work[0], error)
+            print_json({"runs": [run.to_json() for run in runs], "errors": [told]})
+
+    with limited_memory(memory, lambda: at_work[0], conclude):
+        gathered, errors, lossy = _gather(logs, options, at_work, quiet=quiet or json)
+        for vehicle, recordings in gathered.values():
+            at_work[0] = recordings[0].path
+            try:
+                agreed = vehicle if known is None else _agree(known, vehicle, recordings, vehicle_of)
+                diagnoses.append(_judge(recordings, agreed, options, known, quiet=quiet or json))
+            except SlipError as error:
+                print_error(error)
+                errors.append(describe_error(recordings[0].path, error))
     runs = [run for diagnosis in diagnoses for run in diagnosis.runs]
     if apply is not None:
         _apply([run.proposal for run in runs], apply, quiet=quiet or json)
     if json:
-        print_json({"runs": [run.to_json() for run in runs], "errors": errors})
+        left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
+        print_json({"runs": [run.to_json() for run in runs], "errors": errors, **left_out})
     elif not quiet:
         from pipeline.diagnosis.words import describe  # noqa: PLC0415 - only for people
 
@@ -65,49 +96,41 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     return exit_code(errors, lossy=lossy)
 
 
-def _read_model(path: Path | None) -> ModelFile | None:
-    if path is None:
-        return None
-    from pipeline.motion import read_model  # noqa: PLC0415 - heavy
-
-    return read_model(path)
-
-
 def _gather(
-    logs: list[str], options: Options, *, quiet: bool
+    logs: list[str], options: Options, at_work: list[str], *, quiet: bool
 ) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], bool]:
-    """Recordings by vehicle; an error costs one log."""
+    """Recordings by vehicle; an error costs one log. ``at_work`` is told which log it is."""
     from pipeline.job.diagnosis import read_recording  # noqa: PLC0415 - heavy
+    from pipeline.job.options import INPUTS  # noqa: PLC0415
+    from pipeline.job.stored import open_run  # noqa: PLC0415 - heavy
 
     gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
     errors: list[dict[str, str]] = []
     lossy = False
     for log in logs:
+        at_work[0] = log
         try:
-            manifest, losses = _find(log, options, quiet=quiet)
-            vehicle, recording = read_recording(manifest)
+            with (
+                show_progress(Path(log).name, quiet=quiet) as progress,
+                # What a run is stored with does not depend on what is asked about it.
+                open_run(log, replace(options, inputs=INPUTS), progress) as opened,
+            ):
+                vehicle, recording = read_recording(opened.manifest)
         except SlipError as error:
             print_error(error)
             errors.append(describe_error(log, error))
             continue
-        lossy |= losses
+        if opened.note and not quiet:
+            say(f"slip: {opened.note}")
+        lossy |= opened.lossy
         gathered.setdefault(repr(vehicle), (vehicle, []))[1].append(recording)
     return gathered, errors, lossy
 
 
-def _find(log: str, options: Options, *, quiet: bool) -> tuple[Manifest, bool]:
-    """A log is taken through the stages first; a stored run is read."""
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
+def _agree(known: ModelFile, vehicle: Vehicle, recordings: list[Recording], owner: Owner | None) -> Vehicle:
+    from pipeline.job.geometry import agree_on_vehicle  # noqa: PLC0415 - heavy
 
-    if not Path(log).exists() and not Path(log).suffix:
-        from pipeline.job.lookup import find_run  # noqa: PLC0415 - heavy
-
-        return find_run(log, Store(options.out)), False
-    from pipeline.job.analyze import analyze_log  # noqa: PLC0415 - heavy
-
-    with show_progress(Path(log).name, quiet=quiet) as progress:
-        outcome = analyze_log(Path(log), options, progress)
-    return outcome.manifest, outcome.lossy
+    return agree_on_vehicle(known.model.vehicle, {one.name: vehicle for one in recordings}, owner)
 
 
 def _judge(
@@ -125,7 +148,7 @@ def _judge(
         progress("diagnosis")
         return diagnose_runs(
             recordings,
-            vehicle if known is None else known.model.vehicle,
+            vehicle,
             inputs=options.inputs,
             model=None if known is None else known.model,
         )

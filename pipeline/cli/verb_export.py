@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
+from pipeline.cli.model_trust import TrustCode, open_model
 from pipeline.cli.output import CLEAN, print_json, print_lines
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ def export(
     model: Path | None = None,
     input: Literal["command", "measured"] | None = None,  # noqa: A002 - the word people use for it
     frame: str = "map",
+    trust_code: TrustCode = False,
     out: Path = Path("results"),
     json: bool = False,
     quiet: bool = False,
@@ -49,17 +51,18 @@ def export(
         model: a model file whose velocity and predicted path are exported too (default: what was diagnosed).
         input: what the model is fed with (default: the command where there is one).
         frame: fixed frame of the log's poses.
+        trust_code: trust the Python that the model file names, now and later.
         out: results folder.
         json: print one JSON object.
         quiet: print nothing.
     """
     from pipeline.job.lookup import find_run  # noqa: PLC0415 - heavy
-    from pipeline.motion import read_model  # noqa: PLC0415 - heavy
     from pipeline.report import exports  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     manifest = find_run(run, Store(out))
-    chosen, named_on = _find_named(manifest) if model is None else (read_model(model).model, None)
+    known = None if model is None else open_model(model, trust_code=trust_code)
+    chosen, named_on = _find_named(manifest) if known is None else (known.model, None)
     source = exports.ExportSource(manifest, chosen, input or named_on, frame)
     path = file or Path(manifest.run.replace("/", "_") + _SUFFIXES[to])
     if to == "csv":
@@ -72,7 +75,8 @@ def export(
         }[to]
         written = [write(source, path)]
     if json:
-        print_json({"run": manifest.run, "to": to, "files": [str(each) for each in written]})
+        left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
+        print_json({"run": manifest.run, "to": to, "files": [str(each) for each in written], **left_out})
     elif not quiet:
         print_lines(str(each) for each in written)
     return CLEAN

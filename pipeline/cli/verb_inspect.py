@@ -66,6 +66,7 @@ def _as_json(seen: Inspection) -> dict[str, object]:
             }
             for loss in seen.losses
         ],
+        "unchecked": seen.unchecked or None,
         "notes": list(seen.notes),
         "metadata": {name: dict(record) for name, record in index.metadata.items()},
         "topics": [vars(topic) for topic in seen.topics],
@@ -81,6 +82,8 @@ def _as_json(seen: Inspection) -> dict[str, object]:
 
 
 def _describe(seen: Inspection) -> list[str]:
+    from pipeline.logs import shorten  # noqa: PLC0415 - heavy
+
     index = seen.index
     packing = "compression " + (", ".join(name or "none" for name in index.compressions) or "none")
     lines = [
@@ -88,12 +91,15 @@ def _describe(seen: Inspection) -> list[str]:
         f"          {index.size_bytes / 1e6:.1f} MB, {format_duration(index.duration_s)}, {packing}",
         f"          {index.message_count} messages in {index.chunk_count} chunks",
         f"          profile {index.profile or '-'}, written by {index.library or '-'}",
-        f"health    {'complete' if not seen.losses else 'with losses'}",
+        f"health    {'complete' if not seen.losses else 'with losses'}"
+        + (f", unchecked: {seen.unchecked}" if seen.unchecked else ""),
     ]
     lines += [f"  lost    {loss.text}" for loss in seen.losses]
     lines += [f"  note    {note}" for note in seen.notes]
     for name, record in index.metadata.items():
-        lines.append(f"metadata  {name}: " + ", ".join(f"{key} = {value}" for key, value in record.items()))
+        lines.append(
+            f"metadata  {name}: " + ", ".join(f"{key} = {shorten(value)}" for key, value in record.items())
+        )
     lines += ["", *_describe_topics(seen.topics), ""]
     lines.append(f"vehicle   {seen.vehicle.name if seen.vehicle else 'unknown'}")
     if seen.sources is not None:

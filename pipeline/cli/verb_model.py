@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
+from pipeline.cli.model_trust import TrustCode, open_model, trust, trusted, untrust
 from pipeline.cli.output import CLEAN, print_json, print_lines, say
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.motion.model import Model
+    from pipeline.motion.inputs import InputChoice
     from pipeline.motion.model_file import ModelFile
-    from pipeline.motion.problem import Problem
     from pipeline.motion.recording import MotionRun
     from pipeline.motion.score import Errors
     from pipeline.motion.transfer import Transfer
@@ -32,7 +32,12 @@ class On:
         Literal["command", "measured"] | None,
         Parameter(help="what the model is fed with (default: as last time, else measured wheels if there)"),
     ] = None
+    vehicle_of: Annotated[
+        Literal["model", "run"] | None,
+        Parameter(help="whose geometry counts where the run is of another vehicle (default: ask)"),
+    ] = None
     out: Annotated[Path, Parameter(help="results folder")] = Path("results")
+    trust_code: TrustCode = False
     json: Annotated[bool, Parameter(help="print one JSON object", negative="")] = False
     quiet: Annotated[bool, Parameter(help="print no progress and no table", negative="")] = False
 
@@ -43,7 +48,7 @@ Spoken = Annotated[On, Parameter(name="*")]
 def register(app: App) -> None:
     """Add the verb and its own verbs."""
     model = App(name="model", help="Make, show, change, fit, compare and export a motion model.")
-    for command in (new, show, add, drop, fit, compare, export):
+    for command in (new, show, add, drop, fit, compare, export, trust, untrust, trusted):
         model.command(command)
     app.command(model)
 
@@ -86,19 +91,19 @@ def new(
     return CLEAN
 
 
-def show(model: Path, /, *, json: bool = False) -> int:
+def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -> int:
     """Show a model: its effects, values, intervals, and what they were fitted on.
 
     Args:
         model: the model file.
+        trust_code: trust the Python that the model file names, now and later.
         json: print one JSON object.
     """
     from pipeline.motion.describe import describe_parameters, parameters_as_json  # noqa: PLC0415 - heavy
     from pipeline.motion.export import export_json  # noqa: PLC0415
     from pipeline.motion.intervals import NOTHING  # noqa: PLC0415
-    from pipeline.motion.model_file import read_model  # noqa: PLC0415
 
-    file = read_model(model)
+    file = open_model(model, trust_code=trust_code)
     if json:
         sys.stdout.write(export_json(file))
         return CLEAN
@@ -122,16 +127,12 @@ def add(  # noqa: D417 - the shared options document themselves
         model: the model file.
         effects: ids of effects, as `slip effects` lists them.
     """
-    from pipeline.motion.catalogue import find_effect, load_effects  # noqa: PLC0415 - heavy
-    from pipeline.motion.model_file import read_model  # noqa: PLC0415
+    from pipeline.motion.catalogue import find_effect  # noqa: PLC0415 - heavy
 
-    file = read_model(model)
-    own = {
-        name: kind for text in file.effect_files for name, kind in load_effects(model.parent / text).items()
-    }
+    file = open_model(model, trust_code=spoken.trust_code)
     changed = file.model
     for name in effects:
-        changed = changed + find_effect(name, own)()
+        changed = changed + find_effect(name, file.own)()
     return _change(model, file, replace(file, model=changed), spoken)
 
 
@@ -144,9 +145,7 @@ def drop(  # noqa: D417 - the shared options document themselves
         model: the model file.
         effects: ids of effects that the model has.
     """
-    from pipeline.motion.model_file import read_model  # noqa: PLC0415 - heavy
-
-    file = read_model(model)
+    file = open_model(model, trust_code=spoken.trust_code)
     changed = file.model
     for name in effects:
         changed = changed - name
@@ -168,9 +167,7 @@ def fit(  # noqa: D417 - the shared options document themselves
         predict: logs or runs that the fit must not see, to be predicted with it.
         afresh: forget the values there are and search anew.
     """
-    from pipeline.motion.model_file import read_model  # noqa: PLC0415 - heavy
-
-    file = read_model(model)
+    file = open_model(model, trust_code=spoken.trust_code)
     changed = file
     if afresh:
         neutral = [effect.change(**{p.name: p.neutral for p in effect.parameters}) for effect in file.model]
@@ -187,23 +184,32 @@ def compare(  # noqa: D417 - the shared options document themselves
         model: a model file.
         other: another one.
     """
-    from pipeline.motion.model_file import read_model  # noqa: PLC0415 - heavy
+    from pipeline.motion.inputs import choose_input  # noqa: PLC0415 - heavy
     from pipeline.motion.transfer import carry_over  # noqa: PLC0415
-    from pipeline.motion.workshop import choose_input  # noqa: PLC0415
 
+    opened = [open_model(path, trust_code=spoken.trust_code) for path in (model, other)]
+    left_out = [text for file in opened for text in file.warnings]
+    files = [_gather(spoken, file, spoken.on) for file in opened]
+    # Both are fed with the same, or their errors could not be compared.
+    last = {_last_input(file) for file, _ in files}
+    effects = [effect for file, _ in files for effect in file.model]
+    chosen = choose_input(files[0][1], spoken.input, effects, last=last.pop() if len(last) == 1 else None)
     rows: list[tuple[str, Transfer]] = []
-    for path in (model, other):
-        file = read_model(path)
-        runs = _gather(spoken, file, spoken.on)
-        source = choose_input(runs, spoken.input or _last_input(file))
-        rows += [
-            (str(path), item) for item in carry_over(file.model, runs, source, fitted_on=_terrains(file))
-        ]
-    warnings = [item.warning for _, item in rows if item.warning]
+    for path, (file, runs) in zip((model, other), files, strict=True):
+        carried = carry_over(file.model, runs, chosen.source, fitted_on=_terrains(file))
+        rows += [(str(path), item) for item in carried]
+    warnings = [text for text in (chosen.warning, *(item.warning for _, item in rows)) if text]
     if spoken.json:
-        print_json({"compared": [_transfer_as_json(name, item) for name, item in rows], "warnings": warnings})
+        print_json(
+            {
+                "input": chosen.source.value,
+                "input_reason": chosen.reason,
+                "compared": [_transfer_as_json(name, item) for name, item in rows],
+                "warnings": [*left_out, *warnings],
+            }
+        )
     elif not spoken.quiet:
-        print_lines(_describe_transfers(rows))
+        print_lines([f"on {chosen.source.value} ({chosen.reason})", *_describe_transfers(rows)])
         _warn(warnings)
     return CLEAN
 
@@ -214,6 +220,7 @@ def export(  # noqa: D417 - the options document themselves
     *,
     to: Literal["ros2_control", "json", "python"],
     out: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
+    trust_code: TrustCode = False,
 ) -> int:
     """Export a model to what people run.
 
@@ -222,14 +229,13 @@ def export(  # noqa: D417 - the options document themselves
         to: controller and nav2 parameters, JSON, or a Python function without dependencies.
     """
     from pipeline.motion import export as exports  # noqa: PLC0415 - heavy
-    from pipeline.motion.model_file import read_model  # noqa: PLC0415
 
     write = {
         "ros2_control": exports.export_ros2_control,
         "json": exports.export_json,
         "python": exports.export_python,
     }[to]
-    text = write(read_model(model))
+    text = write(open_model(model, trust_code=trust_code))
     if out is None:
         sys.stdout.write(text)
     else:
@@ -241,28 +247,32 @@ def _change(
     path: Path, before: ModelFile, after: ModelFile, spoken: On, *, predict: Sequence[str] = ()
 ) -> int:
     """Judge a model before and after a change, fit it, write its file, and print."""
-    from pipeline.motion.model_text import write_model  # noqa: PLC0415 - heavy
+    from pipeline.motion.inputs import choose_input  # noqa: PLC0415 - heavy
+    from pipeline.motion.model_text import format_model, write_model  # noqa: PLC0415
     from pipeline.motion.problem import Problem  # noqa: PLC0415
     from pipeline.motion.transfer import carry_over  # noqa: PLC0415
-    from pipeline.motion.workshop import choose_input, judge_model, note_fit  # noqa: PLC0415
+    from pipeline.motion.workshop import judge_model, note_fit  # noqa: PLC0415
 
-    runs = _gather(spoken, after, spoken.on)
-    source = choose_input(runs, spoken.input or _last_input(before))
-    problem = Problem(runs, after.model.vehicle, source)
-    old = judge_model(problem, before.model, per_run=before.per_run)
+    # What was left out would be lost from the file: that is said before a long fit, not after it.
+    format_model(after)
+    after, gathered = _gather(spoken, after, [*spoken.on, *predict])
+    runs, others = gathered[: len(spoken.on)], gathered[len(spoken.on) :]
+    chosen = choose_input(runs, spoken.input, after.model, last=_last_input(before))
+    problem = Problem(runs, after.model.vehicle, chosen.source)
+    model_before = replace(before.model, vehicle=after.model.vehicle)
+    old = judge_model(problem, model_before, per_run=before.per_run)
     new_one = old
     if after.model.effects != before.model.effects:
         new_one = judge_model(problem, after.model, per_run=after.per_run)
     written = note_fit(after, new_one)
     write_model(written, path)
     terrains = [run.terrain for run in runs]
-    others = _gather(spoken, after, predict)
-    carried = carry_over(written.model, others, source, fitted_on=terrains) if others else []
-    warnings = [item.warning for item in carried if item.warning]
+    carried = carry_over(written.model, others, chosen.source, fitted_on=terrains) if others else []
+    warnings = [text for text in (chosen.warning, *(item.warning for item in carried)) if text]
     if spoken.json:
-        print_json(_as_json(path, old, new_one, after.model, carried, warnings))
+        print_json(_as_json(path, old, new_one, chosen, carried, [*before.warnings, *warnings]))
     elif not spoken.quiet:
-        lines = _describe(old, new_one, after.model)
+        lines = _describe(old, new_one, chosen)
         if carried:
             lines += ["", *_describe_transfers([(str(path), item) for item in carried])]
         print_lines(lines)
@@ -270,10 +280,13 @@ def _change(
     return CLEAN
 
 
-def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> list[MotionRun]:
+def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFile, list[MotionRun]]:
+    """Runs, and the file with the vehicle whose geometry counts."""
     from pipeline.cli.model_runs import gather_runs  # noqa: PLC0415 - heavy
 
-    return gather_runs(names, file.model.vehicle, spoken.out, quiet=spoken.quiet or spoken.json)
+    quiet = spoken.quiet or spoken.json
+    vehicle, runs = gather_runs(names, file.model.vehicle, spoken.vehicle_of, spoken.out, quiet=quiet)
+    return replace(file, model=replace(file.model, vehicle=vehicle)), runs
 
 
 def _last_input(file: ModelFile) -> str | None:
@@ -290,7 +303,7 @@ def _as_json(
     path: Path,
     old: Judgement,
     new_one: Judgement,
-    model: Model,
+    chosen: InputChoice,
     carried: Sequence[Transfer],
     warnings: Sequence[str],
 ) -> Mapping[str, object]:
@@ -299,6 +312,7 @@ def _as_json(
         errors_as_json,
         ladder_as_json,
         parameters_as_json,
+        step_as_json,
     )
     from pipeline.motion.score import measure_by_terrain  # noqa: PLC0415
 
@@ -306,12 +320,14 @@ def _as_json(
     floor = _choose_floor(old, new_one)
     return {
         "model": str(path),
-        "input": problem.source.value,
+        "input": chosen.source.value,
+        "input_reason": chosen.reason,
         "runs": list(problem.names),
         "ladder_before": ladder_as_json(old.ladder, floor),
         "ladder": ladder_as_json(new_one.ladder, floor),
+        "step": step_as_json(old.whole, new_one.whole),
         "idle": list(new_one.ladder.idle),
-        "not_fitted": _list_asleep(problem, model),
+        "not_fitted": list(chosen.idle),
         "by_run": {
             name: errors_as_json(errors)
             for name, errors in zip(problem.names, new_one.whole.held_out.by_run, strict=True)
@@ -353,33 +369,28 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
     }
 
 
-def _describe(old: Judgement, new_one: Judgement, model: Model) -> list[str]:
+def _describe(old: Judgement, new_one: Judgement, chosen: InputChoice) -> list[str]:
     from pipeline.motion.describe import (  # noqa: PLC0415 - heavy
         describe_ladder,
         describe_parameters,
         describe_recordings,
+        describe_step,
         parameters_as_json,
     )
 
     runs = ", ".join(new_one.problem.names)
     floor = _choose_floor(old, new_one)
-    source = new_one.problem.source.value
-    lines = [f"on {source} of {runs}"]
+    lines = [f"on {chosen.source.value} of {runs} ({chosen.reason})"]
     lines += describe_recordings([comparison.run for comparison in new_one.problem.comparisons])
     if old is not new_one:
         lines += ["", "before", *describe_ladder(old.ladder, floor), "", "after"]
     lines += describe_ladder(new_one.ladder, floor)
-    asleep = _list_asleep(new_one.problem, model)
-    if asleep:
-        lines.append(f"not fitted, acts between command and wheels:  {', '.join(asleep)} (--input command)")
+    if old is not new_one:
+        lines += describe_step(old.whole, new_one.whole)
+    if chosen.warning:
+        lines.append(chosen.warning)
     parameters = parameters_as_json(new_one.fitted.model, new_one.estimates)
     return [*lines, "", "parameters", *describe_parameters(parameters)]
-
-
-def _list_asleep(problem: Problem, model: Model) -> list[str]:
-    """Effects of a model that the input leaves nothing to do: with measured wheels, those before them."""
-    acting = {effect.id for effect in problem.active_effects(model)}
-    return [effect.id for effect in model if effect.id not in acting]
 
 
 def _choose_floor(old: Judgement, new_one: Judgement) -> Errors:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json as json_format
 import re
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ from cyclopts import App, Parameter
 
 from pipeline.cli.output import CLEAN, print_lines
 from pipeline.cli.results_place import open_results
+from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
     import polars as pl
@@ -33,6 +35,7 @@ def query(  # noqa: D417 - arguments document themselves
     dataset: str | None = None,
     day: str | None = None,
     to: Literal["table", "csv", "json"] = "table",
+    allow_files: Annotated[bool, Parameter(negative=())] = False,
     json: Annotated[bool, Parameter(negative=())] = False,
 ) -> int:
     """Answer SQL over the tables (slip, windows, aggregates, datasets, ...) and `runs`, one row a run.
@@ -44,6 +47,7 @@ def query(  # noqa: D417 - arguments document themselves
         dataset: only runs of this dataset.
         day: only runs of this UTC day, 2026-07-31, or of a month, 2026-07.
         to: how to print the answer.
+        allow_files: let the query open files and addresses of its own (read_csv, read_parquet, ...).
         json: print one JSON object: columns and rows.
     """
     from pipeline.store import Partition  # noqa: PLC0415 - only for this verb
@@ -54,7 +58,7 @@ def query(  # noqa: D417 - arguments document themselves
     if place.mirror is not None:
         words = re.findall(r"\w+", sql.lower())
         place.mirror.pull_tables(words, filter(partition.holds, store.manifests()))
-    answer = store.query(sql, partition)
+    answer = store.query(sql, partition, allow_files=allow_files)
     _print(answer, "json" if json else to)
     return CLEAN
 
@@ -63,10 +67,37 @@ def _print(answer: pl.DataFrame, form: Literal["table", "csv", "json"]) -> None:
     import polars as pl  # noqa: PLC0415 - heavy
 
     if form == "csv":
-        sys.stdout.write(answer.write_csv())
+        try:
+            sys.stdout.write(answer.write_csv())
+        except pl.exceptions.PolarsError as error:
+            said = str(error).splitlines()[0]
+            raise SlipError(
+                "no_csv", f"the answer cannot be CSV: {said}", hint="Use --to json, or ask for plain columns"
+            ) from error
     elif form == "json":
-        names = ", ".join(f'"{name}"' for name in answer.columns)
-        sys.stdout.write(f'{{"columns": [{names}], "rows": {answer.write_json()}}}\n')
+        names = json_format.dumps(answer.columns)
+        sys.stdout.write(f'{{"columns": {names}, "rows": {_spell_bytes(answer).write_json()}}}\n')
     else:
         with pl.Config(tbl_rows=-1, tbl_cols=-1, fmt_str_lengths=_WIDE, tbl_width_chars=_WIDE):
             print_lines(str(answer).split("\n"))
+
+
+def _spell_bytes(answer: pl.DataFrame) -> pl.DataFrame:
+    """The same table with bytes as hexadecimal digits: JSON has no word for them."""
+    import polars as pl  # noqa: PLC0415 - heavy
+
+    return answer.with_columns(
+        pl.Series(column.name, [_spell(value) for value in column.to_list()], strict=False)
+        for column in answer
+        if "Binary" in str(column.dtype)
+    )
+
+
+def _spell(value: object) -> object:
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, list):
+        return [_spell(each) for each in value]
+    if isinstance(value, dict):
+        return {name: _spell(each) for name, each in value.items()}
+    return value

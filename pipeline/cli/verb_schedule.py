@@ -10,6 +10,7 @@ from cyclopts import App, Parameter
 
 from pipeline.batch.schedule import Nightly, System, parse_clock, print_units
 from pipeline.cli.output import CLEAN
+from pipeline.core.interpreter import slip_command
 
 
 def register(app: App) -> None:
@@ -35,7 +36,7 @@ def schedule(  # noqa: D417 - arguments document themselves
     hour, minute = parse_clock(at)
     folder = Path.cwd()
     nightly = Nightly(
-        program=(sys.executable, "-m", "pipeline"),
+        program=slip_command(),
         arguments=arguments,
         folder=folder,
         lock=(folder / (lock or ".slip-batch.lock")),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,6 +26,7 @@ def verify(  # noqa: D417 - arguments document themselves
     *,
     out: Annotated[Path, Parameter(show=False)] = Path("results"),
     logs: bool = True,
+    repair: Annotated[bool, Parameter(negative=())] = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -32,6 +34,7 @@ def verify(  # noqa: D417 - arguments document themselves
 
     Args:
         logs: read the logs, too.
+        repair: say what can be made again, and have it made by the next batch over its log.
         json: print one JSON object.
         quiet: print nothing.
     """
@@ -39,15 +42,15 @@ def verify(  # noqa: D417 - arguments document themselves
 
     place = open_results(results or out)
     with show_progress("verify", quiet=quiet or json) as tell:
-        found = verify_results(place.open_store(), mirror=place.mirror, logs=logs, tell=tell)
+        found = verify_results(place.open_store(), mirror=place.mirror, logs=logs, tell=tell, repair=repair)
     if json:
-        print_json(_as_json(found))
+        print_json(_as_json(found, repair=repair))
     elif not quiet:
         print_lines(_describe(found))
     return CLEAN if found.is_clean else FAILED
 
 
-def _as_json(found: Verification) -> dict[str, object]:
+def _as_json(found: Verification, *, repair: bool) -> dict[str, object]:
     files = [
         {"run": problem.run, "path": str(problem.path), "code": problem.code, "message": problem.what}
         for problem in found.files
@@ -59,7 +62,14 @@ def _as_json(found: Verification) -> dict[str, object]:
         ]
         for problems in (found.logs, found.gone)
     )
-    return {"runs": found.checked, "files": files, "logs": logs, "gone": gone}
+    answer = {
+        "runs": found.checked,
+        "files": files,
+        "logs": logs,
+        "gone": gone,
+        "unlisted": list(found.unlisted),
+    }
+    return answer | ({"repairs": [asdict(each) for each in found.repairs]} if repair else {})
 
 
 def _describe(found: Verification) -> list[str]:
@@ -67,10 +77,17 @@ def _describe(found: Verification) -> list[str]:
     lines += [f"damaged  {problem.path}: {problem.what}" for problem in found.files]
     lines += [f"log      {problem.path}: {problem.what} ({problem.run})" for problem in found.logs]
     lines += [f"gone     {problem.path} ({problem.run})" for problem in found.gone]
+    lines += [f"{each.action:<8} {each.subject}: {each.what}" for each in found.repairs]
+    if found.unlisted and not found.repairs:
+        lines.append(
+            f"{len(found.unlisted)} files were written before there was a list of them: "
+            "`slip verify --repair` puts them on it."
+        )
     if found.is_clean:
         lines.append("all is as it was written")
     else:
         lines.append(
-            "Analyze the logs of damaged runs again with --force; copy changed logs from their origin."
+            "`slip verify --repair` has made again what can be, by the next batch over its log; "
+            "copy changed logs from their origin."
         )
     return lines

@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
     from pipeline.diagnosis.judge import Fold
     from pipeline.diagnosis.problem import Problem
-    from pipeline.diagnosis.screen import Candidate, Largest, Proposal, Trial
+    from pipeline.diagnosis.screen import Candidate, Proposal, Trial
     from pipeline.diagnosis.state import State
+    from pipeline.motion.evidence import Evidence, Largest
 
 Floats = NDArray[np.float64]
 
 # A number more must buy something: between models that predict alike the simpler one is named.
 _PRICE_OF_A_NUMBER = 0.004
-_PRICE = {"terrain_change": 0.05}
 _FIRST_STEPS = 4
 _WORTH = 1.15
 _FLOOR = 1.1
@@ -64,25 +64,21 @@ class Arena:
     Attributes:
         problem: what is explained.
         candidates: effects that may be named.
-        largest: what relative starts are shares of.
+        evidence: what the runs can show.
         noise: spread that a saturated fit leaves, shape (n, 3).
         kept: effects that are never dropped: those of the model to start from.
         metric: cost of residuals at the current model.
-        only_early_clock: whether a late clock cannot be told from a late drive.
-        least_delay: delays below it are a matter of sampling [s].
         work: how many times candidates were looked through.
         least_share: share of the asked motion (rms) that an effect must account for.
     """
 
     problem: Problem
     candidates: tuple[Candidate, ...]
-    largest: Largest
+    evidence: Evidence
     noise: Floats
     folds: tuple[Fold, ...]
     metric: Metric
     kept: frozenset[str] = frozenset()
-    only_early_clock: bool = False
-    least_delay: float = 0.0
     least_share: float = 0.0
     _dropped: dict[tuple[str, ...], Contender] = field(default_factory=dict)
     _suggested: dict[tuple[object, ...], list[Contender]] = field(default_factory=dict)
@@ -95,10 +91,14 @@ class Arena:
     def widen(self, candidates: tuple[Candidate, ...]) -> Arena:
         """The same arena with other candidates; nothing that was tried here counts there."""
         return Arena(
-            self.problem, candidates, self.largest, self.noise, self.folds, self.metric,
-            kept=self.kept, only_early_clock=self.only_early_clock,
-            least_delay=self.least_delay, least_share=self.least_share,
+            self.problem, candidates, self.evidence, self.noise, self.folds, self.metric,
+            kept=self.kept, least_share=self.least_share,
         )  # fmt: skip
+
+    @property
+    def largest(self) -> Largest:
+        """What was asked for."""
+        return self.evidence.largest
 
     def enter(self, state: State) -> Contender:
         """Fit a state and hold it out."""
@@ -114,8 +114,7 @@ class Arena:
     def _present(self, fitted: Fitted) -> Contender:
         held = hold_out(fitted, self.metric, self.folds)
         price = 1.0 + sum(
-            _PRICE.get(effect.id, 0.0)
-            + _PRICE_OF_A_NUMBER * sum(np.isfinite(value) for value in effect.values.values())
+            effect.price + _PRICE_OF_A_NUMBER * sum(np.isfinite(value) for value in effect.values.values())
             for effect in fitted.state.effects
         )
         return Contender(fitted, held, self.metric.loss(held) * price)
@@ -189,15 +188,14 @@ class Arena:
         return self._finished[key]
 
     def _simplify(self, contender: Contender) -> Contender:
-        """The model with a plain lag for one whose two time constants have become one beside a new effect."""
-        lag = contender.state.find("turn_lag")
-        simpler = next((candidate for candidate in self.candidates if candidate.id == "drive_lag"), None)
-        if lag is None or simpler is None or "turn_lag" in self.kept or "drive_lag" in contender.ids:
-            return contender
-        if is_nameable(lag, self.largest, self.least_delay):
-            return contender
-        tau = 0.5 * (lag.values["tau_mean"] + lag.values["tau_diff"])
-        return self.enter(contender.state.drop(["turn_lag"]).add(simpler(tau=tau)))
+        """The model with a simpler effect for one that has become it beside a new effect."""
+        known = {candidate.id for candidate in self.candidates} - set(contender.ids)
+        for effect in contender.state.effects:
+            simpler = None if effect.id in self.kept else effect.collapse()
+            if simpler is None or simpler.id not in known or is_nameable(effect, self.evidence):
+                continue
+            return self.enter(contender.state.drop([effect.id]).add(simpler))
+        return contender
 
     def has_room(self, contender: Contender) -> bool:
         """Whether a model leaves more than a saturated fit does in any channel."""
@@ -206,21 +204,19 @@ class Arena:
 
     def is_sound(self, contender: Contender) -> bool:
         """Whether every effect is large enough to be named, and no degenerate form of another."""
-        clock = contender.state.find("clock_offset")
-        if self.only_early_clock and clock is not None and clock.values["d"] > 0.0:
-            return False
         return all(
-            effect.id in self.kept or is_nameable(effect, self.largest, self.least_delay)
-            for effect in contender.state.effects
+            effect.id in self.kept or is_nameable(effect, self.evidence) for effect in contender.state.effects
         )
 
 
 def open_arena(
-    problem: Problem, start: State, candidates: tuple[Candidate, ...], largest: Largest
+    problem: Problem, start: State, candidates: tuple[Candidate, ...], evidence: Evidence
 ) -> tuple[Arena, Contender]:
     """The arena of a problem, and the model to start from, fitted."""
     residual = problem.find_residuals(start)
     noise = saturate(problem, residual)
     metric = make_metric(residual, noise, problem)
-    arena = Arena(problem, candidates, largest, noise, make_folds(problem), metric, kept=frozenset(start.ids))
+    arena = Arena(
+        problem, candidates, evidence, noise, make_folds(problem), metric, kept=frozenset(start.ids)
+    )
     return arena, arena.adapt(arena.enter(start))

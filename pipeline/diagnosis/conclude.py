@@ -13,13 +13,14 @@ from pipeline.diagnosis import leftover
 from pipeline.diagnosis.diagnosis import Named, RunDiagnosis
 from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.naming_rules import join_classes, list_equivalents
-from pipeline.diagnosis.own_way import list_values, measure_values, read_gyro_clock, refer_to_radius
+from pipeline.diagnosis.own_way import list_values, measure_values, read_gyro_clock, rescale_values
 from pipeline.diagnosis.plausibility import find_implausible
 from pipeline.diagnosis.rating import rate_effects
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.where import map_errors, pick_regions
 from pipeline.motion import Input, ModelFile, MotionError, find_effect
 from pipeline.motion.describe import errors_as_json, ladder_as_json
+from pipeline.motion.effect import Late, find_late
 from pipeline.motion.ladder import compare_losses
 from pipeline.motion.windows import WINDOW_S
 from pipeline.motion.workshop import note_fit
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 _DRAWS = 400
 _WORTH = 0.01
 _TOGETHER = 0.995
-_CLOCKS = frozenset({"clock_offset", "heading_skew"})
+_CLOCKS = frozenset({Late.POSES, Late.HEADING})
 # Eight steps of six seconds, and fifteen: with fewer, a delay or a change of terrain stands for the truth.
 _LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
 
@@ -76,7 +77,7 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
     described = tuple(
         _describe(effect, ground, ways, judgements, open_ids)
         for effect in _order(found, judgement)
-        if not _parts(effect) & open_ids and effect.id not in known
+        if not effect.searched_as & open_ids and effect.id not in known
     )
     named = tuple(effect for effect in described if _doubt(effect) is None)
     named = leftover.mark_tentative(_mark_idle(named, judgements), ways, unexplained)
@@ -90,7 +91,7 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
     places = np.concatenate([find_places(comparison) for comparison in comparisons])
     regions = map_errors(problem, residual, places)
     hidden = {name for item in undecided for name in item.candidates} | {effect.id for effect in found}
-    hidden |= set().union(*(_parts(effect) for effect in found)) if found else set()
+    hidden |= set().union(*(effect.searched_as for effect in found))
     unobservable = {u.id: u for way in ways for u in way.unobservable if u.id not in hidden}
     shares = () if judgement is None else judgement.ladder.explained_shares(judgement.floor)
     last = shares[-1] if shares else None
@@ -167,7 +168,7 @@ def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
         effect.id: effect
         for way in ways
         for effect in way.search.final.state.effects
-        if not is_term(effect.id) and effect.id != "clock_offset"
+        if not is_term(effect.id) and effect.late is not Late.POSES
     }
     effects |= {effect.id: effect for effect in clocks.effects}
     joined = join_classes(list(effects.values()))
@@ -187,11 +188,6 @@ def _rate_ways(
     return found
 
 
-def _parts(effect: Effect) -> set[str]:
-    """Ids under which an effect was searched."""
-    return {"icr_offset", "icr_lateral"} if effect.id == "lever_arm" else {effect.id}
-
-
 def _describe(
     effect: Effect,
     ground: Ground,
@@ -202,12 +198,13 @@ def _describe(
     way = _way_of(effect, ways)
     gain, selected = _measure_gain(effect, way)
     judgement = judgements.get(way.search.way)
-    if effect.id == "clock_offset" and ground.has_gyro:
+    if effect.late is Late.POSES and ground.has_gyro:
         values = read_gyro_clock(effect, [delay for delay in ground.yaw_delays if delay is not None])
     elif judgement is not None and effect.id in judgement.fitted.model:
         values = list_values(judgement.fitted.model.effect(effect.id), judgement.estimates)
-        if effect.id == "effective_track" and "wheel_radius" in open_ids & set(judgement.fitted.model.ids):
-            values = refer_to_radius(values, judgement.fitted.model.effect("wheel_radius"))
+        # What is one explanation of several is left out of the numbers of the others.
+        for other in judgement.fitted.model.keep(open_ids):
+            values = rescale_values(values, effect.scale_without(other))
     else:
         values = measure_values(effect, way.search)
     return Named(
@@ -216,7 +213,7 @@ def _describe(
         gain=gain,
         equivalent_to=list_equivalents(effect, ground),
         confused_with=effect.confused_with,
-        corrected=effect.id in _CLOCKS and ground.has_gyro,
+        corrected=effect.late in _CLOCKS and ground.has_gyro,
         way=way.search.way,
         selected=selected,
     )
@@ -274,7 +271,7 @@ def _order(effects: Sequence[Effect], judgement: Judgement | None) -> list[Effec
 
 def _way_of(effect: Effect, ways: Sequence[Explored]) -> Explored:
     for way in ways:
-        if _parts(effect) & set(way.search.final.ids):
+        if effect.searched_as & set(way.search.final.ids):
             return way
     return ways[0]
 
@@ -282,10 +279,11 @@ def _way_of(effect: Effect, ways: Sequence[Explored]) -> Explored:
 def _measure_gain(effect: Effect, way: Explored) -> tuple[float, float]:
     """Relative rise of the held-out loss without an effect, and how often that is worth a name."""
     arena, final = way.search.arena, way.search.final
-    names = _parts(effect) & set(final.ids)
-    if effect.id in _CLOCKS and not names:
-        names = {"clock_offset"} & set(final.ids)
-    if effect.id == "clock_offset" and not names:
+    names = effect.searched_as & set(final.ids)
+    clock = find_late(final.state.effects, Late.POSES)
+    if effect.late in _CLOCKS and not names and clock is not None:
+        names = frozenset({clock.id})
+    if effect.late is Late.POSES and not names:
         state = replace(
             final.state, timing=tuple(replace(one, pose_delay_s=0.0) for one in final.state.timing)
         )

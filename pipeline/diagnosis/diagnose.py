@@ -23,7 +23,7 @@ from pipeline.diagnosis.unexplained import (
     find_places,
     search_formula,
 )
-from pipeline.motion import Input
+from pipeline.motion import Input, choose_input
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.ground import Ground
     from pipeline.diagnosis.subject import Recording
     from pipeline.diagnosis.undecided import Undecided
-    from pipeline.motion import Effect, Model
+    from pipeline.motion import Effect, InputChoice, Model
     from pipeline.vehicles import Vehicle
 
 
@@ -83,18 +83,18 @@ def diagnose_runs(
     vehicle = runs[0].correct_vehicle(vehicle)
     ground = prepare(runs, vehicle)
     known = () if model is None else model.effects
-    if not ground.compare(Input(leading)):
+    chosen = choose_input(ground.runs, inputs[0] if len(inputs) == 1 else None, known)
+    leading = chosen.source.value
+    if not ground.compare(chosen.source):
         other = "measured" if leading == "command" else "command"
-        if other not in inputs or not ground.compare(Input(other)):
-            raise DiagnosisError(
-                "no_input",
-                f"there is no {'command' if leading == 'command' else 'measured wheel'} to diagnose from",
-                where=", ".join(run.name for run in ground.runs),
-                hint=f"Try --input {other}.",
-            )
-        leading = other
+        raise DiagnosisError(
+            "no_input",
+            f"there is no {'command' if leading == 'command' else 'measured wheel'} to diagnose from",
+            where=", ".join(run.name for run in ground.runs),
+            hint=f"Try --input {other}.",
+        )
     ways, clocks = _explore(ground, leading, known)
-    return _conclude(recordings, ground, leading, ways, clocks)
+    return _conclude(recordings, ground, chosen, ways, clocks)
 
 
 def _explore(ground: Ground, leading: str, known: Sequence[Effect]) -> tuple[list[Explored], Clocks]:
@@ -139,11 +139,12 @@ def _explore_wheels(ground: Ground, known: Sequence[Effect], body: Search) -> Ex
 def _conclude(
     recordings: Sequence[Recording],
     ground: Ground,
-    leading: str,
+    chosen: InputChoice,
     ways: Sequence[Explored],
     clocks: Clocks,
 ) -> Diagnosis:
-    common: RunDiagnosis = conclude.summarize(ground, Input(leading), ways, clocks)
+    common: RunDiagnosis = conclude.summarize(ground, chosen.source, ways, clocks)
+    common = replace(common, input_reason=chosen.reason)
     return Diagnosis(
         tuple(
             conclude.of_run(common, recording, number, ground) for number, recording in enumerate(recordings)

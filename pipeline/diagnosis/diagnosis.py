@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 from pipeline.diagnosis.where import tabulate_regions
+from pipeline.motion import find_effect
+from pipeline.motion.intervals import stands_at_bound
 
 if TYPE_CHECKING:
     import polars as pl
@@ -121,6 +123,7 @@ class RunDiagnosis:
     Attributes:
         run: its name.
         input: what the model is fed with: `command` or `measured`.
+        input_reason: why; empty where nothing was fitted.
         joint: names of all runs that were judged together.
         effects: what is missing.
         undecided: explanations that are as good as each other.
@@ -141,6 +144,7 @@ class RunDiagnosis:
 
     run: str
     input: str
+    input_reason: str = ""
     joint: tuple[str, ...] = ()
     effects: tuple[Named, ...] = ()
     undecided: tuple[Undecided, ...] = ()
@@ -163,6 +167,7 @@ class RunDiagnosis:
         return {
             "run": self.run,
             "input": self.input,
+            "input_reason": self.input_reason or None,
             "joint_with": [name for name in self.joint if name != self.run],
             "effects": [effect.to_json() for effect in self.effects],
             "undecided": [
@@ -221,6 +226,34 @@ class Diagnosis:
             "rms_x": pl.Float64, "rms_y": pl.Float64, "rms_w": pl.Float64,
             "t_mrmse": pl.Float64, "r_mrmse": pl.Float64, "explained_share": pl.Float64,
             "kind": pl.Enum(["rung", "floor"]),
+        }  # fmt: skip
+        return pl.DataFrame(rows, schema=schema, orient="row")
+
+    def tabulate_parameters(self, run: str) -> pl.DataFrame:
+        """Numbers of the effects named in one run as table `parameters` (without the run's own columns)."""
+        import polars as pl  # noqa: PLC0415 - heavy
+
+        rows = [
+            {
+                "input": item.input,
+                "effect": effect.id,
+                "parameter": name,
+                "value": _clean(value.value),
+                "low": _clean(value.low),
+                "high": _clean(value.high),
+                "unit": value.unit,
+                "at_bound": stands_at_bound(value.value, find_effect(effect.id)().parameter(name).bounds),
+            }
+            for item in self.runs
+            if item.run == run
+            for effect in item.effects
+            for name, value in effect.parameters.items()
+            if math.isfinite(value.value)
+        ]
+        schema: dict[str, pl.DataType | type[pl.DataType]] = {
+            "input": pl.Enum(["command", "measured"]), "effect": pl.String, "parameter": pl.String,
+            "value": pl.Float64, "low": pl.Float64, "high": pl.Float64, "unit": pl.String,
+            "at_bound": pl.Boolean,
         }  # fmt: skip
         return pl.DataFrame(rows, schema=schema, orient="row")
 

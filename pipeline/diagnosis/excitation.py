@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.diagnosis.arena import Arena, Contender
-    from pipeline.diagnosis.screen import Candidate, Largest
+    from pipeline.diagnosis.screen import Candidate
     from pipeline.motion.effect import Effect
 
 Floats = NDArray[np.float64]
@@ -80,34 +80,8 @@ def suggest_manoeuvre(*effects: Effect) -> str:
     return "; ".join(MANOEUVRES[need] for need in needs[:3])
 
 
-def make_usual(candidate: Candidate, largest: Largest) -> Effect:
-    """The effect at a usual size; limits and thresholds as shares of what the run asked for."""
-    relative = {"speed": 0.7 * largest.speed, "turn": 0.7 * largest.turn, "wheel": 0.7 * largest.wheel}
-    values = {}
-    for parameter in candidate.parameters:
-        if parameter.name == "at_x":
-            continue
-        value = parameter.typical
-        if parameter.relative_to == "duration":
-            value = 0.5 * largest.duration
-        elif parameter.relative_to:
-            value = relative[parameter.relative_to]
-        values[parameter.name] = value
-    if candidate.id == "acceleration_limit":
-        values["limit"] = largest.wheel
-    elif candidate.id == "turn_droop":
-        values["threshold"] = 0.4 * largest.difference
-    elif candidate.id == "deadband":
-        values["d"] *= min(largest.speed, 1.0)
-    for parameter in candidate.parameters:
-        if parameter.name in values:
-            low, high = parameter.bounds
-            values[parameter.name] = min(max(values[parameter.name], low), high)
-    return candidate(**values)
-
-
 def _shift(arena: Arena, final: Contender, candidate: Candidate) -> Floats:
-    changed = arena.problem.find_residuals(final.state.add(make_usual(candidate, arena.largest)))
+    changed = arena.problem.find_residuals(final.state.add(candidate().make_usual(arena.largest)))
     shift: Floats = final.fitted.residual - changed
     return shift
 

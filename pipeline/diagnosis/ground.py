@@ -9,12 +9,13 @@ import numpy as np
 
 from pipeline.diagnosis.errors import DiagnosisError
 from pipeline.diagnosis.problem import BodyProblem, WheelProblem
-from pipeline.diagnosis.screen import Largest
-from pipeline.diagnosis.timing import LEAST_DELAY, YawDelay
+from pipeline.diagnosis.timing import YawDelay
 from pipeline.motion.catalogue import list_effects
 from pipeline.motion.comparison import Comparison, Input
 from pipeline.motion.effect import Place
+from pipeline.motion.evidence import LEAST_DELAY_S, Evidence, Largest
 from pipeline.motion.forward import Timing
+from pipeline.motion.signals import name_inputs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,9 +29,6 @@ _RATE_HZ = 50.0
 _COARSE_HZ = 25.0
 _MOST_CELLS = 20_000
 _FEWEST_WINDOWS = 60
-_STANDING = 0.05
-# A point beside base_link is a shifted centre of rotation: it is searched under that name.
-_TWINS = frozenset({"lever_arm"})
 _DRIVETRAIN = frozenset({Place.COMMAND, Place.DRIVE})
 
 
@@ -64,9 +62,10 @@ class Ground:
         return self.commanded if source is Input.COMMAND else self.measured
 
     @property
-    def moves_both_ways(self) -> bool:
-        """Whether a run both drives and turns."""
-        return min(self.largest.speed, self.largest.turn) > _STANDING
+    def evidence(self) -> Evidence:
+        """What the runs can show; every search looks at measured wheels where there are any."""
+        sampling = self.sampling_s if self.measured else 0.0
+        return Evidence(self.largest, bool(self.measured), self.has_gyro, sampling)
 
     @property
     def sampling_s(self) -> float:
@@ -77,26 +76,21 @@ class Ground:
     def start_timing(self) -> tuple[Timing, ...]:
         """Delays to start from: the heading's against the gyro."""
         return tuple(
-            Timing() if delay is None or abs(delay.seconds) < 0.5 * LEAST_DELAY else Timing(delay.seconds)
+            Timing() if delay is None or abs(delay.seconds) < 0.5 * LEAST_DELAY_S else Timing(delay.seconds)
             for delay in self.yaw_delays
         )
 
     def list_candidates(self, source: Input) -> tuple[Candidate, ...]:
         """Effects that can be told on an input of this vehicle."""
-        found: list[Candidate] = []
-        for effect in list_effects():
-            if self.vehicle.kind not in effect.kinds or effect.id in _TWINS:
-                continue
-            if source is Input.MEASURED and effect.place in _DRIVETRAIN:
-                continue
-            if effect.id == "heading_skew" and self.has_gyro:
-                continue
-            free = source is Input.MEASURED and self.has_gyro
-            if effect.id == "clock_offset" and free and not self.moves_both_ways:
-                # The encoders' delay is free: only driving and turning at once tell it from the poses'.
-                continue
-            found.append(cast("Candidate", effect))
-        return tuple(found)
+        hidden = _DRIVETRAIN if source is Input.MEASURED else frozenset()
+        return tuple(
+            cast("Candidate", effect)
+            for effect in list_effects()
+            if self.vehicle.kind in effect.kinds
+            and effect.place not in hidden
+            and not effect.parts
+            and effect().can_show(self.evidence)
+        )
 
     def list_drivetrain(self) -> tuple[Candidate, ...]:
         """Effects between command and wheels."""
@@ -155,14 +149,8 @@ def _measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
         series = run.commands or run.wheels
         if series is None:
             continue
-        radius = vehicle.wheel_radius_m
-        forward = np.abs(0.5 * radius * (series.left + series.right))
-        if vehicle.kind == "ackermann":
-            around = forward * np.abs(np.tan(series.steering)) / (vehicle.wheelbase_m or 1.0)
-        else:
-            track = (vehicle.track_width_m or 1.0) * vehicle.controller_track_multiplier
-            around = np.abs(radius * (series.right - series.left) / track)
-        speed, turn = max(speed, float(forward.max())), max(turn, float(around.max()))
+        forward, _, around = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
+        speed, turn = max(speed, float(np.abs(forward).max())), max(turn, float(np.abs(around).max()))
         wheel = max(wheel, float(np.abs(series.left).max()), float(np.abs(series.right).max()))
         difference = max(difference, float(np.abs(series.right - series.left).max()))
     places = np.concatenate([run.track.place[run.track.active, 0] for run in runs])

@@ -53,13 +53,8 @@ def search_body(ground: Ground, source: Input, known: Sequence[Effect]) -> Searc
     """Search from an input to the body."""
     usable = [e for e in known if source is Input.COMMAND or e.place > Place.DRIVE]
     start = State((), ground.start_timing()).add(*usable)
-    arena, first = open_arena(ground.pose_body(source), start, ground.list_candidates(source), ground.largest)
-    # Without encoders and gyro a late clock is a late drive; only an early one can be nothing else. With a
-    # gyro the clock is known from the heading: a position that is later still is a body that follows late.
-    alone = source is Input.COMMAND and not ground.measured
-    arena.only_early_clock = ground.has_gyro or alone
-    if source is Input.MEASURED:
-        arena.least_delay = ground.sampling_s
+    candidates = ground.list_candidates(source)
+    arena, first = open_arena(ground.pose_body(source), start, candidates, ground.evidence)
     return Search(source.value, arena, first, search_effects(arena, first))
 
 
@@ -67,7 +62,6 @@ def search_wheels(ground: Ground, known: Sequence[Effect], body: Search) -> Sear
     """Search from command to wheels, the encoders' own delay taken from the way to the body."""
     usable = [e for e in known if e.place <= Place.DRIVE]
     start = State((), body.final.state.timing).add(*usable)
-    arena, first = open_arena(ground.pose_wheels(), start, ground.list_drivetrain(), ground.largest)
-    arena.least_delay = ground.sampling_s
+    arena, first = open_arena(ground.pose_wheels(), start, ground.list_drivetrain(), ground.evidence)
     arena.least_share = _LEAST_SHARE
     return Search("wheels", arena, first, search_effects(arena, first))

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.diagnosis.excitation import suggest_manoeuvre
-from pipeline.diagnosis.timing import LEAST_DELAY
 from pipeline.diagnosis.undecided import Undecided
-from pipeline.motion.catalogue import find_effect
+from pipeline.motion.catalogue import find_late_effect, list_effects
+from pipeline.motion.effect import Late, find_late
+from pipeline.motion.evidence import LEAST_DELAY_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,7 +29,7 @@ class Clocks:
     """What the delays of a run come to.
 
     Attributes:
-        effects: `clock_offset` and `heading_skew`, as far as they are certain.
+        effects: of late poses and of a late heading, as far as they are certain.
         timing: of every run, in JSON's words.
         undecided: a late heading whose position may be late with it or not.
     """
@@ -41,8 +42,8 @@ class Clocks:
 def read_clocks(ground: Ground, body: Search) -> Clocks:
     """Name clocks: with a gyro the delays of heading and position are known apart."""
     state = body.final.state
-    extra = state.find("clock_offset")
-    more = extra.values["d"] if extra is not None else 0.0
+    extra = find_late(state.effects, Late.POSES)
+    more = extra.delay if extra is not None else 0.0
     rows, positions, certain = [], [], []
     for timing, yaw in zip(state.timing, ground.yaw_delays, strict=True):
         late = timing.pose_delay_s + more
@@ -61,14 +62,14 @@ def read_clocks(ground: Ground, body: Search) -> Clocks:
     # A heading that is older than its position is known; the other way round it is a late position.
     skewed = extra is not None and ground.has_gyro and more < 0.0
     if skewed:
-        found.append(find_effect("heading_skew")(d=min(max(-more, -0.6), 0.6)))
-    least = max(LEAST_DELAY, _SKEWED_CLOCK if skewed else 0.0, _held_delay(ground))
+        found.append(find_late_effect(Late.HEADING).of_delay(-more))
+    least = max(LEAST_DELAY_S, _SKEWED_CLOCK if skewed else 0.0, _held_delay(ground))
     known = extra is not None if not ground.has_gyro else all(certain)
     if known and abs(late) >= least:
-        clock = find_effect("clock_offset")(d=min(max(late, -1.0), 1.0))
-        if ground.has_gyro and not ground.moves_both_ways:
+        clock = find_late_effect(Late.POSES).of_delay(late)
+        if ground.has_gyro and not ground.largest.moves_both_ways:
             # The gyro dates the heading; only driving and turning at once tie the position's clock to it.
-            skew = find_effect("heading_skew")()
+            skew = find_late_effect(Late.HEADING)()
             pair = Undecided((clock.id, skew.id), suggest_manoeuvre(clock, skew))
             return Clocks(tuple(found), tuple(rows), (pair,))
         found.append(clock)
@@ -87,22 +88,17 @@ def _held_delay(ground: Ground) -> float:
 
 
 def join_classes(effects: Sequence[Effect]) -> list[Effect]:
-    """Effects with both parts of a lever arm put under its name."""
-    by_id = {effect.id: effect for effect in effects}
-    along, across = by_id.get("icr_offset"), by_id.get("icr_lateral")
-    if along is None or across is None:
-        return list(effects)
-    arm = find_effect("lever_arm")(l_x=-along.values["x_icr"], l_y=-across.values["y_icr"])
-    kept = [effect for effect in effects if effect.id not in {"icr_offset", "icr_lateral"}]
-    return [*kept, arm]
+    """Effects with those of which all parts were found put under their own name."""
+    found = {effect.id: effect for effect in effects}
+    for kind in list_effects():
+        parts = kind().searched_as
+        if kind.parts and parts <= found.keys():
+            found = {name: effect for name, effect in found.items() if name not in parts} | {
+                kind.id: kind.join(found)
+            }
+    return list(found.values())
 
 
 def list_equivalents(effect: Effect, ground: Ground) -> tuple[str, ...]:
     """Other names of the same thing, as far as this recording goes."""
-    if effect.id in {"transport_delay", "clock_offset"}:
-        alone = not ground.measured and not ground.has_gyro
-        if not alone or (effect.id == "clock_offset" and effect.values["d"] < 0.0):
-            return ()
-    if effect.id in {"drive_lag", "body_inertia"} and (ground.moves_both_ways or ground.measured):
-        return ()
-    return effect.equivalent_to
+    return effect.equivalent_to if effect.is_equivalent(ground.evidence) else ()

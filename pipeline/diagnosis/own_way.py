@@ -80,13 +80,9 @@ def read_gyro_clock(effect: Effect, delays: Sequence[YawDelay]) -> dict[str, Val
     return {parameter.name: Value(value, value - half, value + half, parameter.unit)}
 
 
-def refer_to_radius(track: Mapping[str, Value], radius: Effect) -> dict[str, Value]:
-    """An effective track for wheels of the nominal radius, where their radius is one explanation of several.
-
-    The yaw rate is that of the ratio of both, k_radius / k_track: what turns the vehicle is the same.
-    """
-    scale = 1.0 / radius.values["k"]
+def rescale_values(values: Mapping[str, Value], scale: float) -> dict[str, Value]:
+    """Numbers of an effect multiplied, with their intervals."""
     return {
         name: Value(scale * value.value, scale * value.low, scale * value.high, value.unit)
-        for name, value in track.items()
+        for name, value in values.items()
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -142,7 +143,8 @@ def _walk_grid(problem: Problem, metric: Metric, fitted: Fitted, slot: Slot) -> 
     """Shrinking grid around a number, the others following linearly; None where it is best already."""
     others = [place for place, other in enumerate(fitted.slots) if other.search is not Search.GRID]
     value = fitted.state.read(slot)
-    width = 0.5 * abs(value) if slot.name == "d" else 8.0 * slot.step
+    # A moment has no size that its neighbourhood could be a share of.
+    width = 8.0 * slot.step if math.isnan(fitted.state.neutral_of(slot)) else 0.5 * abs(value)
     best, best_loss = value, fitted.loss
     for _ in range(_GRID_ROUNDS):
         for at in (best - width, best - 0.5 * width, best + 0.5 * width, best + width):

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pipeline.motion import HeadingSource, Input, Model, Problem, Timing
+from pipeline.motion.effect import Late, find_late
 from pipeline.motion.workshop import judge_model
 
 if TYPE_CHECKING:
@@ -29,14 +30,13 @@ def rate_effects(
         effects: with their values to start from.
         timing: delays of each run that are no effect.
     """
-    known = {effect.id: effect for effect in effects}
+    clock, skew = find_late(effects, Late.POSES), find_late(effects, Late.HEADING)
     # A skew of the reported heading shows against the reported heading only.
-    heading = HeadingSource.POSE if "heading_skew" in known else HeadingSource.AUTO
-    if "clock_offset" in known:
+    heading = HeadingSource.POSE if skew is not None else HeadingSource.AUTO
+    if clock is not None:
         timing = [replace(one, pose_delay_s=0.0) for one in timing]
-    elif "heading_skew" in known and ground.has_gyro:
+    elif skew is not None and ground.has_gyro:
         # The delay against the gyro is the heading's: the position is younger by the skew.
-        skew = known["heading_skew"].values["d"]
-        timing = [replace(one, pose_delay_s=one.pose_delay_s - skew) for one in timing]
+        timing = [replace(one, pose_delay_s=one.pose_delay_s - skew.delay) for one in timing]
     problem = Problem(ground.runs, ground.vehicle, source, heading=heading, timing=timing, rate_hz=_RATE_HZ)
     return judge_model(problem, Model(ground.vehicle, tuple(effects)))

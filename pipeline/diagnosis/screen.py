@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.polish import Fitted
     from pipeline.diagnosis.problem import Problem
     from pipeline.diagnosis.state import State
+    from pipeline.motion.evidence import Largest
 
 Floats = NDArray[np.float64]
 EffectClass = type[Effect]
@@ -42,25 +43,6 @@ class Candidate(Protocol):
 _LEAST_SHARE = 0.05
 _NO_TRACE = 1e-6
 _FAINT = 3.0
-
-
-@dataclass(frozen=True)
-class Largest:
-    """What relative starts are shares of: the largest that was commanded, and the duration.
-
-    Attributes:
-        speed, turn, wheel: speed [m/s], yaw rate [rad/s], wheel speed [rad/s].
-        difference: of the wheel speeds [rad/s].
-        duration: of the run [s].
-        places: x [m] in the map below which the tenths of the run lie, shape (11,).
-    """
-
-    speed: float
-    turn: float
-    wheel: float
-    difference: float
-    duration: float
-    places: Floats
 
 
 @dataclass(frozen=True)
@@ -157,14 +139,13 @@ def list_starts(candidate: Candidate, largest: Largest) -> list[dict[str, float]
     searched = [p for p in candidate.parameters if p.search is not Search.DIRECT]
     if not searched:
         return [{}]
-    if any(p.relative_to == "duration" for p in searched):
-        times = [{p.name: s * largest.duration for p in searched} for s in searched[0].starts]
-        places = [{"at_x": float(x)} for x in largest.places[2:9]]
-        return times + (places if largest.places[-1] - largest.places[0] > 1.0 else [])
+    alone = [
+        {p.name: value}
+        for p in (*searched, *(p for p in candidate.parameters if p.instead_of))
+        for value in _list_values(p, largest)
+    ]
     if len(searched) == 1:
-        name, values = searched[0].name, _list_values(searched[0], largest)
-        return [{name: value} for value in values]
-    alone = [{p.name: value} for p in searched for value in _list_values(p, largest)]
+        return alone
     together = [
         dict(zip([p.name for p in searched], values, strict=True))
         for values in zip(*(_list_values(p, largest) for p in searched), strict=False)
@@ -173,11 +154,11 @@ def list_starts(candidate: Candidate, largest: Largest) -> list[dict[str, float]
 
 
 def _list_values(parameter: Parameter, largest: Largest) -> list[float]:
-    scale = {"speed": largest.speed, "turn": largest.turn, "wheel": largest.wheel}.get(
-        parameter.relative_to, 1.0
-    )
+    if parameter.relative_to == "place" and not largest.travels:
+        return []
     low, high = parameter.bounds
-    return [share * scale for share in parameter.starts if low <= share * scale <= high]
+    values = [largest.take(share, parameter.relative_to) for share in parameter.starts]
+    return [value for value in values if low <= value <= high]
 
 
 def _find_traced(trial: Trial, size: Floats) -> NDArray[np.bool_]:

@@ -19,9 +19,6 @@ _TIE = 0.03
 # Recordings with much structure offer ever another exchange by a hair.
 _MOST_WORK = 16
 _MOST_SPLIT = 3
-_SLOW = frozenset(
-    {"drive_lag", "turn_lag", "transport_delay", "acceleration_limit", "body_inertia", "clock_offset"}
-)
 
 
 def search_effects(arena: Arena, start: Contender) -> Contender:
@@ -65,8 +62,8 @@ def _add(arena: Arena, current: Contender) -> Contender | None:
 
 def price_of(contender: Contender, other: Contender) -> float:
     """Gain that is asked of a model's additional effects: a change point fits anything a little."""
-    new = set(contender.ids) - set(other.ids)
-    return 0.05 if "terrain_change" in new else LEAST_GAIN
+    new = (effect for effect in contender.state.effects if effect.id not in other.ids)
+    return max([LEAST_GAIN, *(effect.price for effect in new)])
 
 
 def prune(arena: Arena, current: Contender) -> Contender:
@@ -111,7 +108,7 @@ def _swap(arena: Arena, current: Contender) -> Contender | None:
 def _join(arena: Arena, current: Contender) -> Contender | None:
     """One effect in the place of two, or of all that are slow: lags together imitate a delay."""
     free = _free(arena, current)
-    slow = tuple(name for name in free if name in _SLOW)
+    slow = tuple(effect.id for effect in current.state.effects if effect.is_slow and effect.id in free)
     groups = [*combinations(free, 2), *([slow] if len(slow) > 2 else [])]  # noqa: PLR2004 - pairs are there
     for group in groups:
         if arena.work > _MOST_WORK:

@@ -93,6 +93,11 @@ class State:
         effect = self.find(slot.effect)
         return math.nan if effect is None else effect.values[slot.name]
 
+    def neutral_of(self, slot: Slot) -> float:
+        """Value at which a free number does nothing; zero for a delay, NaN where it only says where."""
+        effect = self.find(slot.effect)
+        return 0.0 if effect is None else effect.parameter(slot.name).neutral
+
     def write(self, slot: Slot, value: float) -> State:
         """The state with another value of a free number, held to its bounds."""
         value = min(max(value, slot.bounds[0]), slot.bounds[1])

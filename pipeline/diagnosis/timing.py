@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-LEAST_DELAY = 0.012
+from pipeline.motion.evidence import LEAST_DELAY_S
+
 _SURE = 4.0
 
 
@@ -23,4 +24,4 @@ class YawDelay:
     @property
     def is_certain(self) -> bool:
         """Whether it is a delay beyond doubt."""
-        return abs(self.seconds) >= LEAST_DELAY and abs(self.seconds) > _SURE * self.error
+        return abs(self.seconds) >= LEAST_DELAY_S and abs(self.seconds) > _SURE * self.error

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.diagnosis.excitation import make_usual, suggest_manoeuvre
+from pipeline.diagnosis.excitation import suggest_manoeuvre
 
 if TYPE_CHECKING:
     from pipeline.diagnosis.arena import Arena, Contender
@@ -20,18 +20,6 @@ _ALIKE = 0.7
 _DECIDED_T = 1.6
 # What separates them must stand out of the noise too: a nearly exact encoder splits hairs that mean nothing.
 _DECIDED_Z = 1.0
-_NEVER = 0.02
-# Effects that hold the key as a special case explain whatever it explains.
-_HOLDS: dict[str, frozenset[str]] = {
-    "drive_lag": frozenset({"turn_lag"}),
-    "effective_track": frozenset({"turn_droop", "terrain_change"}),
-    "wheel_radius": frozenset({"terrain_change"}),
-    "time_drift": frozenset({"terrain_change"}),
-}
-# Driven straight only, or turned on the spot only, one lag cannot be told from two.
-_SPLIT = {"drive_lag": "turn_lag", "turn_lag": "drive_lag"}
-# What a limit explains a droop of some rise may explain as well, where only one turn beyond it was asked for.
-_RISING = {"body_turn_limit": ("turn_droop", "gain")}
 
 
 @dataclass(frozen=True)
@@ -60,8 +48,8 @@ def find_undecided(arena: Arena, final: Contender) -> list[Undecided]:
             if _is_as_good(arena, final, rival) and _does_the_same(arena, without, final, rival)
         ]
         names = [name for rival in rivals for name in rival.ids if name not in final.ids]
-        alike = [_find_rising(arena, without, final, effect), _find_split(arena, effect)]
-        names += [name for name in alike if name is not None and name not in names]
+        alike = _list_alike(arena, without, final, effect)
+        names += [name for name in alike if name not in names]
         simple = [name for name in names if name in alike or not _is_larger(arena, name, effect)]
         if simple:
             rest = [c() for c in arena.candidates if c.id in names]
@@ -69,28 +57,23 @@ def find_undecided(arena: Arena, final: Contender) -> list[Undecided]:
     return found
 
 
-def _find_rising(arena: Arena, without: Contender, final: Contender, effect: Effect) -> str | None:
-    """The effect that bends where the named one stops, if at a usual bend it does as well."""
-    name, bend = _RISING.get(effect.id, ("", ""))
-    candidate = next((c for c in arena.candidates if c.id == name), None)
-    if candidate is None:
-        return None
-    rival = arena.enter(without.state.add(make_usual(candidate, arena.largest).fix(bend)))
-    alike = _is_as_good(arena, final, rival) and _does_the_same(arena, without, final, rival)
-    return name if alike and arena.is_sound(rival) else None
-
-
-def _find_split(arena: Arena, effect: Effect) -> str | None:
-    """The effect that treats driving and turning apart, where only one of them was asked for."""
-    name = _SPLIT.get(effect.id)
-    known = name in {candidate.id for candidate in arena.candidates}
-    return name if known and _moves_one_way(arena) else None
-
-
-def _moves_one_way(arena: Arena) -> bool:
-    """Driven straight only, or turned on the spot only."""
-    speed, turn = arena.largest.speed, arena.largest.turn
-    return min(speed, turn) < _NEVER * max(speed, turn)
+def _list_alike(arena: Arena, without: Contender, final: Contender, effect: Effect) -> list[str]:
+    """What does as well though it has more numbers: a bend for a break, and what only one motion shows."""
+    known = {candidate.id for candidate in arena.candidates}
+    softer = [
+        (other.id, arena.enter(without.state.add(other)))
+        for other in effect.list_softer(arena.largest)
+        if other.id in known
+    ]
+    alike = [
+        name
+        for name, rival in softer
+        if _is_as_good(arena, final, rival)
+        and _does_the_same(arena, without, final, rival)
+        and arena.is_sound(rival)
+    ]
+    same = effect.same_in_one_motion if arena.largest.is_one_motion else ()
+    return alike + [name for name in same if name in known]
 
 
 def _is_as_good(arena: Arena, final: Contender, rival: Contender) -> bool:
@@ -111,8 +94,6 @@ def _does_the_same(arena: Arena, without: Contender, final: Contender, rival: Co
 
 def _is_larger(arena: Arena, name: str, effect: Effect) -> bool:
     """Whether an effect fits as well only by more numbers, or by holding the other as a special case."""
-    if name in _HOLDS.get(effect.id, frozenset()):
-        return True
-    rival = next(c for c in arena.candidates if c.id == name)
+    rival = next(candidate() for candidate in arena.candidates if candidate.id == name)
     numbers = sum(bool(np.isfinite(value)) for value in effect.values.values())
-    return len([p for p in rival.parameters if p.name != "at_x"]) > numbers
+    return effect.id in rival.contains or len([p for p in rival.parameters if not p.instead_of]) > numbers

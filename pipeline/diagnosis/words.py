@@ -22,7 +22,7 @@ def describe(diagnosis: Diagnosis) -> str:
         return _write(_describe_alone(diagnosis.runs[0]))
     first = diagnosis.runs[0]
     names = [run.run for run in diagnosis.runs]
-    rows = [("runs", names[0]), *(("", name) for name in names[1:]), ("", f"together, {_WAYS[first.input]}")]
+    rows = [("runs", names[0]), *(("", name) for name in names[1:]), ("", f"together, {_name_way(first)}")]
     rows += _list_shared(first)
     for run in diagnosis.runs:
         rows += _label("findings", [f"{run.run}: {finding['text']}" for finding in _grave(run)])
@@ -36,7 +36,12 @@ def _write(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def _describe_alone(run: RunDiagnosis) -> list[tuple[str, str]]:
-    return [("run", f"{run.run}    {_WAYS[run.input]}"), *list_lines(run)]
+    return [("run", f"{run.run}    {_name_way(run)}"), *list_lines(run)]
+
+
+def _name_way(run: RunDiagnosis) -> str:
+    reason = f" ({run.input_reason})" if run.input_reason else ""
+    return f"{_WAYS[run.input]}{reason}"
 
 
 def list_lines(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:

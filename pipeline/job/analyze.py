@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
-import platform
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import msgspec
 
+from pipeline.core.version import read_version
 from pipeline.job.diagnosis import diagnose_work, has_diagnosis, key_diagnosis
 from pipeline.job.keys import hash_json, key_stages
 from pipeline.job.options import STAGES
 from pipeline.job.peers import find_peers
+from pipeline.job.provenance import list_versions
 from pipeline.job.relative import hash_model
 from pipeline.job.subject import Subject, describe_subject, name_run
 from pipeline.job.summary import summarize_run
 from pipeline.job.work import Progress, Work, read_subject, stored_contexts, stored_keys
+from pipeline.logs import spell_location, to_location
 from pipeline.store import JSON, LogIdentities, Manifest, Store, see_log
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 SUMMARY = "summary.json"
 REPORT = "report.html"
-_PACKAGES = ("slip-pipeline", "mcap", "mcap-ros2-support", "numpy", "polars", "pyarrow")
 
 
 @dataclass(frozen=True)
@@ -78,6 +77,8 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
     run = options.run or name_run(path, sha256, store)
     keys = key_stages(run, sha256, subject, options.inputs, hash_model(options.model))
     current = store.manifest(run)
+    if current is not None and store.is_asked_again(current):
+        options = replace(options, force=True)
     twin = _find_twin(path, sha256, current)
     if current is not None and not options.force and _is_done(current, keys, options):
         return Outcome(_read_summary(current, options), current, (), twin)
@@ -101,7 +102,7 @@ def _find_twin(path: Path, sha256: str, current: Manifest | None) -> str:
     log = current.details.get("log") if current is not None else None
     if not isinstance(log, dict) or log.get("sha256") != sha256:
         return ""
-    recorded = Path(str(log.get("path")))
+    recorded = to_location(str(log.get("path")))
     return str(recorded) if recorded != path.resolve() and recorded.exists() else ""
 
 
@@ -137,12 +138,13 @@ def _is_done(manifest: Manifest, keys: Mapping[str, str], options: Options) -> b
 def _describe_log(subject: Subject, sha256: str, work: Work) -> dict[str, JSON]:
     losses = work.contexts["extract"].get("losses", [])
     return {
-        "path": str(subject.path.resolve()),
+        "path": spell_location(subject.path.resolve()),
         "sha256": sha256,
         "bytes": subject.index.size_bytes,
         "duration_s": round(subject.index.duration_s, 6),
         "complete": not losses,
         "losses": losses,
+        "unchecked": work.contexts["extract"].get("unchecked"),
         "fetched_bytes": work.contexts["extract"].get("fetched_bytes"),
     }
 
@@ -159,7 +161,8 @@ def _write_outputs(
     summary["diagnosis"] = diagnosis
     summary["report"] = REPORT if options.report else None
     summary["provenance"] = {
-        "versions": versions(),
+        "version": read_version(),
+        "versions": list_versions(work),
         "keys": dict(work.keys),
         "configuration": _configuration(work),
     }
@@ -202,24 +205,13 @@ def _details(work: Work, log: Mapping[str, JSON], sha256: str) -> dict[str, JSON
         "vehicle": msgspec.to_builtins(work.vehicle),
         "terrain": work.subject.terrain,
         "dataset": work.subject.dataset,
-        "versions": cast("JSON", versions()),
+        "versions": cast("JSON", list_versions(work)),
     }
 
 
 def _configuration(work: Work) -> JSON:
     plain: JSON = msgspec.to_builtins(work.subject.configuration)
     return plain
-
-
-def versions() -> dict[str, str]:
-    """Versions of what computes the numbers."""
-    return dict(_look_up_versions())
-
-
-@cache
-def _look_up_versions() -> Mapping[str, str]:
-    found = {name: importlib.metadata.version(name) for name in _PACKAGES}
-    return {"python": platform.python_version(), **found}
 
 
 def _read_summary(manifest: Manifest, options: Options) -> dict[str, JSON]:

@@ -48,7 +48,7 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
     )
     written["comparison.html"] = store.write_results_text("comparison.html", page)
     if figures:
-        from pipeline.report.gallery import write_pictures  # noqa: PLC0415 - heavy
+        from pipeline.report.export import write_pictures  # noqa: PLC0415 - heavy
 
         pictures = list_pictures(
             answer.runs,

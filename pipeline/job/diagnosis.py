@@ -20,15 +20,16 @@ if TYPE_CHECKING:
 
 STAGE = "diagnosis"
 DIAGNOSIS = "diagnosis.json"
-VERSION = 2
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
+VERSION = 4
+_WRITTEN = ("ladder", "parameters")
 
 
 def key_diagnosis(keys: Mapping[str, str]) -> str:
     """Key of the diagnosis of a run whose stages have these keys."""
     from schemas import contract_of  # noqa: PLC0415 - brings a table library along
 
-    return hash_json([keys["slip"], STAGE, VERSION, contract_of("ladder").version])
+    return hash_json([keys["slip"], STAGE, VERSION, *(contract_of(table).version for table in _WRITTEN)])
 
 
 def has_diagnosis(manifest: Manifest | None, key: str) -> bool:
@@ -51,8 +52,9 @@ def diagnose_work(work: Work) -> dict[str, JSON] | None:
     previous = generation.previous
     if previous is not None and has_diagnosis(previous, key) and not work.options.force:
         generation.reuse_file(DIAGNOSIS)
-        if "ladder" in previous.tables:
-            generation.reuse_table("ladder")
+        for table in _WRITTEN:
+            if table in previous.tables:
+                generation.reuse_table(table)
         content: dict[str, JSON] = json.loads(previous.path(DIAGNOSIS).read_text(encoding="utf-8"))
     elif work.options.diagnosis:
         work.progress(STAGE)
@@ -83,9 +85,12 @@ def _diagnose(work: Work) -> dict[str, JSON]:
         finding = {"id": error.code, "severity": "warning", "text": str(error), "where": "diagnosis"}
         return {"run": work.run, "effects": [], "undecided": [], "findings": [finding], "ladder": [],
                 "lines": [["missing", f"nothing can be named: {error.what}"]]}  # fmt: skip
-    ladder = diagnosis.tabulate_ladder(work.run)
-    if not ladder.is_empty():
-        work.write("ladder", ladder)
+    for table, frame in (
+        ("ladder", diagnosis.tabulate_ladder(work.run)),
+        ("parameters", diagnosis.tabulate_parameters(work.run)),
+    ):
+        if not frame.is_empty():
+            work.write(table, frame)
     return {**diagnosis.to_json()[0], "lines": [list(line) for line in list_lines(diagnosis.runs[0])]}
 
 

@@ -54,7 +54,7 @@ class TopicHealth:
 
 @dataclass(frozen=True)
 class Inspection:
-    """A log's health: index, topics, losses, and which topics would serve."""
+    """A log's health: index, topics, losses, what no checksum covers, and which topics would serve."""
 
     index: LogIndex
     topics: tuple[TopicHealth, ...]
@@ -63,6 +63,7 @@ class Inspection:
     vehicle: Vehicle | None
     sources: Sources | None
     problem: str
+    unchecked: str = ""
 
 
 def inspect_log(path: Path, *, config: Path | None, overrides: Mapping[str, object]) -> Inspection:
@@ -82,7 +83,11 @@ def inspect_log(path: Path, *, config: Path | None, overrides: Mapping[str, obje
         for channel in index.channels
     )
     vehicle, sources, problem = _choose(index, configuration)
-    return Inspection(index, topics, data.losses, data.notes, vehicle, sources, problem)
+    notes = data.notes + tuple(
+        f"{count} messages of {topic} stand in the log again, byte for byte: each counts once"
+        for topic, count in data.repeated.items()
+    )
+    return Inspection(index, topics, data.losses, notes, vehicle, sources, problem, data.unchecked)
 
 
 def _measure_topic(
@@ -109,7 +114,7 @@ def _measure_topic(
 
 def _choose(index: LogIndex, configuration: Configuration) -> tuple[Vehicle | None, Sources | None, str]:
     """Vehicle and sources as an analysis would choose them; a problem is told, not raised."""
-    recorded = index.metadata.get("deployment", {}).get("vehicle")
+    recorded = index.deployment.get("vehicle")
     problem, vehicle = "", None
     try:
         vehicle = resolve_vehicle(configuration.vehicle, recorded=recorded, where=str(index.path))

@@ -78,7 +78,7 @@ def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None =
     page = render_map(drawn.deployments, drawn.points, drawn.own, notes=drawn.notes, keys=drawn.keys)
     path = store.write_results_text("map.html", page)
     if figures:
-        from pipeline.report.gallery import write_pictures  # noqa: PLC0415 - heavy
+        from pipeline.report.export import write_pictures  # noqa: PLC0415 - heavy
 
         write_pictures([picture_map(drawn.points, drawn.own)], store.root / "figures", figures)
     return path

@@ -10,6 +10,7 @@ import polars as pl
 
 from pipeline.core.errors import SlipError
 from pipeline.job.errors import JobError
+from pipeline.stages.finding import Finding
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -21,15 +22,16 @@ COLUMNS = ("model_x", "model_y", "model_w", "residual_modulus")
 
 
 def hash_model(path: Path | None) -> str | None:
-    """Hash of a model file's bytes; None without one.
+    """Hash of a model file's bytes and of the Python that is run for it; None without one.
 
     Raises:
         JobError: the file cannot be read.
+        MotionError: the model file is wrong.
     """
     if path is None:
         return None
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        content = path.read_bytes()
     except OSError as error:
         raise JobError(
             "model_not_found",
@@ -37,6 +39,9 @@ def hash_model(path: Path | None) -> str | None:
             where=str(path),
             hint="Check the path; `slip model new` makes one.",
         ) from None
+    from pipeline.motion import read_model  # noqa: PLC0415 - heavy
+
+    return hashlib.sha256(content + "".join(read_model(path).code).encode()).hexdigest()
 
 
 def add_model(
@@ -46,8 +51,8 @@ def add_model(
     vehicle: Vehicle,
     *,
     length: float,
-) -> pl.DataFrame:
-    """Table `slip` with the velocity of a model and the modulus of what is left of it.
+) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
+    """Table `slip` with the velocity of a model and the modulus of what is left of it; what was left out.
 
     Args:
         slip: table `slip`, its columns for a model empty.
@@ -63,7 +68,9 @@ def add_model(
     from pipeline.motion import Input, load_run, read_model  # noqa: PLC0415 - heavy
     from pipeline.motion.predict import predict_at  # noqa: PLC0415 - heavy
 
-    model = read_model(path).model
+    file = read_model(path)
+    model = file.model
+    found = [Finding("model_code_left_out", "warning", warning, where="model") for warning in file.warnings]
     if model.vehicle.kind != vehicle.kind:
         raise JobError(
             "wrong_model",
@@ -77,8 +84,9 @@ def add_model(
         part = slip.filter(pl.col("input") == name)
         try:
             predicted = predict_at(model, run, Input(name), part["t"].to_numpy())
-        except SlipError:
+        except SlipError as error:
             # Encoders that are dead, for example: there is an input, but no model can follow it.
+            found.append(Finding("model_not_followed", "warning", f"{name}: {error}", where="model"))
             parts.append(part)
             continue
         left = (predicted - part.select("v_x", "v_y", "v_w").to_numpy()) * np.array([1.0, 1.0, length])
@@ -89,4 +97,4 @@ def add_model(
                 for column, values in zip(COLUMNS, columns, strict=True)
             )
         )
-    return pl.concat(parts)
+    return pl.concat(parts), tuple(found)

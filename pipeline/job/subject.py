@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pipeline.job.errors import JobError
-from pipeline.logs import LogIndex, open_log
+from pipeline.logs import LogIndex, open_log, spell_location
 from pipeline.vehicles import (
     Configuration,
     Sources,
@@ -55,11 +56,13 @@ def describe_subject(path: Path, options: Options) -> Subject:
     configuration = load_configuration(
         path, given=options.config, fleet=options.fleet, overrides=options.overrides
     )
-    recorded = index.metadata.get("deployment", {})
+    recorded = index.deployment
     if not index.channels:
         raise JobError(
             "log_without_messages",
-            "the log holds no message",
+            f"no message of the log can be read{_blame_damage(index)}"
+            if index.losses
+            else "the log holds no message",
             where=str(path),
             hint="Check that the recording was not cut off before its first message.",
         )
@@ -76,7 +79,8 @@ def _require_sources(sources: Sources, index: LogIndex, options: Options) -> Non
     if sources.pose is None:
         raise JobError(
             "no_pose",
-            "no topic can serve as pose (Odometry, PoseStamped, PoseWithCovarianceStamped or transforms)",
+            "no topic can serve as pose (Odometry, PoseStamped, PoseWithCovarianceStamped or transforms)"
+            + _blame_damage(index),
             where=str(index.path),
             hint=f"Name it in run.toml ([pose] topic = ...). The log has: {there}.",
         )
@@ -85,16 +89,26 @@ def _require_sources(sources: Sources, index: LogIndex, options: Options) -> Non
         roles = " or ".join("command" if name == "command" else "measured wheels" for name in options.inputs)
         raise JobError(
             "no_command",
-            f"no topic can serve as {roles}",
+            f"no topic can serve as {roles}{_blame_damage(index)}",
             where=str(index.path),
             hint="Name it in run.toml ([command] topic = ..., or left_topic and right_topic). "
             f"The log has: {there}.",
         )
 
 
+def _blame_damage(index: LogIndex) -> str:
+    """What was lost of the log, for sentences about what is not there; empty where nothing was."""
+    more = f" and {len(index.losses) - 1} more" if len(index.losses) > 1 else ""
+    return f" (the log is damaged: {index.losses[0].text}{more})" if index.losses else ""
+
+
 def name_plainly(path: Path) -> str:
-    """Name of the run of a log where no other run has it: folder/stem."""
-    return f"{path.parent.name}/{path.stem}" if path.parent.name else path.stem
+    r"""Name of the run of a log where no other run has it: folder/stem.
+
+    Bytes of a file name that are no UTF-8 are spelt ``\xe9`` in it.
+    """
+    name = f"{path.parent.name}/{path.stem}" if path.parent.name else path.stem
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def name_run(path: Path, sha256: str, store: Store) -> str:
@@ -111,7 +125,7 @@ def name_run(path: Path, sha256: str, store: Store) -> str:
                 return known.run
         return plain
     before = _log_of(manifest.details)
-    if before.get("sha256") == sha256 or before.get("path") == str(absolute):
+    if before.get("sha256") == sha256 or before.get("path") == spell_location(absolute):
         return plain
     return f"{plain}-{sha256[:8]}"
 

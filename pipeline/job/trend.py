@@ -46,9 +46,9 @@ class Trend:
 def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: Mapping[str, float]) -> Trend:
     """Follow every quantity of every group of the results over the dates of its runs.
 
-    Slip comes from the tables `aggregates`, parameters from the tables `parameters` where runs have them, the
-    health of the data from findings (their values, and how many warnings a run has) and from the share of
-    suspect samples.
+    Slip comes from the tables `aggregates`, parameters from the diagnoses' tables `parameters`, the health of
+    the data from findings (their values, and how many warnings a run has) and from the share of suspect
+    samples.
 
     Args:
         store: the results.
@@ -73,7 +73,8 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
             where=str(store.root),
             hint="Analyze logs whose clock was set, or put the date into their names (2026-05-03).",
         )
-    parts = [_read_slip(material), _read_health(material), _read_parameters(material)]
+    parameters = _read_parameters(material)
+    parts = [_read_slip(material), _read_health(material), parameters]
     values = (
         dated.select("run", "group", "day")
         .with_row_index("order")
@@ -88,11 +89,23 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
     short = sorted(group for group, runs in longest.items() if runs < FEWEST_RUNS)
     if short:
         notes.append(f"too few runs to find a change, {FEWEST_RUNS} are needed: {', '.join(short)}")
+    notes += _note_gaps(series, parameters, longest)
     alerts = raise_alerts(series, threshold=threshold, limits=limits)
     known = {quantity for one in series for quantity in (one.quantity, one.quantity.split(" (")[0])}
     notes += [f"no run has the quantity {name!r} that a limit is for" for name in limits if name not in known]
     keys = tuple(f"{run}/{material.manifests[run].key}" for run in dated["run"])
     return Trend(tuple(series), tuple(alerts), keys, tuple(notes))
+
+
+def _note_gaps(series: Sequence[Series], parameters: pl.DataFrame, runs: Mapping[str, int]) -> list[str]:
+    """Parameters that the diagnoses of only some runs of a group name."""
+    named = set(parameters["quantity"])
+    gaps = [
+        f"{one.quantity} in {one.points.height} of {runs[one.group]} runs of {one.group}"
+        for one in series
+        if one.quantity in named and one.points.height < runs[one.group]
+    ]
+    return [f"named in some runs only: {'; '.join(gaps)}"] if gaps else []
 
 
 def write_trend(store: Store, trend: Trend) -> Path:

@@ -166,6 +166,17 @@ class Work:
             for name, report in broken.items()
         ]
         notes = [Finding("log_note", "info", note, where="log") for note in data.notes]
+        notes += [Finding("log_unchecked", "info", data.unchecked, where="log")] if data.unchecked else []
+        notes += [
+            Finding(
+                "repeated_messages",
+                "warning",
+                f"{count} messages of {topic} stand in the log again, byte for byte: each was counted once",
+                where=topic,
+                count=count,
+            )
+            for topic, count in data.repeated.items()
+        ]
         held = made.tables["poses"]["held"] if not made.tables["poses"].is_empty() else pl.Series([0])
         context: dict[str, JSON] = {
             "start_ns": made.start_ns,
@@ -177,6 +188,7 @@ class Work:
             },
             "fetched_bytes": data.fetched_bytes or None,
             "losses": [describe_loss(loss, data.index.start_ns) for loss in data.losses],
+            "unchecked": data.unchecked or None,
         }
         return StageOutcome((*made.findings, *found, *notes), context)
 
@@ -236,19 +248,19 @@ class Work:
             inputs=self.options.inputs,
             where=str(subject.path),
         )
-        table = self._set_against_model(made.slip)
+        table, left_out = self._set_against_model(made.slip)
         self.write("slip", table)
         self.write("windows", made.windows)
         command = subject.sources.command
         body = command is not None and command.form in {DriveForm.BODY, DriveForm.BODY_SIGNALS}
         samples = checks.gather_samples(velocities, made.inputs, made.cut, body_commanded=body)
-        return StageOutcome((*made.findings, *checks.run_checks(samples, vehicle)))
+        return StageOutcome((*made.findings, *left_out, *checks.run_checks(samples, vehicle)))
 
-    def _set_against_model(self, table: pl.DataFrame) -> pl.DataFrame:
+    def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
         """Table `slip` with the velocity of the model that was given, as it is without one."""
         path, configuration = self.options.model, self.subject.configuration
         if path is None:
-            return table
+            return table, ()
         read = {name: self._read(name) for name in TABLES["align"]}
         return add_model(
             table,

@@ -4,17 +4,19 @@ Reading is columnar and as fast as inflating the chunks; what is damaged is told
 read. Nothing here knows what the numbers mean.
 """
 
+from pipeline.logs.buckets import FETCHED, open_store
 from pipeline.logs.columns import Ragged, RaggedStrings, Strings
 from pipeline.logs.definitions import bundled_types, definition_text, field_names
 from pipeline.logs.errors import LogError, Loss
-from pipeline.logs.index import ChannelInfo, LogIndex, hash_log, open_log
+from pipeline.logs.index import ChannelInfo, LogIndex, hash_log, open_log, shorten
 from pipeline.logs.join import join_channels
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, read_topics
-from pipeline.logs.remote import RemotePath, to_location
+from pipeline.logs.remote import RemotePath, spell_location, to_location
 from pipeline.logs.transforms import TransformBuffer, TransformSeries, wanted_transforms
 from pipeline.logs.writer import LogWriter
 
 __all__ = [
+    "FETCHED",
     "ChannelInfo",
     "LogData",
     "LogError",
@@ -35,7 +37,10 @@ __all__ = [
     "hash_log",
     "join_channels",
     "open_log",
+    "open_store",
     "read_topics",
+    "shorten",
+    "spell_location",
     "to_location",
     "wanted_transforms",
 ]

@@ -13,10 +13,13 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
+from pipeline.logs.errors import LogError
 from pipeline.logs.schema import SIZES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from pipeline.logs.records import Buffer
 
     Ints = NDArray[np.int64]
 
@@ -98,15 +101,53 @@ class MisfitError(Exception):
         self.rows = rows
 
 
+MAX_TEXT: Final = 1 << 16
+"""Longest string that is kept whole [bytes]; frame ids, joint names and states have tens."""
+
+MAX_TEXTS: Final = 256 << 20
+"""Most bytes of all distinct strings of one field."""
+
+_LONG_TEXT: Final = 1 << 10
+"""Strings from here on are looked at one by one, not side by side."""
+
+
 class Vocabulary:
-    """The distinct strings of a field, in order of first appearance."""
+    """The distinct strings of a field, in order of first appearance.
 
-    def __init__(self) -> None:
+    Args:
+        path: the field, for messages.
+
+    Attributes:
+        shortened: strings that were longer than ``MAX_TEXT`` and were cut there.
+    """
+
+    def __init__(self, path: str = "") -> None:
+        self._path = path
         self._codes: dict[bytes, int] = {}
+        self._size = 0
+        self.shortened = 0
 
-    def code(self, text: bytes) -> int:
-        """Code of a string, a new one when it was not met before."""
-        return self._codes.setdefault(text, len(self._codes))
+    def code(self, text: Buffer) -> int:
+        """Code of a string, a new one when it was not met before.
+
+        Raises:
+            LogError: ``too_many_strings``.
+        """
+        key = bytes(text[:MAX_TEXT])
+        if len(text) > MAX_TEXT:
+            self.shortened += 1
+            key += b" (cut, of %d bytes)" % len(text)
+        found = self._codes.get(key)
+        if found is None:
+            found = self._codes[key] = len(self._codes)
+            self._size += len(key)
+            if self._size > MAX_TEXTS:
+                raise LogError(
+                    "too_many_strings",
+                    f"the distinct strings of {self._path} take more than {MAX_TEXTS >> 20} MiB",
+                    hint="Leave the topic out",
+                )
+        return found
 
     def texts(self) -> tuple[str, ...]:
         """The strings by code; bytes that are no UTF-8 are shown as replacement characters."""
@@ -250,6 +291,8 @@ class Cursor:
     def _code_equal(self, length: int, vocabulary: Vocabulary) -> NDArray[np.int32]:
         if length == 0:
             return np.full(self.base.size, vocabulary.code(b""), dtype=np.int32)
+        if length >= _LONG_TEXT:
+            return self._code_unequal(np.full(self.base.size, length, dtype=np.int64), vocabulary)
         texts = self._peek(np.dtype("u1"), length)
         starts = np.flatnonzero(np.r_[True, (texts[1:] != texts[:-1]).any(axis=1)])
         found = [vocabulary.code(texts[start].tobytes()) for start in starts.tolist()]
@@ -260,7 +303,7 @@ class Cursor:
         starts = (self.base + self.place).tolist()
         view = self.data.data
         found = [
-            vocabulary.code(bytes(view[start : start + length]))
+            vocabulary.code(view[start : start + length])
             for start, length in zip(starts, lengths.tolist(), strict=True)
         ]
         return np.array(found, dtype=np.int32)

@@ -13,6 +13,8 @@ from pipeline.logs.decode import Decoder, plan_fields, wanted_leaves
 from pipeline.logs.payloads import Block, Group, Payloads, join_groups
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from pipeline.logs.columns import Column
@@ -60,6 +62,10 @@ class PayloadDecoder(Protocol):
     def notes(self) -> tuple[str, ...]:
         """What is worth knowing of what was decoded."""
 
+    @property
+    def shortened(self) -> Mapping[str, int]:
+        """Fields with strings that were too long and were cut, and how many."""
+
 
 class StructuredDecoder:
     """Decodes CDR and ROS 1 payloads through the type's tree.
@@ -87,6 +93,12 @@ class StructuredDecoder:
         """What is worth knowing of what was decoded."""
         longer = self._decoder.longer
         return (f"{longer} messages hold more bytes than their type describes",) if longer else ()
+
+    @property
+    def shortened(self) -> dict[str, int]:
+        """Fields with strings that were too long and were cut, and how many."""
+        vocabularies = self._decoder.vocabularies
+        return {path: words.shortened for path, words in vocabularies.items() if words.shortened}
 
     def decode(self, ids: Ints, block: Block) -> None:
         """Decode a block; ``ids`` are the numbers of its rows in the channel."""
@@ -171,13 +183,26 @@ class ChannelBuffer:
         self._pending = []
         self._pending_bytes = 0
 
-    def finish(self) -> tuple[Ints, Ints, Ints]:
-        """Decode what is left: log and publish times [ns] and numbers of the good rows, by log time."""
-        self._flush()
+    @property
+    def count(self) -> int:
+        """Messages so far."""
+        return self._count
+
+    def times(self) -> tuple[Ints, Ints]:
+        """Log and publish times [ns] of all messages in the order of the file."""
         empty = np.empty(0, dtype=np.int64)
-        log = np.concatenate([empty, *self._log])
-        publish = np.concatenate([empty, *self._publish])
+        return np.concatenate([empty, *self._log]), np.concatenate([empty, *self._publish])
+
+    def finish(self, repeated: Ints) -> tuple[Ints, Ints, Ints]:
+        """Decode what is left: log and publish times [ns] and numbers of the good rows, by log time.
+
+        Args:
+            repeated: numbers of the messages that are left out because they stand there before.
+        """
+        self._flush()
+        log, publish = self.times()
         good = np.ones(log.size, dtype=np.bool_)
+        good[repeated] = False
         for rejected in self.decoder.rejected:
             good[rejected.rows] = False
         rows = np.flatnonzero(good)

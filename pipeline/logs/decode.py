@@ -125,8 +125,11 @@ class Decoder:
             else:
                 _read_member(member, member.element, cursor, path if wanted else None, out)
 
+    def _vocabulary(self, path: str) -> Vocabulary:
+        return self.vocabularies.setdefault(path, Vocabulary(path))
+
     def _read_texts(self, member: Member, cursor: Cursor, path: str | None, out: Pieces) -> None:
-        vocabulary = None if path is None else self.vocabularies.setdefault(path, Vocabulary())
+        vocabulary = None if path is None else self._vocabulary(path)
         if member.count is None:
             codes = cursor.read_text(vocabulary)
             if codes is not None and path is not None:

@@ -13,12 +13,24 @@ from pipeline.logs.errors import LogError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from numpy.typing import NDArray
+
     from pipeline.logs.columns import Column
 
 STAMPS: Final = ("header.stamp.", "timestamp.")
 """Where messages carry the time they are about: ROS headers, and the protobuf and JSON types of Foxglove."""
 
+_LATEST_S: Final = 1 << 33
+"""Seconds beyond the year 2242, and as many before 1970: no stamp of a recording."""
+
 _INDEXED: Final = re.compile(r"^(?P<path>.*[^\]])\[(?P<number>\d+)\]$")
+
+
+def join_stamp(seconds: NDArray[np.generic], nanoseconds: NDArray[np.generic]) -> NDArray[np.int64] | None:
+    """Stamps [ns] of seconds and nanoseconds, None where one of them is no time at all."""
+    if not ((np.abs(seconds) <= _LATEST_S) & (np.abs(nanoseconds) <= _LATEST_S)).all():
+        return None
+    return seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
 
 
 def select_leaves(leaves: Sequence[str], fields: Sequence[str] | None, *, where: str) -> set[str]:

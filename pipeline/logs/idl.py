@@ -6,12 +6,15 @@ import re
 from typing import TYPE_CHECKING, Final
 
 from pipeline.logs.schema import (
+    MAX_DEPTH,
+    MAX_FIXED,
     SEQUENCE,
     SIZES,
     RawField,
     RawTypes,
     SchemaError,
     Structure,
+    parse_count,
     resolve,
     short_name,
 )
@@ -20,8 +23,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 _SEPARATOR: Final = re.compile(r"^={3,}[ \t\r]*$", re.MULTILINE)
-_COMMENT: Final = re.compile(r"//[^\n]*|/\*.*?\*/|^\s*#[^\n]*|^IDL:[^\n]*", re.MULTILINE | re.DOTALL)
-_TOKEN: Final = re.compile(r'"(?:[^"\\]|\\.)*"|\'(?:[^\'\\]|\\.)*\'|::|[A-Za-z_][\w]*|[\d.]+[\w.+-]*|\S')
+_HIDDEN: Final = re.compile(
+    r'(?P<string>"(?:[^"\\]|\\.)*+(?:"|\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)|^[ \t\r]*#[^\n]*|^IDL:[^\n]*',
+    re.MULTILINE | re.DOTALL,
+)
+"""Strings and comments, whichever begins first. What is not closed reaches to the end: one look will do."""
+
+_TOKEN: Final = re.compile(r'""|\'(?:[^\'\\\n]|\\.){1,8}+\'|::|[A-Za-z_][\w]*|[\d.]+[\w.+-]*|\S')
 _NUMBERS: Final = {
     "boolean": "bool",
     "octet": "uint8",
@@ -55,13 +63,7 @@ def parse_idl(name: str, text: str) -> Structure:
 
 
 def _split_tokens(text: str) -> list[str]:
-    strings: list[str] = []
-
-    def hide(match: re.Match[str]) -> str:
-        strings.append(match[0])
-        return '""'
-
-    return _TOKEN.findall(_COMMENT.sub(" ", re.sub(r'"(?:[^"\\]|\\.)*"', hide, text)))
+    return _TOKEN.findall(_HIDDEN.sub(lambda found: '""' if found["string"] else " ", text))
 
 
 class _Reader:
@@ -75,6 +77,8 @@ class _Reader:
         self._constants: dict[str, int] = {}
 
     def read_declarations(self, modules: list[str]) -> None:
+        if len(modules) > MAX_DEPTH:
+            raise SchemaError(f"modules are nested more than {MAX_DEPTH} deep")
         while self._place < len(self._tokens) and self._here() != "}":
             word = self._next()
             if word == "@":
@@ -123,8 +127,8 @@ class _Reader:
         value = ""
         while self._here() != ";":
             value += self._next()
-        if re.fullmatch(r"\d+", value):
-            self._constants[name] = int(value)
+        if re.fullmatch(r"[0-9]+", value):
+            self._constants[name] = parse_count(value)
 
     def _read_enum(self) -> None:
         self._typedefs[self._next()] = ("uint32", None)
@@ -141,6 +145,8 @@ class _Reader:
                 if count == SEQUENCE:
                     raise SchemaError(f"{name} is an array of sequences")
                 size = length * (1 if size is None else size)
+                if size > MAX_FIXED:
+                    raise SchemaError(f"field {name} is an array of {size} elements")
             yield name, size
             if self._next() == ";":
                 return
@@ -149,6 +155,8 @@ class _Reader:
         word = self._next()
         if word == "sequence":
             self._expect("<")
+            if self._here() == "sequence":
+                raise SchemaError("a sequence of sequences is not understood")
             kind, count = self._read_type()
             if count is not None:
                 raise SchemaError("a sequence of arrays is not understood")
@@ -188,8 +196,8 @@ class _Reader:
 
     def _number(self) -> int:
         word = self._next()
-        if word.isdigit():
-            return int(word)
+        if re.fullmatch(r"[0-9]+", word):
+            return parse_count(word)
         if word in self._constants:
             return self._constants[word]
         raise SchemaError(f"{word!r} is no length of an array")

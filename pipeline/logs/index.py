@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
+from pipeline.core.paths import PathError, resolve_inside
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.part import catalog_file
 from pipeline.logs.remote import to_location
-from pipeline.logs.source import count_fetched, hash_sources, open_source
+from pipeline.logs.source import count_fetched, hash_sources, open_source, version_of
 from pipeline.logs.workers import usable_threads
 
 if TYPE_CHECKING:
@@ -21,6 +22,12 @@ if TYPE_CHECKING:
     from pipeline.logs.records import ChannelRecord, SchemaRecord
     from pipeline.logs.scan import Catalog
     from pipeline.logs.spans import Span
+
+
+_LONGEST_SHOWN: Final = 100
+_MAX_LISTING: Final = 4 << 20
+_LONGEST_NAME: Final = 200
+"""Characters of a name that tables and sentences repeat."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +65,7 @@ class Part:
         numbers: the recording's channel number for each of the file's own.
         data_end: where the data section ends, None when unknown.
         data_crc: checksum of the data section, 0 when there is none.
+        version: of an object on a store, None for a file.
     """
 
     path: Path
@@ -67,6 +75,7 @@ class Part:
     numbers: Mapping[int, int]
     data_end: int | None = None
     data_crc: int = 0
+    version: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +129,11 @@ class LogIndex:
         return not self.losses
 
     @property
+    def deployment(self) -> dict[str, str]:
+        """What the metadata record of this name tells, vehicle and terrain, in names of bearable length."""
+        return {key: shorten(text) for key, text in self.metadata.get("deployment", {}).items()}
+
+    @property
     def message_count(self) -> int:
         """Messages of all channels."""
         return sum(channel.message_count for channel in self.channels)
@@ -127,6 +141,13 @@ class LogIndex:
     def topics(self) -> tuple[str, ...]:
         """Names of all topics, sorted."""
         return tuple(sorted({channel.topic for channel in self.channels}))
+
+
+def shorten(name: str) -> str:
+    """A name that a log gives as it can be repeated in every row; what is left out is said."""
+    if len(name) <= _LONGEST_NAME:
+        return name
+    return f"{name[:_LONGEST_NAME]} (cut, of {len(name)} characters)"
 
 
 def open_log(path: str | os.PathLike[str]) -> LogIndex:
@@ -142,12 +163,16 @@ def open_log(path: str | os.PathLike[str]) -> LogIndex:
     location = to_location(path)
     files, losses = find_parts(location)
     catalogs: list[tuple[Path, int, Catalog]] = []
+    versions: list[str | None] = []
     fetched = 0
     for file in files:
         with open_source(file) as source:
             catalogs.append((file, source.size, catalog_file(source, threads=usable_threads())))
+            versions.append(version_of(source))
             fetched += count_fetched([source])
-    return replace(_merge(location, catalogs, losses), fetched_bytes=fetched)
+    index = _merge(location, catalogs, losses)
+    parts = tuple(replace(part, version=each) for part, each in zip(index.parts, versions, strict=True))
+    return replace(index, parts=parts, fetched_bytes=fetched)
 
 
 def hash_log(path: str | os.PathLike[str]) -> str:
@@ -172,10 +197,19 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
     listing = path / "metadata.yaml"
     here = sorted(path.glob("*.mcap"), key=_split_number)
     if listing.is_file():
-        named = [path / name for name in _listed_files(listing.read_text("utf-8", "replace"))]
-        named = [file for file in named if file.suffix == ".mcap"]
-        found = [file for file in named if file.is_file()] or here
-        missing = [file.name for file in named if not file.is_file()]
+        if listing.stat().st_size > _MAX_LISTING:
+            raise LogError(
+                "not_a_recording",
+                f"metadata.yaml holds {listing.stat().st_size / 1e6:.0f} MB, which no listing of files does",
+                where=str(listing),
+                hint="Put it back from where it was recorded, or remove it: the files are then found by name",
+            )
+        listed = [
+            name for name in _listed_files(listing.read_text("utf-8", "replace")) if name.endswith(".mcap")
+        ]
+        named = {name: _find_listed(path, name) for name in listed}
+        found = [file for file in named.values() if file is not None] or here
+        missing = [_show(name) for name, file in named.items() if file is None]
         if found:
             losses = [
                 Loss("missing_part", f"{name} of the recording is not in its folder") for name in missing
@@ -195,6 +229,22 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
     raise LogError("not_a_recording", what, where=str(path), hint=hint)
 
 
+def _find_listed(folder: Path, name: str) -> Path | None:
+    """A file of a recording by the name that its listing gives; None where it is not in the folder."""
+    try:
+        # The parts of a recording are often links, made by those who keep their logs elsewhere.
+        file = resolve_inside(folder, name, follow_links=True)
+    except PathError:
+        return None
+    return file if file.is_file() else None
+
+
+def _show(name: str) -> str:
+    """A listed name for a message, which whoever wrote the listing chose."""
+    plain = name.rpartition("/")[2]
+    return plain if plain.isprintable() and len(plain) <= _LONGEST_SHOWN else repr(name[:_LONGEST_SHOWN])
+
+
 def _split_number(file: Path) -> tuple[str, int]:
     match = re.search(r"_(\d+)$", file.stem)
     return (file.stem[: match.start()], int(match[1])) if match else (file.stem, -1)
@@ -202,7 +252,8 @@ def _split_number(file: Path) -> tuple[str, int]:
 
 def _listed_files(text: str) -> list[str]:
     """Entries of ``relative_file_paths`` in a rosbag2 ``metadata.yaml``."""
-    block = re.search(r"^\s*relative_file_paths:\s*\n((?:\s*-\s.*\n?)*)", text, re.MULTILINE)
+    entry = r"(?:[ \t\r]*\n)*+[ \t]*-[ \t].*\n?"
+    block = re.search(rf"^[ \t]*relative_file_paths:[ \t\r]*\n((?:{entry})*)", text, re.MULTILINE)
     if block is None:
         return []
     entries = [line.strip()[1:].strip() for line in block[1].splitlines() if line.strip()]

@@ -14,8 +14,16 @@ if TYPE_CHECKING:
 MAX_CHUNK: Final = 1 << 30
 """Largest chunk that is inflated [bytes]; recorders write 1 to 100 MB."""
 
+_PLAUSIBLE: Final = 256 << 20
+_PLAUSIBLE_RATIO: Final = 1000
+"""No recording grows by more in chunks larger than `_PLAUSIBLE` bytes: what does was made to fill memory."""
+
 _MAX_RATIO: Final = {"": 1, "zstd": 40_000, "lz4": 260}
 """No block of these formats can grow by more: zstd stores 128 KiB in four bytes, LZ4 255 bytes in one."""
+
+_LZ4_FLAGS: Final = 4
+_LZ4_HAS_CHECKSUM: Final = 0x04
+"""Bit of the flags behind the magic number of an LZ4 frame."""
 
 _per_thread = threading.local()
 
@@ -59,6 +67,8 @@ def check_size(stored: int, compression: str, size: int) -> None:
         raise InflateError(f"the compression {compression[:20]!r} is not known")
     if size > MAX_CHUNK or size > stored * _MAX_RATIO[compression] + 1024:
         raise InflateError(f"{stored} bytes cannot hold {size}")
+    if size > max(_PLAUSIBLE, stored * _PLAUSIBLE_RATIO):
+        raise InflateError(f"{stored} bytes say they hold {size}, as no recording does")
 
 
 def inflate_into(stored: Buffer, compression: str, target: memoryview) -> None:
@@ -130,7 +140,9 @@ def checksum(records: Buffer) -> int:
 
 
 def holds_own_checksum(stored: Buffer, compression: str) -> bool:
-    """Whether inflating these bytes has verified a checksum of the content in the format itself."""
+    """Whether inflating all of these bytes verifies a checksum of the content in the format itself."""
+    if compression == "lz4":
+        return len(stored) > _LZ4_FLAGS and bool(stored[_LZ4_FLAGS] & _LZ4_HAS_CHECKSUM)
     if compression == "zstd":
         try:
             return bool(zstandard.get_frame_parameters(bytes(stored[:32])).has_checksum)

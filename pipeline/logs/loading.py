@@ -1,13 +1,12 @@
-"""Reading the spans of a file one after the other on several threads, and judging them together."""
+"""Reading the spans of a file one after the other on several threads, and their common checksum."""
 
 from __future__ import annotations
 
 import zlib
-from functools import cache
 from itertools import chain
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from pipeline.logs.spans import SpanKind, load_span, load_together
+from pipeline.logs.spans import load_span, load_together, no_file_checksum
 from pipeline.logs.workers import map_in_order
 
 if TYPE_CHECKING:
@@ -15,15 +14,15 @@ if TYPE_CHECKING:
     from collections.abc import Set as AbstractSet
 
     from pipeline.logs.source import ByteSource
-    from pipeline.logs.spans import Excuse, Loaded, Span
+    from pipeline.logs.spans import FileCheck, Loaded, Span
 
 Result = TypeVar("Result")
 
-_SEVERAL: Final = 3
-"""When the checksums of so many chunks differ and none holds, the writer's are wrong, not the data."""
-
 _TOGETHER: Final = 6 << 20
 """Inflated bytes of neighbouring chunks that are read together: every step in Python then serves more."""
+
+_IN_FLIGHT: Final = 1 << 30
+"""Inflated bytes that all threads together hold, unless a single chunk is larger."""
 
 _CRC_BLOCK: Final = 1 << 20
 
@@ -35,7 +34,7 @@ def load_spans(
     *,
     threads: int,
     wanted: AbstractSet[int] | None = None,
-    data_section: tuple[int, int] | None = None,
+    file_holds: FileCheck = no_file_checksum,
 ) -> Iterator[Result]:
     """Read spans in order.
 
@@ -46,49 +45,26 @@ def load_spans(
             where only some channels are wanted, undamaged neighbours come as one, named by the first.
         threads: how many are read at once.
         wanted: numbers of the channels whose messages are needed, None for all.
-        data_section: where the data section ends and its checksum, None when it has none.
+        file_holds: asked when a chunk's checksum differs whether that of the whole file holds.
 
     Yields:
         What ``use`` returned.
     """
 
-    @cache
-    def whole_file() -> str | None:
-        whole = data_section is not None and _checksum(source, data_section[0]) == data_section[1]
-        return "the checksum of the whole file holds" if whole else None
-
-    def read_with(excuse: Excuse) -> Callable[[list[Span]], list[tuple[bool, Result]]]:
-        def read(group: list[Span]) -> list[tuple[bool, Result]]:
-            told = sum(span.told.uncompressed_size for span in group if span.told is not None)
-            together = load_together(source, group, told) if len(group) > 1 else None
-            if together is not None:
-                return [(False, use(group[0], together))]
-            return [read_alone(span) for span in group]
-
-        def read_alone(span: Span) -> tuple[bool, Result]:
-            loaded = load_span(source, span, excuse, wanted)
-            differs = any(loss.kind == "chunk_crc" for loss in loaded.losses)
-            return differs, use(span, loaded)
-
-        return read
+    def read(group: list[Span]) -> list[Result]:
+        size = sum(span.inflated for span in group)
+        together = load_together(source, group, size) if len(group) > 1 else None
+        if together is not None:
+            return [use(group[0], together)]
+        return [use(span, load_span(source, span, file_holds, wanted)) for span in group]
 
     groups = _group_neighbours(spans) if wanted is not None else [[span] for span in spans]
-    held: list[Result] = []
-    only_differing = True
-    for differs, result in chain.from_iterable(map_in_order(read_with(whole_file), groups, threads)):
-        if only_differing and differs:
-            held.append(result)
-            continue
-        only_differing = False
-        yield from held
-        held = []
-        yield result
-    if len(held) >= _SEVERAL and all(span.kind is SpanKind.CHUNK for span in spans):
-        reason = f"the checksums of all {len(held)} chunks differ: the recorder wrote wrong ones"
-        for _, result in chain.from_iterable(map_in_order(read_with(lambda: reason), groups, threads)):
-            yield result
-    else:
-        yield from held
+    yield from chain.from_iterable(map_in_order(read, groups, threads, weigh=_weigh, limit=_IN_FLIGHT))
+
+
+def _weigh(group: list[Span]) -> int:
+    """Bytes that a group takes in memory."""
+    return sum(max(span.inflated, span.length) for span in group)
 
 
 def _group_neighbours(spans: Sequence[Span]) -> list[list[Span]]:
@@ -96,7 +72,7 @@ def _group_neighbours(spans: Sequence[Span]) -> list[list[Span]]:
     groups: list[list[Span]] = []
     size = 0
     for span in spans:
-        told = _TOGETHER if span.told is None else span.told.uncompressed_size
+        told = _TOGETHER if span.told is None else span.inflated
         last = groups[-1][-1] if groups else None
         behind = last is not None and last.offset + last.length + last.index_length == span.offset
         size += told
@@ -108,8 +84,9 @@ def _group_neighbours(spans: Sequence[Span]) -> list[list[Span]]:
     return groups
 
 
-def _checksum(source: ByteSource, end: int) -> int:
-    crc = 0
+def checksum_holds(source: ByteSource, end: int, crc: int) -> bool:
+    """Whether the checksum of the data section, the first ``end`` bytes of a file, holds."""
+    computed = 0
     for offset in range(0, end, _CRC_BLOCK):
-        crc = zlib.crc32(source.read_at(offset, min(_CRC_BLOCK, end - offset)), crc)
-    return crc
+        computed = zlib.crc32(source.read_at(offset, min(_CRC_BLOCK, end - offset)), computed)
+    return computed == crc

@@ -6,10 +6,13 @@ Messages become nested values first, then columns of their leaf fields.
 from __future__ import annotations
 
 import json
+import math
+import sys
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import Rejected
 from pipeline.logs.columns import Ragged, RaggedStrings
 from pipeline.logs.errors import LogError
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
 
 Value: TypeAlias = "float | str | bool | list[Value] | dict[str, Value] | None"
 Leaf: TypeAlias = "float | str | bool"
+_LARGEST_INTEGER = 1 << 63
 _TIMES = {"nanos": "nanosec", "seconds": "sec", "nsec": "nanosec", "secs": "sec", "nsecs": "nanosec"}
 
 
@@ -47,6 +51,7 @@ class ObjectDecoder:
         self._several: set[str] = set()
         self.rejected: list[Rejected] = []
         self.notes: tuple[str, ...] = ()
+        self.shortened: dict[str, int] = {}
 
     def decode(self, ids: Ints, block: Block) -> None:
         """Decode a block; ``ids`` are the numbers of its rows in the channel."""
@@ -62,13 +67,22 @@ class ObjectDecoder:
                     if several:
                         self._several.add(path)
                     if value is not None:
-                        leaves[path].append(value)
+                        leaves[path].append(self._bound(path, value))
                 self._rows[row] = leaves
             except (ValueError, RecursionError):
                 wrong.append(position)
         if wrong:
             lost = int(block.size[wrong].sum())
             self.rejected.append(Rejected("undecodable", "the payload cannot be parsed", ids[wrong], lost))
+
+    def _bound(self, path: str, value: Leaf) -> Leaf:
+        if isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
+            largest = sys.float_info.max
+            return float(value) if -largest <= value <= largest else math.inf * (1 if value > 0 else -1)
+        if not isinstance(value, str) or len(value) <= MAX_TEXT:
+            return value
+        self.shortened[path] = self.shortened.get(path, 0) + 1
+        return f"{value[:MAX_TEXT]} (cut, of {len(value)} characters)"
 
     def columns(self, rows: Ints) -> dict[str, Column]:
         """Columns of the given rows, in their order.

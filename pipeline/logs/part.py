@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from pipeline.logs import records as rec
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import checksum
-from pipeline.logs.loading import load_spans
+from pipeline.logs.loading import checksum_holds, load_spans
 from pipeline.logs.scan import Catalog, Scanner
 from pipeline.logs.spans import Loaded, Span, SpanKind, StoredAs
 
@@ -33,6 +34,7 @@ class _Summary:
     start: int
     statistics: rec.StatisticsRecord
     chunks: list[rec.ChunkIndexRecord]
+    side_records: set[tuple[int, int, str]]
 
 
 def catalog_file(source: ByteSource, *, threads: int = 1) -> Catalog:
@@ -63,6 +65,7 @@ def catalog_file(source: ByteSource, *, threads: int = 1) -> Catalog:
             catalog.losses.append(Loss("damaged_summary", text))
     else:
         _scan_gaps(source, catalog, start, summary.start)
+        _compare_side_records(catalog, summary)
         _take_statistics(source, catalog, summary, threads)
     return catalog
 
@@ -128,6 +131,7 @@ def _compare_chunks(source: ByteSource, chunks: list[rec.ChunkIndexRecord]) -> N
 def _parse_summary(body: bytes, start: int, catalog: Catalog) -> _Summary:
     statistics: rec.StatisticsRecord | None = None
     chunks: list[rec.ChunkIndexRecord] = []
+    listed: set[tuple[int, int, str]] = set()
     place = 0
     view = memoryview(body)
     while place < len(view):
@@ -149,10 +153,12 @@ def _parse_summary(body: bytes, start: int, catalog: Catalog) -> _Summary:
             statistics = rec.parse_statistics(record)
         elif opcode == rec.CHUNK_INDEX:
             chunks.append(rec.parse_chunk_index(record))
+        elif opcode in {rec.ATTACHMENT_INDEX, rec.METADATA_INDEX}:
+            listed.add(rec.parse_side_index(opcode, record))
     if statistics is None:
         raise _NoSummaryError("the summary has no statistics")
     _check_summary(statistics, chunks, start, catalog)
-    return _Summary(start, statistics, chunks)
+    return _Summary(start, statistics, chunks, listed)
 
 
 def _check_summary(
@@ -183,6 +189,7 @@ def _check_summary(
                 chunk.end_ns,
                 known,
                 StoredAs(chunk.compression, chunk.compressed_size, chunk.uncompressed_size),
+                chunk.uncompressed_size,
             )
         )
     if end > start:
@@ -203,6 +210,13 @@ def _scan_gaps(source: ByteSource, catalog: Catalog, start: int, stop: int) -> N
         if span is not None:
             place = span.offset + span.length + span.index_length
     catalog.spans = sorted([*listed, *found], key=lambda each: each.offset)
+
+
+def _compare_side_records(catalog: Catalog, summary: _Summary) -> None:
+    """Look whether metadata and attachments are where the summary says, and named so."""
+    for _, _, name in sorted(summary.side_records - catalog.side_records):
+        text = f"the metadata or attachment {name!r} that the summary lists is damaged or missing"
+        catalog.losses.append(Loss("contradiction", text))
 
 
 def _take_statistics(source: ByteSource, catalog: Catalog, summary: _Summary, threads: int) -> None:
@@ -232,17 +246,22 @@ def _examine(source: ByteSource, catalog: Catalog, threads: int) -> None:
     examined: list[Span] = []
     schemas: dict[int, rec.SchemaRecord] = {}
     channels: dict[int, rec.ChannelRecord] = {}
-    section = (
-        None if not catalog.data_crc or catalog.data_end is None else (catalog.data_end, catalog.data_crc)
-    )
-    summaries = load_spans(source, catalog.spans, _forget_chunk, threads=threads, data_section=section)
+
+    @cache
+    def file_holds() -> bool:
+        end = catalog.data_end
+        return end is not None and bool(catalog.data_crc) and checksum_holds(source, end, catalog.data_crc)
+
+    summaries = load_spans(source, catalog.spans, _forget_chunk, threads=threads, file_holds=file_holds)
     for span, loaded in summaries:
         messages = loaded.messages
         catalog.losses += [loss for loss in loaded.losses if loss not in catalog.losses]
         for schema in messages.schemas:
-            (catalog.schemas if loaded.unchecked else schemas).setdefault(schema.id, schema)
+            known = (catalog.schemas if loaded.unchecked else schemas).setdefault(schema.id, schema)
+            catalog.note_contradiction(known, schema)
         for channel in messages.channels:
-            (catalog.channels if loaded.unchecked else channels).setdefault(channel.id, channel)
+            before = (catalog.channels if loaded.unchecked else channels).setdefault(channel.id, channel)
+            catalog.note_contradiction(before, channel)
         numbers, counts = np.unique(messages.channel, return_counts=True)
         for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
             catalog.counts[number] = catalog.counts.get(number, 0) + count

@@ -4,25 +4,28 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer
 from pipeline.logs.codecs import decoder_for
+from pipeline.logs.coverage import Coverage, DataSection, count_missing, find_contradictions
 from pipeline.logs.errors import LogError, Loss
-from pipeline.logs.fields import STAMPS, derive_columns
+from pipeline.logs.fields import STAMPS, derive_columns, join_stamp
 from pipeline.logs.index import LogIndex, open_log
 from pipeline.logs.loading import load_spans
 from pipeline.logs.payloads import gather_payloads
+from pipeline.logs.repeats import digest_messages, find_repeated, share_times
 from pipeline.logs.source import ByteSource, count_fetched, hash_sources, open_source
 from pipeline.logs.spans import SpanKind
 from pipeline.logs.workers import map_in_order, usable_threads
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from pipeline.logs.columns import Column
     from pipeline.logs.index import ChannelInfo, Part
     from pipeline.logs.payloads import Payloads
+    from pipeline.logs.repeats import Key
     from pipeline.logs.spans import Loaded, Span
 
     Ints = NDArray[np.int64]
@@ -91,6 +95,8 @@ class LogData:
         notes: what is worth knowing and no loss.
         sha256: of the recording's bytes (hex); of an object, of its version and size.
         fetched_bytes: bytes fetched from an object store.
+        unchecked: what no checksum covers, in words; empty when all that was read is covered.
+        repeated: by topic, messages that stand in the recording again and were counted once.
     """
 
     index: LogIndex
@@ -99,6 +105,8 @@ class LogData:
     notes: tuple[str, ...]
     sha256: str
     fetched_bytes: int = 0
+    unchecked: str = ""
+    repeated: Mapping[str, int] = field(default_factory=dict)
 
     def of(self, topic: str) -> list[TopicColumns]:
         """Columns of every channel of a topic."""
@@ -129,29 +137,45 @@ def read_topics(
     losses: dict[Loss, None] = dict.fromkeys(index.losses)
     notes = list(index.notes)
     jobs = _choose_channels(index, wanted, losses, notes)
+    coverage, walked = Coverage(), 0
     with ExitStack() as stack:
-        sources = [stack.enter_context(open_source(part.path)) for part in index.parts]
+        sources = [stack.enter_context(open_source(part.path, part.version)) for part in index.parts]
         beside = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="hash"))
+        sections = [
+            DataSection(source, part, beside) for part, source in zip(index.parts, sources, strict=True)
+        ]
         digest = None if sha256 is not None else beside.submit(hash_sources, sources)
-        unchecked = walked = 0
-        for part, source in zip(index.parts, sources, strict=True):
-            for gathered in _read_part(source, part, set(jobs), workers):
+        for part, source, section in zip(index.parts, sources, sections, strict=True):
+            unchecked, told = 0, bool(index.losses)
+            for gathered in _read_part(source, part, set(jobs), workers, section):
                 unchecked += gathered.unchecked
+                coverage.spans += gathered.spans
                 walked += gathered.index_damaged
                 losses.update(dict.fromkeys(gathered.losses))
+                told |= bool(gathered.losses)
                 for number, payloads in gathered.payloads.items():
                     jobs[number].buffer.add(payloads)
+            mismatch = section.judge(unchecked, told=told)
+            if mismatch is not None:
+                losses[mismatch] = None
+            coverage.unchecked += 0 if section.holds() else unchecked
+        repeated = _find_repeated(list(zip(index.parts, sources, strict=True)), jobs, workers)
         found = digest.result() if digest is not None else (sha256 or "")
         fetched = index.fetched_bytes + count_fetched(sources)
     if walked:
         notes.append(f"the message indexes of {walked} chunks are damaged; their records were walked")
-    if unchecked:
-        notes.append(f"{unchecked} chunks carry no checksum: damage inside them cannot be seen")
+    counted = [(job.info, job.buffer.count) for job in jobs.values()]
+    losses.update(dict.fromkeys(count_missing(counted, tuple(losses))))
     topics: list[TopicColumns] = []
-    for columns, lost in map_in_order(_finish, jobs.values(), workers):
+    for columns, lost in map_in_order(lambda job: _finish(job, repeated), jobs.values(), workers):
         losses.update(dict.fromkeys(lost))
         topics.append(columns)
-    return LogData(index, tuple(topics), tuple(losses), tuple(notes), found, fetched)
+    twice = {jobs[number].info.topic: 0 for number in repeated}
+    for number, rows in repeated.items():
+        twice[jobs[number].info.topic] += rows.size
+    return LogData(
+        index, tuple(topics), tuple(losses), tuple(notes), found, fetched, coverage.describe(), twice
+    )
 
 
 @dataclass(slots=True, eq=False)
@@ -160,7 +184,8 @@ class _Gathered:
 
     payloads: dict[int, Payloads]
     losses: list[Loss]
-    unchecked: bool
+    spans: int
+    unchecked: int
     index_damaged: bool
 
 
@@ -228,22 +253,62 @@ def _schema_of(index: LogIndex, number: int) -> bytes:
     return b""
 
 
-def _read_part(source: ByteSource, part: Part, wanted: set[int], threads: int) -> Iterator[_Gathered]:
+def _read_part(
+    source: ByteSource, part: Part, wanted: set[int], threads: int, section: DataSection
+) -> Iterator[_Gathered]:
     own = {number for number, merged in part.numbers.items() if merged in wanted}
-    spans = [span for span in part.spans if span.channels is None or span.channels & own]
 
     def gather(span: Span, loaded: Loaded) -> _Gathered:
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)
         merged = {part.numbers[number]: each for number, each in payloads.items()}
-        unchecked = loaded.unchecked and span.kind is SpanKind.CHUNK
-        return _Gathered(merged, loaded.losses, unchecked, loaded.index_damaged)
+        losses = loaded.losses + find_contradictions(part, loaded.messages)
+        # The cut chunk at the end of a file is a loss already.
+        spans = int(bool(merged) and span.kind is not SpanKind.CUT_CHUNK)
+        return _Gathered(merged, losses, spans, spans * loaded.unchecked, loaded.index_damaged)
 
-    section = None if not part.data_crc or part.data_end is None else (part.data_end, part.data_crc)
-    return load_spans(source, spans, gather, threads=threads, wanted=own, data_section=section)
+    spans = _spans_with(part, own)
+    return load_spans(source, spans, gather, threads=threads, wanted=own, file_holds=section.holds)
 
 
-def _finish(job: _Job) -> tuple[TopicColumns, list[Loss]]:
-    log_time, publish_time, rows = job.buffer.finish()
+def _spans_with(part: Part, own: set[int]) -> list[Span]:
+    return [span for span in part.spans if span.channels is None or span.channels & own]
+
+
+def _find_repeated(
+    parts: Sequence[tuple[Part, ByteSource]], jobs: Mapping[int, _Job], threads: int
+) -> dict[int, Ints]:
+    """By channel, numbers of the messages that stand in the recording before, byte for byte."""
+    suspects = {number: share_times(*job.buffer.times()) for number, job in jobs.items()}
+    suspects = {number: rows for number, rows in suspects.items() if rows.size}
+    if not suspects:
+        return {}
+    times = {number: np.unique(jobs[number].buffer.times()[0][rows]) for number, rows in suspects.items()}
+    keys: dict[int, list[Key]] = {number: [] for number in suspects}
+    for part, source in parts:
+        # Reading what was wanted before, and only that, gives the same messages in the same order.
+        own = {number for number, merged in part.numbers.items() if merged in jobs}
+        asked = {number: times[part.numbers[number]] for number in own if part.numbers[number] in times}
+
+        def digest(_span: Span, loaded: Loaded, asked: Mapping[int, Ints] = asked) -> dict[int, list[Key]]:
+            return digest_messages(loaded.chunk, loaded.messages, asked)
+
+        for found in load_spans(source, _spans_with(part, own), digest, threads=threads, wanted=own):
+            for number, more in found.items():
+                keys[part.numbers[number]] += more
+    repeated: dict[int, Ints] = {}
+    for number, rows in suspects.items():
+        log, publish = jobs[number].buffer.times()
+        expected = set(zip(log[rows].tolist(), publish[rows].tolist(), strict=True))
+        here = [key for key in keys[number] if key[:2] in expected]
+        again = find_repeated(here) if len(here) == rows.size else []
+        if again:
+            repeated[number] = rows[again]
+    return repeated
+
+
+def _finish(job: _Job, repeated: Mapping[int, Ints]) -> tuple[TopicColumns, list[Loss]]:
+    left_out = repeated.get(job.info.id, np.empty(0, dtype=np.int64))
+    log_time, publish_time, rows = job.buffer.finish(left_out)
     leaves = job.recipe.decoder.columns(rows)
     header_time = _header_time(leaves)
     fields = derive_columns(leaves, job.fields, job.recipe.leaves or tuple(leaves))
@@ -252,6 +317,11 @@ def _finish(job: _Job) -> tuple[TopicColumns, list[Loss]]:
         start, end = job.buffer.times_of(rejected.rows)
         text = f"{rejected.rows.size} messages of {job.info.topic}: {rejected.reason}"
         losses.append(Loss(rejected.kind, text, rejected.bytes, 0, start, end))
+    for field_path, count in job.recipe.decoder.shortened.items():
+        text = (
+            f"{count} strings in {field_path} of {job.info.topic} are longer than {MAX_TEXT} bytes: cut there"
+        )
+        losses.append(Loss("long_string", text))
     columns = TopicColumns(
         job.info.topic,
         job.info.id,
@@ -270,7 +340,7 @@ def _header_time(leaves: Mapping[str, Column]) -> Ints | None:
         seconds, nanoseconds = leaves.get(f"{prefix}sec"), leaves.get(f"{prefix}nanosec")
         if not isinstance(seconds, np.ndarray) or not isinstance(nanoseconds, np.ndarray):
             continue
-        if np.isfinite(seconds).all() and np.isfinite(nanoseconds).all():
-            stamp: Ints = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
+        stamp = join_stamp(seconds, nanoseconds)
+        if stamp is not None:
             return stamp
     return None

@@ -244,6 +244,15 @@ def parse_chunk_index(body: Buffer) -> ChunkIndexRecord:
     )
 
 
+def parse_side_index(opcode: int, body: Buffer) -> tuple[int, int, str]:
+    """Where the summary says that a metadata record or an attachment stands, its length, and its name."""
+    parser = Parser(body)
+    place, length = parser.number(8), parser.number(8)
+    if opcode == ATTACHMENT_INDEX:
+        parser.take(24)
+    return place, length, parser.text()
+
+
 def parse_statistics(body: Buffer) -> StatisticsRecord:
     """The statistics record."""
     parser = Parser(body)

@@ -13,8 +13,17 @@ import stat
 import threading
 from datetime import UTC, datetime
 from pathlib import Path, PosixPath
-from typing import TYPE_CHECKING, Final, Protocol, cast
+from typing import TYPE_CHECKING, Final, cast
+from urllib.parse import quote_from_bytes, unquote_to_bytes
 
+from pipeline.logs.buckets import (
+    VersionChangedError,
+    describe_version,
+    fetch_all,
+    fetch_range,
+    open_store,
+    unreachable,
+)
 from pipeline.logs.errors import LogError
 
 if TYPE_CHECKING:
@@ -22,18 +31,15 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
+    from pipeline.logs.buckets import Info
+
 _SCHEME = re.compile(r"^([a-z][a-z0-9+]+):/+")
-_LISTING_S: Final = 60
+_LOCAL: Final = "file://"
 _TAIL: Final = 1 << 15
 """A log's index stands at its end: one request fetches the end at once."""
 
-
-class _FileSystem(Protocol):
-    """What is used of fsspec."""
-
-    def ls(self, path: str, detail: bool) -> list[dict[str, object]]: ...  # noqa: FBT001
-    def find(self, path: str, detail: bool) -> dict[str, dict[str, object]]: ...  # noqa: FBT001
-    def cat_file(self, path: str, *, start: int | None = None, end: int | None = None) -> bytes: ...
+_OPENINGS: Final = 3
+"""Looks at an object that changes between the look and the first read."""
 
 
 class RemotePath(PosixPath):
@@ -54,9 +60,10 @@ class RemotePath(PosixPath):
 
         Raises:
             FileNotFoundError: there is no such object or prefix.
+            LogError: ``log_unreadable``, the store does not answer.
         """
         del follow_symlinks
-        info = self._look()
+        info = self.look()
         if info["type"] == "directory":
             return os.stat_result((stat.S_IFDIR, 0, 0, 1, 0, 0, 0, 0, 0, 0), {"st_mtime_ns": 0})
         inode = int(_name_version(info)[:15], 16)
@@ -67,11 +74,7 @@ class RemotePath(PosixPath):
 
     def exists(self, **_: bool) -> bool:
         """Whether there is an object or a prefix of that name."""
-        try:
-            self._look()
-        except OSError:
-            return False
-        return True
+        return bool(self._type())
 
     def is_file(self, **_: bool) -> bool:
         """Whether it is an object."""
@@ -83,14 +86,14 @@ class RemotePath(PosixPath):
 
     def glob(self, pattern: str, **_: bool | None) -> Iterator[Self]:  # type: ignore[override]
         """Objects right below this prefix whose names fit."""
-        for info in _open_store(str(self)).ls(str(self), detail=True):
+        for info in self._list(str(self)):
             child = type(self)(_add_scheme(self, str(info["name"])))
             if child.match(pattern):
                 yield child
 
     def read_bytes(self) -> bytes:
         """All of an object."""
-        return _open_store(str(self)).cat_file(str(self))
+        return fetch_all(open_store(str(self)), str(self))
 
     def read_text(self, encoding: str | None = None, errors: str | None = None, **_: str) -> str:
         """All of an object as text."""
@@ -98,7 +101,10 @@ class RemotePath(PosixPath):
 
     def find_objects(self) -> list[Self]:
         """Every object under this prefix, sorted."""
-        found = _open_store(str(self)).find(str(self), detail=True)
+        try:
+            found = open_store(str(self)).find(str(self), detail=True)
+        except OSError as error:
+            raise unreachable(str(self), error) from None
         return sorted(type(self)(_add_scheme(self, name)) for name in found)
 
     def version(self) -> str:
@@ -107,23 +113,40 @@ class RemotePath(PosixPath):
         Raises:
             FileNotFoundError: there is no such object.
         """
-        return _name_version(self._look())
+        return _name_version(self.look())
+
+    def refresh(self) -> None:
+        """Forget what the store said a moment ago: of objects that were overwritten or added since, too."""
+        open_store(str(self)).invalidate_cache()
 
     def _type(self) -> str:
         try:
-            return str(self._look()["type"])
-        except OSError:
+            return str(self.look()["type"])
+        except FileNotFoundError:
             return ""
 
-    def _look(self) -> dict[str, object]:
-        """What the store says of it; one listing answers for all its neighbours."""
+    def look(self) -> Info:
+        """What the store says of it; one listing answers for all its neighbours.
+
+        Raises:
+            FileNotFoundError: there is no such object or prefix.
+            LogError: ``log_unreadable``, the store does not answer.
+        """
         if len(self.parts) <= 2:  # noqa: PLR2004 - scheme and bucket
             return {"type": "directory", "size": 0}
         plain = "/".join(self.parts[1:])
-        for info in _open_store(str(self)).ls(str(self.parent), detail=True):
+        for info in self._list(str(self.parent)):
             if str(info["name"]).strip("/") == plain:
                 return info
         raise FileNotFoundError(str(self))
+
+    def _list(self, url: str) -> list[Info]:
+        try:
+            return open_store(url).ls(url, detail=True)
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            raise unreachable(str(self), error) from None
 
 
 def to_location(path: str | os.PathLike[str]) -> Path:
@@ -131,42 +154,74 @@ def to_location(path: str | os.PathLike[str]) -> Path:
     if isinstance(path, RemotePath):
         return path
     text = os.fspath(path)
+    if text.startswith(_LOCAL):
+        return Path(os.fsdecode(unquote_to_bytes(text.removeprefix(_LOCAL))))
     return RemotePath(text) if _SCHEME.match(text) else Path(path)
 
 
+def spell_location(path: Path) -> str:
+    """A path as text that every table can hold; `to_location` leads back to it.
+
+    File names are bytes. Those that are no UTF-8 are spelt as an address, ``file:///logs/caf%E9.mcap``.
+    """
+    text = str(path)
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return _LOCAL + quote_from_bytes(os.fsencode(path))
+    return text
+
+
 class RemoteSource:
-    """An object that is read by ranges, from several threads at once.
+    """One version of an object that is read by ranges, from several threads at once.
+
+    Every range is of the version that was opened: an object that is overwritten meanwhile is refused.
 
     Args:
         path: the object.
+        version: the version that must be there still, as `RemoteSource.version` told; None for any.
 
     Raises:
-        LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``.
+        LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``, ``log_changed``.
     """
 
-    def __init__(self, path: RemotePath) -> None:
+    def __init__(self, path: RemotePath, version: str | None = None) -> None:
         self._path = path
-        self._store = _open_store(str(path))
+        self._store = open_store(str(path))
         self._lock = threading.Lock()
         self._fetched = 0
+        # What the store said a moment ago of its objects may be out of date: nothing was read yet.
+        for attempt in range(_OPENINGS):
+            if attempt:
+                path.refresh()
+            self._info = self._look()
+            self._size = cast("int", self._info["size"])
+            self._version = _name_version(self._info)
+            self._tail_start = max(0, self._size - _TAIL)
+            try:
+                if version is None or version == self._version:
+                    self._tail = self._fetch(self._tail_start, self._size)
+                    return
+            except LogError as error:
+                if error.code != "log_changed":
+                    raise
+        raise _changed(path)
+
+    def _look(self) -> Info:
         try:
-            self._size = path.stat().st_size
-            self._version = path.version()
+            info = self._path.look()
         except FileNotFoundError:
             raise LogError(
-                "log_not_found", "there is no such object", where=str(path), hint="Check bucket and key"
+                "log_not_found", "there is no such object", where=str(self._path), hint="Check bucket and key"
             ) from None
-        except OSError as error:
-            raise _unreadable(path, error) from None
-        if self._size == 0:
+        if not info.get("size"):
             raise LogError(
                 "log_empty",
                 "the object holds no bytes",
-                where=str(path),
+                where=str(self._path),
                 hint="The recorder was stopped before it wrote anything; leave it out",
             )
-        self._tail_start = max(0, self._size - _TAIL)
-        self._tail = self._fetch(self._tail_start, self._size)
+        return info
 
     @property
     def size(self) -> int:
@@ -202,9 +257,12 @@ class RemoteSource:
 
     def _fetch(self, start: int, end: int) -> bytes:
         try:
-            found = self._store.cat_file(str(self._path), start=start, end=end)
+            url, look = str(self._path), self._path.look
+            found = fetch_range(self._store, url, start, end, known=self._info, look=look)
+        except (VersionChangedError, FileNotFoundError):
+            raise _changed(self._path) from None
         except OSError as error:
-            raise _unreadable(self._path, error) from None
+            raise unreachable(str(self._path), error) from None
         with self._lock:
             self._fetched += len(found)
         return found
@@ -218,35 +276,15 @@ class RemoteSource:
         self.close()
 
 
-def _open_store(url: str) -> _FileSystem:
-    try:
-        from fsspec.core import url_to_fs  # noqa: PLC0415 - an extra
-
-        store, _ = url_to_fs(url, listings_expiry_time=_LISTING_S)
-    except ImportError as error:
-        raise LogError(
-            "no_object_store",
-            f"what is needed to reach an object store is not installed ({error})",
-            where=url,
-            hint="pip install 'slip-pipeline[s3]'",
-        ) from None
-    except ValueError as error:
-        raise LogError(
-            "no_object_store", f"there is no such kind of store ({error})", where=url, hint="Use s3://"
-        ) from None
-    return cast("_FileSystem", store)
-
-
 def _add_scheme(base: RemotePath, name: str) -> str:
     return f"{base.parts[0]}//{name.strip('/')}"
 
 
-def _name_version(info: dict[str, object]) -> str:
-    tag = info.get("VersionId") or info.get("ETag") or info.get("etag") or _read_time(info)
-    return hashlib.sha256(f"{tag} {info.get('size')}".encode()).hexdigest()
+def _name_version(info: Info) -> str:
+    return hashlib.sha256(describe_version(info).encode()).hexdigest()
 
 
-def _read_time(info: dict[str, object]) -> int:
+def _read_time(info: Info) -> int:
     moment = info.get("LastModified") or info.get("created")
     if not isinstance(moment, datetime):
         return 0
@@ -254,10 +292,10 @@ def _read_time(info: dict[str, object]) -> int:
     return round(aware.timestamp() * 1000) * 1_000_000
 
 
-def _unreadable(path: RemotePath, error: OSError) -> LogError:
+def _changed(path: RemotePath) -> LogError:
     return LogError(
-        "log_unreadable",
-        f"the object cannot be read ({' '.join(str(error).split())})",
+        "log_changed",
+        "the object was overwritten or removed while it was read",
         where=str(path),
-        hint="Check the network and your right to the bucket",
+        hint="Wait until it is no longer written, then run the same command again",
     )

@@ -28,7 +28,8 @@ _MAX_SIDE_RECORD: Final = 1 << 26
 class Catalog:
     """What is known of a file.
 
-    ``metadata`` and ``attachments`` keep the order of the file; ``counts`` are messages by channel number.
+    ``metadata`` and ``attachments`` keep the order of the file, ``side_records`` are their places, lengths
+    and names; ``counts`` are messages by channel number.
     """
 
     profile: str = ""
@@ -47,6 +48,32 @@ class Catalog:
     data_end: int | None = None
     data_crc: int = 0
     footer_seen: bool = False
+    side_records: set[tuple[int, int, str]] = field(default_factory=set)
+
+    def note_contradiction(
+        self, one: rec.SchemaRecord | rec.ChannelRecord, other: rec.SchemaRecord | rec.ChannelRecord
+    ) -> None:
+        """Note a schema or channel that the file holds twice, where the two differ."""
+        loss = describe_contradiction(one, other)
+        if loss is not None and loss not in self.losses:
+            self.losses.append(loss)
+
+
+def describe_contradiction(
+    one: rec.SchemaRecord | rec.ChannelRecord, other: rec.SchemaRecord | rec.ChannelRecord
+) -> Loss | None:
+    """What two records of one number say differently; None where they agree."""
+    if one == other:
+        return None
+    if isinstance(one, rec.ChannelRecord) and isinstance(other, rec.ChannelRecord):
+        # Recorders may add to a channel's own notes, which nothing is decoded by.
+        if replace(one, metadata={}) == replace(other, metadata={}):
+            return None
+        name = f"channel {one.id} ({one.topic})"
+    else:
+        name = f"schema {one.id}"
+    text = f"the file describes {name} in two ways: one of the two is damaged, and its messages may be wrong"
+    return Loss("contradiction", text)
 
 
 class Window:
@@ -121,30 +148,40 @@ class Scanner:
             if place not in self._known:
                 catalog.compressions.add(head.compression)
                 catalog.spans.append(
-                    Span(SpanKind.CHUNK, place, rec.HEAD_SIZE + length, 0, head.start_ns, head.end_ns)
+                    Span(
+                        SpanKind.CHUNK,
+                        place,
+                        rec.HEAD_SIZE + length,
+                        0,
+                        head.start_ns,
+                        head.end_ns,
+                        inflated=head.uncompressed_size,
+                    )
                 )
         elif opcode == rec.MESSAGE_INDEX:
             self._note_index(place, rec.HEAD_SIZE + length)
         elif opcode == rec.ATTACHMENT:
-            catalog.attachments.append(
-                rec.parse_attachment_name(self._window.view(body_at, min(length, 1 << 12)))
-            )
+            name = rec.parse_attachment_name(self._window.view(body_at, min(length, 1 << 12)))
+            catalog.attachments.append(name)
+            catalog.side_records.add((place, rec.HEAD_SIZE + length, name))
         elif length <= _MAX_SIDE_RECORD:
             if opcode == rec.DATA_END:
                 catalog.data_end = place
-            self._note_small(opcode, self._window.view(body_at, length))
+            self._note_small(opcode, place, self._window.view(body_at, length))
         return True
 
-    def _note_small(self, opcode: int, body: memoryview) -> None:
+    def _note_small(self, opcode: int, place: int, body: memoryview) -> None:
         catalog = self._catalog
         if opcode == rec.SCHEMA:
             schema = rec.parse_schema(body)
-            catalog.schemas.setdefault(schema.id, schema)
+            catalog.note_contradiction(catalog.schemas.setdefault(schema.id, schema), schema)
         elif opcode == rec.CHANNEL:
             channel = rec.parse_channel(body)
-            catalog.channels.setdefault(channel.id, channel)
+            catalog.note_contradiction(catalog.channels.setdefault(channel.id, channel), channel)
         elif opcode == rec.METADATA:
-            catalog.metadata.append(rec.parse_metadata(body))
+            record = rec.parse_metadata(body)
+            catalog.metadata.append(record)
+            catalog.side_records.add((place, rec.HEAD_SIZE + len(body), record[0]))
         elif opcode == rec.HEADER:
             catalog.profile, catalog.library = rec.parse_header(body)
         elif opcode == rec.DATA_END:
@@ -238,7 +275,15 @@ class Scanner:
             return False
         self._catalog.compressions.add(chunk.compression)
         self._catalog.spans.append(
-            Span(SpanKind.CUT_CHUNK, place, stop - place, 0, chunk.start_ns, chunk.end_ns)
+            Span(
+                SpanKind.CUT_CHUNK,
+                place,
+                stop - place,
+                0,
+                chunk.start_ns,
+                chunk.end_ns,
+                inflated=chunk.uncompressed_size,
+            )
         )
         return True
 

@@ -32,6 +32,11 @@ MAX_FIXED: Final = 1 << 24
 
 MAX_DEPTH: Final = 64
 
+MAX_LEAVES: Final = 1 << 14
+"""Most fields of a type with all types below it; those of a robot have hundreds."""
+
+_MAX_DIGITS: Final = 9
+
 _ALIASES: Final = {"byte": "uint8", "char": "uint8", "octet": "uint8", "boolean": "bool"}
 _ALIASES_ROS1: Final = {"byte": "int8", "char": "uint8"}
 _SEPARATOR: Final = re.compile(r"^={3,}[ \t\r]*$", re.MULTILINE)
@@ -128,8 +133,19 @@ def _parse_fields(body: str, dialect: str) -> Iterator[RawField]:
         count: int | None = None
         if match["array"]:
             fixed = bool(match["count"]) and not match["bound"]
-            count = int(match["count"]) if fixed else SEQUENCE
+            count = parse_count(match["count"]) if fixed else SEQUENCE
         yield RawField(match["name"], _rename(match["type"], dialect), count)
+
+
+def parse_count(digits: str) -> int:
+    """The number of elements of an array.
+
+    Raises:
+        SchemaError: more elements than any message holds.
+    """
+    if len(digits) > _MAX_DIGITS:
+        raise SchemaError(f"an array has a number of elements of {len(digits)} digits")
+    return int(digits)
 
 
 def _rename(type_name: str, dialect: str) -> str:
@@ -141,7 +157,8 @@ def resolve(root: str, types: Mapping[str, list[RawField]], *, dialect: str = "r
     """Build the tree of ``root`` from flat definitions keyed by ``package/Name``.
 
     Raises:
-        SchemaError: a type that is not defined, contains itself, or holds an absurd array.
+        SchemaError: a type that is not defined, contains itself, or holds an absurd array or absurdly many
+            fields.
     """
     return _Resolver({**_builtin_times(dialect), **types}).build(root, 0)
 
@@ -150,6 +167,8 @@ class _Resolver:
     def __init__(self, known: Mapping[str, list[RawField]]) -> None:
         self._known = known
         self._built: dict[str, Structure] = {}
+        self._leaves: dict[str, int] = {}
+        self._elements: dict[str, int] = {}
 
     def build(self, name: str, depth: int) -> Structure:
         if name in self._built:
@@ -161,7 +180,19 @@ class _Resolver:
         package = name.split("/", 1)[0]
         members = tuple(self._member(field, package, depth) for field in self._known[name])
         self._built[name] = Structure(name, members)
+        self._measure(name, members)
         return self._built[name]
+
+    def _measure(self, name: str, members: tuple[Member, ...]) -> None:
+        """Refuse types that a few lines of text blow up: each of two fields of a type of two fields of ..."""
+        leaves = elements = 0
+        for member in members:
+            inside = "" if isinstance(member.element, str) else member.element.name
+            leaves += self._leaves.get(inside, 1)
+            elements += self._elements.get(inside, 1) * max(1, member.count or 1)
+        if leaves > MAX_LEAVES or elements > MAX_FIXED:
+            raise SchemaError(f"type {name} has {leaves} fields of {elements} elements")
+        self._leaves[name], self._elements[name] = leaves, elements
 
     def _member(self, field: RawField, package: str, depth: int) -> Member:
         if field.count is not None and field.count > MAX_FIXED:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 from typing import TYPE_CHECKING, Final, Protocol
 
 from pipeline.logs.errors import LogError
@@ -56,7 +57,8 @@ class FileSource:
     def __init__(self, path: Path) -> None:
         self._path = path
         try:
-            self._descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+            # Opening a pipe would wait for somebody to write into it.
+            self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except FileNotFoundError:
             raise LogError(
                 "log_not_found", "there is no such file", where=str(path), hint="Check the path"
@@ -68,7 +70,16 @@ class FileSource:
                 where=str(path),
                 hint="Check its permissions",
             ) from None
-        self._size = os.fstat(self._descriptor).st_size
+        status = os.fstat(self._descriptor)
+        self._size = status.st_size
+        if not stat.S_ISREG(status.st_mode):
+            self.close()
+            raise LogError(
+                "log_unreadable",
+                "it is a pipe, a socket or a device, and no file",
+                where=str(path),
+                hint="Give an .mcap file",
+            )
         if self._size == 0:
             self.close()
             raise LogError(
@@ -120,13 +131,27 @@ class FileSource:
         self.close()
 
 
-def open_source(path: Path) -> OpenSource:
+def open_source(path: Path, version: str | None = None) -> OpenSource:
     """Open a file or an object.
 
+    Args:
+        path: the file or object.
+        version: of an object, what `version_of` told when it was opened before; another one is refused.
+
     Raises:
-        LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``.
+        LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``, ``log_changed``.
     """
-    return RemoteSource(path) if isinstance(path, RemotePath) else FileSource(path)
+    return RemoteSource(path, version) if isinstance(path, RemotePath) else FileSource(path)
+
+
+def version_of(source: ByteSource) -> str | None:
+    """Which version of an object is open; None for a file."""
+    return source.version if isinstance(source, RemoteSource) else None
+
+
+def is_fetched(source: ByteSource) -> bool:
+    """Whether every byte has to come from an object store."""
+    return isinstance(source, RemoteSource)
 
 
 def count_fetched(sources: Sequence[ByteSource]) -> int:

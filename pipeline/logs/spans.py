@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.logs import records as rec
 from pipeline.logs.errors import Loss
 from pipeline.logs.inflate import (
+    MAX_CHUNK,
     InflateError,
     check_size,
     checksum,
@@ -36,14 +37,17 @@ if TYPE_CHECKING:
     from pipeline.logs.source import ByteSource
 
     Entries: TypeAlias = tuple[int, NDArray[np.uint64]]
-    Excuse: TypeAlias = Callable[[], str | None]
+    FileCheck: TypeAlias = Callable[[], bool]
 
 
 _CRC_IN_HEAD: Final = 24
 _INVERTED: Final = 0xFFFFFFFF
 
 _ZERO_TAIL: Final = 64
-"""So many zeros at the end of a chunk are bytes that were never written."""
+"""So many zeros at the end of a chunk, and no record behind it, are bytes that were never written."""
+
+_MAX_SPAN: Final = MAX_CHUNK + (64 << 20)
+"""Most bytes that are read at once: the largest chunk and its message indexes."""
 
 _WORTHWHILE: Final = 0.8
 """Stopping early pays when this share of a chunk or less is needed."""
@@ -79,6 +83,7 @@ class Span:
         end_ns: last log time, None when unknown.
         channels: numbers of the channels in it, None when unknown.
         told: how the summary says it is stored, None when it does not.
+        inflated: bytes that come out of a chunk as the summary or its head says.
     """
 
     kind: SpanKind
@@ -89,6 +94,7 @@ class Span:
     end_ns: int | None = None
     channels: frozenset[int] | None = None
     told: StoredAs | None = None
+    inflated: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +105,7 @@ class Loaded:
         chunk: inflated records; empty when nothing could be read.
         messages: where its messages stand.
         losses: what was lost in it.
-        unchecked: whether no checksum covered the records.
+        unchecked: whether no checksum of the chunk's own covered the records.
         index_damaged: whether its message index is of no use, which loses nothing.
     """
 
@@ -110,9 +116,9 @@ class Loaded:
     index_damaged: bool = False
 
 
-def no_excuse() -> str | None:
-    """Nothing else shows that the records of a chunk are whole."""
-    return None
+def no_file_checksum() -> bool:
+    """Nothing but its own checksum shows whether a chunk is whole."""
+    return False
 
 
 class _SpanError(Exception):
@@ -127,7 +133,7 @@ class _SpanError(Exception):
 def load_span(
     source: ByteSource,
     span: Span,
-    excuse: Excuse = no_excuse,
+    file_holds: FileCheck = no_file_checksum,
     wanted: AbstractSet[int] | None = None,
 ) -> Loaded:
     """Read, inflate and check one span.
@@ -138,35 +144,56 @@ def load_span(
     Args:
         source: the file.
         span: which stretch.
-        excuse: asked when a chunk's checksum differs for what else shows that its records are whole.
+        file_holds: asked when a chunk's checksum differs whether that of the whole file holds.
         wanted: numbers of the channels whose messages are needed, None for all.
     """
+    if span.length + span.index_length > _MAX_SPAN:
+        return _lost(span, "too_large", f"more than {_MAX_SPAN >> 20} MiB at once are not read")
     blob = memoryview(source.read_at(span.offset, span.length + span.index_length))
     if span.kind is SpanKind.LOOSE:
         messages = locate_messages(blob, None)
         return Loaded(blob, messages, _damage_losses(span, messages, len(blob)), unchecked=True)
     try:
         head, losses = _open_chunk(span, blob)
-        if span.start_ns is None and head.start_ns <= head.end_ns:
-            span = replace(span, start_ns=head.start_ns, end_ns=head.end_ns)
-        stored = blob[head.body : head.body + head.compressed_size]
-        if span.kind is SpanKind.CUT_CHUNK:
-            return _load_start(span, head, stored, "the file ends inside it")
-        entries = _read_entries(blob[span.length :])
-        if head.crc == 0 and entries and wanted:
-            needed = _needed_size(span, entries, wanted)
-            if needed is not None and needed < head.uncompressed_size * _WORTHWHILE:
-                return _load_prefix(span, head, stored, entries, needed)
-        chunk = _inflate_checked(span, head, stored, excuse, losses)
     except _SpanError as error:
         return _lost(span, error.kind, error.reason)
-    if chunk is None:
-        written = memoryview(bytes(stored).rstrip(b"\0"))
-        return _load_start(span, head, written, f"its last {len(stored) - len(written)} bytes are zero")
+    if span.start_ns is None and head.start_ns <= head.end_ns:
+        span = replace(span, start_ns=head.start_ns, end_ns=head.end_ns)
+    stored = blob[head.body : head.body + head.compressed_size]
+    try:
+        return _load_chunk(span, blob, head, losses, file_holds, wanted)
+    except _SpanError as error:
+        if not _is_unwritten(source, span, stored):
+            return _lost(span, error.kind, error.reason)
+    written = memoryview(bytes(stored).rstrip(b"\0"))
+    return _load_start(span, head, written, f"its last {len(stored) - len(written)} bytes are zero")
+
+
+def _load_chunk(
+    span: Span,
+    blob: memoryview,
+    head: rec.ChunkHead,
+    losses: list[Loss],
+    file_holds: FileCheck,
+    wanted: AbstractSet[int] | None,
+) -> Loaded:
+    """Inflate and check a chunk whose head is known; ``losses`` are those of its head."""
+    stored = blob[head.body : head.body + head.compressed_size]
+    if span.kind is SpanKind.CUT_CHUNK:
+        return _load_start(span, head, stored, "the file ends inside it")
+    entries = _read_entries(blob[span.length :])
+    unchecked = head.crc == 0 and not holds_own_checksum(stored, head.compression)
+    if unchecked and entries and wanted:
+        needed = _needed_size(span, entries, wanted)
+        if needed is not None and needed < head.uncompressed_size * _WORTHWHILE:
+            return _load_prefix(span, head, stored, entries, needed)
+    chunk = _inflate_checked(span, head, stored, file_holds, losses)
     messages = locate_messages(chunk, entries)
     losses += _damage_losses(span, messages, len(chunk))
+    if unchecked:
+        losses += _compare_times(span, head, messages)
     index_damaged = span.index_length > 0 and messages.walked and messages.start.size > 0
-    return Loaded(chunk, messages, losses, unchecked=head.crc == 0, index_damaged=index_damaged)
+    return Loaded(chunk, messages, losses, unchecked=unchecked, index_damaged=index_damaged)
 
 
 def load_together(source: ByteSource, spans: Sequence[Span], size: int) -> Loaded | None:
@@ -261,27 +288,34 @@ def _open_chunk(span: Span, blob: memoryview) -> tuple[rec.ChunkHead, list[Loss]
 
 
 def _inflate_checked(
-    span: Span, head: rec.ChunkHead, stored: Buffer, excuse: Excuse, losses: list[Loss]
-) -> Buffer | None:
-    """Records of a chunk; None where its end was never written. Notes a checksum that is wrong alone."""
-    unwritten = len(stored) >= _ZERO_TAIL and not any(stored[-_ZERO_TAIL:])
+    span: Span, head: rec.ChunkHead, stored: Buffer, file_holds: FileCheck, losses: list[Loss]
+) -> Buffer:
+    """Records of a chunk. Notes a checksum that is wrong alone."""
     try:
         chunk = inflate(stored, head.compression, head.uncompressed_size)
     except InflateError as error:
-        if unwritten:
-            return None
         raise _SpanError("damaged_chunk", f"it cannot be inflated: {error}") from None
     computed = checksum(chunk) if head.crc else 0
     if computed == head.crc:
         return chunk
-    reason = explain_checksum(head.crc, computed, stored, head.compression) or excuse()
-    if reason is not None:
-        text = f"its checksum is wrong but its records are whole ({reason}); they were kept"
-        losses.append(_loss(span, "wrong_crc", text, bytes_lost=0))
-        return chunk
-    if unwritten:
-        return None
-    raise _SpanError("chunk_crc", "its checksum does not match its records")
+    reason = explain_checksum(head.crc, computed, stored, head.compression)
+    if reason is None and file_holds():
+        reason = "the checksum of the whole file holds"
+    if reason is None:
+        raise _SpanError("chunk_crc", "its checksum does not match its records")
+    text = f"its checksum is wrong but its records are whole ({reason}); they were kept"
+    losses.append(_loss(span, "wrong_crc", text, bytes_lost=0))
+    return chunk
+
+
+def _is_unwritten(source: ByteSource, span: Span, stored: Buffer) -> bool:
+    """Whether the end of a chunk was never written: it is zero, and so is what should follow it.
+
+    Zeros at the end alone are no evidence: many messages end in them, as odometry without covariance does.
+    """
+    if len(stored) < _ZERO_TAIL or any(stored[-_ZERO_TAIL:]):
+        return False
+    return not any(source.read_at(span.offset + span.length, rec.HEAD_SIZE))
 
 
 def explain_checksum(stored_crc: int, computed: int, stored: Buffer, compression: str) -> str | None:
@@ -351,6 +385,15 @@ def _damage_losses(span: Span, messages: Messages, size: int) -> list[Loss]:
             Loss("damaged_record", text, end - start, 1, None if first is None else int(first), last)
         )
     return losses
+
+
+def _compare_times(span: Span, head: rec.ChunkHead, messages: Messages) -> list[Loss]:
+    """What contradicts itself in a chunk that no checksum covers: its head tells its messages' times."""
+    log_time = messages.log_time
+    if not log_time.size or (head.start_ns <= int(log_time.min()) and int(log_time.max()) <= head.end_ns):
+        return []
+    reason = "messages lie outside the times that its head tells: one is damaged, both were kept"
+    return [_loss(span, "contradiction", reason, bytes_lost=0)]
 
 
 def _loss(span: Span, kind: str, reason: str, *, bytes_lost: int | None = None) -> Loss:

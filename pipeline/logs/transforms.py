@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.core.rigid import interpolate_poses, invert_quaternions, multiply_quaternions, rotate
 from pipeline.logs.columns import Ragged, RaggedStrings
 from pipeline.logs.errors import LogError
+from pipeline.logs.fields import join_stamp
 from pipeline.logs.reader import Wanted
 
 if TYPE_CHECKING:
@@ -242,9 +243,9 @@ def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[_Rows]:
     if not isinstance(parents, RaggedStrings) or not isinstance(children, RaggedStrings):
         return []
     values = [column.values for column in numbers if isinstance(column, Ragged)]
-    if len(values) != len(_NUMBERS):
+    time = join_stamp(values[0], values[1]) if len(values) == len(_NUMBERS) else None
+    if time is None:
         return []
-    time = values[0].astype(np.int64) * 1_000_000_000 + values[1].astype(np.int64)
     position = np.stack(values[2:5], axis=1).astype(np.float64)
     quaternion = np.stack(values[5:], axis=1).astype(np.float64)
     log_time = np.repeat(columns.log_time, np.diff(children.offsets))

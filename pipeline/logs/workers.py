@@ -26,27 +26,42 @@ def usable_threads() -> int:
     return max(1, min(cores, int(limit))) if limit.isdigit() else cores
 
 
-def map_in_order(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
+def map_in_order(
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    threads: int,
+    *,
+    weigh: Callable[[Item], int] = lambda _item: 0,
+    limit: int = 0,
+) -> Iterator[Result]:
     """Apply ``function`` to every item; results in order, at most twice as many waiting as run.
 
     Args:
         function: called on other threads; with one thread it is called on this one.
         items: its arguments.
         threads: how many calls run at once.
+        weigh: what an item takes while it is worked on and until its result has been used.
+        limit: most weight at once; an item that is heavier alone is worked on alone.
     """
     if threads <= 1:
         for item in items:
             yield function(item)
         return
     with ThreadPoolExecutor(threads, thread_name_prefix="log") as pool:
-        waiting: deque[Future[Result]] = deque()
+        waiting: deque[tuple[Future[Result], int]] = deque()
+        held = 0
         try:
             for item in items:
-                waiting.append(pool.submit(function, item))
-                if len(waiting) > 2 * threads:
-                    yield waiting.popleft().result()
+                weight = weigh(item)
+                while waiting and (len(waiting) > 2 * threads or held + weight > limit):
+                    # What is given out is held by the caller until it asks for more.
+                    future, freed = waiting.popleft()
+                    yield future.result()
+                    held -= freed
+                waiting.append((pool.submit(function, item), weight))
+                held += weight
             while waiting:
-                yield waiting.popleft().result()
+                yield waiting.popleft()[0].result()
         finally:
-            for future in waiting:
+            for future, _ in waiting:
                 future.cancel()

@@ -1,7 +1,7 @@
 """Motion models: a vehicle plus physical effects, fitted to runs and judged on data the fit has not seen.
 
 `Model` composes effects along a command's way; `Problem` makes runs ready once, `fit_model` fits, `hold_out`
-scores, `climb` builds the ladder. The ideal models stand in `ideal`.
+scores, `climb` builds the ladder. The ideal models stand in `pipeline.vehicles.kinematics`.
 """
 
 from pipeline.motion.catalogue import find_effect, list_effects
@@ -25,12 +25,7 @@ from pipeline.motion.fit import Fitted, fit_model
 from pipeline.motion.floor import estimate_floor
 from pipeline.motion.forward import Timing
 from pipeline.motion.heading import HeadingSource
-from pipeline.motion.ideal import (
-    invert_ackermann,
-    invert_differential,
-    predict_ackermann,
-    predict_differential,
-)
+from pipeline.motion.inputs import InputChoice, choose_input
 from pipeline.motion.intervals import Estimate, Estimates, estimate_intervals
 from pipeline.motion.ladder import Ladder, Rung, climb
 from pipeline.motion.model import Model
@@ -59,6 +54,7 @@ __all__ = [
     "HeadingSource",
     "HeldOut",
     "Input",
+    "InputChoice",
     "KinematicEffect",
     "Ladder",
     "LinearEffect",
@@ -78,21 +74,18 @@ __all__ = [
     "Transfer",
     "Weights",
     "carry_over",
+    "choose_input",
     "climb",
     "estimate_floor",
     "estimate_intervals",
     "find_effect",
     "fit_model",
     "hold_out",
-    "invert_ackermann",
-    "invert_differential",
     "list_effects",
     "load_run",
     "predict",
-    "predict_ackermann",
     "predict_at",
     "predict_at_from",
-    "predict_differential",
     "predict_from",
     "read_model",
     "score",

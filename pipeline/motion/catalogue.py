@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import functools
 import importlib
-import importlib.util
 import inspect
 import pkgutil
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import Effect
+from pipeline.motion.effect import Effect, find_late
 from pipeline.motion.errors import MotionError
+from pipeline.motion.trust import hash_code
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
-    from types import ModuleType
+
+    from pipeline.motion.effect import Late
 
 EffectClass = type[Effect]
 
@@ -54,24 +57,44 @@ def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> Effe
     )
 
 
-def load_effects(path: Path) -> dict[str, EffectClass]:
-    """Effects of a user's own file, by id.
+def find_late_effect(late: Late) -> EffectClass:
+    """The effect of the folder that makes this late.
 
     Raises:
-        MotionError: ``effects_file``, the file is missing, does not run, or defines no effect.
+        MotionError: ``unknown_effect``, there is none.
     """
-    spec = importlib.util.spec_from_file_location(f"slip_effects_{path.stem}", path)
-    if spec is None or spec.loader is None or not path.is_file():
+    found = find_late(list_effects(), late)
+    if found is None:
         raise MotionError(
-            "effects_file", "there is no such file of effects", where=str(path), hint="Check the path."
+            "unknown_effect",
+            f"no effect says that {late.value}",
+            where=late.name,
+            hint="Give one of the folder `effects` that `late`.",
         )
-    module = importlib.util.module_from_spec(spec)
+    return found
+
+
+@functools.lru_cache(maxsize=64)
+def run_effects(code: bytes, path: Path) -> Mapping[str, EffectClass]:
+    """Effects of a user's own Python, by id. It is run: see `trust` for whether it may be.
+
+    Args:
+        code: what is run; the file itself is not read again.
+        path: where it stands.
+
+    Raises:
+        MotionError: ``effects_file``, it does not run, or defines no effect.
+    """
+    module = ModuleType(f"slip_effects_{hash_code(code)}")
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module
     try:
-        spec.loader.exec_module(module)
+        exec(compile(code, str(path), "exec", dont_inherit=True), vars(module))  # noqa: S102 - it is trusted
     except Exception as error:
+        del sys.modules[module.__name__]
         raise MotionError(
             "effects_file",
-            f"the file of effects does not run: {type(error).__name__}: {error}",
+            f"the file of effects does not run: {type(error).__name__}: {' '.join(str(error).split())}",
             where=str(path),
             hint="Mend it; it must be importable Python.",
         ) from error

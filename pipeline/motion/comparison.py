@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.motion.cells import make_cells
-from pipeline.motion.effect import ReportEffect
+from pipeline.motion.effect import Late, ReportEffect
 from pipeline.motion.errors import MotionError
 from pipeline.motion.forward import Forward, Timing, replace_surroundings
 from pipeline.motion.heading import HeadingSource, choose_heading
@@ -107,6 +107,8 @@ class Comparison:
                 where=run.name,
                 hint="Choose the other input.",
             )
+        # Whoever's geometry counts, the controller is that of this recording.
+        vehicle = run.correct_vehicle(vehicle)
         self.run = run
         self.source = source
         self.cells = make_cells(run, rate_hz)
@@ -169,7 +171,7 @@ class Comparison:
         """
         if timing.wheel_delay_s <= 0.0:
             return timing
-        hidden = sum(effect.values["tau"] for effect in effects if effect.id == "body_inertia")
+        hidden = sum(effect.delay for effect in effects if effect.late is Late.BODY)
         most = max(self.usual_delay, 0.0)
         return replace(timing, wheel_delay_s=min(timing.wheel_delay_s + hidden, most))
 
@@ -225,7 +227,7 @@ class Comparison:
         """How much later the model itself says positions are stamped [s]."""
         late = sum(effect.delay_s() for effect in effects if isinstance(effect, ReportEffect))
         if self.has_gyro:
-            late -= sum(effect.values["d"] for effect in effects if effect.id == "heading_skew")
+            late -= sum(effect.delay for effect in effects if effect.late is Late.HEADING)
         return late
 
     def _find_place(self, delay: float) -> Spot:

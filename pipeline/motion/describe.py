@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 from pipeline.motion.effect import Search
 from pipeline.motion.formula.formula_effect import FormulaEffect
+from pipeline.motion.ladder import list_rises
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.motion.effect import Effect
+    from pipeline.motion.effect import Effect, Parameter
     from pipeline.motion.intervals import Estimates
     from pipeline.motion.ladder import Ladder, Rung
     from pipeline.motion.model import Model
@@ -40,16 +41,31 @@ def errors_as_json(errors: Errors) -> dict[str, object]:
 
 
 def ladder_as_json(ladder: Ladder, floor: Errors | None = None) -> list[dict[str, object]]:
-    """Rungs with their errors and the share of the removable error that is gone."""
-    shares = ladder.explained_shares(floor)
-    return [
-        {
-            "effects": list(rung.effects),
-            **errors_as_json(rung.errors),
-            "explained_share": None if share is None else _round(share),
-        }
-        for rung, share in zip(ladder.rungs, shares, strict=True)
-    ]
+    """Rungs with their errors and the share of the removable error that is gone; `rises` where one rises."""
+    rungs: list[dict[str, object]] = []
+    below = ladder.rungs[0].errors
+    for rung, share in zip(ladder.rungs, ladder.explained_shares(floor), strict=True):
+        rises = list_rises(below, rung.errors)
+        rungs.append(
+            {
+                "effects": list(rung.effects),
+                **errors_as_json(rung.errors),
+                "explained_share": None if share is None else _round(share),
+                **({"rises": list(rises)} if rises else {}),
+            }
+        )
+        below = rung.errors
+    return rungs
+
+
+def step_as_json(before: Rung, after: Rung) -> dict[str, object]:
+    """Errors over 2 s of all effects together before and after a change, and which of them rise."""
+    return {
+        "effects": [list(before.effects), list(after.effects)],
+        "t_mrmse_m": [_round(before.errors.t_mrmse_m), _round(after.errors.t_mrmse_m)],
+        "r_mrmse_rad": [_round(before.errors.r_mrmse_rad), _round(after.errors.r_mrmse_rad)],
+        "rises": list(list_rises(before.errors, after.errors)),
+    }
 
 
 def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str, object]]:
@@ -107,11 +123,31 @@ def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
         name = "ideal" if number == 0 else f"+ {_added(ladder.rungs[number - 1], rung)}"
         gone = "" if share is None else f"{share:7.0%}"
         lines.append(f"{name:<34}{_columns(rung.errors)}{gone}")
+        lines += _describe_rises(ladder.rungs[max(number - 1, 0)].errors, rung.errors, "taken")
     if floor is not None:
         lines.append(f"{'noise floor (estimated)':<34}{_columns(floor)}")
     if ladder.idle:
-        lines.append(f"left out, no help on unseen data:  {', '.join(ladder.idle)}")
+        lines.append(f"no rung, no help on unseen data:  {', '.join(ladder.idle)}")
     return lines
+
+
+def describe_step(before: Rung, after: Rung) -> list[str]:
+    """What a change did to the errors of all effects together, and which of them rise."""
+    old, new = before.errors, after.errors
+    position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
+    heading = f"{old.r_mrmse_rad:.4f} -> {new.r_mrmse_rad:.4f} rad"
+    done = "taken" if set(after.effects) > set(before.effects) else "done"
+    line = f"{'all effects, before -> after':<34}{position}   {heading}"
+    return [line, *_describe_rises(old, new, done)]
+
+
+def _describe_rises(below: Errors, errors: Errors, done: str) -> list[str]:
+    names = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
+    return [
+        f"  ! {names[key][0]} error rises {getattr(below, key):.4f} -> {getattr(errors, key):.4f} "
+        f"{names[key][1]}: {done} because asked for"
+        for key in list_rises(below, errors)
+    ]
 
 
 def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:
@@ -179,12 +215,32 @@ def describe_effect(effect: type[Effect] | Effect) -> str:
             f"parameter     {parameter.name} [{parameter.unit}]: {parameter.about}; {low:g} to {high:g}, "
             f"neutral {parameter.neutral:g}, usually about {parameter.typical:g}{how}"
         )
+        lines += [f"{'':<14}{text}" for text in _describe_sizes(parameter)]
     lines.append(f"shown by      {', '.join(need.value for need in effect.needs)}")
     if effect.equivalent_to:
         lines.append(f"same as       {', '.join(effect.equivalent_to)} ({effect.equivalent_when})")
+    if effect.contains:
+        lines.append(f"contains      {', '.join(effect.contains)}")
+    if effect.parts:
+        lines.append(f"searched as   {', '.join(part.effect for part in effect.parts)}")
     if effect.confused_with:
         lines.append(f"looks like    {', '.join(effect.confused_with)}")
     return "\n".join(lines)
+
+
+def _describe_sizes(parameter: Parameter) -> list[str]:
+    """What is too small to be named, and what vehicles show."""
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    lines = []
+    if parameter.least is not None:
+        least = parameter.least
+        lines.append(f"too small below {least.size:g}{unit} off neutral: {least.reason}")
+    if parameter.plausible is not None:
+        range_ = parameter.plausible
+        lines.append(f"vehicles show {range_.low:g} to {range_.high:g}{unit}: {range_.source}")
+    if parameter.one_sign:
+        lines.append("named where it is positive: the other sign is no physics")
+    return lines
 
 
 def list_pages(effects: Sequence[type[Effect]]) -> list[str]:

@@ -10,17 +10,22 @@ import enum
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
 
 from pipeline.motion.errors import MotionError
+from pipeline.vehicles.kinematics import list_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from pipeline.motion.evidence import Evidence, Largest, Relative
     from pipeline.motion.signals import Commands, Floats, Rolling, Surroundings, Velocity, Wheels
 
 INF = math.inf
 NAN = math.nan
+
+_USUAL_LIMIT = 0.7
+_USUAL_MOMENT = 0.5
 
 
 class Place(enum.IntEnum):
@@ -58,6 +63,48 @@ class Search(enum.Enum):
     GRID = "grid"
 
 
+class Late(enum.Enum):
+    """What an effect makes late whose only number is a delay: sensors may know that delay beforehand."""
+
+    POSES = "poses are stamped late"
+    HEADING = "the heading is older than its position"
+    BODY = "the body follows its wheels late, which hides a delay of the encoders"
+
+
+@dataclass(frozen=True)
+class Least:
+    """The smallest size of a number that is worth a name.
+
+    Attributes:
+        size: distance from the neutral value, in the parameter's unit.
+        reason: what makes as much of nothing, however small the interval is.
+        sampled: whether sampling the wheels does too: then its delay is the least.
+    """
+
+    size: float
+    reason: str
+    sampled: bool = False
+
+
+STAMPS = "stamps are off by as much"
+MOUNTING = "sensors are mounted no better"
+DATA_SHEET = "a data sheet allows as much"
+
+
+@dataclass(frozen=True)
+class Plausible:
+    """The range that vehicles show, wider than was ever seen: outside, a name stands for something else.
+
+    Attributes:
+        low, high: ends of the range, in the parameter's unit.
+        source: where it comes from.
+    """
+
+    low: float
+    high: float
+    source: str
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One number of an effect.
@@ -71,9 +118,13 @@ class Parameter:
         typical: a usual size.
         search: how it is found.
         starts: values to start or to begin the grid from.
-        relative_to: what the starts are shares of: the largest commanded `speed`, `turn` or `wheel` speed, or
-            the run's `duration`; empty where they are values.
+        relative_to: what the starts are shares of: the largest commanded `speed`, `turn` or `wheel` speed,
+            the run's `duration`, or its way along x (`place`); empty where they are values.
         step: change used for numerical derivatives.
+        least: smallest size worth a name; None where every size is, or where `Effect.is_degenerate` tells.
+        plausible: what vehicles show; None for all within the bounds.
+        one_sign: whether physics has positive values only: the other sign is a clock or chance.
+        instead_of: the parameter that counts no more once this one is given; this one is not searched alone.
     """
 
     name: str
@@ -84,13 +135,33 @@ class Parameter:
     typical: float
     search: Search = Search.DIRECT
     starts: tuple[float, ...] = ()
-    relative_to: Literal["", "speed", "turn", "wheel", "duration"] = ""
+    relative_to: Relative = ""
     step: float = 1e-4
+    least: Least | None = None
+    plausible: Plausible | None = None
+    one_sign: bool = False
+    instead_of: str = ""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A number of an effect that is searched as that of another effect.
+
+    Attributes:
+        name: of the number.
+        effect, parameter: under which it is searched.
+        factor: what that is multiplied with.
+    """
+
+    name: str
+    effect: str
+    parameter: str
+    factor: float
 
 
 DIFFERENTIAL = ("differential",)
 ACKERMANN = ("ackermann",)
-ANY = ("differential", "ackermann")
+ANY = list_kinds()
 
 
 class Effect(ABC):
@@ -103,7 +174,13 @@ class Effect(ABC):
         kinds: kinds of vehicles it exists on.
         needs: what a run must contain to show it.
         confused_with: effects that look alike at first order or under poor driving.
-        equivalent_to: effects that cannot be told from it at all, under `equivalent_when`.
+        equivalent_to: effects that cannot be told from it at all, under `equivalent_when`, which
+            `is_equivalent` looks for in recordings.
+        same_in_one_motion: effects that cannot be told from it by driving straight only, or turning only.
+        contains: effects that are special cases of it: it explains whatever they explain.
+        parts: numbers of other effects under which it is searched; found together, they are named as it.
+        late: what it makes late, where its only number is a delay.
+        price: share of the held-out error that it must take away before it counts.
         values: the numbers themselves.
         fixed: names of parameters that a fit leaves alone.
     """
@@ -117,6 +194,11 @@ class Effect(ABC):
     confused_with: tuple[str, ...] = ()
     equivalent_to: tuple[str, ...] = ()
     equivalent_when: str = ""
+    same_in_one_motion: tuple[str, ...] = ()
+    contains: tuple[str, ...] = ()
+    parts: tuple[Part, ...] = ()
+    late: Late | None = None
+    price: float = 0.0
 
     def __init__(self, *, fixed: Iterable[str] = (), **values: float) -> None:
         self.values: Mapping[str, float] = self._complete(values)
@@ -141,6 +223,91 @@ class Effect(ABC):
     def is_neutral(self) -> bool:
         """Whether every parameter that can be neutral is."""
         return all(math.isnan(p.neutral) or self.values[p.name] == p.neutral for p in self.parameters)
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether it is something that the whole vehicle does late: several such effects imitate one."""
+        return Excitation.CHANGES in self.needs and Excitation.STEERING not in self.needs
+
+    @property
+    def delay(self) -> float:
+        """The number of an effect that makes something late, its only one [s]."""
+        (value,) = self.values.values()
+        return value
+
+    @classmethod
+    def of_delay(cls, seconds: float) -> Self:
+        """The effect, of one that makes something late, with a delay brought inside its bounds [s]."""
+        (parameter,) = cls.parameters
+        low, high = parameter.bounds
+        return cls().change(**{parameter.name: min(max(seconds, low), high)})
+
+    @property
+    def searched_as(self) -> frozenset[str]:
+        """Ids under which it is searched."""
+        return frozenset(part.effect for part in self.parts) or frozenset({self.id})
+
+    @classmethod
+    def join(cls, found: Mapping[str, Effect]) -> Self:
+        """The effect made of its parts, by id."""
+        return cls().change(
+            **{part.name: part.factor * found[part.effect].values[part.parameter] for part in cls.parts}
+        )
+
+    def can_show(self, evidence: Evidence) -> bool:
+        """Whether sensors and driving let it be told at all."""
+        del evidence
+        return True
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """Whether it is, with these numbers, nothing in these runs or another effect in disguise."""
+        del evidence
+        return False
+
+    def is_equivalent(self, evidence: Evidence) -> bool:
+        """Whether nothing in these runs tells it from those that it is equivalent to."""
+        del evidence
+        return True
+
+    def collapse(self) -> Effect | None:
+        """The simpler effect that it has become when it is degenerate; None where there is none."""
+        return None
+
+    def list_softer(self, largest: Largest) -> tuple[Effect, ...]:
+        """Effects that bend where this one breaks, to be tried as such though they have more numbers."""
+        del largest
+        return ()
+
+    def scale_without(self, other: Effect) -> float:
+        """What its numbers are to be multiplied with where another effect is left out of the same motion."""
+        del other
+        return 1.0
+
+    def is_used(self, parameter: Parameter) -> bool:
+        """Whether a parameter takes part: of two that stand for each other only the one that is given."""
+        if parameter.instead_of:
+            return math.isfinite(self.values[parameter.name])
+        return not any(
+            p.instead_of == parameter.name and math.isfinite(self.values[p.name]) for p in self.parameters
+        )
+
+    def make_usual(self, largest: Largest) -> Self:
+        """The same effect at a usual size, brought inside its bounds."""
+        values = self._list_usual(largest)
+        bounds = {p.name: p.bounds for p in self.parameters}
+        return self.change(
+            **{name: min(max(value, bounds[name][0]), bounds[name][1]) for name, value in values.items()}
+        )
+
+    def _list_usual(self, largest: Largest) -> dict[str, float]:
+        """Usual values: a limit below what was asked for, a moment in the middle of the run."""
+        shares = {"": None, "duration": _USUAL_MOMENT}
+        usual = {}
+        for p in self.parameters:
+            share = shares.get(p.relative_to, _USUAL_LIMIT)
+            if not p.instead_of:
+                usual[p.name] = p.typical if share is None else largest.take(share, p.relative_to)
+        return usual
 
     def parameter(self, name: str) -> Parameter:
         """The declared parameter.
@@ -191,6 +358,13 @@ class Effect(ABC):
             parameter = self.parameter(name)
             low, high = parameter.bounds
             neutral = value == parameter.neutral or (math.isnan(value) and math.isnan(parameter.neutral))
+            if not neutral and not math.isfinite(value):
+                raise MotionError(
+                    "out_of_bounds",
+                    f"{name} = {value:g} is no finite number",
+                    where=f"{self.id}.{name}",
+                    hint="Give a value inside the bounds.",
+                )
             if not neutral and not low <= value <= high:
                 unit = "" if parameter.unit == "1" else f" {parameter.unit}"
                 raise MotionError(
@@ -301,3 +475,11 @@ class ReportEffect(Effect):
     def report_gyro(self, velocity: Velocity, around: Surroundings) -> Velocity:
         """As `report`, where the heading is a gyro's and not the poses' own."""
         return self.report(velocity, around)
+
+
+Declared = TypeVar("Declared", Effect, type[Effect])
+
+
+def find_late(effects: Iterable[Declared], late: Late) -> Declared | None:
+    """The effect that makes this late, None without."""
+    return next((effect for effect in effects if effect.late is late), None)

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.motion.catalogue import find_late_effect
 from pipeline.motion.comparison import Comparison, Input
-from pipeline.motion.effects.body_inertia import BodyInertia
+from pipeline.motion.effect import Late
 from pipeline.motion.errors import MotionError
 from pipeline.motion.forward import Timing
 
@@ -57,7 +58,7 @@ def measure_wheel_delay(run: MotionRun, vehicle: Vehicle) -> float:
 
 def _search(comparison: Comparison, tau: float, delays: Floats) -> tuple[float, float]:
     """The best delay [s] for a lag of the body, and what it leaves of the turning."""
-    effects = (BodyInertia(tau=tau),) if tau > 0.0 else ()
+    effects = (find_late_effect(Late.BODY).of_delay(tau),) if tau > 0.0 else ()
     timing = comparison.usual_delay
 
     def judge(late: float) -> float:

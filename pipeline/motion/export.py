@@ -98,6 +98,7 @@ def export_json(file: ModelFile) -> str:
         },
         "effects": effects,
         "fit": _plain(file.fit),
+        **({"warnings": list(file.warnings)} if file.warnings else {}),
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 

@@ -157,8 +157,9 @@ class Forward:
         for effect in effects:
             if effect.place is Place.CENTRE:
                 velocity = cast("AddedEffect", effect).add_to(velocity, rolling, velocity, self.around)
-        arm = self.around.vehicle.base_to_rear_axle_m
-        if self.around.vehicle.kind == "ackermann" and arm != 0.0:
+        vehicle = self.around.vehicle
+        arm = vehicle.kinematics.lever_m(vehicle)
+        if arm != 0.0:
             velocity = velocity.add(y=arm * velocity.w)
         for effect in effects:
             if effect.place is Place.LOCALIZATION:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.motion.effect import Late, find_late
 from pipeline.motion.problem import Free, needs_search
 from pipeline.motion.robust import weigh_system
 
@@ -114,8 +115,6 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
         half = wide * float(errors[index])
         if needs_search(number):
             half = _widen(problem, fitted, number)
-        low, high = number.bounds
-        margin = 1e-6 * (abs(low) + abs(high)) if np.isfinite(low + high) else 0.0
         items.append(
             Estimate(
                 number,
@@ -123,11 +122,18 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
                 value - half,
                 value + half,
                 float(errors[index]),
-                at_bound=not low + margin < value < high - margin,
+                at_bound=stands_at_bound(value, number.bounds),
                 observable=bool(observable[index]),
             )
         )
     return Estimates(tuple(items), correlation, pieces)
+
+
+def stands_at_bound(value: float, bounds: tuple[float, float]) -> bool:
+    """Whether a number stopped because it may go no further."""
+    low, high = bounds
+    margin = 1e-6 * (abs(low) + abs(high)) if np.isfinite(low + high) else 0.0
+    return not low + margin < value < high - margin
 
 
 def _carry_delays(problem: Problem, fitted: Fitted, total: Floats, rows: Integers, size: Floats) -> Floats:
@@ -138,7 +144,7 @@ def _carry_delays(problem: Problem, fitted: Fitted, total: Floats, rows: Integer
     scaled = total[np.ix_(rows, rows)] / np.outer(size[rows], size[rows]) + 1e-9 * np.eye(rows.size)
     for run, comparison in enumerate(problem.comparisons):
         gyro = comparison.heading.gyro
-        if gyro is None or "clock_offset" in fitted.model:
+        if gyro is None or find_late(fitted.model, Late.POSES) is not None:
             continue
         delay = Free("", "pose_delay_s", run, (-1.0, 1.0), _DELAY_STEP)
         column = problem.differentiate(fitted.state, [delay], fitted.residuals)

@@ -82,7 +82,7 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
             held_out = hold_out(problem, candidate)
             if compare_losses(held_out, rungs[-1].held_out) >= 1.0:
                 return Ladder(tuple(rungs), tuple(rest))
-            if not _rises(held_out, rungs[-1].held_out):
+            if "t_mrmse_m" not in list_rises(rungs[-1].errors, held_out.pooled):
                 break
             del waiting[name]
         else:
@@ -120,9 +120,10 @@ def _take_best(
     return best[1], best[2]
 
 
-def _rises(new: HeldOut, old: HeldOut) -> bool:
-    """Whether the position error over 2 s is larger than before; where nothing was predicted it is not."""
-    return new.pooled.t_mrmse_m > old.pooled.t_mrmse_m * (1.0 + _NOTHING)
+def list_rises(below: Errors, errors: Errors) -> tuple[str, ...]:
+    """Errors over 2 s that are larger than one step below: `t_mrmse_m`, `r_mrmse_rad`; never unknown ones."""
+    names = ("t_mrmse_m", "r_mrmse_rad")
+    return tuple(name for name in names if getattr(errors, name) > getattr(below, name) * (1.0 + _NOTHING))
 
 
 def compare_losses(new: HeldOut, old: HeldOut) -> float:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
+import shlex
+import unicodedata
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.motion.catalogue import find_effect, load_effects
+from pipeline.core.toml import TomlError, parse_toml, require_finite
+from pipeline.motion.catalogue import find_effect, run_effects
 from pipeline.motion.errors import MotionError
 from pipeline.motion.formula.formula_effect import CHANNELS, FormulaEffect, make_parameter
 from pipeline.motion.model import Model
+from pipeline.motion.trust import hash_code, list_trusted, read_code
 from pipeline.vehicles import ConfigurationError, resolve_vehicle
 from pipeline.vehicles.configuration import VehicleSection
 
@@ -28,7 +31,7 @@ if TYPE_CHECKING:
 FORMAT = 1
 _SECTIONS = ("format", "effects", "vehicle", "effect", "fit", "note")
 _NUMBER_KEYS = {"value", "low", "high", "unit", "bounds", "neutral", "fixed", "per_run"}
-_LINE = re.compile(r"\(at line (\d+)")
+_ID = re.compile(r"[^\W\d][\w-]{0,63}")
 
 Table = dict[str, object]
 
@@ -44,6 +47,10 @@ class ModelFile:
         intervals: 95 % intervals of the last fit by label.
         fit: what the last fit was: input, runs with hashes, delays, ladder; empty before one.
         note: free text.
+        own: effects of the user's own Python, by id.
+        code: hashes of the Python that was run for them.
+        left_out: ids of effects that only Python which is not trusted can define.
+        warnings: what is left out and why, a line each.
     """
 
     model: Model
@@ -52,16 +59,32 @@ class ModelFile:
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     fit: Mapping[str, object] = field(default_factory=dict)
     note: str = ""
+    own: Mapping[str, EffectClass] = field(default_factory=dict, compare=False)
+    code: tuple[str, ...] = field(default=(), compare=False)
+    left_out: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def read_model(path: Path) -> ModelFile:
     """Read a model file.
 
+    Python that it names is run only where its content has been trusted (`trust`); effects that only such code
+    defines are left out, and the file says so in its warnings.
+
     Raises:
         MotionError: the file is missing, not TOML, or says something that cannot be; with its line.
     """
+    return parse_model(read_text(path), path)
+
+
+def read_text(path: Path) -> str:
+    """Text of a model file.
+
+    Raises:
+        MotionError: the file is missing or cannot be read.
+    """
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise MotionError(
             "model_not_found",
@@ -73,7 +96,6 @@ def read_model(path: Path) -> ModelFile:
         raise MotionError(
             "model_unreadable", f"cannot be read: {error}", where=str(path), hint="Check the file."
         ) from None
-    return parse_model(text, path)
 
 
 def parse_model(text: str, path: Path) -> ModelFile:
@@ -86,6 +108,20 @@ def parse_model(text: str, path: Path) -> ModelFile:
     return _Reader(text, path).read()
 
 
+def list_code(path: Path) -> dict[str, str]:
+    """Python of the user's own that is meant by a file, names by hash; none of it is run.
+
+    Args:
+        path: a model file, or a Python file itself.
+
+    Raises:
+        MotionError: a file is missing or cannot be read.
+    """
+    if path.suffix == ".py":
+        return {hash_code(read_code(path.parent, path.name)): path.name}
+    return {hash_code(read_code(path.parent, name)): name for name in _Reader(read_text(path), path).files}
+
+
 class _Reader:
     """One file: its text for line numbers, its tables, and what was found so far."""
 
@@ -93,16 +129,16 @@ class _Reader:
         self.lines = text.splitlines()
         self.path = path
         try:
-            self.tree: Table = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
-            found = _LINE.search(str(error))
-            line = int(found.group(1)) if found else len(self.lines)
+            self.tree: Table = parse_toml(text)
+        except TomlError as error:
+            place = path if error.line is None else f"{path}:{error.line}"
             raise MotionError(
-                "model_not_toml",
-                f"not a valid TOML file: {error}",
-                where=f"{path}:{line}",
-                hint="Mend that line.",
+                "model_not_toml", error.what, where=str(place), hint="Mend that line."
             ) from None
+        self.own: dict[str, EffectClass] = {}
+        self.code: list[str] = []
+        self.untrusted: list[str] = []
+        self.left_out: list[str] = []
         self.per_run: list[str] = []
         self.intervals: dict[str, tuple[float, float]] = {}
 
@@ -121,13 +157,7 @@ class _Reader:
                 None,
                 "format",
             )
-        files = self._texts("effects")
-        own: dict[str, EffectClass] = {}
-        for name in files:
-            try:
-                own |= load_effects(self.path.parent / name)
-            except MotionError as error:
-                raise self._error(error.code, error.what, error.hint, None, "effects") from error
+        self._load_own()
         vehicle = self._vehicle()
         tables = self.tree.get("effect", [])
         if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
@@ -136,17 +166,45 @@ class _Reader:
             )
         effects: list[Effect] = []
         for number, table in enumerate(tables):
-            effects.append(self._effect(number, table, own))
-            self._check_composition(number, vehicle, effects)
+            effect = self._effect(number, table)
+            if effect is not None:
+                effects.append(effect)
+                self._check_composition(number, vehicle, effects)
         fit = self.tree.get("fit", {})
         return ModelFile(
             model=Model(vehicle, tuple(effects)),
-            effect_files=files,
+            effect_files=self.files,
             per_run=tuple(self.per_run),
             intervals=self.intervals,
             fit=fit if isinstance(fit, dict) else {},
             note=str(self.tree.get("note", "")),
+            own=self.own,
+            code=tuple(self.code),
+            left_out=tuple(self.left_out),
+            warnings=self._warn(),
         )
+
+    def _load_own(self) -> None:
+        trusted = list_trusted() if self.files else {}
+        for name in self.files:
+            try:
+                content = read_code(self.path.parent, name)
+                if hash_code(content) in trusted:
+                    self.own |= run_effects(content, self.path.parent / name)
+                    self.code.append(hash_code(content))
+                else:
+                    self.untrusted.append(name)
+            except MotionError as error:
+                where = f"{name!r}: {error.what}"
+                raise self._error(error.code, where, error.hint, None, "effects") from error
+
+    def _warn(self) -> tuple[str, ...]:
+        if not self.untrusted:
+            return ()
+        files = ", ".join(map(repr, self.untrusted))
+        missing = f"; left out: {', '.join(self.left_out)}" if self.left_out else ""
+        how = f"Read it, then trust it: slip model trust {shlex.quote(str(self.path))}"
+        return (f"{self.path}: Python that is not trusted is not run: {files}{missing}. {how}",)
 
     def _vehicle(self) -> Vehicle:
         table = self.tree.get("vehicle")
@@ -159,26 +217,32 @@ class _Reader:
                 "vehicle",
             )
         try:
+            require_finite({"vehicle": table})
             section = msgspec.convert(table, VehicleSection)
             return resolve_vehicle(section, recorded=None, where=str(self.path))
-        except msgspec.ValidationError as error:
+        except (msgspec.ValidationError, TomlError) as error:
             raise self._error(
                 "vehicle_invalid",
                 f"the vehicle is not valid: {error}",
                 "See README.md, Configuration, for the keys.",
                 ("vehicle", 0),
-                "",
+                error.key.rpartition(".")[2] if isinstance(error, TomlError) else "",
             ) from None
         except ConfigurationError as error:
             raise self._error(error.code, error.what, error.hint, ("vehicle", 0), "preset") from None
 
-    def _effect(self, number: int, table: Table, own: Mapping[str, EffectClass]) -> Effect:
+    def _effect(self, number: int, table: Table) -> Effect | None:
         at = ("effect", number)
         name = table.get("id")
         if not isinstance(name, str) or not name:
             raise self._error(
-                "model_invalid", "an effect needs an id", 'Write id = "effective_track".', at, ""
+                "model_invalid",
+                "an effect needs an id",
+                "Write id = and one of those that `slip effects` lists.",
+                at,
+                "",
             )
+        self._check_names(at, name, table)
         formulas = {key: table[key] for key in CHANNELS if isinstance(table.get(key), str)}
         numbers = {key: value for key, value in table.items() if key not in {"id", "note", *formulas}}
         values, fixed = {}, []
@@ -192,12 +256,34 @@ class _Reader:
             texts = {channel: str(text) for channel, text in formulas.items()}
             return self._formula(at, name, texts, numbers, values, fixed)
         try:
-            effect = find_effect(name, own)
+            effect = find_effect(name, self.own)
         except MotionError as error:
+            if self.untrusted:
+                self.left_out.append(name)
+                return None
             raise self._error(error.code, error.what, error.hint, at, "id") from error
         for key, said in numbers.items():
             self._check_parameter(at, effect(), key, said, values.get(key))
         return self._make(effect, fixed, values)
+
+    def _check_names(self, at: tuple[str, int], name: str, table: Table) -> None:
+        if not _ID.fullmatch(name):
+            raise self._error(
+                "model_invalid",
+                f"{name[:80]!r} cannot be the id of an effect",
+                "Use letters, digits, _ and -, a letter first, at most 64.",
+                at,
+                "id",
+            )
+        for key in table:
+            if not (key.isidentifier() and unicodedata.is_normalized("NFKC", key)):
+                raise self._error(
+                    "model_invalid",
+                    f"{name}: {key[:80]!r} cannot be the name of a parameter",
+                    "Use letters, digits and _, a letter first.",
+                    at,
+                    key,
+                )
 
     def _make(self, effect: EffectClass, fixed: list[str], values: dict[str, float]) -> Effect:
         return effect().change(**values).fix(*fixed)
@@ -244,6 +330,14 @@ class _Reader:
                     key,
                 )
             neutral = table.get("neutral", 0.0)
+            if not _is_number(neutral) or not math.isfinite(neutral):
+                raise self._error(
+                    "model_invalid",
+                    f"neutral of {key} is no finite number",
+                    "Write neutral = 1.0.",
+                    at,
+                    key,
+                )
             unit = str(table.get("unit", "1"))
             low, high = (float(bound) for bound in bounds)
             parameters.append(make_parameter(key, unit, (low, high), neutral=float(neutral)))
@@ -297,11 +391,17 @@ class _Reader:
         except MotionError as error:
             raise self._error(error.code, error.what, error.hint, ("effect", number), "id") from error
 
-    def _texts(self, key: str) -> tuple[str, ...]:
-        value = self.tree.get(key, [])
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Files of Python that the model names."""
+        value = self.tree.get("effects", [])
         if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
             raise self._error(
-                "model_invalid", f"{key} is a list of file names", f'Write {key} = ["a.py"].', None, key
+                "model_invalid",
+                "effects is a list of file names",
+                'Write effects = ["a.py"].',
+                None,
+                "effects",
             )
         return tuple(value)
 
@@ -330,7 +430,7 @@ def find_line(lines: list[str], at: tuple[str, int] | None, key: str) -> int:
                 seen += 1
             inside = name == at[0] and seen == at[1]
             header = number if inside else header
-        elif inside and re.match(rf"{re.escape(key)}\s*=", text) and key:
+        elif inside and re.match(rf"\"?{re.escape(key)}\"?\s*=", text) and key:
             return number
     return header
 

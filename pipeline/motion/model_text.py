@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
-import tempfile
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -14,9 +11,12 @@ import msgspec
 from pipeline.motion.errors import MotionError
 from pipeline.motion.formula.formula_effect import FormulaEffect
 from pipeline.motion.model_file import FORMAT
+from pipeline.store.files import replace_file
 from pipeline.vehicles import find_preset
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pipeline.motion.effect import Effect, Parameter
     from pipeline.motion.model_file import ModelFile
     from pipeline.vehicles import Vehicle
@@ -39,14 +39,11 @@ def write_model(file: ModelFile, path: Path) -> None:
     """Write a model file in one moment: a reader sees the old one or the new one.
 
     Raises:
-        MotionError: ``model_unwritable``.
+        MotionError: ``model_unwritable``; ``model_incomplete``, see `format_model`.
     """
+    text = format_model(file)
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(format_model(file))
-        Path(name).chmod(0o644)
-        Path(name).replace(path)
+        replace_file(path, text.encode())
     except OSError as error:
         raise MotionError(
             "model_unwritable",
@@ -57,7 +54,18 @@ def write_model(file: ModelFile, path: Path) -> None:
 
 
 def format_model(file: ModelFile) -> str:
-    """The text of a model file."""
+    """The text of a model file.
+
+    Raises:
+        MotionError: ``model_incomplete``, effects were left out when it was read and would be lost.
+    """
+    if file.left_out:
+        raise MotionError(
+            "model_incomplete",
+            f"{', '.join(file.left_out)} would be lost: {', '.join(file.effect_files)} is not trusted",
+            where=", ".join(file.left_out),
+            hint="Read it and trust it (slip model trust), or take its effects out of the file by hand.",
+        )
     lines = [
         "# A motion model: a vehicle, and the physical effects by which it differs from the ideal one.",
         "# `slip effects ID` explains an effect; `slip model show` this file.",

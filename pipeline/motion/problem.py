@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.motion.comparison import Comparison, Input
-from pipeline.motion.effect import Place, Search
+from pipeline.motion.effect import Late, Place, Search, find_late
 from pipeline.motion.encoders import measure_wheel_delay
 from pipeline.motion.errors import MotionError
 from pipeline.motion.forward import Timing
@@ -131,7 +131,7 @@ class Problem:
         rate_hz: float | None = None,
     ) -> None:
         more = {} if rate_hz is None else {"rate_hz": rate_hz}
-        self.vehicle = vehicle
+        self.vehicle = runs[0].correct_vehicle(vehicle)
         self.source = source
         self.comparisons = tuple(Comparison(run, vehicle, source, heading=heading, **more) for run in runs)
         self.given_timing = None if timing is None else tuple(timing)
@@ -173,7 +173,7 @@ class Problem:
         """A model before fitting: delays as given, or as the gyro shows them."""
         if self.given_timing is not None:
             return State(model, {}, self.given_timing)
-        known = "clock_offset" not in model
+        known = find_late(model, Late.POSES) is None
         timing = tuple(
             Timing(
                 pose_delay_s=c.heading.gyro.yaw_delay_s if c.heading.gyro is not None and known else 0.0,
@@ -199,7 +199,7 @@ class Problem:
         found: list[Free] = []
         for effect in self.active_effects(model):
             for parameter in effect.parameters:
-                if parameter.name in effect.fixed or not _is_used(effect, parameter):
+                if parameter.name in effect.fixed or not effect.is_used(parameter):
                     continue
                 alone = f"{effect.id}.{parameter.name}" in per_run or effect.id in per_run
                 places: Sequence[int | None] = range(len(self.comparisons)) if alone else [None]
@@ -213,14 +213,14 @@ class Problem:
         """Delays that this input and heading can tell from physics.
 
         With a gyro the delay of the poses is known from their heading and is no free number: a position that
-        is later than its own heading is `heading_skew`, a body that is later than its wheels `body_inertia`.
+        is later than its own heading, or a body that is later than its wheels, are effects (see `Late`).
         """
         if self.given_timing is not None:
             return []
         found = []
         for run, comparison in enumerate(self.comparisons):
             measured = self.source is Input.MEASURED
-            if measured and not comparison.has_gyro and "clock_offset" not in model:
+            if measured and not comparison.has_gyro and find_late(model, Late.POSES) is None:
                 found.append(Free("", "pose_delay_s", run, _DELAY_BOUNDS, _DELAY_STEP))
             if comparison.has_gyro and measured:
                 found.append(Free("", "wheel_delay_s", run, _DELAY_BOUNDS, _DELAY_STEP))
@@ -248,17 +248,6 @@ class Problem:
                 rows = self.run_of == number.run
                 columns[rows, :, index] = (self.find_run_residuals(moved, number.run) - base[rows]) / step
         return columns
-
-
-def _is_used(effect: Effect, parameter: Parameter) -> bool:
-    """Whether a parameter takes part: a place of change that was not given does not."""
-    if effect.id == "terrain_change":
-        at_place = np.isfinite(effect.values["at_x"])
-        if parameter.name == "at_x":
-            return bool(at_place)
-        if parameter.name == "at_s":
-            return not at_place
-    return True
 
 
 def needs_search(free: Free) -> bool:

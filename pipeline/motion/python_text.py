@@ -209,8 +209,9 @@ def write_function(model: Model) -> str:
             where=missing[0],
             hint="Write it as a formula in the model file, or export without it (slip model drop).",
         )
-    if vehicle.kind == "ackermann" and vehicle.base_to_rear_axle_m:
-        parts.append(f"\n        v_y = v_y + {vehicle.base_to_rear_axle_m!r} * v_w")
+    lever_m = vehicle.kinematics.lever_m(vehicle)
+    if lever_m:
+        parts.append(f"\n        v_y = v_y + {lever_m!r} * v_w")
     return "".join([*parts, _TAIL])
 
 

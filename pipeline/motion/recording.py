@@ -347,7 +347,7 @@ def _read_drive(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | N
     def read(name: str) -> Floats:
         return table[f"{name}_aligned" if aligned else name].to_numpy()
 
-    if vehicle.kind == "ackermann":
+    if vehicle.kinematics.has_inputs("speed", "steering"):
         axle = read("speed") / vehicle.wheel_radius_m
         left, right, steering = axle, axle, table["steering"].to_numpy()
     else:

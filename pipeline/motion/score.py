@@ -224,8 +224,9 @@ def measure_by_terrain(problem: Problem, held_out: HeldOut) -> dict[str, Errors]
 def measure_errors(residuals: Floats, position: Floats, yaw: Floats) -> Errors:
     """Errors of residuals (n, 3) and of prediction errors (m,); NaN where nothing was predicted."""
     position, yaw = position[np.isfinite(position)], yaw[np.isfinite(yaw)]
-    rms = np.sqrt(np.mean(residuals**2, axis=0))
-    spread = 1.4826 * np.median(np.abs(residuals), axis=0)
+    known = residuals if len(residuals) else np.full((1, 3), np.nan)
+    rms = np.sqrt(np.mean(known**2, axis=0))
+    spread = 1.4826 * np.median(np.abs(known), axis=0)
     none = np.full(1, np.nan)
     position, yaw = (position, yaw) if position.size else (none, none)
     return Errors(

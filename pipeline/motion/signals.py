@@ -8,7 +8,7 @@ are grouped in spans; between spans the recording had a hole.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,22 @@ class Wheels:
     left: Floats
     right: Floats
     steering: Floats
+
+
+class Drive(Protocol):
+    """Commands, measured wheels, or the drivetrain's output."""
+
+    @property
+    def left(self) -> Floats:
+        """Speed of the left wheels [rad/s]; on a car the rear axle's."""
+
+    @property
+    def right(self) -> Floats:
+        """Speed of the right wheels [rad/s]; on a car the rear axle's."""
+
+    @property
+    def steering(self) -> Floats:
+        """Steering angle [rad]."""
 
 
 @dataclass(frozen=True)
@@ -155,14 +171,16 @@ def find_turning(wheels: Wheels, around: Surroundings) -> Floats:
     return (rim > _LEAST_RIM_SPEED).astype(np.float64)
 
 
+def name_inputs(drive: Drive, vehicle: Vehicle) -> dict[str, Floats]:
+    """The signals of a drive by the names under which kinematics ask for them."""
+    speed = 0.5 * vehicle.wheel_radius_m * (drive.left + drive.right)
+    return {"left": drive.left, "right": drive.right, "speed": speed, "steering": drive.steering}
+
+
 def roll_ideally(wheels: Wheels, around: Surroundings) -> Rolling:
-    """Ideal velocity of the drivetrain's output (see `ideal`), without sideways motion."""
+    """Ideal velocity of the drivetrain's output, without sideways motion."""
     vehicle = around.vehicle
-    forward = 0.5 * vehicle.wheel_radius_m * (wheels.left + wheels.right)
-    if vehicle.kind == "ackermann":
-        turning = forward * np.tan(wheels.steering) / (vehicle.wheelbase_m or 1.0)
-    else:
-        turning = vehicle.wheel_radius_m * (wheels.right - wheels.left) / around.track_m
+    forward, _, turning = vehicle.kinematics.forward(name_inputs(wheels, vehicle), vehicle)
     return Rolling(forward, turning, wheels)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline.motion.comparison import Input
 from pipeline.motion.effect import Search
 from pipeline.motion.robust import estimate_scales, measure_loss, solve_step, weigh_system
+from pipeline.motion.signals import name_inputs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -119,17 +120,9 @@ def _largest(problem: Problem, number: Free) -> float:
         series = comparison.run.commands if problem.source is Input.COMMAND else comparison.run.wheels
         if series is None:
             continue
-        left, right = series.left, series.right
-        if kind == "wheel":
-            values = np.maximum(np.abs(left), np.abs(right))
-        elif kind == "speed":
-            values = np.abs(left + right) * 0.5 * vehicle.wheel_radius_m
-        elif vehicle.kind == "ackermann":
-            along = (left + right) * 0.5 * vehicle.wheel_radius_m
-            values = np.abs(along * np.tan(series.steering)) / (vehicle.wheelbase_m or 1.0)
-        else:
-            track = (vehicle.track_width_m or 1.0) * vehicle.controller_track_multiplier
-            values = np.abs(right - left) * vehicle.wheel_radius_m / track
+        speed, _, turn = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
+        rim = np.maximum(np.abs(series.left), np.abs(series.right))
+        values = {"wheel": rim, "speed": np.abs(speed), "turn": np.abs(turn)}[kind]
         largest = max(largest, float(np.quantile(values, 0.995)))
     return max(largest, 1e-3)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from pipeline.motion.comparison import Input
 from pipeline.motion.describe import errors_as_json
 from pipeline.motion.fit import Fitted, fit_model
 from pipeline.motion.floor import estimate_floor, hold_below
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from pipeline.motion.model import Model
     from pipeline.motion.model_file import ModelFile
     from pipeline.motion.problem import Problem
-    from pipeline.motion.recording import MotionRun
     from pipeline.motion.score import Errors
 
 
@@ -45,13 +43,6 @@ class Judgement:
     def fitted(self) -> Fitted:
         """The fit of all effects."""
         return self.whole.fitted
-
-
-def choose_input(runs: Sequence[MotionRun], asked: str | None) -> Input:
-    """The input asked for; by default measured wheels where every run has them, else the command."""
-    if asked is not None:
-        return Input(asked)
-    return Input.MEASURED if all(run.wheels is not None for run in runs) else Input.COMMAND
 
 
 def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Judgement:

@@ -1,7 +1,8 @@
 """Figures and one offline page for a run.
 
 A figure is one file in `pipeline.report.figures`, a function from tables to an Altair chart; a section of
-the page is a function from the report to HTML. Numbers come from the tables and the summary.
+the page is a function from the report to values and a template that shows them. Numbers come from the tables
+and the summary.
 """
 
 from pipeline.report.bundle import warm_bundle

@@ -10,11 +10,12 @@ import contextlib
 import hashlib
 import os
 import subprocess
-import sys
 import tempfile
 import threading
 from importlib.metadata import version
 from pathlib import Path
+
+from pipeline.core.interpreter import python_command
 
 _DIGEST_LENGTH = 64
 _EXPOSE = "window.vegaEmbed = vegaEmbed;"
@@ -50,8 +51,8 @@ def warm_bundle() -> None:
 
 def _bundle_apart() -> None:
     with contextlib.suppress(OSError):
-        subprocess.run(
-            [sys.executable, "-c", "from pipeline.report.bundle import load_bundle; load_bundle()"],
+        subprocess.run(  # noqa: S603 - our own words
+            python_command("-c", "from pipeline.report.bundle import load_bundle; load_bundle()"),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

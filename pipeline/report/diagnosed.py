@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.motion import Input, Model, MotionError, Problem, find_effect, fit_model, load_run
+from pipeline.motion import Model, MotionError, Problem, choose_input, find_effect, fit_model, load_run
 from pipeline.report.motion_view import MotionStage, MotionView
 from pipeline.report.run import mapping_in, number_in, objects_in
 
@@ -36,10 +36,12 @@ def view_diagnosis(
     model = name_model(diagnosis, vehicle)
     if model is None or "poses" not in tables:
         return None
-    source = Input.MEASURED if diagnosis.get("input") == Input.MEASURED.value else Input.COMMAND
+    asked = diagnosis.get("input")
     try:
         run = load_run(tables, vehicle, name=str(diagnosis.get("run", "")))
-        problem = Problem([run], vehicle, source)
+        problem = Problem(
+            [run], vehicle, choose_input([run], asked if isinstance(asked, str) else None).source
+        )
         state = fit_model(problem, model).state
     except MotionError:
         # A log that is too poor for a model has its slip all the same.

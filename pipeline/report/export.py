@@ -1,20 +1,24 @@
-"""The figures of the page as files, for papers."""
+"""Figures as files, for papers."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 from pipeline.report.errors import ReportError
-from pipeline.report.figures import list_figures
+from pipeline.report.page import draw_pictures
 from pipeline.report.scene import Scene
 from pipeline.report.specs import fill_spec
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from pipeline.report.elements import Picture
     from pipeline.report.run import RunReport
 
-FORMATS = ("svg", "pdf", "png")
+Format = Literal["svg", "pdf", "png"]
+FORMATS: tuple[Format, ...] = get_args(Format)
 
 _PNG_SCALE = 2.0
 _ID = re.compile(r"(?<=url\(#)\w+(?=\))|(?<= id=\")\w+(?=\")")
@@ -23,17 +27,27 @@ _ID = re.compile(r"(?<=url\(#)\w+(?=\))|(?<= id=\")\w+(?=\")")
 def write_figures(
     report: RunReport,
     folder: Path,
-    format: Literal["svg", "pdf", "png"],  # noqa: A002 - the word people use for it
+    format: Format,  # noqa: A002 - the word people use for it
 ) -> list[Path]:
-    """Write every figure that the run has rows for.
+    """Write every figure that the run has rows for, in the order of the page, as `write_pictures` does."""
+    drawn = draw_pictures(Scene(report))
+    return write_pictures([picture for pictures in drawn.values() for picture in pictures], folder, format)
+
+
+def write_pictures(
+    pictures: Iterable[Picture],
+    folder: Path,
+    format: Format,  # noqa: A002 - the word people use for it
+) -> list[Path]:
+    """Write figures as `<figure id>.<format>`.
 
     Args:
-        report: the run.
-        folder: where to write `<figure id>.<format>`; made when it is not there.
+        pictures: the figures.
+        folder: where to write; made when it is not there.
         format: `svg`, `pdf`, or `png` (twice the size of the page's figure).
 
     Returns:
-        The files, in the order of the page.
+        The files, in the order of the figures.
 
     Raises:
         ReportError: the format is none of these, or the folder cannot be written.
@@ -46,30 +60,25 @@ def write_figures(
         )
     import vl_convert  # noqa: PLC0415 - starts a JavaScript engine
 
-    scene = Scene(report)
     written = []
-    for figure in list_figures():
-        drawing = figure.draw(scene)
-        if drawing is None:
-            continue
-        spec = fill_spec(drawing)
-        content: str | bytes
+    for picture in pictures:
+        spec = fill_spec(picture.drawing)
         if format == "svg":
-            content = _number_ids(vl_convert.vegalite_to_svg(spec), figure.id)
+            content: bytes = _number_ids(vl_convert.vegalite_to_svg(spec), picture.id).encode()
         elif format == "pdf":
             content = vl_convert.vegalite_to_pdf(spec)
         else:
             content = vl_convert.vegalite_to_png(spec, scale=_PNG_SCALE)
-        path = Path(folder) / f"{figure.id}.{format}"
+        path = Path(folder) / f"{picture.id}.{format}"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content.encode() if isinstance(content, str) else content)
+            path.write_bytes(content)
         except OSError as error:
             raise ReportError(
                 "figure_not_written",
                 f"a figure cannot be written: {error.strerror}",
                 where=str(path),
-                hint="Choose a folder that can be written with --out",
+                hint="Choose a folder that can be written",
             ) from error
         written.append(path)
     return written

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-    from pipeline.motion import Input, MotionRun
+    from pipeline.motion import MotionRun
     from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
 
@@ -90,12 +90,3 @@ def load_vehicle(manifest: Manifest) -> Vehicle:
             where=manifest.run,
             hint="Analyze the log again with --force.",
         ) from error
-
-
-def choose_source(run: MotionRun, asked: str | None) -> Input:
-    """The input asked for; by default the command where there is one, else the measured wheels."""
-    from pipeline.motion import Input  # noqa: PLC0415 - heavy
-
-    if asked is not None:
-        return Input(asked)
-    return Input.COMMAND if run.commands is not None else Input.MEASURED

@@ -56,6 +56,28 @@ class RunReport:
             found |= set(slip["input"].cast(str).unique())
         return [name for name in INPUTS if name in found]
 
+    @property
+    def ladder(self) -> list[dict[str, float | None]]:
+        """Errors over 2 s, ``t`` [m] and ``r`` [rad], of the ideal model and with each named effect more."""
+        rungs = objects_in(self.diagnosis, "ladder")
+        return [{"t": number_in(rung, "t_mrmse_m"), "r": number_in(rung, "r_mrmse_rad")} for rung in rungs]
+
+    @property
+    def undecided(self) -> list[tuple[str, str]]:
+        """Effects that are as good as each other, and the manoeuvre that would tell them apart."""
+        found = []
+        for entry in objects_in(self.diagnosis, "undecided"):
+            names = entry.get("candidates")
+            between = " or ".join(map(str, names)) if isinstance(names, list) else ""
+            found.append((between, str(entry.get("separate_by", ""))))
+        return found
+
+    @property
+    def split(self) -> tuple[float | None, float | None, float | None]:
+        """Shares of drivetrain, ground and cross term in the mean square of the slip on command."""
+        split = self.part("split")
+        return number_in(split, "drivetrain"), number_in(split, "ground"), number_in(split, "cross")
+
     def text(self, key: str) -> str:
         """A text of the summary; empty when it is not there."""
         value = self.summary.get(key)

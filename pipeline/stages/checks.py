@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.motion.catalogue import find_late_effect
+from pipeline.motion.effect import Late
 from pipeline.stages.delays import estimate_delay
 from pipeline.stages.finding import Finding
 from pipeline.stages.samples import Samples, gather_samples
@@ -146,7 +148,8 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
                 f"against the wheels the heading is {abs(skew) * 1e3:.0f} ms {later} than the position: "
                 "a skew of the localization (it looks like lateral skid) or inertia of the body"
             )
-            findings.append(Finding("heading_skew", "warning", text, where="pose", value=skew))
+            name = find_late_effect(Late.HEADING).id
+            findings.append(Finding(name, "warning", text, where="pose", value=skew))
     if samples.measured is not None and np.isfinite(samples.gyro).any():
         usable = np.flatnonzero(known & np.isfinite(samples.gyro))
         late = _delay_of(samples.measured[:, 2], samples.gyro, usable, samples)

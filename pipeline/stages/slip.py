@@ -10,7 +10,6 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import timegrid
-from pipeline.motion.ideal import predict_ackermann, predict_differential
 from pipeline.stages import steps
 from pipeline.stages.errors import StageError
 from pipeline.stages.finding import Finding
@@ -197,12 +196,15 @@ def interpolate_wheels(times: Floats, wheels: pl.DataFrame, vehicle: Vehicle) ->
 
 
 def _predict(drive: pl.DataFrame, vehicle: Vehicle) -> Floats:
-    def read(name: str) -> Floats:
-        return drive[f"{name}_aligned" if "left_aligned" in drive.columns else name].to_numpy()
+    kinematics = vehicle.kinematics
+    inputs = {quantity.name: _read_aligned(drive, quantity.name) for quantity in kinematics.inputs}
+    return np.stack(kinematics.forward(inputs, vehicle), axis=-1)
 
-    if vehicle.kind == "ackermann":
-        return predict_ackermann(read("speed"), drive["steering"].to_numpy(), vehicle)
-    return predict_differential(read("left"), read("right"), vehicle)
+
+def _read_aligned(drive: pl.DataFrame, name: str) -> Floats:
+    """A signal of the drive as it was put right, where it was."""
+    aligned = f"{name}_aligned"
+    return drive[aligned if aligned in drive.columns else name].to_numpy()
 
 
 def _usual_period(stamps: Floats) -> float:

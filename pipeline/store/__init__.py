@@ -13,12 +13,13 @@ from pipeline.store.mirror import Mirror
 from pipeline.store.notes import LOG_NOTES, Notes
 from pipeline.store.partitions import Partition
 from pipeline.store.results import Store, Survey
-from pipeline.store.verification import Problem
+from pipeline.store.verification import Examination, Problem
 
 __all__ = [
     "JSON",
     "LOG_NOTES",
     "STEPS",
+    "Examination",
     "FileEntry",
     "Generation",
     "LogIdentities",

@@ -10,12 +10,11 @@ from pipeline.store.files import (
     draft_file,
     link_or_copy,
     make_folder,
-    replace_file,
     sync_files,
-    sync_folder,
     temporary_beside,
 )
 from pipeline.store.homes import name_free_folder, point_latest
+from pipeline.store.listing import Replacement
 from pipeline.store.manifest import (
     MANIFEST,
     MARKER,
@@ -28,8 +27,8 @@ from pipeline.store.manifest import (
     hash_file,
     read_parquet,
 )
-from pipeline.store.manifest_file import encode_manifest, load_manifest
-from pipeline.store.names import check_file_name
+from pipeline.store.manifest_file import encode_manifest, encode_marker, load_manifest
+from pipeline.store.names import check_file_name, place_inside
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -64,11 +63,19 @@ class Generation:
     """
 
     def __init__(
-        self, *, run: str, key: str, home: Path, previous: Manifest | None, watch: Callable[[str], None]
+        self,
+        *,
+        run: str,
+        key: str,
+        root: Path,
+        home: Path,
+        previous: Manifest | None,
+        watch: Callable[[str], None],
     ) -> None:
         self.run = run
         self.key = key
         self.previous = previous
+        self._root = root
         self._home = home
         self._watch = watch
         self._folder = temporary_beside(home / key)
@@ -201,16 +208,17 @@ class Generation:
         self._require_open()
         with name_disk_errors(self._home):
             manifest = self._describe(details)
-            data = encode_manifest(manifest)
-            self._draft(self._folder / MARKER, b"")
+            replacement = Replacement(self._root, self._home / MANIFEST, encode_manifest(manifest), manifest)
+            self._draft(self._folder / MARKER, encode_marker(manifest))
             folders = sorted(path for path in self._folder.rglob("*") if path.is_dir())
-            sync_files([*self._drafts, *folders, self._folder])
+            sync_files([*self._drafts, replacement.draft(), *folders, self._folder])
             self._watch("folder_synced")
             self._folder.rename(manifest.folder)
             self._folder = manifest.folder
-            sync_folder(self._home)
+            replacement.announce()
+            sync_files([self._home, replacement.folder])
             self._watch("folder_renamed")
-            replace_file(self._home / MANIFEST, data, when_written=lambda: self._watch("manifest_written"))
+            replacement.replace(when_written=lambda: self._watch("manifest_written"))
             self._watch("manifest_replaced")
         self._is_open = False
         point_latest(self._home, manifest.folder.name)
@@ -236,7 +244,7 @@ class Generation:
         return Manifest(
             run=self.run,
             key=self.key,
-            folder=name_free_folder(self._home, self.key),
+            folder=name_free_folder(self._home, self.key, earlier),
             tables=self._tables,
             files=self._files,
             details=details,
@@ -258,7 +266,7 @@ class Generation:
 
     def _link(self, name: str, sha256: str) -> None:
         self._require_new(name)
-        source = self._require_previous(name).folder / name
+        source = place_inside(self._require_previous(name).folder, name)
         with name_disk_errors(source):
             try:
                 found = hash_file(source)

@@ -9,6 +9,7 @@ from pipeline.store.files import remove_folder, temporary_beside
 from pipeline.store.manifest import MARKER
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
     from pathlib import Path
 
     from pipeline.store.manifest import Manifest
@@ -16,14 +17,19 @@ if TYPE_CHECKING:
 LATEST = "latest"
 
 
-def name_free_folder(home: Path, key: str) -> Path:
+def name_free_folder(home: Path, key: str, taken: Collection[str] = ()) -> Path:
     """The folder for a new generation: the key, with a number behind it where the key is taken.
 
     A generation made again under the same key gets a folder of its own, because a folder cannot be replaced
     in one moment, and the readers of the old one must not find the new one's files in it.
+
+    Args:
+        home: the run's folder.
+        key: key of the generation.
+        taken: names that the manifest knows: a generation that somebody deleted still has its own.
     """
     folder, number = home / key, 1
-    while folder.exists():
+    while folder.name in taken or folder.exists():
         number += 1
         folder = home / f"{key}.{number}"
     return folder

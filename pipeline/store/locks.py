@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import os
 import platform
-import time
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
@@ -17,7 +14,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _RETRY_S = 0.02
-_BUSY = (errno.EWOULDBLOCK, errno.EACCES)
 
 
 @contextmanager
@@ -27,6 +23,9 @@ def hold_lock(path: Path, *, patience_s: float) -> Iterator[None]:
     The file stays: removing it would let two writers hold two files of one name. What stands in it only
     serves the message to those who wait.
 
+    A file system without locks (some network mounts) is refused: a file that merely exists would outlive a
+    writer that was killed.
+
     Args:
         path: the lock file; its folder exists.
         patience_s: how long to wait for another holder.
@@ -34,39 +33,29 @@ def hold_lock(path: Path, *, patience_s: float) -> Iterator[None]:
     Raises:
         StoreError: ``locked``, another process held the lock all that time; or the disk refuses.
     """
+    from filelock import FileLock, Timeout  # noqa: PLC0415 - heavy, and only writers need it
+
+    lock = FileLock(path, thread_local=False, fallback_to_soft=False, preserve_lock_file=True)
     with name_disk_errors(path):
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-    try:
-        with name_disk_errors(path):
-            _wait_for_lock(descriptor, path, patience_s)
-        # The note is a courtesy: a full disk must be reported by what needs the space.
-        with suppress(OSError):
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, f"process {os.getpid()} on {platform.node()}".encode(), 0)
         try:
-            yield
-        finally:
-            fcntl.flock(descriptor, fcntl.LOCK_UN)
-    finally:
-        os.close(descriptor)
-
-
-def _wait_for_lock(descriptor: int, path: Path, patience_s: float) -> None:
-    deadline = time.monotonic() + patience_s
-    while True:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno not in _BUSY:
-                raise
-        else:
-            return
-        if time.monotonic() >= deadline:
-            holder = os.pread(descriptor, 200, 0).decode(errors="replace") or "another process"
+            lock.acquire(timeout=patience_s, poll_interval=_RETRY_S)
+        except Timeout as error:
             raise StoreError(
                 "locked",
-                f"{holder} has been writing here for more than {patience_s:g} s",
+                f"{_read_holder(path)} has been writing here for more than {patience_s:g} s",
                 where=str(path.parent),
                 hint="Wait until it is done or stop it, then run the same command again",
-            )
-        time.sleep(_RETRY_S)
+            ) from error
+    try:
+        # The note is a courtesy: a full disk must be reported by what needs the space.
+        with suppress(OSError):
+            path.write_text(f"process {os.getpid()} on {platform.node()}", encoding="utf-8")
+        yield
+    finally:
+        lock.release()
+
+
+def _read_holder(path: Path) -> str:
+    with suppress(OSError):
+        return path.read_text(encoding="utf-8", errors="replace")[:200] or "another process"
+    return "another process"

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeAlias
 
 from pipeline.store.errors import StoreError
+from pipeline.store.names import place_inside
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -91,13 +92,13 @@ class Manifest:
         """Path of a table or a quarantine (by its name) or of another file (by its file name).
 
         Raises:
-            StoreError: ``no_such_table``, this generation holds neither.
+            StoreError: ``no_such_table``, this generation holds neither; ``file_outside``, a link leads away.
         """
         if name in self.tables:
-            return self.folder / self.tables[name].file
+            return place_inside(self.folder, self.tables[name].file)
         for file in (name, f"{name}.parquet"):
             if file in self.files:
-                return self.folder / file
+                return place_inside(self.folder, file)
         raise StoreError(
             "no_such_table",
             f"the results of {self.run!r} hold no {name!r}; they hold {', '.join(self.names()) or 'nothing'}",
@@ -108,6 +109,11 @@ class Manifest:
     def names(self) -> tuple[str, ...]:
         """Names of all tables, then of all other files."""
         return (*sorted(self.tables), *sorted(self.files))
+
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of every file by its name in the generation's folder, sorted."""
+        found = {entry.file: entry.sha256 for entry in self.tables.values()}
+        return dict(sorted((found | {name: entry.sha256 for name, entry in self.files.items()}).items()))
 
     def read(self, table: str) -> pl.DataFrame:
         """A table of exactly this generation, or the ``quarantine_<table>`` of one.

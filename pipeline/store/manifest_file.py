@@ -1,14 +1,15 @@
-"""The manifest's file: JSON, strict in reading, the same bytes for the same manifest."""
+"""The manifest's file: sealed JSON, strict in reading, the same bytes for the same manifest."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from pipeline.core.paths import PathError, resolve_inside
 from pipeline.store.errors import StoreError
 from pipeline.store.manifest import MANIFEST, FileEntry, Manifest, TableEntry
-from pipeline.store.names import is_file_name
+from pipeline.store.names import is_file_name, is_key
+from pipeline.store.seals import check_seal, seal, unseal
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,8 +35,7 @@ def encode_manifest(manifest: Manifest) -> bytes:
         "earlier": manifest.earlier,
     }
     try:
-        text = json.dumps(content, allow_nan=False, ensure_ascii=False, indent=1, sort_keys=True)
-        return text.encode() + b"\n"
+        return seal(content, indent=1)
     except (TypeError, ValueError) as error:
         raise StoreError(
             "bad_details",
@@ -52,22 +52,39 @@ def load_manifest(home: Path) -> Manifest | None:
         StoreError: ``manifest_damaged``, or ``manifest_too_new`` when a newer version wrote it.
         OSError: the file cannot be read.
     """
+    try:
+        data = (home / MANIFEST).read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return parse_manifest(data, home)
+
+
+def parse_manifest(data: bytes, home: Path) -> Manifest:
+    """The manifest in the content of its file.
+
+    Args:
+        data: the content.
+        home: the run's folder.
+
+    Raises:
+        StoreError: ``manifest_damaged``, or ``manifest_too_new`` when a newer version wrote it.
+    """
     import msgspec  # noqa: PLC0415 - heavy, and `slip --help` imports this room
 
     path = home / MANIFEST
     try:
-        data = path.read_bytes()
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    try:
         written_in = msgspec.json.decode(data, type=_Header).format
         stored = msgspec.json.decode(data, type=_Stored) if written_in <= FORMAT else None
+        folder = home
         if stored is not None:
             _check_names(stored)
-    except (msgspec.DecodeError, ValueError) as error:
+            check_seal(data)
+            folder = resolve_inside(home, stored.folder)
+    except (msgspec.DecodeError, ValueError, RecursionError, PathError) as error:
+        said = error.what if isinstance(error, PathError) else " ".join(str(error).split())
         raise StoreError(
             "manifest_damaged",
-            f"the manifest is damaged ({error})",
+            f"the manifest is damaged ({said})",
             where=str(path),
             hint="Delete this one file and analyze its log again",
         ) from error
@@ -81,12 +98,31 @@ def load_manifest(home: Path) -> Manifest | None:
     return Manifest(
         run=stored.run,
         key=stored.key,
-        folder=home / stored.folder,
+        folder=folder,
         tables=stored.tables,
         files=stored.files,
         details=stored.details,
         earlier=stored.earlier,
     )
+
+
+def encode_marker(manifest: Manifest) -> bytes:
+    """What stands in a generation's own folder: its files, for when no manifest names them any more."""
+    return seal({"run": manifest.run, "files": manifest.hashes()})
+
+
+def parse_marker(data: bytes) -> dict[str, str]:
+    """SHA-256 of a generation's files by name, as its marker tells them.
+
+    Raises:
+        ValueError: the marker is damaged.
+    """
+    files = unseal(data).get("files")
+    if not isinstance(files, dict) or not all(
+        is_file_name(name) and isinstance(sha256, str) for name, sha256 in files.items()
+    ):
+        raise ValueError("it does not tell the files")
+    return files
 
 
 @dataclass(frozen=True)
@@ -107,8 +143,12 @@ class _Stored:
 
 def _check_names(stored: _Stored) -> None:
     # Files are read and old folders removed by these names: an edited one must not lead elsewhere.
-    folders = (stored.folder, *stored.earlier)
-    files = (*stored.files, *(entry.file for entry in stored.tables.values()))
-    for name in (*folders, *files):
-        if not is_file_name(name) or (name in folders and "/" in name):
+    parts = (stored.folder, *stored.earlier, *stored.tables)
+    for name in (*parts, *stored.files, *(entry.file for entry in stored.tables.values())):
+        if not is_file_name(name) or (name in parts and "/" in name):
             raise ValueError(f"it names {name!r}")
+    for table, entry in stored.tables.items():
+        if entry.file != f"{table}.parquet":
+            raise ValueError(f"it names {entry.file!r} for the table {table!r}")
+    if not is_key(stored.key):
+        raise ValueError(f"its key is {stored.key!r}")

@@ -1,5 +1,7 @@
 """Results on an object store, through a mirror of them in a local folder.
 
+Names of objects are given by whoever may write to the store: each becomes a path in the mirror or an error.
+
 Generations never change, so what was fetched once is never fetched again. A run is published as on a disk:
 its files first, its manifest last, in one request that takes place as a whole or not at all. Readers
 therefore see whole runs, the old or the new. There are no locks between machines: of two that write one run
@@ -9,25 +11,27 @@ at the same time the later manifest stays; share the logs with ``--shard`` inste
 from __future__ import annotations
 
 import hashlib
-import json
 import os
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
-from pipeline.store.errors import StoreError
+from pipeline.store.errors import StoreError, name_disk_errors
 from pipeline.store.files import make_folder, replace_file
-from pipeline.store.manifest import MANIFEST, hash_bytes
-from pipeline.store.manifest_file import encode_manifest, load_manifest
-from pipeline.store.names import encode_run
+from pipeline.store.listing import ABSENT, encode_entry, entry_name, is_run_manifest, make_entry
+from pipeline.store.manifest import MANIFEST, MARKER, hash_bytes
+from pipeline.store.manifest_file import encode_manifest, load_manifest, parse_manifest
+from pipeline.store.names import encode_run, is_file_name, place_inside
 from pipeline.store.notes import LOG_NOTES
 from pipeline.store.results import RUNS, Store
-from pipeline.store.verification import Problem
+from pipeline.store.seals import seal, unseal
+from pipeline.store.verification import Examination, examine_files
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from pipeline.store.manifest import Manifest
+    from pipeline.store.verification import Problem
 
 _SEEN = "mirror.json"
 _TOGETHER = 200
@@ -76,11 +80,7 @@ class Mirror:
         with self._name_errors():
             self._objects.invalidate_cache()
             found = self._list()
-        wanted = [
-            name
-            for name in found
-            if name.endswith(f"/{MANIFEST}") or name.startswith(f"{LOG_NOTES}/") or "/" not in name
-        ]
+        wanted = [name for name in found if _is_index(name)]
         self._forget_gone(found)
         self._fetch_changed({name: found[name] for name in wanted})
 
@@ -99,7 +99,7 @@ class Mirror:
         self._put(f"{home}/{MANIFEST}", data)
         manifest = load_manifest(self.store.root / home)
         if manifest is not None:
-            self._fetch_missing(manifest, manifest.names())
+            self._fetch(self._list_missing(manifest, manifest.names()))
 
     def pull_tables(self, names: Iterable[str], manifests: Iterable[Manifest]) -> None:
         """Fetch tables of the given generations that are not here yet.
@@ -108,10 +108,10 @@ class Mirror:
             StoreError: as `pull_index`.
         """
         wanted = set(names)
-        missing: list[str] = []
+        missing: dict[str, str] = {}
         for manifest in manifests:
             there = [name for name in manifest.names() if name in wanted]
-            missing += self._list_missing(manifest, there)
+            missing |= self._list_missing(manifest, there)
         self._fetch(missing)
 
     def push_run(self, manifest: Manifest) -> None:
@@ -123,23 +123,24 @@ class Mirror:
         home = manifest.folder.parent.relative_to(self.store.root).as_posix()
         with self._name_errors():
             there = self._list(f"{home}/{manifest.folder.name}")
-            for name in manifest.names():
-                path = manifest.path(name)
+            marker = manifest.folder / MARKER
+            paths = [manifest.path(name) for name in manifest.names()]
+            for path in [*paths, marker] if marker.exists() else paths:
                 place = path.relative_to(self.store.root).as_posix()
                 if there.get(place, {}).get("size") != path.stat().st_size:
                     self._objects.pipe_file(self._place(place), path.read_bytes())
-            self._objects.pipe_file(self._place(f"{home}/{MANIFEST}"), encode_manifest(manifest))
+            self._publish(f"{home}/{MANIFEST}", encode_manifest(manifest), manifest)
 
     def push_file(self, name: str) -> None:
-        """Publish a file of the results that belongs to no run, if the mirror has it.
+        """Publish a file over all runs, if the mirror has it.
 
         Raises:
             StoreError: as `pull_index`.
         """
-        path = self.store.root / name
+        path = place_inside(self.store.root, name)
         if path.exists():
             with self._name_errors():
-                self._objects.pipe_file(self._place(name), path.read_bytes())
+                self._publish(name, path.read_bytes())
 
     def push_note(self, name: str) -> None:
         """Publish a note on a log.
@@ -148,7 +149,10 @@ class Mirror:
             StoreError: as `pull_index`.
         """
         path = self.store.notes(LOG_NOTES).path_of(name)
-        self.push_file(path.relative_to(self.store.root).as_posix())
+        if path.exists():
+            with self._name_errors():
+                place = self._place(path.relative_to(self.store.root).as_posix())
+                self._objects.pipe_file(place, path.read_bytes())
 
     def prune(self, manifests: Iterable[Manifest]) -> int:
         """Publish shorter manifests, then remove the generations that they no longer name.
@@ -164,7 +168,7 @@ class Mirror:
             home = manifest.folder.parent.relative_to(self.store.root).as_posix()
             named = {manifest.folder.name, *manifest.earlier}
             with self._name_errors():
-                self.push_file(f"{home}/{MANIFEST}")
+                self._publish(f"{home}/{MANIFEST}", encode_manifest(manifest), manifest)
                 inside = [(name, name.removeprefix(f"{home}/").split("/")) for name in self._list(home)]
                 doomed = [name for name, parts in inside if len(parts) > 1 and parts[0] not in named]
                 if doomed:
@@ -173,26 +177,81 @@ class Mirror:
         return len(removed)
 
     def verify(self) -> tuple[Problem, ...]:
-        """Fetch and hash every file of every current generation; what differs from its manifest."""
-        problems: list[Problem] = []
-        for manifest in self.store.manifests():
-            expected = {entry.file: entry.sha256 for entry in manifest.tables.values()}
-            expected |= {name: entry.sha256 for name, entry in manifest.files.items()}
-            for name, sha256 in sorted(expected.items()):
-                path = manifest.folder / name
-                problem = self._check(path, sha256)
-                if problem is not None:
-                    problems.append(Problem(run=manifest.run, path=path, code=problem[0], what=problem[1]))
-        return tuple(problems)
+        """Fetch and hash everything; what is not what was written.
 
-    def _check(self, path: Path, sha256: str) -> tuple[str, str] | None:
-        place = self._place(path.relative_to(self.store.root).as_posix())
+        Raises:
+            StoreError: as `pull_index`.
+        """
+        return self.examine().problems
+
+    def examine(self) -> Examination:
+        """As `verify`, with what cannot be judged."""
+        return examine_files(self)
+
+    def put_on_list(self, name: str) -> None:
+        """As `Store.put_on_list`.
+
+        Raises:
+            StoreError: as `pull_index`.
+        """
+        data = self.read(name)
+        if data is not None:
+            manifest = parse_manifest(data, self._hold(name).parent) if is_run_manifest(name) else None
+            self._publish(name, data, manifest)
+
+    def remove(self, name: str) -> None:
+        """As `Store.remove`.
+
+        Raises:
+            StoreError: as `pull_index`.
+        """
+        with self._name_errors(), suppress(FileNotFoundError):
+            self._objects.rm([self._place(name)])
+        self._hold(name).unlink(missing_ok=True)
+
+    def names(self) -> Collection[str]:
+        """Every name in the results on the store.
+
+        Raises:
+            StoreError: as `pull_index`.
+        """
+        with self._name_errors():
+            self._objects.invalidate_cache()
+            return self._list()
+
+    def read(self, name: str) -> bytes | None:
+        """The content of an object; None when there is none.
+
+        Raises:
+            StoreError: as `pull_index`.
+        """
         with self._name_errors():
             try:
-                data = self._objects.cat_file(place)
+                return self._objects.cat_file(self._place(name))
             except FileNotFoundError:
-                return "file_missing", "the object is gone"
-        return None if hash_bytes(data) == sha256 else ("file_damaged", "the object is not what was written")
+                return None
+
+    def hash(self, name: str) -> str:
+        """SHA-256 of an object in hexadecimal; empty when there is none.
+
+        Raises:
+            StoreError: as `pull_index`.
+        """
+        data = self.read(name)
+        return ABSENT if data is None else hash_bytes(data)
+
+    def place(self, name: str) -> Path:
+        """Where an object stands, or would stand, in the mirror."""
+        return self.store.root / name
+
+    def _publish(self, name: str, data: bytes, manifest: Manifest | None = None) -> None:
+        """Replace an object that is on the list, as `Replacement` replaces a file."""
+        before, new = self.hash(name), hash_bytes(data)
+        entry = self._place(entry_name(name))
+        if before != new:
+            self._objects.pipe_file(entry, encode_entry(make_entry(name, new, before, manifest=manifest)))
+            self._objects.pipe_file(self._place(name), data)
+        self._objects.pipe_file(entry, encode_entry(make_entry(name, new, manifest=manifest)))
 
     def _list(self, under: str = "") -> dict[str, Mapping[str, object]]:
         """What the store says of the objects under a prefix, by their names in the results."""
@@ -200,8 +259,12 @@ class Mirror:
             found = self._objects.find(self._place(under) if under else self.address, detail=True)
         except FileNotFoundError:
             return {}
-        start = len(self._prefix) + 1
-        return {name.strip("/")[start:]: info for name, info in found.items()}
+        return {self._name_of(place): info for place, info in found.items()}
+
+    def _name_of(self, place: str) -> str:
+        """Name in the results of an object, by the store's own name or by its address."""
+        plain = place.partition("://")[2] or place
+        return plain.removeprefix("/").removeprefix(f"{self._prefix}/")
 
     def _place(self, name: str) -> str:
         return f"{self.address}/{name}"
@@ -209,7 +272,7 @@ class Mirror:
     def _fetch_changed(self, found: Mapping[str, Mapping[str, object]]) -> None:
         seen_file = self.store.root / _SEEN
         try:
-            seen = json.loads(seen_file.read_bytes())
+            seen = unseal(seen_file.read_bytes())
         except (OSError, ValueError):
             seen = {}
         tags = {
@@ -217,51 +280,79 @@ class Mirror:
             for name, info in found.items()
         }
         changed = [
-            name
-            for name, tag in tags.items()
-            if seen.get(name) != tag or not (self.store.root / name).exists()
+            name for name, tag in tags.items() if seen.get(name) != tag or not self._hold(name).exists()
         ]
-        if changed or set(seen) != set(tags):
-            self._fetch(changed)
-            make_folder(self.store.root)
-            replace_file(seen_file, json.dumps(tags, sort_keys=True).encode())
+        if changed or set(seen) - {""} != set(tags):
+            self._fetch(dict.fromkeys(changed, ""))
+            with name_disk_errors(seen_file):
+                make_folder(self.store.root)
+                replace_file(seen_file, seal({"": "", **tags}))
 
     def _forget_gone(self, found: Mapping[str, object]) -> None:
         """Runs and notes that are not on the store any more, or not yet, are not in the mirror either."""
         for path in self.store.homes():
             name = (path / MANIFEST).relative_to(self.store.root).as_posix()
             if name not in found:
-                (path / MANIFEST).unlink(missing_ok=True)
+                self._hold(name).unlink(missing_ok=True)
         for path in (self.store.root / LOG_NOTES).glob("*/*.json"):
-            if path.relative_to(self.store.root).as_posix() not in found:
-                path.unlink(missing_ok=True)
+            name = path.relative_to(self.store.root).as_posix()
+            if name not in found:
+                self._hold(name).unlink(missing_ok=True)
 
-    def _fetch_missing(self, manifest: Manifest, names: Iterable[str]) -> None:
-        self._fetch(self._list_missing(manifest, names))
+    def _list_missing(self, manifest: Manifest, names: Iterable[str]) -> dict[str, str]:
+        """Files of a generation that the mirror has not, and their hashes."""
+        hashes = manifest.hashes()
+        paths = {name: manifest.path(name) for name in names}
+        return {
+            path.relative_to(self.store.root).as_posix(): hashes[path.relative_to(manifest.folder).as_posix()]
+            for path in paths.values()
+            if not path.exists()
+        }
 
-    def _list_missing(self, manifest: Manifest, names: Iterable[str]) -> list[str]:
-        paths = (manifest.path(name) for name in names)
-        return [path.relative_to(self.store.root).as_posix() for path in paths if not path.exists()]
-
-    def _fetch(self, names: list[str]) -> None:
+    def _fetch(self, wanted: Mapping[str, str]) -> None:
+        """Fetch objects by name; those with a hash must have it."""
+        names = list(wanted)
         for start in range(0, len(names), _TOGETHER):
             some = names[start : start + _TOGETHER]
             with self._name_errors():
                 found = self._objects.cat([self._place(name) for name in some], on_error="return")
-            start_of_name = len(self._prefix) + 1
             for place, data in found.items():
+                name = self._name_of(place)
                 # What was removed between the listing and now is simply not there.
                 if isinstance(data, FileNotFoundError):
                     continue
                 if isinstance(data, Exception):
                     raise self._unreachable(data)
-                plain = place.partition("://")[2] or place
-                self._put(plain.strip("/")[start_of_name:], data)
+                if wanted.get(name) not in {"", hash_bytes(data)}:
+                    raise StoreError(
+                        "file_damaged",
+                        "an object of the results is not what was written",
+                        where=self._place(name),
+                        hint="Look with `slip verify` for what else is damaged",
+                    )
+                self._put(name, data)
 
     def _put(self, name: str, data: bytes) -> None:
-        path = self.store.root / name
-        make_folder(path.parent)
-        replace_file(path, data)
+        path = self._hold(name)
+        with name_disk_errors(path):
+            make_folder(path.parent)
+            replace_file(path, data)
+
+    def _hold(self, name: str) -> Path:
+        """The path of an object in the mirror.
+
+        Raises:
+            StoreError: ``bad_object_name``.
+        """
+        try:
+            return place_inside(self.store.root, name)
+        except StoreError as error:
+            raise StoreError(
+                "bad_object_name",
+                f"an object cannot be a file of the results: {error.what}",
+                where=self.address,
+                hint="Nothing was written; remove that object, and find out who put it there",
+            ) from None
 
     @contextmanager
     def _name_errors(self) -> Iterator[None]:
@@ -279,21 +370,27 @@ class Mirror:
         )
 
 
+def _is_index(name: str) -> bool:
+    """Whether an object tells what there is; a store may hold others, which are none of ours."""
+    is_note = name.startswith(f"{LOG_NOTES}/")
+    looks_like_a_run = name.startswith(f"{RUNS}/") and name.endswith(f"/{MANIFEST}")
+    return is_note or looks_like_a_run or (is_file_name(name) and "/" not in name and name != _SEEN)
+
+
 def _default_folder(address: str) -> Path:
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return cache / "slip" / "results" / hashlib.sha256(address.encode()).hexdigest()[:16]
 
 
 def _open_objects(address: str) -> _Objects:
-    try:
-        from fsspec.core import url_to_fs  # noqa: PLC0415 - an extra
+    from pipeline.logs import LogError, open_store  # noqa: PLC0415 - only where results are on an object store
 
-        objects, _ = url_to_fs(address)
-    except (ImportError, ValueError) as error:
+    try:
+        return cast("_Objects", open_store(address))
+    except LogError as error:
         raise StoreError(
             "no_object_store",
-            f"the store of the results cannot be reached ({error})",
+            f"the store of the results cannot be reached ({error.what})",
             where=address,
             hint="pip install 'slip-pipeline[s3]', and use an s3:// address",
         ) from None
-    return cast("_Objects", objects)

@@ -11,8 +11,13 @@ import hashlib
 import re
 import unicodedata
 from pathlib import PurePosixPath
+from typing import TYPE_CHECKING
 
+from pipeline.core.paths import PathError, may_lead_out, resolve_inside
 from pipeline.store.errors import StoreError
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 LONGEST_PART = 120
 """Bytes of one part of a path; file systems allow 255, encrypted ones 143."""
@@ -44,13 +49,40 @@ def encode_run(run: str) -> PurePosixPath:
     return PurePosixPath(*(_encode_part(part) for part in parts))
 
 
+def check_home(run: str, home: Path, *, top: Path) -> None:
+    """Refuse a run that stands in the folder of another one, such as a copy.
+
+    Args:
+        run: name of the run, as its manifest tells it.
+        home: the folder that the manifest stands in.
+        top: the folder of all runs.
+
+    Raises:
+        StoreError: ``name_clash``.
+    """
+    place = str(home)[len(str(top)) + 1 :]
+    # Asked for every run of a season; most are called like their folders.
+    if run != place and (not run or str(encode_run(run)) != unicodedata.normalize("NFC", place)):
+        raise name_clash(run, place, home)
+
+
+def name_clash(run: str, other: str, folder: Path) -> StoreError:
+    """The error for two runs in one folder."""
+    return StoreError(
+        "name_clash",
+        f"the results of {run!r} and of {other!r} would share a folder",
+        where=str(folder),
+        hint="Rename one of the logs, or give it another folder with --out",
+    )
+
+
 def check_key(key: str) -> None:
     """Refuse generation keys that are not a plain word of at most 64 letters, digits, ``_`` and ``-``.
 
     Raises:
         StoreError: ``bad_key``.
     """
-    if not _KEY.fullmatch(key):
+    if not is_key(key):
         raise StoreError(
             "bad_key",
             f"{key!r} cannot be the key of a generation",
@@ -70,6 +102,23 @@ def check_file_name(name: str) -> None:
             f"{name!r} cannot name a file of the results",
             hint="Use letters, digits, dots, _ and -, and start with a letter or a digit",
         )
+
+
+def is_key(key: str) -> bool:
+    """Whether a text can be the key of a generation."""
+    return _KEY.fullmatch(key) is not None
+
+
+def place_inside(folder: Path, name: str) -> Path:
+    """A file of the results by a name that something outside of the program gave.
+
+    Raises:
+        StoreError: ``file_outside``, the name or a link in its way leads out of the folder.
+    """
+    try:
+        return resolve_inside(folder, name)
+    except PathError as error:
+        raise StoreError("file_outside", error.what, where=error.where, hint=error.hint) from None
 
 
 def is_file_name(name: str) -> bool:
@@ -94,6 +143,10 @@ def _encode_part(part: str) -> str:
     )
     if encoded.casefold() in _RESERVED:
         encoded = _encode_character(encoded[0]) + encoded[1:]
+    if may_lead_out(encoded):
+        encoded = "".join(
+            character if character.isascii() else _encode_character(character) for character in encoded
+        )
     if normal == part and len(encoded.encode()) <= LONGEST_PART:
         return encoded or "%"
     digest = hashlib.sha256(part.encode()).hexdigest()[:_HASH_DIGITS]

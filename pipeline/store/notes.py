@@ -1,4 +1,4 @@
-"""Small notes beside the results, one file each: replaced whole, written by many at once without waiting.
+"""Small notes beside the results, one sealed file each: replaced whole, by many at once without waiting.
 
 A note may be lost, for example in a power cut, and must then only cost time. What must not be lost belongs
 into a generation.
@@ -6,14 +6,14 @@ into a generation.
 
 from __future__ import annotations
 
-import json
 import os
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from pipeline.store.errors import StoreError, name_disk_errors
 from pipeline.store.files import temporary_beside
 from pipeline.store.manifest import hash_bytes
+from pipeline.store.seals import seal, unseal
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -24,6 +24,13 @@ if TYPE_CHECKING:
 
 LOG_NOTES = "batch/logs"
 """Folder of the notes on logs, the only ones that several machines share."""
+
+
+NOTES = ("batch/", "identities/")
+"""How the names of all notes in the results begin."""
+
+AGAIN_NOTES = "batch/again"
+"""Folder of the notes on runs that are to be made again."""
 
 
 class Notes:
@@ -43,7 +50,7 @@ class Notes:
             Whether it was written.
         """
         try:
-            self._write(self.path_of(name), json.dumps(content, sort_keys=True).encode())
+            self._write(self.path_of(name), seal(content))
         except StoreError:
             return False
         return True
@@ -84,7 +91,7 @@ class Notes:
 
 def _load(path: Path) -> dict[str, JSON] | None:
     try:
-        content = json.loads(path.read_bytes())
+        # Nothing but a file is opened: a pipe would be waited for.
+        return cast("dict[str, JSON]", unseal(path.read_bytes())) if path.is_file() else None
     except (OSError, ValueError):
         return None
-    return content if isinstance(content, dict) else None

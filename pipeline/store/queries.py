@@ -18,6 +18,11 @@ if TYPE_CHECKING:
 
     from pipeline.store.manifest import Manifest
 
+_READERS = re.compile(
+    r"(?:read|scan)_(?:csv|parquet|ipc|json|ndjson|avro|delta|iceberg|excel|database|\w*(?=\W*\())"
+)
+"""Names by which SQL opens files and addresses, wherever they stand: none is ever meant as a text."""
+
 RUNS_TABLE = "runs"
 """A table that is made of the manifests: one row a run."""
 
@@ -63,7 +68,7 @@ def scan_table(table: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.L
     for manifest in manifests:
         entry = manifest.tables.get(table.removeprefix(QUARANTINE))
         if entry is not None and (table in manifest.tables or f"{table}.parquet" in manifest.files):
-            path = manifest.folder / f"{table}.parquet"
+            path = manifest.path(table)
             (current if entry.contract_version == present else others).append(path)
     if (root / f"{table}.parquet").exists():
         others.append(root / f"{table}.parquet")
@@ -73,12 +78,28 @@ def scan_table(table: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.L
     return pl.concat(frames) if frames else pl.LazyFrame(schema=schema)
 
 
-def answer_query(sql: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.DataFrame:
+def answer_query(
+    sql: str, *, root: Path, manifests: Sequence[Manifest], allow_files: bool = False
+) -> pl.DataFrame:
     """Answer SQL over all tables and their quarantines by name.
 
+    Args:
+        sql: the question.
+        root: the results folder.
+        manifests: the generations to look at.
+        allow_files: whether the question may open files and addresses that are none of the results.
+
     Raises:
-        StoreError: ``bad_query``, with what polars says about it.
+        StoreError: ``bad_query``, with what polars says about it; ``files_not_allowed``.
     """
+    reader = None if allow_files else _READERS.search(sql.lower())
+    if reader is not None:
+        raise StoreError(
+            "files_not_allowed",
+            f"the query names {reader[0]}, which opens files outside the results",
+            where=sql,
+            hint="Ask the tables of the results only, or give --allow-files if the query is your own",
+        )
     names = [contract.name for contract in list_contracts()]
     known = (RUNS_TABLE, *names, *(f"{QUARANTINE}{name}" for name in names))
     # With many runs, getting every table ready takes longer than the answer: only those that are spoken of.
@@ -87,10 +108,10 @@ def answer_query(sql: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.D
     try:
         with name_disk_errors(root):
             return pl.SQLContext(frames).execute(sql, eager=True)
-    except pl.exceptions.PolarsError as error:
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
         raise StoreError(
             "bad_query",
-            f"the query cannot be answered: {str(error).splitlines()[0]}",
+            f"the query cannot be answered: {str(error).partition(chr(10))[0]}",
             where=sql,
             hint=f"The tables are: {', '.join((RUNS_TABLE, *names))}",
         ) from error

@@ -18,11 +18,19 @@ from pipeline.store.files import (
 )
 from pipeline.store.generation import Generation
 from pipeline.store.homes import point_latest, remove_orphans
+from pipeline.store.listing import (
+    LIST,
+    encode_entry,
+    entry_name,
+    is_run_manifest,
+    make_entry,
+    replace_listed,
+)
 from pipeline.store.locks import hold_lock
-from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes
+from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes, hash_file
 from pipeline.store.manifest_file import encode_manifest, load_manifest
-from pipeline.store.names import check_file_name, check_key, encode_run
-from pipeline.store.notes import Notes
+from pipeline.store.names import check_file_name, check_home, check_key, encode_run, name_clash, place_inside
+from pipeline.store.notes import AGAIN_NOTES, Notes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -31,7 +39,7 @@ if TYPE_CHECKING:
 
     from pipeline.store.manifest import TableReport
     from pipeline.store.partitions import Partition
-    from pipeline.store.verification import Problem
+    from pipeline.store.verification import Examination, Problem
 
 LOCK = ".lock"
 RUNS = "runs"
@@ -77,7 +85,7 @@ class Store:
         with name_disk_errors(home):
             manifest = load_manifest(home)
         if manifest is not None and manifest.run != run:
-            raise _name_clash(run, manifest.run, home)
+            raise name_clash(run, manifest.run, home)
         return manifest
 
     def manifests(self) -> tuple[Manifest, ...]:
@@ -98,6 +106,8 @@ class Store:
             try:
                 with name_disk_errors(home):
                     manifest = load_manifest(home)
+                if manifest is not None:
+                    check_home(manifest.run, home, top=self.root / RUNS)
             except StoreError as error:
                 errors.append(error)
                 continue
@@ -136,7 +146,9 @@ class Store:
             with name_disk_errors(home):
                 remove_leftovers(home)
                 remove_orphans(home, previous)
-            generation = Generation(run=run, key=key, home=home, previous=previous, watch=self._watch)
+            generation = Generation(
+                run=run, key=key, root=self.root, home=home, previous=previous, watch=self._watch
+            )
             try:
                 yield generation
             finally:
@@ -183,19 +195,23 @@ class Store:
 
         return scan_table(table, root=self.root, manifests=self._select(partition))
 
-    def query(self, sql: str, partition: Partition | None = None) -> pl.DataFrame:
+    def query(
+        self, sql: str, partition: Partition | None = None, *, allow_files: bool = False
+    ) -> pl.DataFrame:
         """Answer SQL over all tables by name.
 
         Args:
             sql: the question.
             partition: the runs to look at, as for `scan`.
+            allow_files: whether the question may open files and addresses that are none of the results.
 
         Raises:
-            StoreError: ``bad_query``, or a manifest is damaged.
+            StoreError: ``bad_query``, ``files_not_allowed``, or a manifest is damaged.
         """
         from pipeline.store.queries import answer_query  # noqa: PLC0415 - heavy
 
-        return answer_query(sql, root=self.root, manifests=self._select(partition))
+        manifests = self._select(partition)
+        return answer_query(sql, root=self.root, manifests=manifests, allow_files=allow_files)
 
     def _select(self, partition: Partition | None) -> tuple[Manifest, ...]:
         manifests = self.manifests()
@@ -204,10 +220,46 @@ class Store:
         return tuple(manifest for manifest in manifests if partition.holds(manifest))
 
     def verify(self) -> tuple[Problem, ...]:
-        """Rehash every file of every current generation; what differs from its manifest."""
-        from pipeline.store.verification import verify_home  # noqa: PLC0415 - keeps the room's import light
+        """Read everything again; what is not what was written."""
+        return self.examine().problems
 
-        return tuple(problem for home in self.homes() for problem in verify_home(home, top=self.root / RUNS))
+    def examine(self) -> Examination:
+        """As `verify`, with what cannot be judged."""
+        from pipeline.store.verification import DiskFiles, examine_files  # noqa: PLC0415 - rarely needed
+
+        return examine_files(DiskFiles(self.root))
+
+    def ask_again(self, manifest: Manifest) -> None:
+        """Have a run made again by whoever analyzes its log next; until then readers keep its results."""
+        self.notes(AGAIN_NOTES).write(manifest.run, {"run": manifest.run, "folder": manifest.folder.name})
+
+    def is_asked_again(self, manifest: Manifest) -> bool:
+        """Whether exactly this generation is to be made again."""
+        note = self.notes(AGAIN_NOTES).read(manifest.run)
+        return note is not None and note.get("folder") == manifest.folder.name
+
+    def put_on_list(self, name: str) -> None:
+        """Have a manifest, or a file over all runs, on the list as it is.
+
+        Raises:
+            StoreError: ``locked``, or the disk refuses.
+        """
+        path = place_inside(self.root, name)
+        with self._lock(path.parent), name_disk_errors(path):
+            manifest = load_manifest(path.parent) if is_run_manifest(name) else None
+            entry = make_entry(name, hash_file(path), manifest=manifest)
+            make_folder(self.root / LIST)
+            replace_file(self.root / entry_name(name), encode_entry(entry))
+
+    def remove(self, name: str) -> None:
+        """Remove a file that nobody can use any more: a damaged manifest, entry or note.
+
+        Raises:
+            StoreError: ``locked``, or the disk refuses.
+        """
+        path = place_inside(self.root, name)
+        with self._lock(path.parent if is_run_manifest(name) else self.root), name_disk_errors(path):
+            path.unlink(missing_ok=True)
 
     def prune(self, keep: int) -> tuple[Path, ...]:
         """Remove all but the newest ``keep`` generations of every run that are not current.
@@ -240,11 +292,9 @@ class Store:
         valid, broken = checked.encode()
         quarantine = self.root / f"{QUARANTINE}{name}.parquet"
         with self._lock(self.root), name_disk_errors(self.root):
-            replace_file(self.root / f"{name}.parquet", valid)
-            if broken is None:
-                quarantine.unlink(missing_ok=True)
-            else:
-                replace_file(quarantine, broken)
+            replace_listed(self.root, self.root / f"{name}.parquet", valid)
+            if broken is not None or quarantine.exists():
+                replace_listed(self.root, quarantine, broken)
         return checked.report
 
     def write_results_text(self, name: str, text: str) -> Path:
@@ -254,11 +304,11 @@ class Store:
             StoreError: ``bad_file_name``, ``locked``, or the disk refuses.
         """
         check_file_name(name)
-        path = self.root / name
+        path = place_inside(self.root, name)
         with self._lock(self.root), name_disk_errors(path):
             make_folder(path.parent)
             remove_leftovers(path.parent)
-            replace_file(path, text.encode())
+            replace_listed(self.root, path, text.encode())
         return path
 
     def notes(self, folder: str) -> Notes:
@@ -295,14 +345,14 @@ class Store:
             yield False
 
     def _home_of(self, run: str) -> Path:
-        return self.root / RUNS / encode_run(run)
+        return place_inside(self.root / RUNS, str(encode_run(run)))
 
     @contextmanager
     def _lock_run(self, run: str) -> Iterator[Path]:
         home = self._home_of(run)
         for folder in (home, home.parent):
             if (folder / MARKER).exists():
-                raise _name_clash(run, folder.parent.name, folder)
+                raise name_clash(run, folder.parent.name, folder)
         with self._lock(home):
             yield home
 
@@ -324,18 +374,9 @@ class Store:
             doomed = [home / name for name in manifest.earlier[keep:]]
             # First the manifest forgets them: killed in between, they are orphans for the next writer.
             shorter = manifest.with_earlier(manifest.earlier[:keep])
-            replace_file(home / MANIFEST, encode_manifest(shorter))
+            replace_listed(self.root, home / MANIFEST, encode_manifest(shorter), shorter)
             for folder in doomed:
                 if folder.exists():
                     remove_folder(folder)
             point_latest(home, manifest.folder.name)
         return doomed
-
-
-def _name_clash(run: str, other: str, folder: Path) -> StoreError:
-    return StoreError(
-        "name_clash",
-        f"the results of {run!r} and of {other!r} would share a folder",
-        where=str(folder),
-        hint="Rename one of the logs, or give it another folder with --out",
-    )

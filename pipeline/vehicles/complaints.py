@@ -19,7 +19,6 @@ _PLACE = re.compile(r"at `\$\.?([^`]*)`")
 _UNKNOWN = re.compile(r"unknown field `([^`]*)`")
 _VALUE = re.compile(r"value '([^']*)'")
 _STEP = re.compile(r"[A-Za-z_]\w*|\[")
-_SECTION = re.compile(r"\s*\[+\s*([^\]]+?)\s*\]")
 
 
 def describe_fault(error: msgspec.ValidationError, where: str, source: Path | None) -> ConfigurationError:
@@ -128,11 +127,18 @@ def _find_line(source: Path, names: list[str], value: str) -> int | None:
     key = re.compile(rf"\s*\"?{re.escape(names[-1])}\"?\s*=")
     section: list[str] = []
     for number, line in enumerate(lines, start=1):
-        opened = _SECTION.match(line)
+        opened = _read_header(line)
         if opened:
-            section = opened[1].split(".")
+            section = opened.split(".")
             if section[-len(names) :] == names and not value:
                 return number
         elif key.match(line) and section[len(section) - len(above) :] == above and value in line:
             return number
     return None
+
+
+def _read_header(line: str) -> str:
+    """Name of the section that a line opens; empty where it opens none."""
+    text = line.strip()
+    name, closed, _ = text.lstrip("[").partition("]")
+    return name.strip() if text.startswith("[") and closed else ""

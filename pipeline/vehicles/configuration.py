@@ -5,12 +5,17 @@ Every section is optional. Unknown keys are errors, so that a misspelt one is no
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import msgspec
 
+from pipeline.vehicles.kinematics import list_kinds
+
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-Kind = Literal["differential", "ackermann"]
+if TYPE_CHECKING:
+    Kind: TypeAlias = str
+else:
+    Kind = Literal[list_kinds()]
 Clock = Literal["header", "log", "publish"]
 Unit = Literal["rad/s", "rpm", "m/s"]
 
@@ -21,7 +26,7 @@ class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     Attributes:
         preset: name or alias of a preset.
         name: what to call the vehicle.
-        kind: ideal model, ``differential`` or ``ackermann``.
+        kind: ideal model, the name of a file in `kinematics`.
         wheel_radius_m: r.
         track_width_m: b, between the middles of the left and right wheels.
         wheelbase_m: l, between the axles.

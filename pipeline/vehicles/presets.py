@@ -11,6 +11,7 @@ import msgspec
 
 from pipeline.vehicles.configuration import Kind, Positive, VehicleSection
 from pipeline.vehicles.errors import ConfigurationError
+from pipeline.vehicles.kinematics import Kinematics, find_kinematics
 
 
 class UsualTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -43,6 +44,11 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     controller_track_multiplier: Positive = 1.0
     aliases: Annotated[list[str], msgspec.Meta(description="other names")] = []
     topics: UsualTopics = UsualTopics()
+
+    @property
+    def kinematics(self) -> Kinematics:
+        """The ideal motion of its kind."""
+        return find_kinematics(self.kind)
 
 
 @functools.cache
@@ -109,8 +115,9 @@ def resolve_vehicle(section: VehicleSection, *, recorded: str | None, where: str
 
 
 def _check_geometry(vehicle: Vehicle, where: str) -> Vehicle:
-    needed = "track_width_m" if vehicle.kind == "differential" else "wheelbase_m"
-    if getattr(vehicle, needed) is None:
+    required = [quantity.name for quantity in vehicle.kinematics.geometry if quantity.required]
+    needed = next((name for name in required if getattr(vehicle, name) is None), None)
+    if needed is not None:
         raise ConfigurationError(
             "vehicle_incomplete",
             f"a vehicle of kind {vehicle.kind!r} needs {needed}",

@@ -2,6 +2,7 @@
 
 What the configuration names is taken. Otherwise the candidates of a role are those of a fitting type; names
 that vehicles usually have, and words such as `cmd` or `status`, rank them. The choice carries its reason.
+Where a log holds several robots, all roles are filled from the namespace of one.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import re
 from typing import TYPE_CHECKING, TypeVar
 
 from pipeline.vehicles.errors import ConfigurationError
+from pipeline.vehicles.robots import choose_robot, find_robots
 from pipeline.vehicles.sources import DriveForm, DriveSource, PoseSource, Signal, Sources, TopicSource
 
 if TYPE_CHECKING:
@@ -64,9 +66,11 @@ def choose_sources(
         where: the log, for error messages.
 
     Raises:
-        ConfigurationError: a configured topic is not in the log, or needs a field path.
+        ConfigurationError: a configured topic is not in the log, or needs a field path; or the log holds
+            several robots, and nothing says which is meant.
     """
     chooser = _Chooser([channel for channel in channels if channel.message_count != 0], vehicle, where)
+    chooser.settle_robot(configuration)
     return Sources(
         command=chooser.choose_drive(configuration.command, commanded=True),
         wheels=chooser.choose_drive(configuration.wheels, commanded=False),
@@ -86,10 +90,32 @@ class _Chooser:
         self.vehicle = vehicle
         self.where = where
         self.notes: list[str] = []
+        self._robot: str | None = None
+
+    def settle_robot(self, configuration: Configuration) -> None:
+        """Find out whose topics may be chosen, where the log holds those of several robots."""
+        pairs = (*self._pairs_of_sides(), *self._pairs_of_speed_and_steering())
+        drives = {
+            *self.of_type(JOINTS, *BODY_TYPES, *ACKERMANN_TYPES),
+            *(side for pair in pairs for side in pair),
+        }
+        poses = {topic for topic in self.of_type(*POSE_TYPES) if self._rank_pose(topic) is not None}
+        poses |= {topic for topic in self.of_type(*TRANSFORM_TYPES) if "static" not in topic}
+        robots = find_robots(drives, poses)
+        named = (*_list_topics(configuration.command), *_list_topics(configuration.wheels))
+        named = tuple(filter(None, (*named, configuration.pose.topic, configuration.imu.topic)))
+        self._robot = choose_robot(robots, configured=named, drives=drives, poses=poses, where=self.where)
+        if self._robot is not None:
+            others = ", ".join(robot.strip("/") for robot in robots if robot != self._robot)
+            self.notes.append(f"robot: {self._robot.strip('/')}; the log holds topics of {others} as well")
 
     def of_type(self, *types: str) -> list[str]:
-        """Topics of any of the types."""
-        return [topic for topic, kind in self.types.items() if kind in types]
+        """Topics of any of the types, of one robot."""
+        return [
+            topic
+            for topic, kind in self.types.items()
+            if kind in types and topic.startswith(self._robot or "")
+        ]
 
     def require(self, text: str, role: str) -> Signal:
         """A configured signal, or an error when its topic is not in the log."""
@@ -173,7 +199,7 @@ class _Chooser:
 
     def _drive_candidates(self, *, commanded: bool) -> Iterable[tuple[float, DriveSource]]:
         """Candidates with their rank: wheel commands before body commands, since the drive received them."""
-        ackermann = self.vehicle.kind == "ackermann"
+        ackermann = self.vehicle.kinematics.has_inputs("speed", "steering")
         for topic in self.of_type(JOINTS):
             says_command = bool(_COMMANDED.search(topic.lower()))
             if says_command == commanded:
@@ -224,7 +250,7 @@ class _Chooser:
 
     def choose_pose(self, topic: str | None, frames: list[str] | None) -> PoseSource | None:
         """The localization: configured, else the best named one, else transforms, else any odometry."""
-        transforms = self._dynamic_transforms()
+        transforms = self._dynamic_transforms(is_configured=bool(frames))
         if frames:
             if not transforms:
                 raise ConfigurationError(
@@ -253,9 +279,13 @@ class _Chooser:
             candidates.append((2.5, PoseSource(transforms, "the chain of transforms", from_transforms=True)))
         return self._best(candidates, self.vehicle.topics.pose, "pose")
 
-    def _dynamic_transforms(self) -> str:
-        found = [name for name in self.of_type(*TRANSFORM_TYPES) if "static" not in name]
-        return found[0] if found else ""
+    def _dynamic_transforms(self, *, is_configured: bool) -> str:
+        found = [
+            name for name, kind in self.types.items() if kind in TRANSFORM_TYPES and "static" not in name
+        ]
+        own = [name for name in found if name.startswith(self._robot or "")]
+        # Transforms of all robots at once serve where frames are named, and only there.
+        return next(iter(own or (found if is_configured else [])), "")
 
     def _rank_pose(self, topic: str) -> tuple[float, PoseSource] | None:
         name = topic.lower()
@@ -308,6 +338,12 @@ class _Chooser:
         if others:
             self.notes.append(f"{role}: {ranked[0][1]} was preferred to {others}")
         return ranked[0][1]
+
+
+def _list_topics(section: DriveSection) -> Iterable[str]:
+    """Topics that the configuration of a drive names."""
+    pairs = (section.left_topic, section.right_topic, section.speed_topic, section.steering_topic)
+    return filter(None, (section.topic, *pairs, section.yaw_rate_topic))
 
 
 def _rank_pairs(

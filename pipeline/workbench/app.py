@@ -1,36 +1,42 @@
-"""The web side: routes, and errors as JSON."""
+"""The web side: what each address answers."""
 
 from __future__ import annotations
 
+from contextlib import asynccontextmanager
 from importlib.resources import files
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
-from pipeline.core.errors import SlipError
 from pipeline.job.analyze import REPORT
 from pipeline.report.bundle import load_bundle
 from pipeline.vehicles import list_presets
+from pipeline.workbench.answers import answer, make_handlers
 from pipeline.workbench.errors import WorkbenchError
 from pipeline.workbench.guard import LOOPBACK, Guard
 from pipeline.workbench.hall import Hall
+from pipeline.workbench.limits import Limits
+from pipeline.workbench.places import Places
 from pipeline.workbench.requests import read_ask
 from pipeline.workbench.runs import find_run, list_runs
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import AsyncIterator, Awaitable, Callable
     from pathlib import Path
 
     from starlette.requests import Request
     from starlette.types import ASGIApp
 
+    from pipeline.batch.work import Report, Task
+
     Answer = Callable[[Request], Awaitable[Response]]
 
-MOST_BYTES = 16_000_000_000
+_LONGEST_LENGTH = 18
+"""Digits of the size of a log, before it is taken for a number."""
 
 _PAGES = {
     "/": ("pipeline.workbench", "page.html", "text/html"),
@@ -44,9 +50,8 @@ _PAGES = {
 # The report's own policy stands inside it: it may run what it brought, and reach nothing.
 _REPORT_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
-    "sandbox allow-scripts"
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox allow-scripts"
 )
-_NOT_FOUND = ("no_such_run", "no_such_desk", "no_such_job")
 
 
 class Web:
@@ -84,29 +89,29 @@ class Web:
         listed = await run_in_threadpool(list_runs, hall.store)
         presets = [{"id": preset.id, "name": preset.name} for preset in list_presets()]
         more = {"jobs": hall.jobs.show(), "vehicles": presets, "results": str(hall.results)}
-        return JSONResponse({**listed, **more})
+        return answer({**listed, **more})
 
     async def jobs(self, _: Request) -> Response:
         """Logs on their way to runs."""
-        return JSONResponse({"jobs": self._hall.jobs.show()})
+        return answer({"jobs": self._hall.jobs.show()})
 
     async def desk(self, request: Request) -> Response:
         """A change to a desk, and what it looks like then."""
-        return JSONResponse(await run_in_threadpool(self._hall.answer, await read_ask(request)))
+        return answer(await run_in_threadpool(self._hall.answer, await read_ask(request)))
 
     async def figures(self, request: Request) -> Response:
         """All figures of a desk."""
-        return JSONResponse(await run_in_threadpool(self._hall.draw, await read_ask(request)))
+        return answer(await run_in_threadpool(self._hall.draw, await read_ask(request)))
 
     async def rows(self, request: Request) -> Response:
         """Rows of the figures of a desk."""
-        return JSONResponse(await run_in_threadpool(self._hall.redraw, await read_ask(request)))
+        return answer(await run_in_threadpool(self._hall.redraw, await read_ask(request)))
 
     async def save(self, request: Request) -> Response:
         """Write the model file of a desk."""
         ask = await read_ask(request)
         path = await run_in_threadpool(self._hall.save_model, ask.run, ask.slot)
-        return JSONResponse({"path": str(path)})
+        return answer({"path": str(path)})
 
     async def download(self, request: Request) -> Response:
         """The model file of a desk."""
@@ -120,8 +125,11 @@ class Web:
         """The stored report of a run, shut off from this page."""
         run = request.query_params.get("run", "")
         manifest = await run_in_threadpool(find_run, self._hall.store, run)
+        path = manifest.path(REPORT)
+        if not path.is_file():
+            raise WorkbenchError("no_report", "its report is gone", where=run, hint="Analyze the log again.")
         headers = {"content-security-policy": _REPORT_POLICY}
-        return FileResponse(manifest.path(REPORT), media_type="text/html", headers=headers)
+        return FileResponse(path, media_type="text/html", headers=headers)
 
     async def bundle(self, _: Request) -> Response:
         """The JavaScript that draws."""
@@ -133,47 +141,61 @@ class Web:
     async def upload(self, request: Request) -> Response:
         """Take a log in, and begin to analyze it."""
         length = request.headers.get("content-length", "")
-        if not length.isdecimal():
+        if not (length.isascii() and length.isdecimal() and len(length) <= _LONGEST_LENGTH):
             raise WorkbenchError("no_length", "the size of the log is not known", hint="Drop it again.")
         name = request.query_params.get("name", "")
         job = await self._hall.jobs.take(name, int(length), request.stream())
-        return JSONResponse({"job": job.show()})
+        return answer({"job": job.show()})
 
     async def diagnose(self, request: Request) -> Response:
         """Begin to name what is missing from the model of a run."""
         ask = await read_ask(request)
         manifest = await run_in_threadpool(find_run, self._hall.store, ask.run)
-        return JSONResponse({"job": self._hall.jobs.diagnose(manifest).show()})
+        return answer({"job": self._hall.jobs.diagnose(manifest).show()})
 
     async def retry(self, request: Request) -> Response:
         """Analyze a log again, now that its vehicle is known."""
         query = request.query_params
         job = self._hall.jobs.retry(query.get("id", ""), query.get("vehicle", ""))
-        return JSONResponse({"job": job.show()})
+        return answer({"job": job.show()})
 
     async def dismiss(self, request: Request) -> Response:
         """Forget a job that has ended."""
         self._hall.jobs.dismiss(request.query_params.get("id", ""))
-        return JSONResponse({"jobs": self._hall.jobs.show()})
+        return answer({"jobs": self._hall.jobs.show()})
 
 
 def build_app(
     results: Path,
     *,
+    token: str,
     hosts: tuple[str, ...] = LOOPBACK,
-    most_bytes: int = MOST_BYTES,
+    limits: Limits | None = None,
     diagnosis: bool = True,
+    work: Callable[[Task], Report] | None = None,
 ) -> ASGIApp:
     """The workbench as an ASGI application.
 
     Args:
         results: the results folder; need not exist yet.
+        token: what whoever asks must know.
         hosts: names under which it may be addressed, without a port.
-        most_bytes: the largest log that is taken in.
+        limits: what logs and the work on them may cost.
         diagnosis: whether a dropped log is diagnosed too.
+        work: what the worker process does with a task; importable by its name there.
     """
-    web = Web(Hall(results, most_bytes, diagnosis=diagnosis))
-    return Guard(Starlette(routes=web.routes(), exception_handlers={SlipError: _tell_error}), hosts)
+    places = Places(results)
+    hall = Hall(results, limits or Limits(), diagnosis=diagnosis, places=places, work=work)
+
+    @asynccontextmanager
+    async def live(_: Starlette) -> AsyncIterator[None]:
+        try:
+            yield
+        finally:
+            await run_in_threadpool(hall.jobs.close)
+
+    app = Starlette(routes=Web(hall).routes(), exception_handlers=make_handlers(places), lifespan=live)
+    return Guard(app, token, hosts)
 
 
 def _serve_own(package: str, name: str, kind: str) -> Answer:
@@ -183,10 +205,3 @@ def _serve_own(package: str, name: str, kind: str) -> Answer:
         return Response(content, media_type=kind)
 
     return serve
-
-
-async def _tell_error(_: Request, error: Exception) -> Response:
-    if not isinstance(error, SlipError):
-        raise error
-    told = {"code": error.code, "message": error.what, "where": error.where, "hint": error.hint}
-    return JSONResponse({"error": told}, status_code=404 if error.code in _NOT_FOUND else 422)

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.motion import Input, Problem, State, Timing, fit_model, hold_out
+from pipeline.motion import Input, Problem, State, Timing, choose_input, fit_model, hold_out
 from pipeline.motion.describe import errors_as_json
 from pipeline.motion.floor import estimate_floor
 from pipeline.motion.intervals import estimate_intervals
 from pipeline.motion.score import score
-from pipeline.report.motion_run import choose_source, load_motion_run, load_vehicle
+from pipeline.report.motion_run import load_motion_run, load_vehicle
 from pipeline.report.motion_view import MotionStage
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ class Bench:
             MotionError: the run has too little that can be compared.
         """
         vehicle, run = self.load(manifest)
-        chosen = choose_source(run, source)
+        chosen = choose_input([run], source).source
         key = (manifest.run, manifest.key, chosen.value)
         with self._lock:
             making = self._making.setdefault(key, threading.Lock())

@@ -37,9 +37,15 @@ def show_desk(desk: Desk, file: ModelFile) -> dict[str, object]:
         "by_hand": step.by_hand,
         "ideal": _errors(step.ladder[0]),
         "errors": _errors(step.ladder[-1]),
-        "before": _errors(before.ladder[-1]) if before is not None else None,
+        "before": _errors(before.ladder[-1]) if before is not None and before.ladder else None,
         "floor": _errors(desk.floor) if desk.floor else None,
-        "effects": [show_effect(file, name, step.off, step.without.get(name)) for name in step.order],
+        # What the loader of models left out, and why.
+        "warnings": list(file.warnings),
+        "effects": [
+            show_effect(file, name, step.off, step.without.get(name))
+            for name in step.order
+            if name not in file.left_out
+        ],
         "undo": desk.steps[desk.at].said if desk.at > 0 else None,
         "redo": desk.steps[desk.at + 1].said if desk.at + 1 < len(desk.steps) else None,
         "history": [each.said for each in desk.steps[: desk.at + 1]][-_LATEST:],

@@ -88,6 +88,11 @@ class Desk(msgspec.Struct, frozen=True, kw_only=True):
         steps = [*self.steps[: self.at + 1], step][-_MOST_STEPS:]
         return msgspec.structs.replace(self, steps=steps, at=len(steps) - 1)
 
+    def drop(self, which: int) -> Desk:
+        """The desk without one of its steps; before it where that one counted."""
+        steps = [step for number, step in enumerate(self.steps) if number != which]
+        return msgspec.structs.replace(self, steps=steps, at=max(self.at - (which <= self.at), 0))
+
     def move(self, by: int) -> Desk:
         """The desk some steps back (negative) or forward, as far as there are any."""
         return msgspec.structs.replace(self, at=min(max(self.at + by, 0), len(self.steps) - 1))

@@ -1,18 +1,25 @@
-"""Who may ask: this machine's own page, and nobody else.
+"""Who may ask: whoever holds the token, from this server's own page, and nobody else.
 
-A page of another site that a browser has open may send requests to the loopback; a name that such a site owns
-may even resolve to it. So the host must be one that the server was started for, and whatever comes from
-another origin is refused.
+Other users of the machine can reach the loopback as well, so the token that was printed with the address is
+asked for: once in the address, then as a cookie, or as `Authorization: Bearer` by a script. A page of another
+site that a browser has open may send requests here too; a name that such a site owns may even resolve to this
+machine. So the host must be one that the server was started for, and whatever comes from another origin is
+refused.
 """
 
 from __future__ import annotations
 
+import secrets
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
 
-from starlette.responses import JSONResponse
+from starlette.datastructures import QueryParams
+from starlette.requests import cookie_parser
+from starlette.responses import HTMLResponse, JSONResponse
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from starlette.responses import Response
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 POLICY = (
@@ -29,21 +36,40 @@ HEADERS = {
     "cache-control": "no-store",
 }
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+_HOW_TO_ENTER = (
+    "open the workbench with the whole address that `slip serve` printed, the one with ?token= in it; "
+    "a script sends the token as `Authorization: Bearer`"
+)
 
 _SAFE = ("GET", "HEAD")
 _OWN_SITES = ("same-origin", "none")
+_HEAD = (
+    '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>workbench \u00b7 slip</title>'
+    '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    '<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,">'
+)
+# The page is opened by a request of its own: the token leaves the address, and the browser takes later
+# requests for the same site's, wherever the link to here stood.
+_WELCOME = f'{_HEAD}<meta http-equiv="refresh" content="0; url=/"></head><body></body></html>'
+
+
+def make_token() -> str:
+    """A token that nobody can guess."""
+    return secrets.token_urlsafe(32)
 
 
 class Guard:
-    """Refuses foreign hosts and origins, and puts the headers on every answer.
+    """Refuses whoever has no token, foreign hosts and origins, and puts the headers on every answer.
 
     Args:
         app: what is guarded.
+        token: what must be known.
         hosts: names under which the server may be addressed, without a port.
     """
 
-    def __init__(self, app: ASGIApp, hosts: tuple[str, ...] = LOOPBACK) -> None:
+    def __init__(self, app: ASGIApp, token: str, hosts: tuple[str, ...] = LOOPBACK) -> None:
         self._app = app
+        self._token = token
         self._hosts = frozenset(host.lower() for host in hosts)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -62,29 +88,48 @@ class Guard:
                 message = {**message, "headers": [*message["headers"], *more]}
             await send(message)
 
-        refused = self._refuse(scope)
-        if refused:
-            answer = JSONResponse({"error": {"code": "refused", "message": refused}}, status_code=403)
-            await answer(scope, receive, send_guarded)
-            return
-        await self._app(scope, receive, send_guarded)
+        await (self._answer(scope) or self._app)(scope, receive, send_guarded)
 
-    def _refuse(self, scope: Scope) -> str:
+    def _answer(self, scope: Scope) -> Response | None:
+        """The answer to a request that does not reach the workbench."""
         headers = {
             name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]
         }
+        scheme, _, bearer = headers.get("authorization", "").partition(" ")
+        bears = scheme.lower() == "bearer" and self._is_token(bearer.strip())
+        refused = self._check_origin(scope, headers, bears=bears)
+        if refused:
+            return _refuse(scope, "refused", refused)
+        if bears:
+            return None
+        # Cookies do not tell ports apart: workbenches side by side need names of their own.
+        cookie = f"slip-{scope['server'][1]}"
+        if scope["path"] == "/" and self._is_token(QueryParams(scope["query_string"]).get("token", "")):
+            welcome = HTMLResponse(_WELCOME)
+            welcome.set_cookie(cookie, self._token, httponly=True, samesite="strict")
+            return welcome
+        if self._is_token(cookie_parser(headers.get("cookie", "")).get(cookie, "")):
+            return None
+        return _refuse(scope, "no_token", _HOW_TO_ENTER)
+
+    def _is_token(self, given: str) -> bool:
+        return secrets.compare_digest(given.encode(), self._token.encode())
+
+    def _check_origin(self, scope: Scope, headers: Mapping[str, str], *, bears: bool) -> str:
         host = headers.get("host", "")
         if strip_port(host) not in self._hosts:
             return "this server does not go by that name"
         origin = headers.get("origin")
-        if origin is not None and not _is_own(origin, host):
+        if origin is not None and origin.lower() != f"http://{host.lower()}":
             return "the request comes from another origin"
-        if scope["method"] in _SAFE:
-            # A link from elsewhere may open the page; it may not read or load anything else.
-            site = headers.get("sec-fetch-site", "same-origin")
-            navigates = headers.get("sec-fetch-mode") == "navigate" and scope["path"] == "/"
-            return "" if site in _OWN_SITES or navigates else "the request comes from another site"
-        if origin is None:
+        # A link from elsewhere may open the page; it may not read, load or change anything.
+        navigates = (
+            scope["method"] in _SAFE and headers.get("sec-fetch-mode") == "navigate" and scope["path"] == "/"
+        )
+        if headers.get("sec-fetch-site", "same-origin") not in _OWN_SITES and not navigates:
+            return "the request comes from another site"
+        # No page of another site can send the token itself, as a script does.
+        if scope["method"] not in _SAFE and origin is None and not bears:
             return "a request that changes something must say its origin"
         return ""
 
@@ -96,6 +141,8 @@ def strip_port(host: str) -> str:
     return host.partition(":")[0].lower()
 
 
-def _is_own(origin: str, host: str) -> bool:
-    parts = urlsplit(origin)
-    return parts.scheme == "http" and parts.netloc.lower() == host.lower()
+def _refuse(scope: Scope, code: str, why: str) -> Response:
+    if scope["path"] == "/":
+        sentence = f"{why[0].upper()}{why[1:]}."
+        return HTMLResponse(f"{_HEAD}</head><body><p>{sentence}</p></body></html>", status_code=403)
+    return JSONResponse({"error": {"code": code, "message": why}}, status_code=403)

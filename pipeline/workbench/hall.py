@@ -15,7 +15,7 @@ from pipeline.workbench.bench import Bench
 from pipeline.workbench.cards import list_catalogue, show_desk
 from pipeline.workbench.desk import DeskFile, switch_off
 from pipeline.workbench.diagnoses import read_diagnosis
-from pipeline.workbench.errors import WorkbenchError
+from pipeline.workbench.errors import WorkbenchError, evaluating
 from pipeline.workbench.formulas import make_formula
 from pipeline.workbench.jobs import Jobs
 from pipeline.workbench.live import Album
@@ -26,12 +26,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from pipeline.batch.work import Report, Task
     from pipeline.motion.formula import FormulaEffect
     from pipeline.motion.model_file import ModelFile
     from pipeline.report.motion_view import MotionView
     from pipeline.store import Manifest
     from pipeline.workbench.bench import Stand
     from pipeline.workbench.desk import Desk
+    from pipeline.workbench.limits import Limits
+    from pipeline.workbench.places import Places
     from pipeline.workbench.requests import Ask
 
 _MOST_ALBUMS = 6
@@ -42,14 +45,24 @@ class Hall:
 
     Args:
         results: the results folder.
-        most_bytes: the largest log that is taken in.
+        limits: what logs and the work on them may cost.
         diagnosis: whether a dropped log is diagnosed too.
+        places: what the page is not told.
+        work: what the worker process does with a task; importable by its name there.
     """
 
-    def __init__(self, results: Path, most_bytes: int, *, diagnosis: bool) -> None:
+    def __init__(
+        self,
+        results: Path,
+        limits: Limits,
+        *,
+        diagnosis: bool,
+        places: Places,
+        work: Callable[[Task], Report] | None = None,
+    ) -> None:
         self.results = results
         self.store = Store(results)
-        self.jobs = Jobs(results, most_bytes, diagnosis=diagnosis)
+        self.jobs = Jobs(results, limits, diagnosis=diagnosis, places=places, work=work)
         self._bench = Bench()
         self._trials = Trials()
         self._albums: OrderedDict[tuple[str, str], Album] = OrderedDict()
@@ -64,26 +77,30 @@ class Hall:
         manifest = find_run(self.store, ask.run)
         file = DeskFile(self.results, ask.run, ask.slot)
         stand = self._bench.stand(manifest, self._input_of(ask, file, manifest))
-        with stand.lock:
+        with stand.lock, evaluating(ask.run):
             desk = work.open_desk(file, stand)
             if ask.action == "preview":
                 return self._preview(file, stand, desk, ask)
             changed = work.learn_floor(
                 self._change(file, stand, desk, ask), read_diagnosis(self.results, manifest)
             )
+            # A step that cannot be shown is not kept.
+            shown = self._show(file, stand, changed)
             if changed is not desk:
                 file.write(changed)
-            return self._show(file, stand, changed)
+            return shown
 
     def draw(self, ask: Ask) -> dict[str, object]:
         """All figures of a desk."""
         album, view = self._look(ask)
-        return album.draw(view)
+        with evaluating(ask.run):
+            return album.draw(view)
 
     def redraw(self, ask: Ask) -> dict[str, object]:
         """The rows of a desk's figures that a change moves."""
         album, view = self._look(ask)
-        return album.redraw(view)
+        with evaluating(ask.run):
+            return album.redraw(view)
 
     def format_model(self, run: str, slot: str) -> str:
         """The model file of a desk as text."""
@@ -108,7 +125,7 @@ class Hall:
         manifest = find_run(self.store, ask.run)
         file = DeskFile(self.results, ask.run, ask.slot)
         stand = self._bench.stand(manifest, self._input_of(ask, file, manifest))
-        with stand.lock:
+        with stand.lock, evaluating(ask.run):
             desk = work.open_desk(file, stand)
         return stand, desk, file.parse(desk.step.model)
 
@@ -132,8 +149,8 @@ class Hall:
             "set": lambda: work.set_value(file, stand, desk, ask.effect, {ask.parameter: ask.value}),
             "lock": lambda: work.lock_value(file, desk, ask.effect, ask.parameter),
             "fit": lambda: work.fit_desk(file, stand, desk),
-            "undo": lambda: desk.move(-1),
-            "redo": lambda: desk.move(1),
+            "undo": lambda: work.move(file, desk, -1),
+            "redo": lambda: work.move(file, desk, 1),
             "try": lambda: self._begin_trial(file, stand, desk),
         }
         return changes[ask.action]()
@@ -167,7 +184,8 @@ class Hall:
     def _look(self, ask: Ask) -> tuple[Album, MotionView]:
         stand, desk, parsed = self._open(ask)
         model = switch_off(parsed.model, desk.step.off)
-        view = stand.view(model, desk.step.timing, desk.step.ladder, desk.floor or None)
+        with evaluating(ask.run):
+            view = stand.view(model, desk.step.timing, desk.step.ladder, desk.floor or None)
         return self._album(stand.manifest), view
 
     def _album(self, manifest: Manifest) -> Album:

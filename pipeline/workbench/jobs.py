@@ -1,29 +1,30 @@
-"""Logs that were dropped on the page: taken in piece by piece, then analyzed, with progress."""
+"""Dropped logs on their way to runs, and diagnoses: in the background, with progress."""
 
 from __future__ import annotations
 
-import os
-import re
 import secrets
-import shutil
 import threading
 import time
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.core.errors import SlipError
-from pipeline.job.analyze import analyze_log, update_datasets
 from pipeline.job.options import STAGES, Options
-from pipeline.store import Store
-from pipeline.workbench.desk import FOLDER
-from pipeline.workbench.diagnoses import write_diagnosis
+from pipeline.job.subject import name_run
+from pipeline.store import LogSighting, Store, see_log
 from pipeline.workbench.errors import WorkbenchError
+from pipeline.workbench.uploads import Upload, Uploads, clean_name
+from pipeline.workbench.workers import ANALYZE, DIAGNOSE, Errand, Workers
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-    from pathlib import Path
+    from collections.abc import AsyncIterator, Callable
 
+    from pipeline.batch.work import Report, Task
     from pipeline.store import Manifest
+    from pipeline.workbench.limits import Limits
+    from pipeline.workbench.places import Places
 
 WORDS = {
     "upload": "taking the log in",
@@ -38,10 +39,10 @@ WORDS = {
 }
 
 _STEPS = ("upload", "read", *STAGES, "diagnosis", "report")
-_SPARE_BYTES = 200_000_000
 _MOST_JOBS = 50
-_LOST_NAME = "dropped.mcap"
-_PLAIN = re.compile(r"[^0-9A-Za-z._ -]")
+_LONGEST_NAME = 200
+_FOLDER = Path("/dropped")
+"""A run is called after its log's folder and name; this one need not exist."""
 
 
 @dataclass
@@ -51,7 +52,6 @@ class Job:
     Attributes:
         id: for the page.
         name: of the file, as dropped.
-        path: where it stands.
         total: bytes that were announced.
         received: bytes that have come.
         stage: what is being done.
@@ -60,12 +60,13 @@ class Job:
         error: what went wrong, as JSON; None while nothing did.
         done: whether it has ended.
         lossy: whether the log had losses.
+        upload: the log, as long as it is there: until it is analyzed, or while its vehicle is asked for.
+        sha256: of the log.
     """
 
     id: str
     name: str
-    path: Path
-    total: int
+    total: int = 0
     received: int = 0
     stage: str = "upload"
     began: float = field(default_factory=time.monotonic)
@@ -73,6 +74,8 @@ class Job:
     error: dict[str, str] | None = None
     done: bool = False
     lossy: bool = False
+    upload: Upload | None = None
+    sha256: str = ""
 
     def tell(self, stage: str) -> None:
         """Go on to a stage."""
@@ -98,87 +101,72 @@ class Job:
 
 
 class Jobs:
-    """All logs that were dropped since the server started.
+    """All logs that were dropped and all diagnoses that were asked for since the server started.
 
     Args:
         results: the results folder.
-        most_bytes: the largest log that is taken in.
+        limits: what logs and the work on them may cost.
         diagnosis: whether a dropped log is diagnosed too.
+        work: what is done in the worker process; importable by its name there.
     """
 
-    def __init__(self, results: Path, most_bytes: int, *, diagnosis: bool) -> None:
-        self._results = results
-        self._most = most_bytes
+    def __init__(
+        self,
+        results: Path,
+        limits: Limits,
+        *,
+        diagnosis: bool,
+        places: Places,
+        work: Callable[[Task], Report] | None = None,
+    ) -> None:
+        self._results = results.resolve()
         self._diagnosis = diagnosis
+        self._places = places
         self._jobs: dict[str, Job] = {}
-        self._one_at_a_time = threading.Lock()
+        self._uploads = Uploads(results, limits)
+        self._workers = Workers(limits, work)
 
     def show(self) -> list[dict[str, object]]:
         """All jobs as JSON, the newest first."""
-        return [job.show() for job in reversed(self._jobs.values())]
+        return [job.show() for job in reversed(tuple(self._jobs.values()))]
 
     def dismiss(self, name: str) -> None:
         """Forget a job that has ended."""
-        if name in self._jobs and self._jobs[name].done:
-            del self._jobs[name]
+        job = self._jobs.get(name)
+        if job is not None and job.done:
+            self._forget(job)
+
+    def close(self) -> None:
+        """End what is being done, and delete the logs."""
+        self._workers.close()
+        self._uploads.close()
 
     async def take(self, name: str, total: int, chunks: AsyncIterator[bytes]) -> Job:
         """Take a log in, piece by piece, and begin to analyze it.
 
         Args:
-            name: of the file; only its last part is used, and only plain characters of it.
+            name: of the file, as the browser says it.
             total: bytes that were announced.
             chunks: the content.
 
         Raises:
-            WorkbenchError: too large, no room on the disk, or the connection broke.
+            WorkbenchError: too large or too many, no room on the disk, or the connection broke.
         """
-        self._check_room(name, total)
-        folder = self._results.resolve() / FOLDER / "uploads" / secrets.token_hex(4)
-        # A run is called after its log's folder and name.
-        place = folder / "dropped"
-        place.mkdir(parents=True)
-        job = Job(folder.name, name, place / clean_name(name), total)
-        self._jobs[job.id] = job
-        while len(self._jobs) > _MOST_JOBS:
-            self._jobs.pop(next(iter(self._jobs)))
+        job = Job(secrets.token_hex(4), name[:_LONGEST_NAME], total)
+
+        def begin() -> None:
+            self._add(job)
+
+        def tell(received: int) -> None:
+            job.received = received
+
         try:
-            await self._fill(job, chunks)
-        except BaseException as error:
-            shutil.rmtree(folder, ignore_errors=True)
+            job.upload, job.sha256 = await self._uploads.take(job.name, total, chunks, begin, tell)
+        except BaseException:
             self._jobs.pop(job.id, None)
-            if isinstance(error, OSError):
-                raise WorkbenchError(
-                    "upload_not_written",
-                    f"the log cannot be kept: {error.strerror}",
-                    where=name,
-                    hint="Free some space.",
-                ) from error
             raise
-        self.start(job, None)
+        self._start(job, job.upload, None)
         return job
-
-    async def _fill(self, job: Job, chunks: AsyncIterator[bytes]) -> None:
-        part = job.path.with_name(f".{job.path.name}.part")
-        with part.open("wb") as file:
-            async for chunk in chunks:
-                job.received += len(chunk)
-                if job.received > self._most:
-                    raise self._too_large(job.name)
-                file.write(chunk)
-        if job.received != job.total:
-            raise WorkbenchError(
-                "upload_broken",
-                f"{job.received} of {job.total} bytes came",
-                where=job.name,
-                hint="Drop it again.",
-            )
-        part.replace(job.path)
-
-    def start(self, job: Job, vehicle: str | None) -> None:
-        """Analyze the log of a job in the background."""
-        job.error, job.done = None, False
-        threading.Thread(target=self._analyze, args=(job, vehicle), daemon=True).start()
 
     def retry(self, name: str, vehicle: str) -> Job:
         """Analyze again, now that the vehicle is known.
@@ -187,9 +175,9 @@ class Jobs:
             WorkbenchError: ``no_such_job``.
         """
         job = self._jobs.get(name)
-        if job is None or not job.done or job.error is None:
+        if job is None or not job.done or job.upload is None:
             raise WorkbenchError("no_such_job", "that log is not waiting", hint="Drop it again.")
-        self.start(job, vehicle)
+        self._start(job, job.upload, vehicle)
         return job
 
     def diagnose(self, manifest: Manifest) -> Job:
@@ -199,71 +187,66 @@ class Jobs:
             WorkbenchError: ``busy``, that is being done already.
         """
         name = f"diagnosis of {manifest.run}"
-        if any(job.name == name and not job.done for job in self._jobs.values()):
+        if any(job.name == name and not job.done for job in tuple(self._jobs.values())):
             raise WorkbenchError(
                 "busy", "that is being done already", where=manifest.run, hint="Wait for it."
             )
-        job = Job(secrets.token_hex(4), name, manifest.folder, 0)
+        job = Job(secrets.token_hex(4), name)
         job.tell("diagnosis")
-        self._jobs[job.id] = job
-        threading.Thread(target=self._diagnose, args=(job, manifest), daemon=True).start()
+        self._add(job)
+        self._begin(job, partial(self._make_diagnosis, manifest))
         return job
 
-    def _diagnose(self, job: Job, manifest: Manifest) -> None:
-        try:
-            with self._one_at_a_time:
-                write_diagnosis(self._results, manifest)
-            job.run = manifest.run
-        except SlipError as error:
-            job.error = {"code": error.code, "message": str(error), "hint": error.hint}
-        finally:
-            job.done = True
+    def _add(self, job: Job) -> None:
+        self._jobs[job.id] = job
+        for old in tuple(self._jobs.values()):
+            if len(self._jobs) > _MOST_JOBS and old.done:
+                self._forget(old)
 
-    def _analyze(self, job: Job, vehicle: str | None) -> None:
+    def _forget(self, job: Job) -> None:
+        self._jobs.pop(job.id, None)
+        if job.upload is not None:
+            self._uploads.remove(job.upload)
+
+    def _start(self, job: Job, upload: Upload, vehicle: str | None) -> None:
+        job.error, job.done = None, False
         job.tell("read")
-        overrides = {"vehicle": {"preset": vehicle}} if vehicle else {}
-        options = Options(out=self._results, overrides=overrides, diagnosis=self._diagnosis)
+        self._begin(job, partial(self._make_analysis, upload, job.sha256, vehicle))
+
+    def _begin(self, job: Job, prepare: Callable[[], Errand]) -> None:
+        threading.Thread(target=self._do, args=(job, prepare), daemon=True).start()
+
+    def _do(self, job: Job, prepare: Callable[[], Errand]) -> None:
         try:
-            with self._one_at_a_time:
-                outcome = analyze_log(job.path, options, job.tell)
-                update_datasets(Store(self._results))
-            job.run, job.lossy = outcome.manifest.run, outcome.lossy
+            entry = self._workers.run(prepare(), job.tell)
+            job.run, job.lossy = entry.run, entry.state == "lossy"
         except SlipError as error:
-            job.error = {"code": error.code, "message": str(error), "hint": error.hint}
-        except Exception as error:  # noqa: BLE001 - a log must not take the server down, whatever is in it
-            job.error = {
-                "code": "failed",
-                "message": f"{type(error).__name__}: {error}",
-                "hint": "Try `slip analyze` on it.",
-            }
+            code, upload = error.code, job.upload
+            message = str(error) if upload is None else str(error).replace(str(upload.path), job.name)
+            job.error = {"code": code, "message": self._places.hide(message), "hint": error.hint}
+        except Exception as error:  # noqa: BLE001 - whoever waits for the job must hear that it has ended
+            message = self._places.hide(f"{type(error).__name__}: {error}")
+            job.error = {"code": "failed", "message": message, "hint": "Try it in a terminal."}
         finally:
+            # A log whose vehicle is asked for is needed once more.
+            waits = job.error is not None and "vehicle" in job.error["code"]
+            if job.upload is not None and not waits:
+                self._uploads.remove(job.upload)
+                job.upload = None
             job.done = True
 
-    def _check_room(self, name: str, total: int) -> None:
-        if total > self._most:
-            raise self._too_large(name)
-        self._results.mkdir(parents=True, exist_ok=True)
-        free = shutil.disk_usage(self._results).free
-        if total + _SPARE_BYTES > free:
-            raise WorkbenchError(
-                "disk_full",
-                f"the log has {total / 1e6:.0f} MB, the disk {free / 1e6:.0f} MB left",
-                where=name,
-                hint="Free some space, or run `slip analyze` on the file where it is.",
-            )
-
-    def _too_large(self, name: str) -> WorkbenchError:
-        return WorkbenchError(
-            "too_large",
-            f"more than {self._most / 1e6:.0f} MB are not taken in",
-            where=name,
-            hint="Run `slip analyze` on the file where it is; it appears here by itself.",
+    def _make_analysis(self, upload: Upload, sha256: str, vehicle: str | None) -> Errand:
+        store = Store(self._results)
+        options = Options(
+            out=self._results,
+            run=name_run(_FOLDER / clean_name(upload.name), sha256, store),
+            overrides={"vehicle": {"preset": vehicle}} if vehicle else {},
+            diagnosis=self._diagnosis,
         )
+        log = see_log(upload.path)
+        return Errand(path=upload.path, log=log, basis=ANALYZE, options=options, notes=upload.notes)
 
-
-def clean_name(name: str) -> str:
-    """A file name out of whatever a browser sends: its last part, plain characters, one suffix."""
-    last = os.path.basename(name.replace("\\", "/"))  # noqa: PTH119 - the text need not be a path here
-    plain = _PLAIN.sub("_", last).strip(". ")[-100:]
-    stem = plain.removesuffix(".mcap").strip(". ") or _LOST_NAME.removesuffix(".mcap")
-    return f"{stem}.mcap"
+    def _make_diagnosis(self, manifest: Manifest) -> Errand:
+        options = Options(out=self._results, run=manifest.run)
+        log = LogSighting(path=manifest.run, size=0, mtime_ns=0, inode=0, seen_ns=0)
+        return Errand(path=manifest.folder, log=log, basis=DIAGNOSE, options=options, notes=None)

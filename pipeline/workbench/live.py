@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING
 
 from pipeline.report import RunReport, theme
@@ -17,6 +16,7 @@ from pipeline.report.figures.velocities import model_rows
 from pipeline.report.scene import Scene
 from pipeline.report.sections.where import VERBS, find_regions
 from pipeline.report.specs import build_spec, pack_rows, share_rows
+from pipeline.workbench.runs import read_summary
 
 if TYPE_CHECKING:
     from pipeline.report.motion_view import MotionView
@@ -43,12 +43,9 @@ class Album:
     """
 
     def __init__(self, manifest: Manifest) -> None:
-        summary = {}
-        if "summary.json" in manifest.files:
-            summary = json.loads(manifest.path("summary.json").read_text(encoding="utf-8"))
         wanted = ("velocities", "slip", "windows", "aggregates")
         self._tables = {name: manifest.read(name) for name in wanted if name in manifest.tables}
-        self._summary = summary
+        self._summary = read_summary(manifest)
 
     def draw(self, view: MotionView) -> dict[str, object]:
         """Specifications, rows, titles and words of all figures."""

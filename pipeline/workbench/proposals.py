@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.errors import SlipError
 from pipeline.motion import MotionError, fit_model, hold_out, list_effects
 from pipeline.motion.ladder import compare_losses
 from pipeline.workbench.cards import describe_shortly
+from pipeline.workbench.errors import evaluating
 
 if TYPE_CHECKING:
     from pipeline.motion import HeldOut, Model, Problem
@@ -100,6 +102,15 @@ def _key(stand: Stand, model: Model) -> tuple[object, ...]:
 
 
 def _try_all(stand: Stand, model: Model, names: list[str], trial: Trial) -> None:
+    try:
+        with evaluating(stand.manifest.run):
+            _try_each(stand, model, names, trial)
+    except SlipError:
+        # On top of a model that cannot be fitted nothing can be tried.
+        trial.tried = trial.total
+
+
+def _try_each(stand: Stand, model: Model, names: list[str], trial: Trial) -> None:
     problem = stand.coarse_problem()
     base: HeldOut = hold_out(problem, fit_model(problem, model))
     kinds = {effect.id: effect for effect in list_effects()}

@@ -69,7 +69,7 @@ async def read_ask(request: Request) -> Ask:
             raise _bad("it is too long")
     try:
         ask = msgspec.json.decode(bytes(body), type=Ask)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise _bad(str(error)) from None
     if not math.isfinite(ask.value):
         raise _bad("the value is no number")

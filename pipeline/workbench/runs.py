@@ -5,12 +5,17 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from pipeline.workbench.errors import WorkbenchError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from pathlib import Path
 
     from pipeline.store import Manifest, Store
+
+_LONGEST = 500
+"""Characters of a text that a log wrote; longer ones are cut on the page."""
 
 _KEYS = (
     "vehicle",
@@ -38,29 +43,43 @@ def describe_run(manifest: Manifest) -> dict[str, object]:
     summary = read_summary(manifest)
     log = summary.get("log")
     log = log if isinstance(log, dict) else {}
-    findings = summary.get("findings")
-    findings = findings if isinstance(findings, list) else []
     return {
         "run": manifest.run,
-        **{key: summary.get(key) for key in _KEYS},
-        "sha256": log.get("sha256"),
-        "duration_s": log.get("duration_s"),
-        "complete": log.get("complete"),
-        "losses": log.get("losses") or [],
-        "findings": [
-            {key: entry.get(key) for key in ("id", "severity", "text")}
-            for entry in findings
-            if isinstance(entry, dict)
-        ],
+        **{key: _cut(summary.get(key)) for key in _KEYS},
+        "sha256": _cut(log.get("sha256")),
+        "duration_s": _cut(log.get("duration_s")),
+        "complete": log.get("complete") is True,
+        "losses": _cut_all(log.get("losses"), ("kind", "text")),
+        "findings": _cut_all(summary.get("findings"), ("id", "severity", "text")),
         "report": "report.html" in manifest.files,
     }
 
 
-def read_summary(manifest: Manifest) -> Mapping[str, object]:
-    """The stored summary; empty where there is none."""
-    if "summary.json" not in manifest.files:
+def _cut_all(entries: object, keys: tuple[str, ...]) -> list[dict[str, object]]:
+    known = entries if isinstance(entries, list) else []
+    return [{key: _cut(entry.get(key)) for key in keys} for entry in known if isinstance(entry, dict)]
+
+
+def _cut(value: object) -> object:
+    """A number or a text that is not too long; None for anything else."""
+    if isinstance(value, str):
+        return value if len(value) <= _LONGEST else f"{value[:_LONGEST]} \u2026"
+    return value if isinstance(value, int | float) else None
+
+
+def read_summary(manifest: Manifest) -> dict[str, object]:
+    """The stored summary; empty where there is none that can be read."""
+    return read_json(manifest.path("summary.json")) if "summary.json" in manifest.files else {}
+
+
+def read_json(path: Path) -> dict[str, object]:
+    """The object in a file; empty where there is none that can be read."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        # What is half of a character in there cannot be sent on.
+        msgspec.json.encode(found)
+    except (OSError, ValueError, RecursionError):
         return {}
-    found = json.loads(manifest.path("summary.json").read_text(encoding="utf-8"))
     return found if isinstance(found, dict) else {}
 
 

@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from typing import TYPE_CHECKING
 
 from pipeline.report.bundle import warm_bundle
 from pipeline.workbench.app import build_app
 from pipeline.workbench.errors import WorkbenchError
-from pipeline.workbench.guard import LOOPBACK
+from pipeline.workbench.guard import LOOPBACK, make_token
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from pipeline.workbench.limits import Limits
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address can be reached from this machine only."""
+    return host in LOOPBACK or host == "::1"
+
 
 def serve(
-    results: Path, *, host: str, port: int, tell: Callable[[str], None], diagnosis: bool = True
+    results: Path,
+    *,
+    host: str,
+    port: int,
+    tell: Callable[[str, str], None],
+    limits: Limits,
+    diagnosis: bool = True,
 ) -> None:
     """Serve the workbench until it is interrupted.
 
@@ -24,7 +38,8 @@ def serve(
         results: the results folder.
         host: address to listen on; anything but the loopback opens it to the network.
         port: 0 takes any that is free.
-        tell: told the address once it listens.
+        tell: told the address and the token once it listens.
+        limits: what logs and work on them may cost.
         diagnosis: whether a dropped log is diagnosed too.
 
     Raises:
@@ -32,12 +47,15 @@ def serve(
     """
     import uvicorn  # noqa: PLC0415 - heavy
 
+    # Processes that are started from here take no code from the folder they are started in.
+    os.environ["PYTHONSAFEPATH"] = "1"
     listener = _listen(host, port)
-    hosts = LOOPBACK if host in LOOPBACK or host == "::1" else (*LOOPBACK, host.lower(), *_own_names(host))
-    app = build_app(results, hosts=hosts, diagnosis=diagnosis)
+    hosts = LOOPBACK if is_loopback(host) else (*LOOPBACK, host.lower(), *_own_names(host))
+    token = make_token()
+    app = build_app(results, token=token, hosts=hosts, limits=limits, diagnosis=diagnosis)
     warm_bundle()
     shown = f"[{host}]" if ":" in host else host
-    tell(f"http://{shown}:{listener.getsockname()[1]}/")
+    tell(f"http://{shown}:{listener.getsockname()[1]}/", token)
     configuration = uvicorn.Config(
         app,
         ws="none",
@@ -55,6 +73,8 @@ def _listen(host: str, port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
+        # Whoever reads the address may ask at once; the answer comes when the server is ready.
+        listener.listen()
     except OSError as error:
         listener.close()
         raise WorkbenchError(

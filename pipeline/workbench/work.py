@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -9,12 +10,14 @@ import msgspec
 from pipeline.motion import find_effect
 from pipeline.motion.describe import errors_as_json
 from pipeline.workbench.bench import rung_as_json
+from pipeline.workbench.cards import show_desk
 from pipeline.workbench.desk import Desk, Step, begin_desk, format_step, switch_off
+from pipeline.workbench.errors import WorkbenchError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.motion import Effect, Model
+    from pipeline.motion import Effect, Errors, Model
     from pipeline.workbench.bench import Judged, Stand
     from pipeline.workbench.desk import DeskFile
 
@@ -22,18 +25,42 @@ if TYPE_CHECKING:
 
 
 def open_desk(file: DeskFile, stand: Stand) -> Desk:
-    """The desk of a run as it was left; begun anew where there is none or the results have changed."""
+    """The desk of a run as it was left; begun anew where there is none or the results have changed.
+
+    Steps that cannot be opened any more are left out.
+    """
     desk = file.read()
     source = stand.problem.source.value
-    if desk is None or desk.key != stand.manifest.key or desk.input != source or not desk.steps:
+    if desk is not None and (desk.key != stand.manifest.key or desk.input != source):
+        desk = None
+    desk = desk.move(0) if desk is not None else None
+    while desk is not None and desk.steps and not _can_open(file, desk):
+        desk = desk.drop(desk.at)
+    if desk is None or not desk.steps:
         desk = begin_desk(stand.manifest.run, stand.manifest.key, source, stand.vehicle)
-    if not desk.step.ladder:
         fitted = _fit_anew(
             stand, desk, _model_of(file, desk), desk.step.order, desk.step.said, off=desk.step.off, known={}
         )
         desk = msgspec.structs.replace(fitted, steps=[fitted.step], at=0)
         file.write(desk)
     return desk
+
+
+def move(file: DeskFile, desk: Desk, by: int) -> Desk:
+    """The desk a step back (-1) or forward (1); steps that cannot be opened any more are left out."""
+    while True:
+        moved = desk.move(by)
+        if moved.at == desk.at or _can_open(file, moved):
+            return moved
+        desk = desk.drop(moved.at)
+
+
+def _can_open(file: DeskFile, desk: Desk) -> bool:
+    try:
+        show_desk(desk, file.parse(desk.step.model))
+    except Exception:  # noqa: BLE001 - whatever a file holds that was written elsewhere
+        return False
+    return True
 
 
 def add_effect(file: DeskFile, stand: Stand, desk: Desk, effect: Effect | str) -> Desk:
@@ -93,6 +120,7 @@ def _model_of(file: DeskFile, desk: Desk) -> Model:
 
 def _score_by_hand(stand: Stand, step: Step, model: Model, said: str, off: list[str]) -> Step:
     errors = stand.score(switch_off(model, off), step.timing)
+    _require_numbers(errors, stand.manifest.run)
     shown = [name for name in step.order if name not in off]
     ladder = [rung for rung in step.ladder if set(_effects_of(rung)) < set(shown)]
     ladder.append(rung_as_json(shown, errors))
@@ -121,6 +149,7 @@ def _fit_anew(
         known: rungs that need not be fitted again.
     """
     whole = stand.judge(switch_off(model, off))
+    _require_numbers(whole.errors, desk.run)
     fitted = whole.fitted.model
     shown = [name for name in order if name in fitted]
     ladder = []
@@ -142,6 +171,16 @@ def _fit_anew(
         without={name: stand.score(fitted - name, delays).t_mrmse_m for name in shown},
     )
     return msgspec.structs.replace(desk, floor=_lower_floor(desk, whole)).push(step)
+
+
+def _require_numbers(errors: Errors, run: str) -> None:
+    if not (math.isfinite(errors.t_mrmse_m) and math.isfinite(errors.r_mrmse_rad)):
+        raise WorkbenchError(
+            "not_finite",
+            "with that the model predicts no finite motion on this run",
+            where=run,
+            hint="The model is as it was; take other values or another formula.",
+        )
 
 
 def _known_rungs(step: Step) -> Rungs:

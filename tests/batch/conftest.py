@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,10 @@ import pytest
 from pipeline.simulate import simulate_case
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+if find_spec("s3fs") and find_spec("moto"):
+    # Tests that need an object store are left out where there is no library for it.
+    from object_store import bucket, server  # noqa: F401
 
 NAMES = ("a", "b", "c", "d")
 

@@ -80,6 +80,7 @@ def kill_at_random(
         if len(Store(out).runs()) == len(list(field.glob("*.mcap"))):
             # Everything is done: begin again, so that every round has something to kill.
             shutil.rmtree(out / "runs")
+            shutil.rmtree(out / "listed")
     return seen
 
 

@@ -13,13 +13,13 @@ from batch_tools import batch, counts, read_tables
 pytest.importorskip("s3fs", reason="the extra s3 is not installed")
 pytest.importorskip("moto", reason="moto is not installed")
 
-import fsspec
 import numpy as np
-from moto.server import ThreadedMotoServer
+from object_store import BUCKET, upload
 
 from pipeline.batch import Pruning
 from pipeline.batch.recordings import find_recordings
 from pipeline.batch.verification import verify_results
+from pipeline.cli import main
 from pipeline.logs import (
     LogError,
     LogWriter,
@@ -34,42 +34,7 @@ from pipeline.store import Mirror, Partition, Store, StoreError
 from pipeline.store import mirror as mirror_room
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-BUCKET = "s3://field"
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[str]:
-    place = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    place.start()
-    host, port = place.get_host_and_port()
-    yield f"http://{host}:{port}"
-    place.stop()
-
-
-@pytest.fixture
-def bucket(server: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[fsspec.AbstractFileSystem]:
-    """An empty bucket; whoever uses `s3://` in this test, or in a process it starts, gets to it."""
-    for name, value in {
-        "AWS_ENDPOINT_URL": server,
-        "AWS_ACCESS_KEY_ID": "a",
-        "AWS_SECRET_ACCESS_KEY": "b",
-        "AWS_DEFAULT_REGION": "us-east-1",
-    }.items():
-        monkeypatch.setenv(name, value)
-    fsspec.get_filesystem_class("s3").clear_instance_cache()
-    store = fsspec.filesystem("s3", listings_expiry_time=60)
-    store.mkdir(BUCKET)
-    yield store
-    store.rm(BUCKET, recursive=True)
-    fsspec.get_filesystem_class("s3").clear_instance_cache()
-
-
-def upload(store: fsspec.AbstractFileSystem, files: dict[str, Path | bytes]) -> None:
-    for key, content in files.items():
-        store.pipe_file(f"{BUCKET}/{key}", content if isinstance(content, bytes) else content.read_bytes())
-    store.invalidate_cache()
+    import fsspec
 
 
 def test_a_log_is_read_as_if_it_were_here(bucket: fsspec.AbstractFileSystem, season: Path) -> None:
@@ -159,7 +124,9 @@ def list_published(store: fsspec.AbstractFileSystem, out: str) -> dict[str, byte
     """Every table and text that people read, by its path in the results."""
     store.invalidate_cache()
     start = len(out.removeprefix("s3://")) + 1
-    names = [name for name in store.find(out) if not name[start:].startswith("batch/")]
+    names = [
+        name for name in store.find(out) if not name[start:].startswith("batch/") and "/." not in name[start:]
+    ]
     return {name[start:]: store.cat_file(name) for name in names}
 
 
@@ -245,3 +212,35 @@ def test_a_bucket_that_is_not_there_is_said(
     assert caught.value.code == "no_object_store"
     outcome = batch(season / "a.mcap", tmp_path / "mirror", address="s3://nowhere/results")
     assert outcome.lines[0].code == "store_unreachable"
+
+
+def test_a_bucket_of_a_stranger_writes_nothing_outside_of_its_mirror(
+    bucket: fsspec.AbstractFileSystem,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / ".bashrc").write_text("precious")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home / ".cache"))
+    monkeypatch.setenv("HOME", str(home))
+    # Of the mirror in ~/.cache/slip/results/<hash> everything above is within reach.
+    upload(
+        bucket,
+        {
+            "results/batch/logs/../../../../../../.bashrc": b"evil",
+            "results/runs/../../../../../.config/manifest.json": b"evil",
+        },
+    )
+    out = f"{BUCKET}/results"
+    for arguments in (("status", out), ("verify", out), ("query", "SELECT 1", "--out", out)):
+        with pytest.raises(SystemExit) as ended:
+            main(list(arguments))
+        assert ended.value.code == 1
+        said = capsys.readouterr().err.splitlines()
+        assert len(said) == 1
+        assert out in said[0]
+    found = {path.relative_to(home).as_posix() for path in home.rglob("*") if path.is_file()}
+    assert found == {".bashrc"}
+    assert (home / ".bashrc").read_text() == "precious"

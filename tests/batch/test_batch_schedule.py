@@ -77,7 +77,7 @@ def test_what_a_unit_runs_does_the_work_and_never_twice(season: Path, tmp_path: 
     text = print_units(nightly, system)
     if system == "systemd":
         service = read_systemd(text)["Service"]
-        assert service["WorkingDirectory"].replace("%%", "%") == str(nightly.folder)
+        assert Path(service["WorkingDirectory"].replace("%%", "%")) == nightly.folder
         command: list[str] | str = words_of(service["ExecStart"])
         folder = nightly.folder
     else:

@@ -135,7 +135,7 @@ def test_status_verify_and_query_look_without_logs(
     assert "done          4" in slip(capsys, "status", "--out", out)[1]
 
     code, text, _ = slip(capsys, "verify", out, "--json")
-    assert (code, json.loads(text)) == (0, {"runs": 4, "files": [], "logs": [], "gone": []})
+    assert (code, json.loads(text)) == (0, {"runs": 4, "files": [], "logs": [], "gone": [], "unlisted": []})
     next(out.rglob("slip.parquet")).write_bytes(b"x")
     code, text, _ = slip(capsys, "verify", out, "--no-logs", "--quiet")
     assert (code, text) == (1, "")

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, cast
 
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
-from pipeline.motion import Model, Problem, find_effect, fit_model
+from pipeline.motion import Model, Problem, choose_input, find_effect, fit_model
 from pipeline.motion.score import score
-from pipeline.report.motion_run import choose_source, load_motion_run, load_vehicle
+from pipeline.report.motion_run import load_motion_run, load_vehicle
 from pipeline.simulate import simulate_case
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "workbench"))
@@ -86,7 +86,7 @@ def answer_anew(manifest: Manifest) -> None:
     """What a moved value does to the error, with nothing kept ready."""
     vehicle = load_vehicle(manifest)
     run = load_motion_run(manifest, vehicle)
-    problem = Problem([run], vehicle, choose_source(run, None))
+    problem = Problem([run], vehicle, choose_input([run]).source)
     ideal = fit_model(problem, Model(vehicle))
     model = Model(vehicle, (find_effect("effective_track")(k=1.6),))
     score(problem, problem.start_state(model), ideal.weights)

@@ -188,12 +188,12 @@ def _list_findings(run: Run) -> pl.DataFrame:
 def _list_parameters(run: Run) -> pl.DataFrame:
     rows = [
         {"input": "measured", "effect": effect, "parameter": name, "value": value, "low": None, "high": None,
-         "unit": unit}
+         "unit": unit, "at_bound": False}
         for effect, name, value, unit in run.parameters
     ]  # fmt: skip
     schema = {
         "input": _INPUTS, "effect": pl.String, "parameter": pl.String, "value": pl.Float64, "low": pl.Float64,
-        "high": pl.Float64, "unit": pl.String,
+        "high": pl.Float64, "unit": pl.String, "at_bound": pl.Boolean,
     }  # fmt: skip
     return pl.DataFrame(rows, schema=schema, orient="row")
 

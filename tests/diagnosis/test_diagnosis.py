@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from pipeline.diagnosis import Diagnosis, Recording, Value, diagnose_runs
-from pipeline.diagnosis.own_way import refer_to_radius
+from pipeline.diagnosis.own_way import rescale_values
 from pipeline.diagnosis.plausibility import find_implausible, is_nameable
-from pipeline.diagnosis.screen import Largest
 from pipeline.diagnosis.words import describe, list_lines
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
-from pipeline.motion import find_effect, read_model
+from pipeline.motion import Model, find_effect, read_model
 from pipeline.motion.errors import MotionError
+from pipeline.motion.evidence import Evidence, Largest
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,
@@ -254,7 +254,7 @@ def test_a_diagnosis_is_the_same_each_time(tmp_path: Path) -> None:
     assert diagnose_runs([recording], vehicle).to_json() == first
 
 
-_LARGEST = Largest(1.0, 1.0, 8.0, 3.0, 120.0, np.zeros(11))
+_EVIDENCE = Evidence(Largest(1.0, 1.0, 8.0, 3.0, 120.0, np.zeros(11)))
 
 
 @pytest.mark.parametrize(
@@ -270,10 +270,11 @@ _LARGEST = Largest(1.0, 1.0, 8.0, 3.0, 120.0, np.zeros(11))
         ("body_speed_limit", {"limit": 1.0}),
         ("effective_track", {"k": 6.0}),
         ("body_inertia", {"tau": 5.0}),
+        ("clock_offset", {"d": 0.1}),
     ],
 )
 def test_what_is_too_small_or_another_in_disguise_is_not_named(name: str, values: dict[str, float]) -> None:
-    assert not is_nameable(find_effect(name)(**values), _LARGEST)
+    assert not is_nameable(find_effect(name)(**values), _EVIDENCE)
 
 
 @pytest.mark.parametrize(
@@ -283,10 +284,32 @@ def test_what_is_too_small_or_another_in_disguise_is_not_named(name: str, values
         ("terrain_change", {"k_v": 0.9, "k_w": 0.6, "at_s": 60.0}),
         ("turn_lag", {"tau_mean": 0.3, "tau_diff": 1.0}),
         ("body_speed_limit", {"limit": 0.7}),
+        ("clock_offset", {"d": -0.1}),
     ],
 )
 def test_what_is_large_enough_is_named(name: str, values: dict[str, float]) -> None:
-    assert is_nameable(find_effect(name)(**values), _LARGEST)
+    assert is_nameable(find_effect(name)(**values), _EVIDENCE)
+
+
+def test_what_sampling_makes_of_nothing_is_not_named() -> None:
+    sampled = replace(_EVIDENCE, encoders=True, least_delay_s=0.06)
+    assert is_nameable(find_effect("drive_lag")(tau=0.05), _EVIDENCE)
+    assert not is_nameable(find_effect("drive_lag")(tau=0.05), sampled)
+    assert is_nameable(find_effect("body_inertia")(tau=0.05), sampled)
+
+
+def test_a_late_clock_that_is_known_keeps_nothing_else_from_being_named(tmp_path: Path) -> None:
+    scenario = replace(
+        _SCENE,
+        vehicle=VEHICLES["husky"],
+        effects={"clock_offset": 0.15, "effective_track": 1.6},
+        recording=Recorded("body_command"),
+        imu=Imu(),
+    )
+    recording, vehicle = _record(scenario, tmp_path)
+    known = Model(vehicle, (find_effect("clock_offset")(d=0.15),))
+    (run,) = diagnose_runs([recording], vehicle, model=known).runs
+    assert [effect.id for effect in run.effects] == ["effective_track"]
 
 
 def test_what_no_vehicle_does_is_said() -> None:
@@ -298,7 +321,8 @@ def test_what_no_vehicle_does_is_said() -> None:
 
 def test_a_track_is_told_for_the_nominal_radius_where_the_radius_is_undecided() -> None:
     track = {"k": Value(1.65, 1.6, 1.7, "1")}
-    told = refer_to_radius(track, find_effect("wheel_radius")(k=0.95))["k"]
+    scale = find_effect("effective_track")(k=1.65).scale_without(find_effect("wheel_radius")(k=0.95))
+    told = rescale_values(track, scale)["k"]
     assert told.value == pytest.approx(1.65 / 0.95)
     assert (told.low, told.high) == pytest.approx((1.6 / 0.95, 1.7 / 0.95))
 

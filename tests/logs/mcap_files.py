@@ -132,6 +132,22 @@ def value_of(fields: Mapping[str, Any], row: int) -> object:
     return tuple(names.row(row)), tuple(velocity.row(row).tolist()), frame.values[frame.codes[row]]
 
 
+def value_in_full(fields: Mapping[str, Any], row: int) -> object:
+    """Every field of one message, whatever its type."""
+    found = []
+    for name, column in sorted(fields.items()):
+        if isinstance(column, Strings):
+            value: object = column.values[column.codes[row]] if column.codes[row] >= 0 else None
+        elif isinstance(column, RaggedStrings):
+            value = tuple(column.row(row))
+        elif isinstance(column, Ragged):
+            value = column.row(row).tobytes()
+        else:
+            value = np.asarray(column[row]).tobytes()
+        found.append((name, value))
+    return tuple(found)
+
+
 def records_of(content: bytes) -> list[McapRecord]:
     """Every record of a whole file, chunks kept."""
     return list(StreamReader(io.BytesIO(content), emit_chunks=True).records)

@@ -7,20 +7,25 @@ import zlib
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+import lz4.frame
 import numpy as np
 import pytest
-from mcap.writer import CompressionType, IndexType
+import zstandard
+from mcap.writer import CompressionType, IndexType, Writer
 from mcap_files import (
+    START,
     WITHOUT_INDEX,
     Truth,
+    payloads,
     read_small,
     record_starts,
     records_of,
+    small_truth,
     write_official,
     write_small,
 )
 
-from pipeline.logs import LogError, open_log
+from pipeline.logs import LogError, LogWriter, Wanted, definition_text, open_log, read_topics
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -217,7 +222,9 @@ def test_a_lost_message_index_loses_nothing(tmp_path: Path) -> None:
     path.write_bytes(content)
     data, found = read_small(path)
     assert found == truth
-    assert not data.losses
+    (loss,) = data.losses
+    assert loss.kind == "checksum_mismatch"
+    assert "messages that were read are whole" in loss.text
     assert any("message indexes" in note for note in data.notes)
 
 
@@ -240,15 +247,77 @@ def test_a_wrong_checksum_over_good_records_is_told(tmp_path: Path, change: int)
 
 
 @pytest.mark.parametrize("tail", [None, -60])
-def test_checksums_that_are_wrong_throughout_are_the_writers(tmp_path: Path, tail: int | None) -> None:
+@pytest.mark.parametrize("way", ["inverted", "other byte order", "over the compressed bytes"])
+def test_checksums_written_in_another_way_throughout_are_the_writers(
+    tmp_path: Path, way: str, tail: int | None
+) -> None:
     path = tmp_path / "log.mcap"
     truth = write_small(path)
     content = path.read_bytes()
-    for number, (start, _) in enumerate(chunk_places(content)):
-        content = set_crc(content, start, 0x12345678 + number)
+    for start, end in chunk_places(content):
+        crc = struct.unpack_from("<I", content, start + 33)[0]
+        named = struct.unpack_from("<I", content, start + 37)[0]
+        other = {
+            "inverted": crc ^ 0xFFFFFFFF,
+            "other byte order": int.from_bytes(crc.to_bytes(4, "little"), "big"),
+            "over the compressed bytes": zlib.crc32(content[start + 49 + named : end]),
+        }
+        content = set_crc(content, start, other[way])
     found, losses = read_damaged(path, content[:tail], truth)
     assert found == truth
     assert losses.count("wrong_crc") == len(chunk_places(path.read_bytes()))
+
+
+@pytest.mark.parametrize("compression", ["zstd", ""])
+def test_chunks_that_are_all_damaged_are_not_whole(tmp_path: Path, compression: str) -> None:
+    """That every checksum differs is no evidence: here every chunk has the same bit wrong."""
+    path = tmp_path / "log.mcap"
+    truth = write_small(path, compression=compression)
+    content = bytearray(path.read_bytes())
+    chunks = chunk_places(bytes(content))
+    for _, end in chunks:
+        content[end - 20] ^= 0x10
+    found, losses = read_damaged(path, bytes(content), truth)
+    assert not found
+    assert losses.count("chunk_crc") + losses.count("damaged_chunk") == len(chunks) >= 9
+
+
+def write_odometry(path: Path) -> np.ndarray:
+    """Uncompressed chunks that end in zeros, as the covariance of the twist does."""
+    x = np.arange(60) * 0.25
+    with LogWriter(path, chunk_size=3000, compression="") as writer:
+        fields = {"pose.pose.position.x": x, "pose.pose.orientation.w": 1.0}
+        writer.write_columns("/odom", "nav_msgs/msg/Odometry", START + np.arange(60) * 20_000_000, fields)
+    return x
+
+
+def test_a_damaged_chunk_that_ends_in_zeros_is_not_a_cut_one(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    write_odometry(path)
+    content = path.read_bytes()
+    for start, end in chunk_places(content)[1:4]:
+        assert not any(content[end - 64 : end])
+        for place in range(start + 60, end, 97):
+            damaged = bytearray(content)
+            damaged[place] ^= 0x40
+            path.write_bytes(damaged)
+            data = read_topics(path, [Wanted("/odom", ("pose.pose.position.x",))], sha256="-")
+            assert [loss.kind for loss in data.losses] == ["chunk_crc"], place
+            (columns,) = data.topics
+            rows = (columns.log_time - START) // 20_000_000
+            assert columns.fields["pose.pose.position.x"].tolist() == (rows * 0.25).tolist()
+
+
+def test_a_chunk_whose_end_was_never_written_is_read_up_to_there(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    truth = write_small(path, compression="")
+    content = path.read_bytes()
+    start, end = chunk_places(content)[4]
+    cut = (start + end) // 2
+    found, losses = read_damaged(path, content[:cut] + bytes(end - cut + 100) + content[end + 100 :], truth)
+    assert "truncated" in losses
+    before, _ = read_damaged(path, content[:start], truth)
+    assert len(found) > len(before)
 
 
 def test_a_checksum_of_the_whole_file_clears_a_chunk(tmp_path: Path) -> None:
@@ -340,3 +409,98 @@ def test_what_is_no_log_is_refused_with_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
         codes.append(caught.value.code)
     assert codes == ["log_empty", "not_mcap", "not_a_recording", "log_not_found"]
+
+
+@pytest.mark.parametrize(
+    "options", [{"use_chunking": False}, {"enable_crcs": False, "compression": CompressionType.NONE}], ids=str
+)
+def test_the_checksum_of_the_data_section_is_used(tmp_path: Path, options: dict[str, Any]) -> None:
+    path = tmp_path / "log.mcap"
+    truth = write_official(path, enable_data_crcs=True, **options)
+    data, found = read_small(path)
+    assert found == truth
+    assert not data.losses
+    assert not data.unchecked
+    content = path.read_bytes()
+    section = next(start for start in record_starts(content) if content[start] == 0x0F)
+    for place in range(20, section, 211):
+        damaged = bytearray(content)
+        damaged[place] ^= 0x08
+        path.write_bytes(damaged)
+        data, found = read_small(path)
+        assert data.losses, place
+        if found != truth and len(found) == len(truth):
+            (text,) = [loss.text for loss in data.losses if loss.kind == "checksum_mismatch"]
+            assert "any value may be wrong" in text
+
+
+def test_a_log_without_checksums_is_called_unchecked(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    write_official(path, enable_crcs=False)
+    data, _ = read_small(path)
+    assert not data.losses
+    assert data.unchecked == "no checksum covers its messages: damage in them cannot be seen"
+    write_official(path)
+    assert not read_small(path)[0].unchecked
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_checksum_inside_the_compression_is_used(tmp_path: Path, compression: str) -> None:
+    path = tmp_path / "log.mcap"
+    truth = write_official(path, enable_crcs=False, compression=CompressionType.NONE, chunk_size=1 << 20)
+    content = path.read_bytes()
+    ((start, end),) = chunk_places(content)
+    records = content[start + 49 : end]
+    packed = {
+        "zstd": zstandard.ZstdCompressor(write_checksum=True).compress(records),
+        "lz4": lz4.frame.compress(records, content_checksum=True),
+    }[compression]
+    name = compression.encode()
+    body = content[start + 9 : start + 37] + struct.pack("<I", len(name)) + name
+    body += struct.pack("<Q", len(packed)) + packed
+    chunk = b"\x06" + struct.pack("<Q", len(body)) + body
+    path.write_bytes(content[:start] + chunk)
+    data, found = read_small(path)
+    assert found == truth
+    assert not data.unchecked
+    for place in range(len(chunk) - len(packed) + 20, len(chunk), 29):
+        damaged = bytearray(chunk)
+        damaged[place] ^= 0x04
+        found, losses = read_damaged(path, content[:start] + bytes(damaged), truth)
+        # Another distance to the same bytes is no damage.
+        assert found == truth or (not found and "damaged_chunk" in losses)
+
+
+@pytest.mark.parametrize(("opcode", "inside"), [(3, 8), (4, 10), (0x0D, 22), (0x0C, 6)])
+def test_what_the_file_holds_twice_is_compared(tmp_path: Path, opcode: int, inside: int) -> None:
+    """Without any checksum a damaged schema, channel or name of metadata contradicts its other copy."""
+    path = tmp_path / "log.mcap"
+    topics, _ = small_truth(20)
+    with path.open("wb") as stream:
+        writer = Writer(stream, enable_crcs=False, compression=CompressionType.NONE)
+        writer.start(profile="ros2", library="test")
+        writer.add_metadata("deployment", {"vehicle": "husky_a200"})
+        kind, time, fields = topics["/speed"]
+        schema = writer.register_schema(kind, "ros2msg", (definition_text(kind) or "").encode())
+        channel = writer.register_channel("/speed", "cdr", schema)
+        for time_ns, payload in zip(time.tolist(), payloads(kind, time.size, fields), strict=True):
+            writer.add_message(channel, time_ns, payload, time_ns)
+        writer.finish()
+    content = bytearray(path.read_bytes())
+    assert not read_small(path)[0].losses
+    place = next(start for start in record_starts(bytes(content)) if content[start] == opcode)
+    content[place + 9 + inside] ^= 0x01
+    path.write_bytes(content)
+    data, _ = read_small(path)
+    assert [loss.kind for loss in data.losses] == ["contradiction"]
+
+
+def test_what_the_statistics_count_and_nobody_finds_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    write_official(path, enable_crcs=False, use_chunking=False)
+    content = bytearray(path.read_bytes())
+    place = [start for start in record_starts(bytes(content)) if content[start] == 5][7]
+    content[place] = 0x85
+    path.write_bytes(content)
+    data, _ = read_small(path)
+    assert [loss.kind for loss in data.losses] == ["missing_messages"]

@@ -341,6 +341,37 @@ def test_a_split_recording_is_one_run(tmp_path: Path, *, listed: bool) -> None:
         assert [loss.kind for loss in open_log(folder).losses] == ["missing_part"]
 
 
+def test_a_listing_names_no_file_outside_of_its_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    write_small(tmp_path / "secret.mcap", rows=50)
+    write_small(folder / "run_0.mcap", rows=2)
+    own = open_log(folder).message_count
+    names = ["../secret.mcap", str(tmp_path / "secret.mcap"), "x/../../secret.mcap", "..\\secret.mcap",
+             "\uff0e\uff0e/secret.mcap", "C:secret.mcap", "x" * 300 + ".mcap"]  # fmt: skip
+    listing = folder / "metadata.yaml"
+    for name in names:
+        for listed in ([name], ["run_0.mcap", name]):
+            lines = "\n".join(f"    - '{each}'" for each in listed)
+            listing.write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:\n{lines}\n")
+            index = open_log(folder)
+            assert index.message_count == own
+            assert [loss.kind for loss in index.losses] == ["missing_part"]
+            assert hash_log(folder) == hash_log(folder / "run_0.mcap")
+    (folder / "run_0.mcap").unlink()
+    with pytest.raises(LogError) as caught:
+        open_log(folder)
+    assert caught.value.code == "not_a_recording"
+
+
+def test_parts_may_be_links_to_where_their_owner_keeps_them(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    write_small(tmp_path / "kept.mcap", rows=2)
+    (tmp_path / "run" / "run_0.mcap").symlink_to(tmp_path / "kept.mcap")
+    (tmp_path / "run" / "metadata.yaml").write_text("x:\n  relative_file_paths:\n    - run_0.mcap\n")
+    assert open_log(tmp_path / "run").message_count == open_log(tmp_path / "kept.mcap").message_count
+
+
 def test_a_folder_of_several_recordings_is_refused(tmp_path: Path) -> None:
     for name in ("a.mcap", "b.mcap"):
         write_small(tmp_path / name, rows=2)
@@ -441,7 +472,7 @@ def test_a_chunk_without_checksum_is_read_up_to_the_last_wanted_message(tmp_path
     data = read_topics(path, [Wanted("/x")])
     assert data.of("/x")[0].fields["data"].tolist() == list(range(50))
     assert not data.losses
-    assert any("no checksum" in note for note in data.notes)
+    assert "no checksum" in data.unchecked
 
 
 def test_the_index_tells_what_a_log_holds(tmp_path: Path) -> None:
@@ -458,3 +489,18 @@ def test_the_index_tells_what_a_log_holds(tmp_path: Path) -> None:
     assert {channel.type_name for channel in index.channels} == {FLOAT, JOINTS, TEXT}
     assert isinstance(read_topics(path, [Wanted("/joints")]).topics[0].fields["name"], RaggedStrings)
     assert io.BytesIO(path.read_bytes()).read(5) == b"\x89MCAP"
+
+
+def test_absurd_stamps_and_numbers_in_json_warn_nobody(tmp_path: Path) -> None:
+    """Tests turn every warning of numpy into an error."""
+    path = tmp_path / "log.mcap"
+    seconds = ["1e308", "NaN", "-Infinity", "1" * 400, "-9223372036854775808", "5"]
+    encoded = [
+        f'{{"header": {{"stamp": {{"sec": {text}, "nanosec": {text}}}}}, "x": {text}}}'.encode()
+        for text in seconds
+    ]
+    write_channels(path, [("/json", "T", "jsonschema", b"{}", "json", encoded)])
+    columns = read_one(path, "/json")
+    assert columns.header_time is None
+    assert columns.fields["x"][3] == np.inf
+    assert columns.fields["x"][5] == 5.0

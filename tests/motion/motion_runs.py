@@ -10,7 +10,6 @@ import polars as pl
 
 from pipeline.core.segments import find_held, find_jumps, number_segments
 from pipeline.motion import MotionRun, load_run
-from pipeline.motion.ideal import invert_differential
 from pipeline.simulate import Disturbance, PoseSensor, Scenario, SimulatedRun, simulate_run
 from pipeline.stages.align import align_tables
 from pipeline.stages.slip import compute_slip
@@ -95,8 +94,8 @@ def _commands(made: SimulatedRun, vehicle: Vehicle) -> pl.DataFrame:
     asked = made.commands
     if vehicle.kind == "ackermann":
         return _frame(asked.time_s, {"speed": asked.speed_mps, "steering": asked.turn})
-    left, right = invert_differential(asked.speed_mps, asked.turn, vehicle)
-    return _frame(asked.time_s, {"left": left, "right": right})
+    body = (asked.speed_mps, np.zeros_like(asked.speed_mps), asked.turn)
+    return _frame(asked.time_s, vehicle.kinematics.inverse(body, vehicle))
 
 
 def _wheels(made: SimulatedRun, vehicle: Vehicle) -> pl.DataFrame:

@@ -6,9 +6,9 @@ import pytest
 from motion_runs import vehicle_of
 
 from pipeline.motion import Model, ModelFile, MotionError, find_effect, list_effects, read_model, write_model
-from pipeline.motion.catalogue import load_effects
-from pipeline.motion.model_file import parse_model
+from pipeline.motion.model_file import list_code, parse_model
 from pipeline.motion.model_text import format_model
+from pipeline.motion.trust import trust
 
 HEAD = '[vehicle]\npreset = "husky_a200"\n\n'
 HERE = Path("model.toml")
@@ -118,8 +118,10 @@ def test_effects_of_one_s_own_come_from_a_file_beside_the_model(tmp_path: Path) 
     path.write_text(
         'effects = ["my_effects.py"]\n' + HEAD + '[[effect]]\nid = "tilt"\nk = 0.2\n', encoding="utf-8"
     )
+    trust(list_code(path))
     file = read_model(path)
     assert file.model.effect("tilt").values == {"k": 0.2}
+    assert file.warnings == ()
     write_model(file, path)
     assert read_model(path).model.ids == ("tilt",)
 
@@ -127,8 +129,12 @@ def test_effects_of_one_s_own_come_from_a_file_beside_the_model(tmp_path: Path) 
 @pytest.mark.parametrize(("text", "says"), [("1 / 0", "ZeroDivisionError"), ("x = 1", "no effect")])
 def test_a_file_of_effects_that_does_not_work_is_named(tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "own.py").write_text(text, encoding="utf-8")
-    with pytest.raises(MotionError, match=says):
-        load_effects(tmp_path / "own.py")
+    path = tmp_path / "m.toml"
+    path.write_text('effects = ["own.py"]\n' + HEAD, encoding="utf-8")
+    trust(list_code(path))
+    with pytest.raises(MotionError, match=says) as caught:
+        read_model(path)
+    assert caught.value.where == f"{path}:1"
 
 
 def test_models_compose_in_the_order_of_a_command_s_way() -> None:

@@ -23,7 +23,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / done.stdout.split()[-1]
 
 
-def test_the_wheel_carries_presets_contracts_and_the_page(wheel: Path) -> None:
+def test_the_wheel_carries_presets_contracts_and_pages(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
 
     for folder, pattern in (
@@ -31,6 +31,8 @@ def test_the_wheel_carries_presets_contracts_and_the_page(wheel: Path) -> None:
         ("schemas", "*.py"),
         ("pipeline/report", "page.*"),
         ("pipeline/report", "*.js"),
+        ("pipeline/report/templates", "**/*.html"),
+        ("pipeline/batch", "catalogue.*"),
         ("pipeline/workbench", "page.*"),
         ("pipeline/workbench", "*.js"),
     ):
@@ -58,3 +60,6 @@ def test_the_wheel_analyzes_a_log_in_a_bare_environment(wheel: Path, tmp_path: P
 
     assert done.returncode == 0, done.stderr
     assert "husky_a200" in done.stdout
+    asked = [str(environment / "bin" / "slip"), "--version"]
+    said = subprocess.run(asked, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert f"-{said.stdout.strip()}-" in wheel.name

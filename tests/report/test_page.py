@@ -7,16 +7,20 @@ import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
+import jinja2
 import polars as pl
 import pytest
 from report_synthesis import make_report
 
-from pipeline.report import RunReport, render_report
+from pipeline.report import RunReport, render_report, templating
 from pipeline.report.figures import list_figures
 from pipeline.report.sections.glance import say_standing
-from pipeline.report.words import encode_json, escape, say_date, say_duration, say_number, say_share
+from pipeline.report.templating import render_template, show_text
+from pipeline.report.words import say_date, say_duration, say_number, say_share
 
+TEMPLATES = Path(templating.__file__).parents[1]
 HOSTILE = "</script><script>alert(1)</script><!-- <img src=x onerror=alert(2)> \u2028 \" ' & \u202e"
 
 # Names of formats and an unused link to an editor inside the bundle; nothing fetches them.
@@ -199,11 +203,49 @@ def test_text_out_of_a_log_stays_text(key: str) -> None:
     data_of(outline)
 
 
-def test_json_for_a_script_element_can_neither_end_it_nor_start_a_comment() -> None:
-    packed = encode_json({HOSTILE: [HOSTILE]})
-    assert not set("<>&\u2028\u2029") & set(packed)
-    assert json.loads(packed) == {HOSTILE: [HOSTILE]}
-    assert escape("a\x00b\u202ec") == "a\ufffdb\ufffdc"
+def render_without_figures(**names: str) -> str:
+    report = make_report(duration_s=20.0, names=names)
+    return render_report(RunReport(report.summary, {}, report.diagnosis))
+
+
+def test_names_of_any_length_and_several_lines_stay_in_their_places() -> None:
+    name = "<b>\n" + "\u200fx\"'" * 3000
+    usual = outline_of(render_without_figures())
+    outline = outline_of(render_without_figures(vehicle=name, terrain=name, topic=name, reason=name))
+    assert [tag for tag, _ in outline.tags] == [tag for tag, _ in usual.tags]
+    assert [set(found) for _, found in outline.tags] == [set(found) for _, found in usual.tags]
+
+
+def test_rows_of_figures_can_neither_end_their_element_nor_start_a_comment() -> None:
+    values = {"title": "", "facts": [], "style": "", "scripts": []}
+    page = render_template("report/templates/figures.html", data={HOSTILE: [HOSTILE]}, **values)
+    outline = outline_of(page)
+    packed = outline.scripts[0][1]
+    assert not set("<>&'\u2028\u2029") & set(packed)
+    assert data_of(outline) == {HOSTILE: [HOSTILE]}
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        render_template("report/templates/figures.html", data={"rows": float("nan")}, **values)
+
+
+def test_what_cannot_be_seen_is_shown_and_a_lone_surrogate_can_be_written() -> None:
+    assert show_text("a\x00b\u202ec\ud800\n\u202f") == "a\ufffdb\ufffdc\ufffd\n\u202f"
+    page = render_without_figures(topic="/a\ud800")
+    assert "/a\ufffd" in page
+    page.encode()
+
+
+def test_only_our_style_and_scripts_stand_in_a_page_unescaped() -> None:
+    templates = {path.name: path.read_text(encoding="utf-8") for path in TEMPLATES.rglob("*.html")}
+    trusted = {name: re.findall(r"\{\{([^}]*\|\s*safe\b[^}]*)\}\}", text) for name, text in templates.items()}
+    assert {name: found for name, found in trusted.items() if found} == {
+        "base.html": [" style | safe ", " script | safe "]
+    }
+    assert not any(re.search(r"autoescape|Markup", text) for text in templates.values())
+
+
+def test_a_value_that_a_template_does_not_get_is_an_error() -> None:
+    with pytest.raises(jinja2.UndefinedError, match="'title' is undefined"):
+        render_template("report/templates/base.html", style="", scripts=[])
 
 
 def test_same_tables_give_the_same_bytes(page: str) -> None:

@@ -12,19 +12,11 @@ from hypothesis import strategies as st
 from stage_logs import FIELD, PLAIN, TakeThrough, rms, slope
 
 from pipeline.core.timegrid import usual_hold
-from pipeline.motion.ideal import (
-    invert_ackermann,
-    invert_differential,
-    predict_ackermann,
-    predict_differential,
-)
 from pipeline.simulate import VEHICLES, Program, Recording
 from pipeline.stages import StageError
 from pipeline.stages.slip import compute_slip, cut_windows, hold_commands, interpolate_wheels
 from pipeline.vehicles import Vehicle, find_preset
 from pipeline.vehicles.loading import convert
-
-speeds = st.floats(-20.0, 20.0)
 
 
 def preset(name: str, **changes: float) -> Vehicle:
@@ -36,49 +28,6 @@ def preset(name: str, **changes: float) -> Vehicle:
 
 
 HUSKY = preset("husky")
-
-
-@given(speeds, speeds)
-def test_the_ideal_differential_drive_is_the_published_one(left: float, right: float) -> None:
-    (found,) = predict_differential(np.array([left]), np.array([right]), HUSKY)
-    assert np.allclose(found, [0.165 * (left + right) / 2.0, 0.0, 0.165 * (right - left) / 0.55])
-
-
-@given(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
-def test_a_body_command_comes_back_from_its_wheels(forward: float, yaw_rate: float) -> None:
-    left, right = invert_differential(np.array([forward]), np.array([yaw_rate]), HUSKY)
-    assert np.allclose(predict_differential(left, right, HUSKY), [[forward, 0.0, yaw_rate]])
-    assert (right[0] > left[0]) == (yaw_rate > 0.0) or abs(yaw_rate) < 1e-9
-
-
-def test_a_controller_that_widens_the_track_asks_for_more_difference() -> None:
-    wide = preset("husky", controller_track_multiplier=1.875)
-    left, right = invert_differential(np.array([0.0]), np.array([1.0]), wide)
-    assert np.allclose(predict_differential(left, right, wide), [[0.0, 0.0, 1.875]])
-
-
-@given(st.floats(0.1, 8.0), st.floats(-0.5, 0.5), st.floats(-2.0, 2.0))
-def test_a_car_turns_about_its_rear_axle(speed: float, steering: float, ahead: float) -> None:
-    car = preset("car", base_to_rear_axle_m=ahead)
-    (found,) = predict_ackermann(np.array([speed]), np.array([steering]), car)
-    yaw_rate = speed * np.tan(steering) / 2.6
-    # The rear axle itself does not move sideways; base_link ahead of it swings out with the turn.
-    assert np.allclose(found, [speed, ahead * yaw_rate, yaw_rate])
-    assert found[1] - ahead * found[2] == pytest.approx(0.0, abs=1e-12)
-
-
-@given(st.floats(0.1, 8.0), st.floats(-1.0, 1.0))
-def test_a_cars_body_command_comes_back_within_its_steering(speed: float, yaw_rate: float) -> None:
-    car = preset("car")
-    forward, steering = invert_ackermann(np.array([speed]), np.array([yaw_rate]), car)
-    assert abs(steering[0]) <= 0.6
-    if abs(steering[0]) < 0.6:
-        assert predict_ackermann(forward, steering, car)[0, 2] == pytest.approx(yaw_rate, abs=1e-9)
-
-
-def test_a_car_that_stands_has_its_wheels_straight() -> None:
-    _, steering = invert_ackermann(np.zeros(1), np.ones(1), preset("car"))
-    assert steering.tolist() == [0.0]
 
 
 def test_slip_is_ideal_minus_measured_and_its_modulus_takes_the_length_scale(drive: TakeThrough) -> None:

@@ -3,6 +3,7 @@
 store_writer.py die ROOT RUN KEY SEED STEP COUNT    write a generation, die at the COUNT-th STEP
 store_writer.py loop ROOT RUN SEED ROUNDS           write one after another, tell each, prune in between
 store_writer.py hold ROOT RUN                       open a generation and sleep
+store_writer.py hold_with_child ROOT RUN            the same, with a forked child that sleeps as long
 """
 
 from __future__ import annotations
@@ -46,10 +47,18 @@ def hold(root: str, run: str) -> None:
         time.sleep(60)
 
 
+def hold_with_child(root: str, run: str) -> None:
+    with Store(Path(root)).open_generation(run, "held"):
+        child = os.fork()
+        if child:
+            _say(str(child))
+        time.sleep(60)
+
+
 def _say(word: str) -> None:
     sys.stdout.write(f"{word}\n")
     sys.stdout.flush()
 
 
 if __name__ == "__main__":
-    {"die": die, "loop": loop, "hold": hold}[sys.argv[1]](*sys.argv[2:])
+    {"die": die, "loop": loop, "hold": hold, "hold_with_child": hold_with_child}[sys.argv[1]](*sys.argv[2:])

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
+import os
+import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
@@ -10,8 +14,11 @@ import pytest
 from store_samples import read_seed, write_generation
 
 from pipeline.store import Store, StoreError
+from pipeline.store.locks import hold_lock
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from conftest import StartWriter
 
 RUN = "husky"
@@ -74,3 +81,45 @@ def test_waiting_ends_with_the_name_of_the_holder_and_death_releases(
     write_generation(hasty, RUN, "new", 1)
     assert read_seed(store, RUN) == 1
     assert not list((store.root / "runs" / RUN).glob(".tmp-*"))
+
+
+def test_a_child_that_outlives_a_killed_writer_does_not_keep_its_lock(
+    store: Store, start_writer: StartWriter
+) -> None:
+    holder = start_writer("hold_with_child", store.root, RUN)
+    assert holder.stdout is not None
+    child = int(holder.stdout.readline())
+    try:
+        holder.kill()
+        holder.wait()
+        write_generation(Store(store.root, patience_s=0.1), RUN, "new", 1)
+        os.kill(child, 0)  # still there
+    finally:
+        os.kill(child, signal.SIGKILL)
+    assert read_seed(store, RUN) == 1
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS], ids=errno.errorcode.get)
+def test_a_file_system_without_locks_is_refused_in_one_line(
+    code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(StoreError) as caught, hold_lock(tmp_path / "lock", patience_s=0.0):
+        pytest.fail("two writers would write at once")
+    assert caught.value.code == "no_locks"
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_the_file_stays_and_a_thread_other_than_the_one_that_locked_may_let_go(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    held = hold_lock(path, patience_s=0.0)
+    held.__enter__()
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(held.__exit__, None, None, None).result()
+    inode = path.stat().st_ino
+    with hold_lock(path, patience_s=0.0):
+        assert path.stat().st_ino == inode
+        assert f"process {os.getpid()} on" in path.read_text()

@@ -74,6 +74,7 @@ def test_tables_of_an_older_contract_are_fitted(store: Store) -> None:
     older.write_parquet(manifest.path("windows"))
     path = manifest.folder.parent / "manifest.json"
     content = json.loads(path.read_text())
+    del content["checksum"]
     content["tables"]["windows"]["contract_version"] = 0
     path.write_text(json.dumps(content))
 
@@ -96,7 +97,7 @@ def test_table_of_the_whole_results_is_replaced(store: Store) -> None:
     store.write_results_table("windows", second)
     assert (store.root / "windows.parquet").read_bytes() == check_table("windows", second).valid
     assert_frame_equal(store.scan("windows").collect(), second)
-    assert {path.name for path in store.root.iterdir()} == {"windows.parquet", ".lock"}
+    assert {path.name for path in store.root.iterdir()} == {"windows.parquet", ".lock", "listed"}
 
 
 def test_text_of_the_whole_results_is_replaced(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,7 +114,7 @@ def test_text_of_the_whole_results_is_replaced(store: Store, monkeypatch: pytest
             store.write_results_text("comparison.html", "new")
     assert caught.value.code == "disk_full"
     assert path.read_text() == "é"
-    assert {path.name for path in store.root.iterdir()} == {"comparison.html", ".lock"}
+    assert {path.name for path in store.root.iterdir()} == {"comparison.html", ".lock", "listed"}
     with pytest.raises(StoreError):
         store.write_results_text("../comparison.html", "")
 
@@ -122,4 +123,4 @@ def test_leftovers_of_killed_writers_are_removed(store: Store, tmp_path: Path) -
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / ".tmp-1-dead").write_bytes(b"half")
     store.write_results_text("map.html", "map")
-    assert {path.name for path in store.root.iterdir()} == {"map.html", ".lock"}
+    assert {path.name for path in store.root.iterdir()} == {"map.html", ".lock", "listed"}

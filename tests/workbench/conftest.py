@@ -45,3 +45,11 @@ def workbench(results: Path) -> Iterator[Workbench]:
     server = Workbench(results)
     yield server
     server.close()
+
+
+@pytest.fixture(scope="session")
+def shared_workbench(analyzed: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workbench]:
+    """For tests that leave the desk as they found it."""
+    server = Workbench(Path(shutil.copytree(analyzed, tmp_path_factory.mktemp("shared") / "results")))
+    yield server
+    server.close()

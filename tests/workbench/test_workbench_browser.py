@@ -183,8 +183,11 @@ def test_a_run_stands_beside_those_that_its_report_does(chrome: Chrome, workbenc
             generation.commit({"dataset": summary["dataset"], "log": summary["log"]})
     assert len(find_peers(store, own)[own["leading_input"]]) == 2
     chrome.size(LAPTOP, 900)
-    chrome.open(f"{workbench.address}#a={RUN}")
+    chrome.open(workbench.address)
     chrome.wait(SHOWN)
+    chrome.run(f"location.hash = 'a={RUN}'")
+    chrome.run("location.reload()")
+    chrome.wait(f"document.querySelector('.title h2')?.textContent === '{RUN}' && {SHOWN}")
     facts = str(chrome.run("document.querySelector('.facts').textContent"))
     assert "vs 2 runs of husky_ice: more slip than 1" in facts
     look_for_trouble(chrome)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import time
-from typing import TYPE_CHECKING, cast
+from pathlib import Path
+from typing import cast
 
 import pytest
 from workbench_server import RUN, TRACK, Workbench
 
 from pipeline.motion import read_model
 from pipeline.simulate import simulate_case
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 Desk = dict[str, dict[str, float]]
 
@@ -133,6 +131,19 @@ def test_a_saved_model_is_a_model_file(workbench: Workbench) -> None:
     assert b"effective_track" in body
 
 
+def test_working_on_a_model_leaves_the_run_byte_for_byte(workbench: Workbench) -> None:
+    home = workbench.results / "runs"
+    before = {path: path.read_bytes() for path in home.rglob("*") if path.is_file()}
+
+    workbench.get("/api/runs")
+    for action, more in (("open", {}), ("add", {"effect": "effective_track"}), ("undo", {})):
+        workbench.desk(RUN, action, **more)
+    workbench.post("/api/rows", run=RUN)
+    workbench.post("/api/save", run=RUN)
+    assert workbench.request("GET", "/report?run=field%2Fhidden")[0] == 200
+    assert {path: path.read_bytes() for path in home.rglob("*") if path.is_file()} == before
+
+
 def test_a_formula_is_parsed_with_its_units_and_never_run(workbench: Workbench) -> None:
     typed = {"effect": "my_track", "channel": "v_w", "formula": "c * w0", "parameters": "c [1] -0.9 .. 0.5"}
     opened = workbench.desk(RUN)
@@ -175,6 +186,7 @@ def test_every_effect_is_tried_and_the_hidden_one_comes_first(workbench: Workben
 def test_what_a_diagnosis_named_is_shown(workbench: Workbench) -> None:
     home = workbench.results / "runs/field/hidden"
     manifest = json.loads((home / "manifest.json").read_text())
+    del manifest["checksum"]
     named = {
         "input": "command",
         "effects": [{"id": "effective_track", "gain": 0.9}],
@@ -215,6 +227,108 @@ def test_what_cannot_be_done_is_said_and_changes_nothing(workbench: Workbench) -
     far = {"effect": "effective_track", "parameter": "k", "value": 99.0}
     assert workbench.refuse("/api/desk", run=RUN, action="set", **far)["code"] == "out_of_bounds"
     assert len(effects(workbench.desk(RUN))) == 1
+
+
+FORMULA = {"effect": "own", "channel": "v_w", "formula": "c * w0", "parameters": "c [1] -0.9 .. 0.5"}
+WORDS = (
+    "where", "id", "note", "v_x", "v_y", "v_w", "self", "name", "formulas", "parameters", "fixed", "values",
+    "value", "effect", "t", "yaw", "w0", "pi", "lambda", "__class__", "true", "inf", "nan", "sin",
+    "\u00e9", "\u212b",
+)  # fmt: skip
+DIGITS = "9" * 350
+UNUSUAL = (
+    *({"formula": f"{word} * w0", "parameters": f"{word} [1] -0.9 .. 0.5"} for word in WORDS),
+    *({"effect": word} for word in ("where", "v_x", "pi", "effective_track", "../x")),
+    {"formula": f"c * w0 * {DIGITS}"},
+    {"formula": f"c * w0 * 0.{DIGITS}"},
+    {"formula": f"c * w0 + {DIGITS} * w0 - {DIGITS} * w0"},
+    {"parameters": f"c [1] -{DIGITS} .. {DIGITS}"},
+    {"parameters": "c [1] -1e999 .. 1e999"},
+    {"parameters": f"c [1] {DIGITS} .. 1{DIGITS}"},
+    {"parameters": f"c [m^{DIGITS}] 0 .. 1"},
+    {"parameters": f"c [m^{'9' * 5000}] 0 .. 1"},
+    {"parameters": "c [1] 0 .. 1, c [1] 0 .. 1"},
+    {"parameters": f"c [{'m*' * 200}m] 0 .. 1"},
+    {"formula": "(" * 190 + "c * w0" + ")" * 190},
+    {"formula": "-" * 380 + "c * w0"},
+    {"formula": "c * w0" + "**1" * 120},
+    {"formula": "abs(" * 70 + "c * w0" + ")" * 70},
+    {"formula": "c * w0 * exp(exp(exp(exp(w0 + 9))))"},
+    {"formula": "c * w0 / (w0 - w0)"},
+    {"formula": "c * w0 * log(-1 - abs(yaw))"},
+    {"formula": "c * w0 * (0 - 1) ** 0.5"},
+    {"formula": "c ** 0.5 * w0"},
+    {"formula": "c * w0\n"},
+    {"formula": 'c * w0 # """'},
+    {"formula": "c * w0\x00"},
+    {"formula": '"'},
+    {"formula": "True * c * w0"},
+    {"formula": "1j * c * w0"},
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("unusual", UNUSUAL, ids=lambda case: str(case)[:50])
+def test_whatever_formula_is_written_the_desk_stays_usable(
+    shared_workbench: Workbench, unusual: dict[str, str]
+) -> None:
+    before = shared_workbench.desk(RUN)["desk"]
+    body = json.dumps({"run": RUN, "action": "formula", **FORMULA, **unusual}).encode()
+    status, _, answered = shared_workbench.request("POST", "/api/desk", body)
+    if status == 200:
+        # What was taken can be opened, drawn, changed, saved and read again, by the command line too.
+        for action in ("undo", "redo"):
+            shared_workbench.desk(RUN, action)
+        shared_workbench.post("/api/rows", run=RUN)
+        saved = shared_workbench.post("/api/save", run=RUN)
+        read_model(Path(str(saved["path"])))
+        shared_workbench.desk(RUN, "undo")
+    else:
+        assert status == 422, answered
+        error = json.loads(answered)["error"]
+        assert error["hint"]
+        assert len(error["message"]) < 1000
+    assert shared_workbench.desk(RUN)["desk"]["effects"] == before["effects"]  # type: ignore[index]
+    assert errors(shared_workbench.desk(RUN)) == cast("Desk", before)["errors"]
+
+
+@pytest.mark.parametrize(
+    "broken",
+    ["not = [toml", '[[effect]]\nid = "magic"\n', "", "x = " + "[" * 5000, "x = " + "9" * 5000, "\u0000"],
+    ids=["no_toml", "unknown_effect", "empty", "deep", "digits", "null"],
+)
+def test_a_step_that_cannot_be_opened_any_more_is_left_out(workbench: Workbench, broken: str) -> None:
+    added = workbench.desk(RUN, "add", effect="effective_track")
+    path = workbench.results / "workbench/desks/a/field/hidden.json"
+    kept = json.loads(path.read_text())
+    kept["steps"].append({**kept["steps"][-1], "model": broken, "said": "broken"})
+    kept["at"] = 2
+    path.write_text(json.dumps(kept))
+    assert errors(workbench.desk(RUN)) == errors(added)
+    assert effects(workbench.desk(RUN, "undo")) == []
+    assert errors(workbench.desk(RUN, "redo")) == errors(added)
+
+    # Also where it stands in the way of undo.
+    kept["steps"] = [kept["steps"][0], kept["steps"][2], kept["steps"][1]]
+    path.write_text(json.dumps(kept))
+    assert errors(workbench.desk(RUN)) == errors(added)
+    assert effects(workbench.desk(RUN, "undo")) == []
+    assert errors(workbench.desk(RUN, "redo")) == errors(added)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "[" * 100_000, '{"run": ' + '{"a":' * 100_000, '{"value": ' + "9" * 350 + "}", '{"run": "\\ud800"}',
+        "", "null", "[]", '"x"', "{", '{"run": "x", "run": 3}', '{"value": NaN}', "\u0000",
+        '{"run": "' + "x" * 90_000 + '"}', '{"run": "\\u0000"}', '{"x": 1}',
+    ],
+    ids=lambda content: content[:20],
+)  # fmt: skip
+def test_a_request_that_cannot_be_read_is_one_sentence(shared_workbench: Workbench, content: str) -> None:
+    for path in ("/api/desk", "/api/figures", "/api/rows", "/api/save", "/api/diagnose"):
+        status, _, body = shared_workbench.request("POST", path, content.encode())
+        assert status in {404, 422}, body
+        assert len(json.loads(body)["error"]["message"]) < 1000
 
 
 @pytest.mark.long

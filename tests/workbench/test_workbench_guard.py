@@ -2,20 +2,99 @@
 
 from __future__ import annotations
 
+import http.client
 import json
+import secrets
 import socket
 from typing import TYPE_CHECKING
 
 import pytest
-from workbench_server import RUN
+from workbench_server import LIMITS, RUN, TOKEN
 
 from pipeline.workbench import WorkbenchError, serve
-from pipeline.workbench.guard import strip_port
+from pipeline.workbench.guard import Guard, make_token, strip_port
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from workbench_server import Workbench
+
+
+EVERYTHING = (
+    ("GET", "/"), ("GET", "/page.js"), ("GET", "/vega.js"), ("GET", "/api/runs"), ("GET", "/api/jobs"),
+    ("GET", f"/report?run={RUN}"), ("GET", f"/model.toml?run={RUN}"), ("GET", "/nowhere"), ("HEAD", "/"),
+    ("POST", "/api/desk"), ("POST", "/api/upload?name=x.mcap"), ("POST", "/api/diagnose"), ("PUT", "/"),
+)  # fmt: skip
+STRANGERS: tuple[dict[str, str], ...] = (
+    {},
+    {"Cookie": "slip-1=x; slip=y"},
+    {"Authorization": "Bearer"},
+    {"Authorization": f"Bearer {TOKEN[:-1]}"},
+    {"Authorization": f"Basic {TOKEN}"},
+    {"Authorization": "Bearer \xe9\xff"},
+)
+
+
+@pytest.mark.parametrize(("method", "path"), EVERYTHING)
+def test_whoever_has_no_token_gets_nothing_but_a_sentence(
+    workbench: Workbench, method: str, path: str
+) -> None:
+    for headers in (*STRANGERS, {"Cookie": f"slip-{workbench.port}=guess"}):
+        status, answered, body = workbench.request(method, path, b"", headers=headers, known=False)
+        assert status == 403
+        assert method == "HEAD" or b"`slip serve` printed" in body
+        assert RUN.encode() not in body
+        assert answered["set-cookie"] is None
+    assert not (workbench.results / "workbench").exists()
+
+
+def test_a_wrong_token_in_the_address_is_refused(workbench: Workbench) -> None:
+    for token in ("", "guess", TOKEN[:-1], TOKEN + "x", "%E9", "%ff"):
+        status, headers, _ = workbench.request("GET", f"/?token={token}", known=False)
+        assert status == 403
+        assert headers["set-cookie"] is None
+    # It is asked for where the page is opened, and nowhere else: it must not end up in logs and links.
+    assert workbench.request("GET", f"/api/runs?token={TOKEN}", known=False)[0] == 403
+
+
+def test_the_printed_address_gives_a_cookie_that_only_the_browser_sees(workbench: Workbench) -> None:
+    path = workbench.address.removeprefix(workbench.origin)
+    status, headers, body = workbench.request("GET", path, known=False)
+    assert status == 200
+    assert TOKEN.encode() not in body
+    kept, *flags = [part.strip().lower() for part in headers["set-cookie"].split(";")]
+    assert {"httponly", "samesite=strict", "path=/"} <= set(flags)
+    assert not any(flag.startswith(("domain", "expires", "max-age")) for flag in flags)
+    for foreign, page in (("/", 200), ("/api/runs", 200)):
+        assert workbench.request("GET", foreign, headers={"Cookie": kept}, known=False)[0] == page
+
+
+def test_a_script_sends_the_token_as_a_header(workbench: Workbench) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", workbench.port)
+    bearer = {"Authorization": f"Bearer {TOKEN}"}
+    connection.request("POST", "/api/desk", json.dumps({"run": RUN}).encode(), headers=bearer)
+    assert connection.getresponse().status == 200
+    connection.close()
+    # Whatever it knows, another origin is another origin.
+    for foreign in ({"Origin": "https://evil.example"}, {"Sec-Fetch-Site": "cross-site"}):
+        assert workbench.request("GET", "/api/runs", headers={**bearer, **foreign}, known=False)[0] == 403
+
+
+def test_tokens_are_compared_in_constant_time_and_made_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared = []
+
+    def compare(one: bytes, two: bytes) -> bool:
+        compared.append((one, two))
+        return False
+
+    monkeypatch.setattr(secrets, "compare_digest", compare)
+    asked = {"type": "http", "path": "/", "method": "GET", "query_string": b"token=guess", "server": ("", 80)}
+    headers = [(b"host", b"localhost"), (b"cookie", b"slip-80=crumb"), (b"authorization", b"Bearer word")]
+    answer = Guard(lambda *_: None, TOKEN)._answer({**asked, "headers": headers})  # type: ignore[arg-type, return-value]
+    assert answer is not None
+    assert {given for given, _ in compared} == {b"guess", b"crumb", b"word"}
+    assert {make_token() for _ in range(20)}.__len__() == 20
+    assert len(make_token()) >= 43
 
 
 def test_answers_carry_a_strict_policy(workbench: Workbench) -> None:
@@ -37,6 +116,7 @@ def test_a_report_is_shut_off_from_the_page_that_links_to_it(workbench: Workbenc
     assert policy is not None
     assert len(policy) == 1
     assert "sandbox allow-scripts" in policy[0]
+    assert "frame-ancestors 'none'" in policy[0]
     assert "allow-same-origin" not in policy[0]
 
 
@@ -58,7 +138,15 @@ def test_the_loopback_by_any_of_its_names_is_let_in(workbench: Workbench, host: 
 
 @pytest.mark.parametrize(
     "origin",
-    ["https://evil.example", "null", "http://localhost:1", "http://127.0.0.1", "http://127.0.0.1:99999"],
+    [
+        "https://evil.example",
+        "null",
+        "http://[",
+        "",
+        "http://localhost:1",
+        "http://127.0.0.1",
+        "http://127.0.0.1:99999",
+    ],
 )
 def test_another_origin_is_refused(workbench: Workbench, origin: str) -> None:
     body = json.dumps({"run": RUN, "action": "add", "effect": "drive_lag"}).encode()
@@ -70,10 +158,9 @@ def test_another_origin_is_refused(workbench: Workbench, origin: str) -> None:
 
 
 def test_a_change_without_an_origin_is_refused(workbench: Workbench) -> None:
-    import http.client  # noqa: PLC0415 - this one request must not say its origin
-
     connection = http.client.HTTPConnection("127.0.0.1", workbench.port)
-    connection.request("POST", "/api/desk", b"{}")
+    cookie = {"Cookie": f"slip-{workbench.port}={TOKEN}"}
+    connection.request("POST", "/api/desk", b"{}", headers=cookie)
     assert connection.getresponse().status == 403
     connection.close()
 
@@ -103,5 +190,5 @@ def test_a_taken_port_is_named(tmp_path: Path) -> None:
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(WorkbenchError, match="--port") as caught:
-            serve(tmp_path, host="127.0.0.1", port=port, tell=lambda _: None)
+            serve(tmp_path, host="127.0.0.1", port=port, tell=lambda *_: None, limits=LIMITS)
     assert caught.value.code == "port_taken"

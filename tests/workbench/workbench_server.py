@@ -7,25 +7,36 @@ import json
 import threading
 import time
 from typing import TYPE_CHECKING, cast
+from urllib.parse import urlencode
 
 import uvicorn
 
-from pipeline.workbench import build_app
+from pipeline.workbench import Limits, build_app
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
     from pathlib import Path
+
+    from pipeline.batch.work import Report, Task
 
 RUN = "field/hidden"
 TRACK = 1.6
 PATIENCE_S = 60.0
+TOKEN = "the-token-of-the-tests"  # noqa: S105 - of no server but these
+LIMITS = Limits(log_bytes=200_000_000, all_bytes=400_000_000, timeout_s=600.0)
 
 
 class Workbench:
     """A server on a free port of the loopback."""
 
-    def __init__(self, results: Path, *, most_bytes: int = 200_000_000) -> None:
-        app = build_app(results, most_bytes=most_bytes, diagnosis=False)
+    def __init__(
+        self,
+        results: Path,
+        *,
+        limits: Limits = LIMITS,
+        work: Callable[[Task], Report] | None = None,
+    ) -> None:
+        app = build_app(results, token=TOKEN, limits=limits, diagnosis=False, work=work)
         configuration = uvicorn.Config(
             app, host="127.0.0.1", port=0, ws="none", log_level="warning", timeout_graceful_shutdown=1
         )
@@ -40,8 +51,13 @@ class Workbench:
         self.results = results
 
     @property
+    def origin(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    @property
     def address(self) -> str:
-        return f"http://127.0.0.1:{self.port}/"
+        """As `slip serve` prints it."""
+        return f"{self.origin}/?{urlencode({'token': TOKEN})}"
 
     def close(self) -> None:
         self._server.should_exit = True
@@ -54,9 +70,11 @@ class Workbench:
         body: bytes | None = None,
         *,
         headers: Mapping[str, str] | None = None,
+        known: bool = True,
     ) -> tuple[int, http.client.HTTPMessage, bytes]:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
-        own = {} if method == "GET" else {"Origin": self.address.rstrip("/")}
+        own = {"Cookie": f"slip-{self.port}={TOKEN}"} if known else {}
+        own |= {} if method == "GET" else {"Origin": self.origin}
         try:
             connection.request(method, path, body, headers={**own, **(headers or {})})
             answer = connection.getresponse()

@@ -16,6 +16,7 @@ from pipeline.batch.errors import BatchError
 from pipeline.batch.executors import Blame, Settings
 from pipeline.batch.executors.local import THREAD_VARIABLES
 from pipeline.batch.work import Report, Task, read_rss, work_safely
+from pipeline.core.interpreter import keep_current_folder_out
 from pipeline.store import Store
 
 if TYPE_CHECKING:
@@ -67,6 +68,7 @@ def _start_cluster(settings: Settings) -> Client:
 
     for variable in THREAD_VARIABLES:
         os.environ.setdefault(variable, "1")
+    keep_current_folder_out()
     # The guard judges memory; dask's own limit would pause workers before it.
     plain = {
         "distributed.scheduler.allowed-failures": 0,

@@ -24,6 +24,8 @@ from pipeline.batch.errors import BatchError
 from pipeline.batch.executors import Blame, Settings
 from pipeline.batch.memory import MemoryWatchdog
 from pipeline.batch.work import work_safely
+from pipeline.core.interpreter import keep_current_folder_out
+from pipeline.core.quiet import silence_warnings
 
 if TYPE_CHECKING:
     from pipeline.batch.work import Report, Task
@@ -62,6 +64,7 @@ class LocalExecutor:
         # Spawned processes take the environment over; more threads than cores only get in each other's way.
         for variable in THREAD_VARIABLES:
             os.environ.setdefault(variable, "1")
+        keep_current_folder_out()
         self._workers: list[_Worker] = []
         self._ended: list[_Worker] = []
         self._watchdog = MemoryWatchdog(settings.memory_bytes)
@@ -284,7 +287,8 @@ def describe_exit(code: int | None) -> str:
 
 
 def prepare_worker(parent: int) -> None:
-    """End this process when the batch that it works for is killed."""
+    """End this process when the batch that it works for is killed, and keep it quiet."""
+    silence_warnings()
     threading.Thread(target=_die_with, args=(parent,), name="parent", daemon=True).start()
 
 

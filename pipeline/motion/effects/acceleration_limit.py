@@ -16,7 +16,11 @@ from pipeline.motion.effect import INF, DriveEffect, Excitation, Parameter, Sear
 from pipeline.motion.filters import limit_rate
 
 if TYPE_CHECKING:
+    from pipeline.motion.evidence import Evidence, Largest
     from pipeline.motion.signals import Surroundings, Wheels
+
+# A limit that the largest wheel speed is reached under in less shows in no pose.
+_LEAST_RAMP_S = 0.08
 
 
 class AccelerationLimit(DriveEffect):
@@ -48,3 +52,10 @@ class AccelerationLimit(DriveEffect):
             left=limit_rate(wheels.left, limit, step, resets, resets.start[:, 0]),
             right=limit_rate(wheels.right, limit, step, resets, resets.start[:, 1]),
         )
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """Steps of the command are reached at once."""
+        return not self.values["limit"] * _LEAST_RAMP_S < evidence.largest.wheel
+
+    def _list_usual(self, largest: Largest) -> dict[str, float]:
+        return {"limit": largest.wheel}

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.motion.effect import BodyEffect, Excitation, Parameter, Search
+from pipeline.motion.effect import STAMPS, BodyEffect, Excitation, Late, Least, Parameter, Plausible, Search
 from pipeline.motion.filters import lag_signal
 from pipeline.motion.signals import Velocity
 
 if TYPE_CHECKING:
+    from pipeline.motion.evidence import Evidence
     from pipeline.motion.signals import Rolling, Surroundings
 
 
@@ -37,12 +38,15 @@ class BodyInertia(BodyEffect):
             search=Search.STARTS,
             starts=(0.15, 0.4, 0.9, 1.6),
             step=5e-3,
+            least=Least(0.02, STAMPS),
+            plausible=Plausible(0.0, 3.0, "wider than the 0.2 to 1 s of ice"),
         ),
     )
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("lateral_skid", "drive_lag", "acceleration_limit", "heading_skew")
     equivalent_to = ("drive_lag",)
     equivalent_when = "never turning, or only turning on the spot"
+    late = Late.BODY
 
     def move_body(self, rolling: Rolling, around: Surroundings) -> Velocity:
         """See the formula above."""
@@ -56,3 +60,7 @@ class BodyInertia(BodyEffect):
         start = (resets.start[:, 0] + 1j * resets.start[:, 1]) * frame[resets.at]
         slide = lag_signal(rolling.v0 * frame, tau, step, resets, start) * np.conj(frame)
         return Velocity(slide.real, slide.imag, w)
+
+    def is_equivalent(self, evidence: Evidence) -> bool:
+        """Encoders tell a wheel from a body; without them only driving and turning at once does."""
+        return not (evidence.encoders or evidence.largest.moves_both_ways)

@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.motion.effect import INF, CommandEffect, Excitation, Parameter, Search
 
 if TYPE_CHECKING:
+    from pipeline.motion.evidence import Evidence
     from pipeline.motion.signals import Commands, Surroundings
 
 
@@ -48,3 +49,7 @@ class BodySpeedLimit(CommandEffect):
         forward = 0.5 * radius * (commands.left + commands.right)
         excess = (forward - np.clip(forward, -limit, limit)) / radius
         return commands.change_wheels(commands.left - excess, commands.right - excess)
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """No command reaches it."""
+        return not evidence.largest.reaches(self.values["limit"], "speed")

@@ -16,8 +16,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.motion.effect import INF, CommandEffect, Excitation, Parameter, Search
+from pipeline.motion.effects.turn_droop import TurnDroop
 
 if TYPE_CHECKING:
+    from pipeline.motion.effect import Effect
+    from pipeline.motion.evidence import Evidence, Largest
     from pipeline.motion.signals import Commands, Surroundings
 
 
@@ -56,3 +59,11 @@ class BodyTurnLimit(CommandEffect):
         turning = 0.5 * (commands.right - commands.left) / to_wheels
         excess = (turning - np.clip(turning, -limit, limit)) * to_wheels
         return commands.change_wheels(commands.left + excess, commands.right - excess)
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """No command reaches it."""
+        return not evidence.largest.reaches(self.values["limit"], "turn")
+
+    def list_softer(self, largest: Largest) -> tuple[Effect, ...]:
+        """A droop of a usual gain, where only one turn beyond the limit was asked for."""
+        return (TurnDroop().make_usual(largest).fix("gain"),)

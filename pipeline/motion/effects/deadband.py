@@ -16,7 +16,11 @@ import numpy as np
 from pipeline.motion.effect import CommandEffect, Excitation, Parameter, Search
 
 if TYPE_CHECKING:
+    from pipeline.motion.evidence import Evidence, Largest
     from pipeline.motion.signals import Commands, Surroundings
+
+# Of the largest speed: less is passed through in one step of a command.
+_LEAST_SHARE = 0.02
 
 
 class Deadband(CommandEffect):
@@ -46,3 +50,11 @@ class Deadband(CommandEffect):
         left = np.where(np.abs(commands.left) < least, 0.0, commands.left)
         right = np.where(np.abs(commands.right) < least, 0.0, commands.right)
         return commands.change_wheels(left, right)
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """It is too small against what was asked for."""
+        return not self.values["d"] > _LEAST_SHARE * evidence.largest.speed
+
+    def _list_usual(self, largest: Largest) -> dict[str, float]:
+        (d,) = self.parameters
+        return {"d": d.typical * min(largest.speed, 1.0)}

@@ -12,10 +12,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import DriveEffect, Excitation, Parameter, Search
+from pipeline.motion.effect import STAMPS, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.motion.filters import lag_signal
 
 if TYPE_CHECKING:
+    from pipeline.motion.evidence import Evidence
     from pipeline.motion.signals import Surroundings, Wheels
 
 
@@ -35,12 +36,15 @@ class DriveLag(DriveEffect):
             search=Search.STARTS,
             starts=(0.1, 0.3, 0.7, 1.4),
             step=5e-3,
+            least=Least(0.015, STAMPS, sampled=True),
+            plausible=Plausible(0.0, 3.0, "wider than the 0.55 to 1.2 s of Husky and Warthog"),
         ),
     )
     needs = (Excitation.CHANGES,)
     confused_with = ("transport_delay", "turn_lag", "acceleration_limit")
     equivalent_to = ("body_inertia",)
     equivalent_when = "never turning, or only turning on the spot"
+    same_in_one_motion = ("turn_lag",)
 
     def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
         """See the formula above."""
@@ -50,3 +54,7 @@ class DriveLag(DriveEffect):
             left=lag_signal(wheels.left, tau, step, resets, resets.start[:, 0]),
             right=lag_signal(wheels.right, tau, step, resets, resets.start[:, 1]),
         )
+
+    def is_equivalent(self, evidence: Evidence) -> bool:
+        """Encoders tell a wheel from a body; without them only driving and turning at once does."""
+        return not (evidence.encoders or evidence.largest.moves_both_ways)

@@ -11,9 +11,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import DIFFERENTIAL, Excitation, KinematicEffect, Parameter
+from pipeline.motion.effect import (
+    DATA_SHEET,
+    DIFFERENTIAL,
+    Excitation,
+    KinematicEffect,
+    Least,
+    Parameter,
+    Plausible,
+)
+from pipeline.motion.effects.wheel_radius import WheelRadius
 
 if TYPE_CHECKING:
+    from pipeline.motion.effect import Effect
     from pipeline.motion.signals import Rolling, Surroundings
 
 
@@ -23,7 +33,18 @@ class EffectiveTrack(KinematicEffect):
     id = "effective_track"
     rank = 20
     kinds = DIFFERENTIAL
-    parameters = (Parameter("k", "1", (0.2, 10.0), 1.0, "effective over nominal track", 1.8),)
+    parameters = (
+        Parameter(
+            "k",
+            "1",
+            (0.2, 10.0),
+            1.0,
+            "effective over nominal track",
+            1.8,
+            least=Least(0.01, DATA_SHEET),
+            plausible=Plausible(0.7, 4.0, "wider than the 1.8 and 1.9 of Warthog and Husky"),
+        ),
+    )
     needs = (Excitation.TURNING,)
     confused_with = ("wheel_radius", "terrain_change")
 
@@ -31,3 +52,7 @@ class EffectiveTrack(KinematicEffect):
         """See the formula above."""
         del around
         return rolling.scale(1.0, 1.0 / self.values["k"])
+
+    def scale_without(self, other: Effect) -> float:
+        """The yaw rate is that of the ratio k_radius / k_track: for nominal wheels the track is that wide."""
+        return 1.0 / other.values["k"] if isinstance(other, WheelRadius) else 1.0

@@ -15,10 +15,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.motion.effect import Excitation, Parameter, ReportEffect
+from pipeline.motion.effect import STAMPS, Excitation, Late, Least, Parameter, Plausible, ReportEffect
+from pipeline.motion.evidence import LEAST_DELAY_S
 from pipeline.motion.signals import earlier_in_span
 
 if TYPE_CHECKING:
+    from pipeline.motion.evidence import Evidence
     from pipeline.motion.signals import Surroundings, Velocity
 
 
@@ -28,10 +30,23 @@ class HeadingSkew(ReportEffect):
     id = "heading_skew"
     rank = 30
     parameters = (
-        Parameter("d", "s", (-0.6, 0.6), 0.0, "age of the heading against the position", 0.1, step=1e-3),
+        # A heading newer than its position is lateral skid to the first order, and skid is what vehicles do.
+        Parameter(
+            "d",
+            "s",
+            (-0.6, 0.6),
+            0.0,
+            "age of the heading against the position",
+            0.1,
+            step=1e-3,
+            least=Least(LEAST_DELAY_S, STAMPS),
+            plausible=Plausible(-0.3, 0.4, "wider than the 0.1 s of the DRIVE recordings"),
+            one_sign=True,
+        ),
     )
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("lateral_skid", "body_inertia", "icr_offset")
+    late = Late.HEADING
 
     def report(self, velocity: Velocity, around: Surroundings) -> Velocity:
         """See the formula above."""
@@ -57,3 +72,7 @@ class HeadingSkew(ReportEffect):
         """The gyro's heading has no skew: nothing but the delay of the position is left."""
         del around
         return velocity
+
+    def can_show(self, evidence: Evidence) -> bool:
+        """It shows against the reported heading only."""
+        return not evidence.gyro

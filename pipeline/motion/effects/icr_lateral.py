@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import Excitation, LinearEffect, Parameter, Place
+from pipeline.motion.effect import MOUNTING, Excitation, Least, LinearEffect, Parameter, Place, Plausible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,7 +25,18 @@ class IcrLateral(LinearEffect):
 
     id = "icr_lateral"
     place = Place.CENTRE
-    parameters = (Parameter("y_icr", "m", (-1.0, 1.0), 0.0, "centre of rotation left of base_link", 0.08),)
+    parameters = (
+        Parameter(
+            "y_icr",
+            "m",
+            (-1.0, 1.0),
+            0.0,
+            "centre of rotation left of base_link",
+            0.08,
+            least=Least(0.004, MOUNTING),
+            plausible=Plausible(-0.5, 0.5, "further out it lies beside the wheels of a Warthog"),
+        ),
+    )
     needs = (Excitation.TURNING,)
     confused_with = ("wheel_asymmetry",)
     equivalent_to = ("lever_arm",)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import Excitation, LinearEffect, Parameter, Place
+from pipeline.motion.effect import MOUNTING, Excitation, Least, LinearEffect, Parameter, Place, Plausible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,7 +26,18 @@ class IcrOffset(LinearEffect):
 
     id = "icr_offset"
     place = Place.CENTRE
-    parameters = (Parameter("x_icr", "m", (-1.0, 1.0), 0.0, "centre of rotation ahead of base_link", 0.12),)
+    parameters = (
+        Parameter(
+            "x_icr",
+            "m",
+            (-1.0, 1.0),
+            0.0,
+            "centre of rotation ahead of base_link",
+            0.12,
+            least=Least(0.004, MOUNTING),
+            plausible=Plausible(-0.6, 0.6, "wider than the -0.08 to 0.24 m that were seen"),
+        ),
+    )
     needs = (Excitation.TURNING,)
     confused_with = ("lateral_skid", "heading_skew")
     equivalent_to = ("lever_arm",)

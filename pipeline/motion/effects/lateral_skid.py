@@ -12,7 +12,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import Excitation, LinearEffect, Parameter
+from pipeline.motion.effect import STAMPS, Excitation, Least, LinearEffect, Parameter, Plausible
+from pipeline.motion.evidence import LEAST_DELAY_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,7 +26,19 @@ class LateralSkid(LinearEffect):
     """Lateral skid: in a turn the vehicle slides outward."""
 
     id = "lateral_skid"
-    parameters = (Parameter("c", "s", (-0.5, 0.5), 0.0, "outward slip per centripetal acceleration", 0.1),)
+    parameters = (
+        Parameter(
+            "c",
+            "s",
+            (-0.5, 0.5),
+            0.0,
+            "outward slip per centripetal acceleration",
+            0.1,
+            least=Least(LEAST_DELAY_S, STAMPS),
+            plausible=Plausible(-0.02, 0.4, "wider than 0.02 on tile and 0.15 on ice"),
+            one_sign=True,
+        ),
+    )
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("icr_offset", "body_inertia", "heading_skew", "drive_lag")
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import Excitation, LinearEffect, Parameter, Place
+from pipeline.motion.effect import Excitation, LinearEffect, Parameter, Part, Place
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,6 +34,7 @@ class LeverArm(LinearEffect):
     confused_with = ("lateral_skid", "wheel_asymmetry")
     equivalent_to = ("icr_offset", "icr_lateral")
     equivalent_when = "always: a centre of rotation at (-l_x, -l_y) moves alike"
+    parts = (Part("l_x", "icr_offset", "x_icr", -1.0), Part("l_y", "icr_lateral", "y_icr", -1.0))
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
         """See the formula above."""

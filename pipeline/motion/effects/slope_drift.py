@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.motion.effect import Excitation, LinearEffect, Parameter
+from pipeline.motion.effect import Excitation, LinearEffect, Parameter, Plausible
 from pipeline.motion.signals import find_turning
 
 if TYPE_CHECKING:
@@ -28,7 +28,18 @@ class SlopeDrift(LinearEffect):
     """Slope drift: while it drives on a slope, the vehicle slides downhill."""
 
     id = "slope_drift"
-    parameters = (Parameter("k", "m/s", (-3.0, 3.0), 0.0, "downhill speed on a vertical slope", 0.6),)
+    parameters = (
+        Parameter(
+            "k",
+            "m/s",
+            (-3.0, 3.0),
+            0.0,
+            "downhill speed on a vertical slope",
+            0.6,
+            plausible=Plausible(-0.1, 2.5, "wider than the 0.4 to 0.8 m/s that were seen"),
+            one_sign=True,
+        ),
+    )
     needs = (Excitation.SLOPE,)
     confused_with = ("lateral_drift",)
 

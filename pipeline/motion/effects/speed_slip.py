@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.motion.effect import Excitation, LinearEffect, Parameter
+from pipeline.motion.effect import Excitation, LinearEffect, Parameter, Plausible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,7 +26,18 @@ class SpeedSlip(LinearEffect):
     """Speed slip: the faster the wheels turn, the larger the share of their motion that is lost."""
 
     id = "speed_slip"
-    parameters = (Parameter("k", "s/m", (-0.5, 0.5), 0.0, "share of speed lost per speed", 0.08),)
+    parameters = (
+        Parameter(
+            "k",
+            "s/m",
+            (-0.5, 0.5),
+            0.0,
+            "share of speed lost per speed",
+            0.08,
+            plausible=Plausible(-0.02, 0.4, "wider than the 0.08 of loose ground"),
+            one_sign=True,
+        ),
+    )
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("wheel_radius", "turning_resistance")
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import ACKERMANN, DriveEffect, Excitation, Parameter
+from pipeline.motion.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter, Plausible
 
 if TYPE_CHECKING:
     from pipeline.motion.signals import Surroundings, Wheels
@@ -24,7 +24,18 @@ class SteeringGain(DriveEffect):
     id = "steering_gain"
     rank = 50
     kinds = ACKERMANN
-    parameters = (Parameter("g", "1", (0.05, 5.0), 1.0, "steered over asked angle", 0.85),)
+    parameters = (
+        Parameter(
+            "g",
+            "1",
+            (0.05, 5.0),
+            1.0,
+            "steered over asked angle",
+            0.85,
+            least=Least(0.01, DATA_SHEET),
+            plausible=Plausible(0.5, 1.5, "wider than the 0.85 of a worn linkage"),
+        ),
+    )
     needs = (Excitation.STEERING,)
     confused_with = ("understeer",)
 

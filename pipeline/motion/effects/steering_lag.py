@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import ACKERMANN, DriveEffect, Excitation, Parameter, Search
+from pipeline.motion.effect import ACKERMANN, STAMPS, DriveEffect, Excitation, Least, Parameter, Search
 from pipeline.motion.filters import lag_signal
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ class SteeringLag(DriveEffect):
             search=Search.STARTS,
             starts=(0.1, 0.3, 0.7, 1.4),
             step=5e-3,
+            least=Least(0.015, STAMPS, sampled=True),
         ),
     )
     needs = (Excitation.CHANGES, Excitation.STEERING)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import ACKERMANN, DriveEffect, Excitation, Parameter
+from pipeline.motion.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter
 
 if TYPE_CHECKING:
     from pipeline.motion.signals import Surroundings, Wheels
@@ -24,7 +24,17 @@ class SteeringOffset(DriveEffect):
     id = "steering_offset"
     rank = 70
     kinds = ACKERMANN
-    parameters = (Parameter("o", "rad", (-0.5, 0.5), 0.0, "angle at which straight ahead is asked", 0.04),)
+    parameters = (
+        Parameter(
+            "o",
+            "rad",
+            (-0.5, 0.5),
+            0.0,
+            "angle at which straight ahead is asked",
+            0.04,
+            least=Least(0.002, DATA_SHEET),
+        ),
+    )
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("yaw_drift",)
 

@@ -15,10 +15,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.motion.effect import NAN, Excitation, KinematicEffect, Parameter, Search
+from pipeline.motion.effect import (
+    DATA_SHEET,
+    NAN,
+    Excitation,
+    KinematicEffect,
+    Least,
+    Parameter,
+    Plausible,
+    Search,
+)
 
 if TYPE_CHECKING:
+    from pipeline.motion.evidence import Evidence
     from pipeline.motion.signals import Rolling, Surroundings
+
+_LEAST = Least(0.03, DATA_SHEET)
+_PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")
+# Nearer to the ends of a run it is a wheel radius and a track under another name.
+_EDGE = 0.15
 
 
 class TerrainChange(KinematicEffect):
@@ -27,8 +42,12 @@ class TerrainChange(KinematicEffect):
     id = "terrain_change"
     rank = 60
     parameters = (
-        Parameter("k_v", "1", (0.05, 3.0), 1.0, "share of speed beyond", 0.85),
-        Parameter("k_w", "1", (0.05, 3.0), 1.0, "share of turning beyond", 0.75),
+        Parameter(
+            "k_v", "1", (0.05, 3.0), 1.0, "share of speed beyond", 0.85, least=_LEAST, plausible=_PLAUSIBLE
+        ),
+        Parameter(
+            "k_w", "1", (0.05, 3.0), 1.0, "share of turning beyond", 0.75, least=_LEAST, plausible=_PLAUSIBLE
+        ),
         Parameter(
             "at_s",
             "s",
@@ -41,10 +60,23 @@ class TerrainChange(KinematicEffect):
             relative_to="duration",
             step=1.0,
         ),
-        Parameter("at_x", "m", (-1e6, 1e6), NAN, "place of the change along the map's x axis", 0.0),
+        Parameter(
+            "at_x",
+            "m",
+            (-1e6, 1e6),
+            NAN,
+            "place of the change along the map's x axis",
+            0.0,
+            starts=(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
+            relative_to="place",
+            instead_of="at_s",
+        ),
     )
     needs = (Excitation.LONG, Excitation.TURNING)
     confused_with = ("time_drift", "wheel_radius", "effective_track")
+    contains = ("effective_track", "wheel_radius", "time_drift")
+    # A change point fits anything a little.
+    price = 0.05
 
     def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
         """See the formula above."""
@@ -56,3 +88,12 @@ class TerrainChange(KinematicEffect):
         return rolling.scale(
             np.where(beyond, self.values["k_v"], 1.0), np.where(beyond, self.values["k_w"], 1.0)
         )
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """It does not lie within the run."""
+        at_s, at_x, largest = self.values["at_s"], self.values["at_x"], evidence.largest
+        if math.isfinite(at_s):
+            return not _EDGE <= at_s / largest.duration <= 1.0 - _EDGE
+        tenths = largest.places
+        low, high = 0.5 * (tenths[1] + tenths[2]), 0.5 * (tenths[-3] + tenths[-2])
+        return math.isfinite(at_x) and not low <= at_x <= high

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import Excitation, KinematicEffect, Parameter
+from pipeline.motion.effect import DATA_SHEET, Excitation, KinematicEffect, Least, Parameter, Plausible
 
 if TYPE_CHECKING:
     from pipeline.motion.signals import Rolling, Surroundings
@@ -22,7 +22,18 @@ class TimeDrift(KinematicEffect):
 
     id = "time_drift"
     rank = 50
-    parameters = (Parameter("k", "1", (-0.9, 0.9), 0.0, "share lost at the end of the run", 0.1),)
+    parameters = (
+        Parameter(
+            "k",
+            "1",
+            (-0.9, 0.9),
+            0.0,
+            "share lost at the end of the run",
+            0.1,
+            least=Least(0.015, DATA_SHEET),
+            plausible=Plausible(-0.4, 0.4, "wider than the 10 % of long deployments"),
+        ),
+    )
     needs = (Excitation.LONG,)
     confused_with = ("terrain_change", "wheel_radius")
 

@@ -13,9 +13,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import CommandEffect, Excitation, Parameter, Search
+from pipeline.motion.effect import STAMPS, CommandEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.motion.evidence import LEAST_DELAY_S
 
 if TYPE_CHECKING:
+    from pipeline.motion.evidence import Evidence
     from pipeline.motion.signals import Commands, Surroundings
 
 
@@ -35,6 +37,8 @@ class TransportDelay(CommandEffect):
             search=Search.STARTS,
             starts=(0.05, 0.15, 0.3, 0.5),
             step=5e-3,
+            least=Least(LEAST_DELAY_S, STAMPS, sampled=True),
+            plausible=Plausible(0.0, 0.8, "wider than the 0.5 s after which a ros2_control drive stops"),
         ),
     )
     needs = (Excitation.CHANGES,)
@@ -46,3 +50,7 @@ class TransportDelay(CommandEffect):
         """See the formula above."""
         del around
         return replace(commands, times=commands.times + self.values["d"])
+
+    def is_equivalent(self, evidence: Evidence) -> bool:
+        """Another clock tells it."""
+        return not (evidence.encoders or evidence.gyro)

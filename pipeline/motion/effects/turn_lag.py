@@ -14,11 +14,19 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import DIFFERENTIAL, DriveEffect, Excitation, Parameter, Search
+from pipeline.motion.effect import DIFFERENTIAL, DriveEffect, Excitation, Parameter, Plausible, Search
+from pipeline.motion.effects.drive_lag import DriveLag
 from pipeline.motion.filters import lag_signal
 
 if TYPE_CHECKING:
+    from pipeline.motion.effect import Effect
+    from pipeline.motion.evidence import Evidence
     from pipeline.motion.signals import Surroundings, Wheels
+
+_PLAUSIBLE = Plausible(0.0, 3.0, "wider than the 0.1 to 1.6 s of Husky and Warthog")
+# Closer together, as a share of the slower one or in seconds, both time constants are one.
+_APART = 0.08
+_LEAST_APART_S = 0.02
 
 
 class TurnLag(DriveEffect):
@@ -38,6 +46,7 @@ class TurnLag(DriveEffect):
             search=Search.STARTS,
             starts=(0.1, 0.4),
             step=5e-3,
+            plausible=_PLAUSIBLE,
         ),
         Parameter(
             "tau_diff",
@@ -49,10 +58,13 @@ class TurnLag(DriveEffect):
             search=Search.STARTS,
             starts=(0.3, 1.2),
             step=5e-3,
+            plausible=_PLAUSIBLE,
         ),
     )
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("drive_lag", "transport_delay", "turn_droop")
+    same_in_one_motion = ("drive_lag",)
+    contains = ("drive_lag",)
 
     def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
         """See the formula above."""
@@ -65,3 +77,13 @@ class TurnLag(DriveEffect):
         mean = lag_signal(0.5 * (wheels.left + wheels.right), fast, step, resets, 0.5 * (left + right))
         difference = lag_signal(wheels.right - wheels.left, slow, step, resets, right - left)
         return replace(wheels, left=mean - 0.5 * difference, right=mean + 0.5 * difference)
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """With equal time constants it is a drive lag."""
+        fast, slow = self.values["tau_mean"], self.values["tau_diff"]
+        least, larger = max(evidence.least_delay_s, _LEAST_APART_S), max(fast, slow)
+        return not (larger > least and abs(fast - slow) > max(_APART * larger, least))
+
+    def collapse(self) -> Effect | None:
+        """A drive lag of the mean time constant."""
+        return DriveLag(tau=0.5 * (self.values["tau_mean"] + self.values["tau_diff"]))

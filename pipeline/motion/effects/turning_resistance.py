@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.motion.effect import Excitation, LinearEffect, Parameter
+from pipeline.motion.effect import Excitation, LinearEffect, Parameter, Plausible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,7 +26,18 @@ class TurningResistance(LinearEffect):
     """Turning resistance: a skid-steered vehicle loses forward speed while it turns."""
 
     id = "turning_resistance"
-    parameters = (Parameter("k", "s", (-1.0, 1.0), 0.0, "share of speed lost per yaw rate", 0.24),)
+    parameters = (
+        Parameter(
+            "k",
+            "s",
+            (-1.0, 1.0),
+            0.0,
+            "share of speed lost per yaw rate",
+            0.24,
+            plausible=Plausible(-0.05, 0.6, "wider than the 0.24 of a Husky in snow"),
+            one_sign=True,
+        ),
+    )
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("speed_slip", "wheel_radius")
 

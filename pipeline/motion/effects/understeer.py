@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.motion.effect import ACKERMANN, Excitation, KinematicEffect, Parameter
+from pipeline.motion.effect import ACKERMANN, Excitation, KinematicEffect, Parameter, Plausible
 
 if TYPE_CHECKING:
     from pipeline.motion.signals import Rolling, Surroundings
@@ -26,7 +26,17 @@ class Understeer(KinematicEffect):
     id = "understeer"
     rank = 40
     kinds = ACKERMANN
-    parameters = (Parameter("K", "s^2/m", (-0.05, 1.0), 0.0, "understeer gradient", 0.03),)
+    parameters = (
+        Parameter(
+            "K",
+            "s^2/m",
+            (-0.05, 1.0),
+            0.0,
+            "understeer gradient",
+            0.03,
+            plausible=Plausible(-0.02, 0.5, "wider than the 0.03 of a road car"),
+        ),
+    )
     needs = (Excitation.SPEED_SPREAD, Excitation.STEERING)
     confused_with = ("steering_gain",)
 

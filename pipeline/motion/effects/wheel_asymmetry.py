@@ -12,7 +12,15 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import DIFFERENTIAL, Excitation, KinematicEffect, Parameter
+from pipeline.motion.effect import (
+    DATA_SHEET,
+    DIFFERENTIAL,
+    Excitation,
+    KinematicEffect,
+    Least,
+    Parameter,
+    Plausible,
+)
 
 if TYPE_CHECKING:
     from pipeline.motion.signals import Rolling, Surroundings
@@ -25,7 +33,16 @@ class WheelAsymmetry(KinematicEffect):
     rank = 10
     kinds = DIFFERENTIAL
     parameters = (
-        Parameter("e", "1", (-0.5, 0.5), 0.0, "right radius less left radius over their mean", 0.04),
+        Parameter(
+            "e",
+            "1",
+            (-0.5, 0.5),
+            0.0,
+            "right radius less left radius over their mean",
+            0.04,
+            least=Least(0.003, DATA_SHEET),
+            plausible=Plausible(-0.2, 0.2, "wider than the 8 % of one soft side"),
+        ),
     )
     needs = (Excitation.BOTH_SIGNS, Excitation.SPEED_SPREAD)
     confused_with = ("yaw_drift", "lever_arm", "icr_lateral")

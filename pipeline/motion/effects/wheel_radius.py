@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import Excitation, KinematicEffect, Parameter
+from pipeline.motion.effect import DATA_SHEET, Excitation, KinematicEffect, Least, Parameter, Plausible
 
 if TYPE_CHECKING:
     from pipeline.motion.signals import Rolling, Surroundings
@@ -22,7 +22,18 @@ class WheelRadius(KinematicEffect):
 
     id = "wheel_radius"
     rank = 30
-    parameters = (Parameter("k", "1", (0.0, 5.0), 1.0, "true over nominal radius", 0.92),)
+    parameters = (
+        Parameter(
+            "k",
+            "1",
+            (0.0, 5.0),
+            1.0,
+            "true over nominal radius",
+            0.92,
+            least=Least(0.004, DATA_SHEET),
+            plausible=Plausible(0.7, 1.3, "wider than the 2 to 25 % that were seen"),
+        ),
+    )
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("speed_slip", "effective_track")
 

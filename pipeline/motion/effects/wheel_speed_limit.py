@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.motion.effect import INF, CommandEffect, Excitation, Parameter, Search
 
 if TYPE_CHECKING:
+    from pipeline.motion.evidence import Evidence
     from pipeline.motion.signals import Commands, Surroundings
 
 
@@ -48,3 +49,7 @@ class WheelSpeedLimit(CommandEffect):
         return commands.change_wheels(
             np.clip(commands.left, -limit, limit), np.clip(commands.right, -limit, limit)
         )
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """No command reaches it."""
+        return not evidence.largest.reaches(self.values["limit"], "wheel")

@@ -14,7 +14,7 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.motion.effect import Excitation, Parameter, ReportEffect
+from pipeline.motion.effect import MOUNTING, Excitation, Least, Parameter, Plausible, ReportEffect
 
 if TYPE_CHECKING:
     from pipeline.motion.signals import Surroundings, Velocity
@@ -25,7 +25,18 @@ class YawMisalignment(ReportEffect):
 
     id = "yaw_misalignment"
     rank = 20
-    parameters = (Parameter("psi", "rad", (-0.8, 0.8), 0.0, "reported less true heading", 0.05),)
+    parameters = (
+        Parameter(
+            "psi",
+            "rad",
+            (-0.8, 0.8),
+            0.0,
+            "reported less true heading",
+            0.05,
+            least=Least(0.003, MOUNTING),
+            plausible=Plausible(-0.35, 0.35, "wider than the 1 to 5 degrees that were seen"),
+        ),
+    )
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("lateral_drift",)
 

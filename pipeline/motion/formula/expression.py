@@ -142,7 +142,10 @@ class _Parser:
         value = node.value
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise _bad(self.where, f"{value!r} is no number", "Use plain numbers.")
-        number = float(value)
+        try:
+            number = float(value)
+        except OverflowError:
+            raise _bad(self.where, "a number is too large", "Use plain numbers.") from None
         return _Node(PLAIN, lambda _values: number, number)
 
     def _name(self, name: str) -> _Node:
@@ -176,7 +179,8 @@ class _Parser:
             if power is None or abs(power) > _LARGEST_POWER:
                 raise _bad(self.where, "a power must be a small plain number", "Write for example v0**2.")
             unit = left.unit.power(Fraction(power).limit_denominator(12))
-            return _Node(unit, lambda values: one(values) ** power)
+            # Plain numbers of Python would become complex, or an exception, where arrays become nan.
+            return _Node(unit, lambda values: np.asarray(one(values)) ** power)
         raise _bad(self.where, f"{self.text!r} uses an operator that is not known", "Use + - * / **.")
 
     def _call(self, name: str, arguments: list[_Node]) -> _Node:

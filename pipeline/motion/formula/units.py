@@ -8,7 +8,9 @@ from fractions import Fraction
 
 from pipeline.motion.errors import MotionError
 
-_TOKEN = re.compile(r"\s*(?:([A-Za-z]+|1)(?:\s*(?:\^|\*\*)\s*(-?\d+))?|([*/]))\s*")
+_TOKEN = re.compile(r"\s*(?:([A-Za-z]+|1)(?:\s*(?:\^|\*\*)\s*(-?\d{1,3}))?|([*/]))\s*")
+_LONGEST = 100
+"""Characters of a unit; a longer one is none."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ def parse_unit(text: str, where: str) -> Unit:
         MotionError: ``bad_unit``.
     """
     unit, place, divide, expect = PLAIN, 0, False, True
+    text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
     while place < len(text):
         found = _TOKEN.match(text, place)
         if found is None or (found.group(3) is None) != expect:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.report.words import build_table, escape, say_number
+from pipeline.report.elements import Cell, Column, Table
+from pipeline.report.words import MISSING, say_number
 from pipeline.statistics import kendall_tau, list_swaps
 
 if TYPE_CHECKING:
@@ -29,50 +30,52 @@ _MOST_SWAPS = 4
 _FEWEST = 2
 
 
-def render_difficulty(shown: pl.DataFrame) -> str:
-    """Values and ranks of every measure, their agreement, and the contradictions in words.
+def tabulate_difficulty(shown: pl.DataFrame) -> Table:
+    """Values and ranks of every measure, and how far each agrees with the modulus.
 
     Args:
         shown: table `datasets` of one input.
     """
-    rated = shown.drop_nulls("median_modulus").sort("median_modulus")
-    head = ["dataset", *(f"{name} <small>{unit}</small>" for name, unit, _ in MEASURES.values())]
+    rated = _rate(shown)
     ranks = {column: rated[column].rank("min") for column in MEASURES}
-    rows = [
+    rows: list[list[str | Cell]] = [
         [
-            escape(row["dataset"]),
+            str(row["dataset"]),
             *(
-                say_number(row[column])
-                + (f" <small>({int(ranks[column][i])})</small>" if row[column] is not None else "")
+                Cell(
+                    say_number(row[column]),
+                    small=f"({int(ranks[column][i])})" if row[column] is not None else "",
+                )
                 for column in MEASURES
             ),
         ]
         for i, row in enumerate(rated.iter_rows(named=True))
     ]
-    agreement = ["<i>agreement with the modulus (Kendall)</i>"]
-    told: list[str] = []
-    for column in MEASURES:
-        both = rated.drop_nulls(column)
-        if both.height < _FEWEST:
-            agreement.append("\u2013")
-            continue
-        usual, own = both["median_modulus"].to_numpy(), both[column].to_numpy()
-        agreement.append(f"{kendall_tau(usual, own):.2f}")
-        told += [
-            f"{both['dataset'][i]} slips more than {both['dataset'][j]} by modulus, "
-            f"but less by {MEASURES[column][0]}"
-            for i, j in list_swaps(usual, own)[:_MOST_SWAPS]
-        ]
-    table = build_table(
-        head,
-        [*rows, agreement],
-        caption="Median over runs and, in brackets, the rank from easy to hard",
-        numeric=range(1, len(head)),
+    both = {column: rated.drop_nulls(column) for column in MEASURES}
+    agreement = (
+        MISSING
+        if pair.height < _FEWEST
+        else f"{kendall_tau(pair['median_modulus'].to_numpy(), pair[column].to_numpy()):.2f}"
+        for column, pair in both.items()
     )
-    meanings = "".join(
-        f"<div><dt>{name} [{unit}]</dt><dd>{escape(text)}</dd></div>"
-        for name, unit, text in MEASURES.values()
-    )
-    swaps = "".join(f"<li>{escape(line)}</li>" for line in told)
-    listed = f'<p class="caption">Where they disagree</p><ul>{swaps}</ul>' if swaps else ""
-    return f'{table}{listed}<dl class="facts">{meanings}</dl>'
+    rows.append([Cell("agreement with the modulus (Kendall)", tag="i"), *agreement])
+    head = [Column("dataset"), *(Column(name, unit, number=True) for name, unit, _ in MEASURES.values())]
+    return Table("Median over runs and, in brackets, the rank from easy to hard", head, rows)
+
+
+def list_contradictions(shown: pl.DataFrame) -> list[str]:
+    """Pairs of datasets that a measure orders otherwise than the modulus does, in words."""
+    told = []
+    for column, (name, _, _) in MEASURES.items():
+        both = _rate(shown).drop_nulls(column)
+        if both.height >= _FEWEST:
+            swaps = list_swaps(both["median_modulus"].to_numpy(), both[column].to_numpy())
+            told += [
+                f"{both['dataset'][i]} slips more than {both['dataset'][j]} by modulus, but less by {name}"
+                for i, j in swaps[:_MOST_SWAPS]
+            ]
+    return told
+
+
+def _rate(shown: pl.DataFrame) -> pl.DataFrame:
+    return shown.drop_nulls("median_modulus").sort("median_modulus")

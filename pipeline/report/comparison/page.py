@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.report.comparison.difficulty import render_difficulty
+from pipeline.report.comparison.difficulty import MEASURES, list_contradictions, tabulate_difficulty
 from pipeline.report.comparison.figures import draw_boxes, draw_runs
-from pipeline.report.gallery import Chapter, Picture, render_gallery
+from pipeline.report.elements import Cell, Column, Picture, Table
+from pipeline.report.page import render_figures
 from pipeline.report.run import INPUT_WORDS
-from pipeline.report.words import begin_large, build_table, escape, say_distance, say_duration, say_number
+from pipeline.report.words import MISSING, say_distance, say_duration, say_number
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -24,6 +25,23 @@ _SHOWN = (
     "transitory_median_modulus", "steady_median_modulus", "median_window_norm", "published_norm",
     "drivetrain_mean_square", "ground_mean_square", "cross_mean_square", "height_rate",
     "largest_kinetic_energy",
+)  # fmt: skip
+
+_DATASETS = (
+    Column("dataset"), Column("runs", number=True), Column("samples", number=True),
+    Column("distance", number=True), Column("duration", number=True),
+    Column("median modulus", "m/s", number=True), Column("95 % interval", number=True),
+    Column("transitory", number=True), Column("steady", number=True),
+    Column("window norm", "m/s", number=True), Column("as published", number=True),
+    Column("drivetrain", "m\u00b2/s\u00b2", number=True), Column("ground", number=True),
+    Column("cross", number=True), Column("height rate", "m/s", number=True),
+    Column("largest energy", "J", number=True),
+)  # fmt: skip
+_PAIRS = (
+    Column("pair"), Column("shift b \u2212 a", "m/s", number=True), Column("95 % interval", number=True),
+    Column("Cliff\u2019s delta"), Column("p corrected", number=True), Column("p of the pair", number=True),
+    Column("smallest p", number=True), Column("verdict"), Column("unit"),
+    Column("plain p,", "not valid", number=True),
 )  # fmt: skip
 
 
@@ -51,32 +69,26 @@ def render_comparison(
         notes: what must be known.
     """
     shown = datasets.filter(pl.col("input") == input_name)
-    pictures = list_pictures(runs, intervals, windows, input_name=input_name, quantity=quantity)
-    told = "".join(f"<li>{escape(begin_large(note))}.</li>" for note in notes)
-    keys = "".join(
-        f"<li><b>{escape(row['dataset'])}</b> {escape(row['keys'])}</li>"
-        for row in shown.iter_rows(named=True)
-    )
-    chapters = [
-        Chapter(
-            "datasets",
-            "Which deployment is harder",
-            lead=f'<p class="lead">{escape(_say_verdict(comparisons))}</p>',
-            pictures=pictures,
-            rest=_tabulate_datasets(shown, input_name),
-        ),
-        Chapter("pairs", "How sure", rest=_tabulate_pairs(comparisons)),
-        Chapter("difficulty", "Fair between vehicles", rest=render_difficulty(shown)),
-        Chapter("notes", "What must be known", rest=f"<ul>{told}</ul>"),
-        Chapter("provenance", "Runs counted", rest=f"<ul>{keys}</ul>"),
-    ]
     facts = [
         f"{shown.height} datasets",
         f"{shown['runs'].sum()} runs",
         f"slip {INPUT_WORDS[input_name]}",
         "as published" if quantity == "published_norm" else "median modulus",
     ]
-    return render_gallery("Deployments compared", facts, chapters)
+    return render_figures(
+        "report/templates/comparison.html",
+        list_pictures(runs, intervals, windows, input_name=input_name, quantity=quantity),
+        title="Deployments compared",
+        facts=facts,
+        verdict=_say_verdict(comparisons),
+        datasets=_tabulate_datasets(shown, input_name),
+        pairs=_tabulate_pairs(comparisons),
+        difficulty=tabulate_difficulty(shown),
+        swaps=list_contradictions(shown),
+        measures=list(MEASURES.values()),
+        notes=notes,
+        counted=shown.select("dataset", "keys").to_dicts(),
+    )
 
 
 def list_pictures(
@@ -130,61 +142,50 @@ def _say_verdict(comparisons: pl.DataFrame) -> str:
     return f"{verdict}. Corrected for asking often, 5 %."
 
 
-def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> str:
-    head = [
-        "dataset", "runs", "samples", "distance", "duration",
-        "median modulus <small>m/s</small>", "95 % interval", "transitory", "steady",
-        "window norm <small>m/s</small>", "as published", "drivetrain <small>m\u00b2/s\u00b2</small>",
-        "ground", "cross", "height rate <small>m/s</small>", "largest energy <small>J</small>",
-    ]  # fmt: skip
-    rows = [
+def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
+    rows: list[list[str | Cell]] = [
         [
-            escape(row["dataset"]),
+            str(row["dataset"]),
             str(row["runs"]),
             f"{row['samples']:,}",
             say_distance(row["distance"]).replace(" ", "\u00a0"),
             say_duration(row["duration"]).replace(" ", "\u00a0"),
             say_number(row["median_modulus"]),
-            _say_ends(row) + (" <small>this run</small>" if row["interval"] == "this run only" else ""),
+            Cell(_say_ends(row), small="this run" if row["interval"] == "this run only" else ""),
             *(say_number(row[name]) for name in _SHOWN),
         ]
         for row in shown.sort("median_modulus").iter_rows(named=True)
     ]
     caption = f"Medians over runs, slip {INPUT_WORDS[input_name]}; a run counts once, whatever its length"
     # What nobody has worked out, or the logs do not show, is no column.
-    kept = [i for i in range(len(head)) if any(row[i] != say_number(None) for row in rows)]
-    head, rows = [head[i] for i in kept], [[row[i] for i in kept] for row in rows]
-    return build_table(head, rows, caption=caption, numeric=range(1, len(head)))
+    kept = [i for i in range(len(_DATASETS)) if any(row[i] not in (MISSING, Cell(MISSING)) for row in rows)]
+    return Table(caption, [_DATASETS[i] for i in kept], [[row[i] for i in kept] for row in rows])
 
 
-def _tabulate_pairs(comparisons: pl.DataFrame) -> str:
+def _tabulate_pairs(comparisons: pl.DataFrame) -> Table | None:
     if comparisons.is_empty():
-        return ""
-    head = [
-        "pair", "shift b \u2212 a <small>m/s</small>", "95 % interval", "Cliff\u2019s delta", "p corrected",
-        "p of the pair", "smallest p", "verdict", "unit", "plain p, <small>not valid</small>",
-    ]  # fmt: skip
+        return None
     rows = [
         [
-            f"{escape(row['a'])} | {escape(row['b'])} <small>{row['runs_a']} + {row['runs_b']}</small>",
+            Cell(f"{row['a']} | {row['b']}", small=f"{row['runs_a']} + {row['runs_b']}"),
             say_number(row["shift"]),
             _say_ends(row),
-            f"{say_number(row['cliffs_delta'], digits=2)} {escape(row['size'])}",
+            f"{say_number(row['cliffs_delta'], digits=2)} {row['size']}",
             _say_p(row["p_adjusted"]),
             _say_p(row["p"]),
             _say_p(row["smallest_p"]),
             _say_pair(row),
             "runs" if row["unit_of_analysis"] == "runs" else "run\u00a0against\u00a0run",
-            f"<small>{_say_p(row['p_uncorrected'])}</small>",
+            Cell(small=_say_p(row["p_uncorrected"])),
         ]
         for row in comparisons.sort("p_adjusted", "p").iter_rows(named=True)
     ]
-    return build_table(head, rows, caption=_ABOUT_PAIRS, numeric=(1, 2, 4, 5, 6, 9))
+    return Table(_ABOUT_PAIRS, _PAIRS, rows)
 
 
-def _say_pair(row: Mapping[str, object]) -> str:
+def _say_pair(row: Mapping[str, object]) -> str | Cell:
     if _number(row["p_adjusted"]) <= _LEVEL:
-        return "<b>different</b>"
+        return Cell("different", tag="b")
     if _number(row["smallest_p"]) > _LEVEL:
         return "too few runs to tell"
     return "not shown to differ"
@@ -195,11 +196,11 @@ def _number(value: object) -> float:
 
 
 def _say_p(p: float) -> str:
-    return f"{p:.4f}" if p >= 1e-4 else "&lt; 0.0001"  # noqa: PLR2004 - as many digits as are shown
+    return f"{p:.4f}" if p >= 1e-4 else "< 0.0001"  # noqa: PLR2004 - as many digits as are shown
 
 
 def _say_ends(row: Mapping[str, object]) -> str:
     low, high = row["low"], row["high"]
     if not isinstance(low, float) or not isinstance(high, float):
-        return "\u2013"
+        return MISSING
     return f"{say_number(low)}\u00a0to\u00a0{say_number(high)}"

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.motion import Comparison, MotionError, Timing, predict_at_from, predict_from
-from pipeline.report.motion_run import COLUMNS, choose_source, make_motion_run
+from pipeline.motion import Comparison, MotionError, Timing, choose_input, predict_at_from, predict_from
+from pipeline.report.motion_run import COLUMNS, make_motion_run
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -81,7 +81,8 @@ class ModelFeed:
         """
         try:
             run = self._load(low, high)
-            comparison = Comparison(run, self._model.vehicle, choose_source(run, self._source.input))
+            source = choose_input([run], self._source.input, self._model).source
+            comparison = Comparison(run, self._model.vehicle, source)
         except MotionError as error:
             self._refused = self._refused or error
             return None

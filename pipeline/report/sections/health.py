@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pipeline.report.elements import Column, Table
 from pipeline.report.run import RunReport, mapping_in, number_in, objects_in
-from pipeline.report.words import begin_large, build_table, escape, say_bytes, say_number, say_share
+from pipeline.report.words import MISSING, say_bytes, say_number, say_share
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from pipeline.report.sections.page import Page
 
@@ -23,11 +24,17 @@ _TOPICS = {
 }
 
 
-def render_health(page: Page) -> str:
+def view_health(page: Page) -> dict[str, object]:
     """Findings, losses and topics."""
     report = page.report
-    parts = (_render_findings, _render_losses, _render_quarantine, _render_topics)
-    return "".join(render(report) for render in parts)
+    notes = report.part("topics").get("notes")
+    return {
+        "findings": [_view_finding(finding) for finding in list_findings(report)],
+        "losses": _tabulate_losses(report),
+        "quarantine": _tabulate_quarantine(report),
+        "topics": list(_list_topics(report)),
+        "topic_notes": notes if isinstance(notes, list) else [],
+    }
 
 
 def list_findings(report: RunReport) -> list[Mapping[str, object]]:
@@ -45,6 +52,8 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
     losses = objects_in(log, "losses")
     complete = log.get("complete") is not False and not losses
     strip = [("good", "log complete") if complete else ("error", f"log has losses ({max(len(losses), 1)})")]
+    if log.get("unchecked"):
+        strip.append(("note", "log unchecked"))
     segments = report.number("segments")
     if segments is not None:
         gaps = int(segments) - 1
@@ -72,74 +81,58 @@ def _held_share(report: RunReport) -> float | None:
     return None
 
 
-def _render_findings(report: RunReport) -> str:
-    findings = list_findings(report)
-    if not findings:
-        return "<p>Nothing was noticed that would make these numbers doubtful.</p>"
-    return f'<ul class="findings">{"".join(_render_finding(finding) for finding in findings)}</ul>'
-
-
-def _render_finding(finding: Mapping[str, object]) -> str:
+def _view_finding(finding: Mapping[str, object]) -> dict[str, object]:
     severity = str(finding.get("severity", "info"))
     grade = severity if severity in _RANK else "info"
-    place = [escape(finding["where"])] if finding.get("where") else []
+    places = [str(finding["where"])] if finding.get("where") else []
     start, end = number_in(finding, "t_start"), number_in(finding, "t_end")
-    if start is not None and end is not None:
-        place.append(f"{say_number(start)}\u2013{say_number(end)} s")
-    elif start is not None:
-        place.append(f"at {say_number(start)} s")
-    place.append(f"<code>{escape(finding.get('id', ''))}</code>")
-    where = " \u00b7 ".join(place)
-    return (
-        f'<li class="{grade}"><span class="grade">{_SEVERITY_WORDS[grade]}</span>'
-        f'<div>{begin_large(escape(finding.get("text", "")))}<p class="where">{where}</p></div></li>'
-    )
+    if start is not None:
+        places.append(f"at {say_number(start)} s" if end is None else _say_stretch(start, end))
+    return {
+        "grade": grade,
+        "word": _SEVERITY_WORDS[grade],
+        "text": str(finding.get("text", "")),
+        "places": places,
+        "id": finding.get("id", ""),
+    }
 
 
-def _render_losses(report: RunReport) -> str:
-    losses = objects_in(report.part("log"), "losses")
-    if not losses:
-        return ""
+def _say_stretch(start: float | None, end: float | None) -> str:
+    return MISSING if start is None else f"{say_number(start)}\u2013{say_number(end)} s"
+
+
+def _tabulate_losses(report: RunReport) -> Table:
     rows = []
-    for loss in losses:
-        start, end = number_in(loss, "start_s"), number_in(loss, "end_s")
+    for loss in objects_in(report.part("log"), "losses"):
         chunks = number_in(loss, "chunks")
         rows.append(
             [
-                escape(loss.get("kind", "")),
+                str(loss.get("kind", "")),
                 say_bytes(number_in(loss, "bytes")),
-                "\u2013" if chunks is None else f"{chunks:.0f}",
-                f"{say_number(start)}\u2013{say_number(end)} s" if start is not None else "\u2013",
+                MISSING if chunks is None else f"{chunks:.0f}",
+                _say_stretch(number_in(loss, "start_s"), number_in(loss, "end_s")),
             ]
         )
-    head = ["kind", "size", "chunks", "stretch"]
-    return build_table(head, rows, caption="What the log has lost", numeric=(1, 2))
+    head = (Column("kind"), Column("size", number=True), Column("chunks", number=True), Column("stretch"))
+    return Table("What the log has lost", head, rows)
 
 
-def _render_quarantine(report: RunReport) -> str:
+def _tabulate_quarantine(report: RunReport) -> Table:
     """Rows that broke a contract, counted by table and rule."""
-    rows = []
-    for table in report.part("quarantined"):
-        rules = mapping_in(mapping_in(report.part("quarantined"), table), "rules")
-        rows += [[escape(table), escape(rule), escape(count)] for rule, count in rules.items()]
-    head = ["table", "rule", "rows"]
-    return build_table(head, rows, caption="Rows set aside", numeric=(2,)) if rows else ""
+    broken = report.part("quarantined")
+    rows = [
+        [table, rule, str(count)]
+        for table in broken
+        for rule, count in mapping_in(mapping_in(broken, table), "rules").items()
+    ]
+    return Table("Rows set aside", (Column("table"), Column("rule"), Column("rows", number=True)), rows)
 
 
-def _render_topics(report: RunReport) -> str:
+def _list_topics(report: RunReport) -> Iterator[tuple[str, object, object]]:
+    """What it serves as, the topic, and why this one."""
     topics = report.part("topics")
-    rows = []
     for key, words in _TOPICS.items():
         chosen = mapping_in(topics, key) or {"topic": topics.get(key)}
         topic, reason = chosen.get("topic"), chosen.get("reason")
-        if not topic and not reason:
-            continue
-        shown = f"<code>{escape(topic)}</code>" if topic else "none"
-        because = f' <span class="because">{escape(reason)}</span>' if reason else ""
-        rows.append(f"<div><dt>{words}</dt><dd>{shown}{because}</dd></div>")
-    if not rows:
-        return ""
-    notes = topics.get("notes")
-    told = "".join(f'<p class="note">{escape(note)}</p>' for note in notes) if isinstance(notes, list) else ""
-    joined = "".join(rows)
-    return f'<p class="caption">Topics used, and why these</p><dl class="facts">{joined}</dl>{told}'
+        if topic or reason:
+            yield words, topic, reason

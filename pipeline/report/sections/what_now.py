@@ -5,22 +5,14 @@ from __future__ import annotations
 import shlex
 from typing import TYPE_CHECKING
 
-from pipeline.report.words import escape
-
 if TYPE_CHECKING:
     from pipeline.report.run import RunReport
     from pipeline.report.sections.page import Page
 
 
-def render_what_now(page: Page) -> str:
+def view_what_now(page: Page) -> dict[str, object]:
     """Commands that go on from this run."""
-    if not page.report.text("run"):
-        return ""
-    items = "".join(
-        f"<div><dt>{words}</dt><dd><code>{escape(line)}</code></dd></div>"
-        for words, line in list_steps(page.report)
-    )
-    return f'<dl class="steps">{items}</dl>'
+    return {"steps": list_steps(page.report) if page.report.text("run") else []}
 
 
 def list_steps(report: RunReport) -> list[tuple[str, str]]:

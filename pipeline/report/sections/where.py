@@ -9,7 +9,6 @@ import polars as pl
 from pipeline.report.figures.figure import Section
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.scales import round_up
-from pipeline.report.words import say_share
 
 if TYPE_CHECKING:
     from pipeline.report.sections.page import Page
@@ -22,22 +21,14 @@ _SLOW = 0.05
 VERBS = {"command": ("Asked to turn", "Asked to drive"), "measured": ("Turning", "Driving")}
 
 
-def render_where(page: Page) -> str:
+def view_where(page: Page) -> dict[str, object]:
     """The regions that carry the slip, the linked figures, and a way to mark time without a mouse."""
-    figures = page.render_figures(Section.WHERE)
-    if not figures:
-        return ""
-    regions = find_regions(page.scene.sound_slip.get(page.report.main_input), VERBS[page.report.main_input])
-    told = ""
-    if regions:
-        words = INPUT_WORDS[page.report.main_input]
-        lines = "".join(
-            f"<li><b>{region}</b> carries {say_share(slip)} of the squared slip {words} "
-            f"in {say_share(time)} of the time</li>"
-            for region, slip, time in regions
-        )
-        told = f'<ul class="regions">{lines}</ul>'
-    return told + _MARKING + figures
+    name = page.report.main_input
+    return {
+        "regions": find_regions(page.scene.sound_slip.get(name), VERBS[name]),
+        "input": INPUT_WORDS[name],
+        "pictures": page.pictures[Section.WHERE],
+    }
 
 
 def find_regions(slip: pl.DataFrame | None, verbs: tuple[str, str]) -> list[tuple[str, float, float]]:
@@ -79,11 +70,3 @@ def find_regions(slip: pl.DataFrame | None, verbs: tuple[str, str]) -> list[tupl
 def _threshold(slip: pl.DataFrame, name: str) -> float:
     level = float(slip[name].abs().quantile(_UPPER_QUANTILE) or 0.0)
     return round_up(level) if level > _SLOW else _SLOW
-
-
-_MARKING = """<div class="marking" role="group" aria-label="Mark a stretch of time">
-<span>Mark a stretch: drag over any figure, or</span>
-<label>from <input type="number" id="mark-from" step="0.1" inputmode="decimal"> s</label>
-<label>to <input type="number" id="mark-to" step="0.1" inputmode="decimal"> s</label>
-<button type="button" id="mark-set">Mark</button>
-</div>"""

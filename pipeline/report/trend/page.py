@@ -11,9 +11,10 @@ import polars as pl
 
 from pipeline.comparison.trend import describe_step
 from pipeline.report import theme
+from pipeline.report.elements import Picture
 from pipeline.report.figures import Drawing
-from pipeline.report.gallery import Chapter, Picture, render_gallery
-from pipeline.report.words import begin_large, escape
+from pipeline.report.page import render_figures
+from pipeline.report.words import begin_large
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,25 +36,27 @@ def render_trend(
         notes: what must be known.
         keys: run/generation of every run.
     """
-    told = "".join(f"<li>{escape(begin_large(alert.text))}.</li>" for alert in alerts)
-    lead = (
-        f'<div class="doubts"><p>Look at these:</p><ul>{told}</ul></div>'
-        if told
-        else '<p class="lead">Nothing moved beyond the threshold.</p>'
+    names = list(dict.fromkeys(one.group for one in series))
+    groups = [
+        (number, name, _draw_group([one for one in series if one.group == name], number))
+        for number, name in enumerate(names)
+    ]
+    return render_figures(
+        "report/templates/trend.html",
+        [picture for _, _, pictures in groups for picture in pictures],
+        title="Trends",
+        facts=[f"{len(names)} groups", f"{len(series)} series", f"{len(keys)} runs", f"{len(alerts)} alerts"],
+        alerts=[alert.text for alert in alerts],
+        notes=notes,
+        groups=[group for group in groups if group[2]],
+        runs=keys,
     )
-    known = "".join(f"<li>{escape(begin_large(note))}.</li>" for note in notes)
-    chapters = [Chapter("alerts", "What changed", lead=lead, rest=f"<ul>{known}</ul>")]
-    groups = list(dict.fromkeys(one.group for one in series))
-    for number, group in enumerate(groups):
-        own = [one for one in series if one.group == group and one.points.height >= _FEWEST_POINTS]
-        own.sort(key=lambda one: (not one.steps, one.quantity.startswith(_LATER), one.quantity))
-        pictures = [_picture(one, f"trend_{number}_{place}") for place, one in enumerate(own)]
-        if pictures:
-            chapters.append(Chapter(f"group-{number}", group, pictures=pictures))
-    listed = "".join(f"<li>{escape(key)}</li>" for key in keys)
-    chapters.append(Chapter("provenance", "Runs counted", rest=f"<ul>{listed}</ul>"))
-    facts = [f"{len(groups)} groups", f"{len(series)} series", f"{len(keys)} runs", f"{len(alerts)} alerts"]
-    return render_gallery("Trends", facts, chapters)
+
+
+def _draw_group(series: Sequence[Series], number: int) -> list[Picture]:
+    own = [one for one in series if one.points.height >= _FEWEST_POINTS]
+    own.sort(key=lambda one: (not one.steps, one.quantity.startswith(_LATER), one.quantity))
+    return [_picture(one, f"trend_{number}_{place}") for place, one in enumerate(own)]
 
 
 def _picture(series: Series, name: str) -> Picture:

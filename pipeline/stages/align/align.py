@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from pipeline.core import timegrid
 from pipeline.motion.errors import MotionError
 from pipeline.motion.heading import fit_gyro
-from pipeline.motion.ideal import invert_differential
 from pipeline.motion.recording import Alignment, MotionRun, make_run, tabulate_alignment
 from pipeline.stages.align.command_scale import CommandScale, measure_command_scale
 from pipeline.stages.align.outliers import SAMPLE_S, find_outliers
@@ -169,7 +168,9 @@ def _correct_commands(commands: pl.DataFrame, vehicle: Vehicle, scale: CommandSc
     left, right = columns["left"], columns["right"]
     if scale.track_multiplier != vehicle.controller_track_multiplier:
         there = msgspec.structs.replace(vehicle, controller_track_multiplier=scale.track_multiplier)
-        left, right = invert_differential(columns["body_x"], columns["body_w"], there)
+        forward, turning = columns["body_x"], columns["body_w"]
+        asked = there.kinematics.inverse((forward, np.zeros_like(forward), turning), there)
+        left, right = asked["left"], asked["right"]
     aligned = {"left_aligned": left, "right_aligned": right, "speed_aligned": columns["speed"]}
     return commands.with_columns(
         pl.Series(name, scale.scale * values, dtype=pl.Float64).fill_nan(None)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.core import timegrid
 from pipeline.motion.heading import align_heading, has_barred, mark_barred
+from pipeline.motion.signals import name_inputs
 
 if TYPE_CHECKING:
     from pipeline.motion.recording import DriveSeries, MotionRun
@@ -90,11 +91,7 @@ def _measure_misfit(
     heading, delay = _choose_heading(run)
     moved = (track.path[last] - track.path[first]) * np.exp(-0.5j * (heading[first] + heading[last]))
     span = track.times[last] - track.times[first]
-    forward = 0.5 * vehicle.wheel_radius_m * (wheels.left + wheels.right)
-    if vehicle.kind == "ackermann":
-        turning = forward * np.tan(wheels.steering) / (vehicle.wheelbase_m or 1.0)
-    else:
-        turning = vehicle.wheel_radius_m * (wheels.right - wheels.left) / (vehicle.track_width_m or 1.0)
+    forward, _, turning = vehicle.kinematics.forward(name_inputs(wheels, vehicle), vehicle)
 
     def drive(rate: Floats, late: float) -> Floats:
         way = timegrid.integrate_rate(wheels.times, rate)

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.motion.catalogue import find_late_effect
+from pipeline.motion.effect import Late
 from pipeline.stages.finding import Finding
 
 if TYPE_CHECKING:
@@ -230,7 +232,8 @@ def _join_time_bases(
                 f"the recorder's clock lies {home:.3g} s from the stamps: "
                 f"{clock.topic}, which has none, was shifted"
             )
-        findings.append(Finding("clock_offset", "warning", text, where=clock.topic, value=away))
+        name = find_late_effect(Late.POSES).id
+        findings.append(Finding(name, "warning", text, where=clock.topic, value=away))
         joined[key] = TopicClock(
             clock.topic, clock.clock, clock.stamp + shift, clock.usable, clock.breaks, clock.latency_s
         )

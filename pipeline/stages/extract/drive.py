@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns
-from pipeline.motion.ideal import invert_ackermann, invert_differential
 from pipeline.stages.errors import StageError
 from pipeline.stages.finding import Finding
 from pipeline.vehicles import DriveForm, DriveSection, Vehicle
@@ -89,7 +88,7 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
         if not _is_known(position, joint):
             raise _no_wheels(columns.topic, joints)
         velocity[joint] = differentiate_angle(times, position[joint])
-    if vehicle.kind == "ackermann":
+    if vehicle.kinematics.has_inputs("steering"):
         steering = _mean_steering(position, section.steering_joint, columns.topic)
         wheels = [velocity[joint] for joint in (*left, *right)]
         if not wheels:
@@ -179,7 +178,7 @@ def _to_radps(values: Floats, section: DriveSection, vehicle: Vehicle) -> Floats
 
 def read_sides(left: Floats, right: Floats, section: DriveSection, vehicle: Vehicle) -> Drive:
     """A signal a side, already at common times."""
-    if vehicle.kind == "ackermann":
+    if vehicle.kinematics.has_inputs("steering"):
         raise StageError(
             "no_steering",
             "a pair of wheel speeds has no steering angle",
@@ -192,19 +191,16 @@ def read_sides(left: Floats, right: Floats, section: DriveSection, vehicle: Vehi
 def read_body(forward: Floats, yaw_rate: Floats, section: DriveSection, vehicle: Vehicle) -> Drive:
     """A body command, turned into the drive's by the vehicle's ideal inverse."""
     forward = forward * section.sign
-    if vehicle.kind == "ackermann":
-        speed, steering = invert_ackermann(forward, yaw_rate, vehicle)
-        return Drive(speed=speed, steering=steering, body_x=forward, body_w=yaw_rate)
-    left, right = invert_differential(forward, yaw_rate, vehicle)
-    return Drive(left=left, right=right, body_x=forward, body_w=yaw_rate)
+    inputs = vehicle.kinematics.inverse((forward, np.zeros_like(forward), yaw_rate), vehicle)
+    return Drive(**inputs, body_x=forward, body_w=yaw_rate, findings=())
 
 
 def read_steering(speed: Floats, steering: Floats, section: DriveSection, vehicle: Vehicle) -> Drive:
     """Speed and steering angle, as recorded."""
-    if vehicle.kind == "differential":
+    if not vehicle.kinematics.has_inputs("speed", "steering"):
         raise StageError(
             "wrong_kind",
-            f"speed and steering cannot drive {vehicle.name}, which is differential",
+            f"speed and steering cannot drive {vehicle.name}, which is {vehicle.kind}",
             where="configuration",
             hint='Set vehicle.kind = "ackermann" and vehicle.wheelbase_m.',
         )

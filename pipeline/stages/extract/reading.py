@@ -20,6 +20,7 @@ _POSE_PREFIX = {
     "geometry_msgs/PoseStamped": "pose.",
     "geometry_msgs/PoseWithCovarianceStamped": "pose.pose.",
 }
+_LONGEST_NAME = 200
 _POSITION = ("position.x", "position.y", "position.z")
 _ORIENTATION = ("orientation.x", "orientation.y", "orientation.z", "orientation.w")
 _RATES = tuple(f"angular_velocity.{axis}" for axis in "xyz")
@@ -131,10 +132,11 @@ def numbers(columns: TopicColumns, name: str) -> Floats:
 
 
 def first_text(columns: TopicColumns, name: str) -> str:
-    """The text that a column of strings starts with."""
+    """The text that a column of strings starts with, no longer than a sentence about it can bear."""
     column = columns.fields.get(name)
-    if isinstance(column, Strings) and len(column):
-        return column.to_list()[0] if len(column.values) != 1 else column.values[0]
+    if isinstance(column, Strings) and len(column) and column.codes[0] >= 0:
+        text: str = column.values[int(column.codes[0])]
+        return text[:_LONGEST_NAME]
     return ""
 
 

@@ -6,7 +6,7 @@ written all the same: the store moves them to quarantine, where they can be look
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline.logs import join_channels
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract import localization, reading
+from pipeline.stages.extract.absurd import remove_absurd
 from pipeline.stages.extract.clocks import Recorded, TopicClock, align_clocks
 from pipeline.stages.extract.drive import (
     Drive,
@@ -93,19 +94,19 @@ class _Extraction:
     def __init__(
         self, data: LogData, sources: Sources, configuration: Configuration, vehicle: Vehicle, where: str
     ) -> None:
-        self.data = data
+        topics, self.findings = remove_absurd(data.topics)
+        self.data = replace(data, topics=topics)
         self.sources = sources
         self.configuration = configuration
         self.vehicle = vehicle
         self.where = where
-        self.findings: list[Finding] = []
         self.columns = {
             topic: found
-            for topic in dict.fromkeys(columns.topic for columns in data.topics)
+            for topic in dict.fromkeys(columns.topic for columns in topics)
             if (found := self._join_channels(topic)) is not None
         }
         pose = sources.pose
-        self.chain = chain_poses(data.topics, pose, where) if pose and pose.from_transforms else None
+        self.chain = chain_poses(topics, pose, where) if pose and pose.from_transforms else None
         self.clocks = self._align()
         self.start_ns = self._find_start()
 
@@ -217,9 +218,12 @@ class _Extraction:
                     spans += find_spans_of_state(times, said, section)
             values = " or ".join(repr(section.equals or DEFAULT_INTERVAL[1]) for section in asked)
             if not spans:
+                said_so = f"{source.topic} never says {values}"
+                if self.data.losses:
+                    said_so = f"what is left of {source.topic} does not say {values}{self._blame_damage()}"
                 raise StageError(
                     "no_interval",
-                    f"{source.topic} never says {values}, so that no command counts",
+                    f"{said_so}, so that no command counts",
                     where=self.where,
                     hint="Set another `equals` in [[interval]], or take everything with --interval all.",
                 )
@@ -283,10 +287,16 @@ class _Extraction:
     def _time_columns(self, times: Floats, stamp: Stamps, log_time: Stamps) -> dict[str, NDArray[np.generic]]:
         return {"t": times, "stamp": stamp, "log_time": log_time}
 
+    def _blame_damage(self) -> str:
+        """What was lost of the log, for sentences about what is not there; empty where nothing was."""
+        losses = self.data.losses
+        more = f" and {len(losses) - 1} more" if len(losses) > 1 else ""
+        return f" (the log is damaged: {losses[0].text}{more})" if losses else ""
+
     def _nothing(self, role: str, topic: str) -> StageError:
         return StageError(
             f"no_{role}",
-            f"the topic {topic!r} chosen as {role} has no readable message",
+            f"the topic {topic!r} chosen as {role} has no readable message{self._blame_damage()}",
             where=self.where,
             hint=f"Choose another with {role}.topic in run.toml; `slip inspect` lists what there is.",
         )

@@ -1,0 +1,53 @@
+"""What `slip analyze` and `slip diagnose` do when a log takes more memory than it may."""
+
+from __future__ import annotations
+
+import os
+import sys
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from pipeline.cli.output import FAILED, print_error
+from pipeline.core.errors import SlipError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+_SHARE = 0.8
+"""Of the machine's memory: the rest of the machine needs some, too."""
+
+
+@contextmanager
+def limited_memory(
+    size: str | None, name_log: Callable[[], str], conclude: Callable[[SlipError], None]
+) -> Iterator[None]:
+    """End the program with one line when it holds too much memory.
+
+    Args:
+        size: most memory, for example ``2GB``; None for a share of the machine's.
+        name_log: which log is being worked on.
+        conclude: prints what was found before, where JSON was asked for.
+
+    Raises:
+        BatchError: ``bad_size``.
+    """
+    from pipeline.batch import measure_memory, parse_size  # noqa: PLC0415 - heavy
+    from pipeline.batch.memory import limit_memory  # noqa: PLC0415 - heavy
+
+    limit = int(_SHARE * measure_memory()) if size is None else parse_size(size)
+
+    def give_up(held: int) -> None:
+        error = SlipError(
+            "out_of_memory",
+            f"it held {held / 1e9:.2g} GB of memory, more than {limit / 1e9:.2g} GB",
+            where=name_log(),
+            hint="Give it more with --memory, or leave the log out",
+        )
+        print_error(error)
+        conclude(error)
+        sys.stdout.flush()
+        # Nothing else ends a library's computation. Results are as after a kill: those before, whole.
+        os._exit(FAILED)
+
+    with limit_memory(limit, give_up):
+        yield

@@ -1,0 +1,131 @@
+"""What the checksums of a recording cover, and what is said where they do not hold or there are none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from pipeline.logs.errors import Loss
+from pipeline.logs.loading import checksum_holds
+from pipeline.logs.scan import describe_contradiction
+from pipeline.logs.source import is_fetched
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from concurrent.futures import Executor, Future
+
+    from pipeline.logs.index import ChannelInfo, Part
+    from pipeline.logs.messages import Messages
+    from pipeline.logs.records import ChannelRecord, SchemaRecord
+    from pipeline.logs.source import ByteSource
+
+_NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be seen"
+
+
+class DataSection:
+    """The checksum over the data section of one file, computed once, beside the reading.
+
+    Args:
+        source: the file.
+        part: what it holds.
+        beside: computes it.
+    """
+
+    def __init__(self, source: ByteSource, part: Part, beside: Executor) -> None:
+        self._source = source
+        self._part = part
+        self._beside = beside
+        self._check: Future[bool] | None = None
+        # All of an object is fetched for this only where nothing else covers its messages.
+        if not is_fetched(source):
+            self._begin()
+
+    def _begin(self) -> None:
+        end, crc = self._part.data_end, self._part.data_crc
+        if self._check is None and end is not None and crc:
+            self._check = self._beside.submit(checksum_holds, self._source, end, crc)
+
+    def holds(self) -> bool:
+        """Whether there is such a checksum and it holds."""
+        self._begin()
+        return self._check is not None and self._check.result()
+
+    def judge(self, unchecked: int, *, told: bool) -> Loss | None:
+        """What is lost because it does not hold.
+
+        Args:
+            unchecked: stretches with messages that were read and have no checksum of their own.
+            told: whether damage in this file has been told already, which is reason enough.
+        """
+        if unchecked:
+            self._begin()
+        if self._check is None or (told and not unchecked) or self._check.result():
+            return None
+        wrong = "the checksum of the data section does not match its bytes"
+        if unchecked:
+            text = (
+                f"{wrong}, and its messages have none of their own: some are damaged, and nobody can tell "
+                "which. They were read all the same; any value may be wrong"
+            )
+        else:
+            text = (
+                f"{wrong}: the messages that were read are whole, as their chunks' own checksums say; "
+                "something else is damaged, such as metadata or chunks that were not read"
+            )
+        times = [span.start_ns for span in self._part.spans if span.start_ns is not None]
+        ends = [span.end_ns for span in self._part.spans if span.end_ns is not None]
+        return Loss(
+            "checksum_mismatch",
+            text,
+            bytes=self._part.data_end or 0,
+            start_ns=min(times, default=None),
+            end_ns=max(ends, default=None),
+        )
+
+
+@dataclass(slots=True)
+class Coverage:
+    """How many stretches with messages were read, and how many of them no checksum covers."""
+
+    spans: int = 0
+    unchecked: int = 0
+
+    def describe(self) -> str:
+        """What is unchecked, in words; empty when all that was read is covered."""
+        if not self.unchecked:
+            return ""
+        if self.unchecked == self.spans:
+            return _NOTHING_COVERED
+        return (
+            f"{self.unchecked} of {self.spans} stretches of it carry no checksum: "
+            "damage in them cannot be seen"
+        )
+
+
+def find_contradictions(part: Part, messages: Messages) -> list[Loss]:
+    """Schemas and channels that a chunk describes otherwise than the rest of the file does."""
+    pairs: list[tuple[SchemaRecord | ChannelRecord, SchemaRecord | ChannelRecord]] = [
+        *((part.schemas.get(schema.id, schema), schema) for schema in messages.schemas),
+        *((part.channels.get(channel.id, channel), channel) for channel in messages.channels),
+    ]
+    losses = [describe_contradiction(one, other) for one, other in pairs]
+    return [loss for loss in losses if loss is not None]
+
+
+def count_missing(counted: Iterable[tuple[ChannelInfo, int]], losses: Sequence[Loss]) -> list[Loss]:
+    """Messages that the summary counts and nobody found, where no other loss explains them.
+
+    Args:
+        counted: channels with the number of their messages that were found.
+        losses: what is known to be lost.
+    """
+    if losses:
+        return []
+    return [
+        Loss(
+            "missing_messages",
+            f"the summary counts {info.message_count} messages of {info.topic}, {found} were found",
+        )
+        for info, found in counted
+        if found < info.message_count
+    ]

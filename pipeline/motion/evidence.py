@@ -1,0 +1,88 @@
+"""What recordings can show of an effect: what was asked for, and which sensors tell of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Relative = Literal["", "speed", "turn", "wheel", "duration", "place"]
+
+# Of poses, headings and encoders against each other [s]: below it they are stamped no better.
+LEAST_DELAY_S = 0.012
+
+_STANDING = 0.05
+_NEVER = 0.02
+_LEAST_WAY_M = 1.0
+# Above this share of the largest that was asked for, a limit cuts nothing off.
+_REACHED = 0.99
+
+
+@dataclass(frozen=True)
+class Largest:
+    """What relative starts are shares of: the largest that was commanded, and the duration.
+
+    Attributes:
+        speed, turn, wheel: speed [m/s], yaw rate [rad/s], wheel speed [rad/s].
+        difference: of the wheel speeds [rad/s].
+        duration: of the run [s].
+        places: x [m] in the map below which the tenths of the run lie, shape (11,).
+    """
+
+    speed: float
+    turn: float
+    wheel: float
+    difference: float
+    duration: float
+    places: Floats
+
+    @property
+    def moves_both_ways(self) -> bool:
+        """Whether a run both drives and turns."""
+        return min(self.speed, self.turn) > _STANDING
+
+    @property
+    def is_one_motion(self) -> bool:
+        """Driven straight only, or turned on the spot only."""
+        return min(self.speed, self.turn) < _NEVER * max(self.speed, self.turn)
+
+    @property
+    def travels(self) -> bool:
+        """Whether places along x differ enough for anything to change between them."""
+        return float(self.places[-1] - self.places[0]) > _LEAST_WAY_M
+
+    def take(self, share: float, of: Relative) -> float:
+        """A share of what was asked for; the number itself where it is no share.
+
+        Args:
+            share: of the largest or of the duration; for a `place`, the part of the run that lies below it.
+            of: which.
+        """
+        if of == "place":
+            return float(self.places[round(share * (self.places.size - 1))])
+        whole = {"speed": self.speed, "turn": self.turn, "wheel": self.wheel, "duration": self.duration}
+        return share * whole.get(of, 1.0)
+
+    def reaches(self, limit: float, of: Relative) -> bool:
+        """Whether commands went beyond a limit of `speed`, `turn` or `wheel` speed."""
+        return limit <= self.take(_REACHED, of)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the recordings of a search can show.
+
+    Attributes:
+        largest: what was asked for.
+        encoders: whether every run has measured wheels.
+        gyro: whether every run has a good gyro as heading and clock.
+        least_delay_s: delays and lags below it are a matter of sampling the wheels [s].
+    """
+
+    largest: Largest
+    encoders: bool = False
+    gyro: bool = False
+    least_delay_s: float = 0.0

@@ -1,0 +1,181 @@
+"""The list of what stands in the results under a fixed name: manifests of runs, and files over all runs.
+
+What a manifest names is checked by its hash; nothing names the manifest. The list does: one small file for
+each, so that writers never wait for each other. An entry is written before its file is replaced and holds
+both hashes until it has been: killed in between, either content is right. A file that is not on the list was
+written before there was one.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+from pipeline.core.paths import PathError, check_name
+from pipeline.store.files import (
+    draft_file,
+    make_folder,
+    replace_file,
+    sync_files,
+    sync_folder,
+    temporary_beside,
+)
+from pipeline.store.manifest import MANIFEST, hash_bytes
+from pipeline.store.seals import seal, unseal
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from pipeline.store.manifest import Manifest
+
+LIST = "listed"
+"""Folder of the list."""
+
+ABSENT = ""
+"""Stands for the hash of a file that is not there."""
+
+_DIGITS = 32
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """What is known of a file.
+
+    Attributes:
+        path: its name in the results.
+        sha256: hashes of what it may hold; two while it is being replaced, `ABSENT` among them where it may
+            not be there.
+        run: the run whose manifest it is; empty for another file.
+        log: path of the log that the run was made of; empty where it is not known.
+    """
+
+    path: str
+    sha256: tuple[str, ...]
+    run: str = ""
+    log: str = ""
+
+
+def entry_name(path: str) -> str:
+    """Name in the results of the entry of a file."""
+    return f"{LIST}/{hash_bytes(path.encode())[:_DIGITS]}.json"
+
+
+def make_entry(path: str, *sha256: str, manifest: Manifest | None = None) -> Entry:
+    """The entry of a file that may hold any of some contents."""
+    hashes = tuple(dict.fromkeys(sha256))
+    if manifest is None:
+        return Entry(path=path, sha256=hashes)
+    log = manifest.details.get("log")
+    recorded = log.get("path") if isinstance(log, dict) else None
+    return Entry(
+        path=path, sha256=hashes, run=manifest.run, log=recorded if isinstance(recorded, str) else ""
+    )
+
+
+def encode_entry(entry: Entry) -> bytes:
+    """An entry as the content of its file."""
+    return seal(asdict(entry))
+
+
+def parse_entry(data: bytes, name: str) -> Entry:
+    """The entry in a file of the list.
+
+    Args:
+        data: its content.
+        name: its name in the results.
+
+    Raises:
+        ValueError: it is damaged, or the entry of another file.
+    """
+    content = unseal(data)
+    hashes = content.pop("sha256", None)
+    texts = {key: text for key, text in content.items() if isinstance(text, str)}
+    if not isinstance(hashes, list) or texts.keys() != {"path", "run", "log"}:
+        raise ValueError("it is no entry of the list")
+    entry = Entry(sha256=tuple(map(str, hashes)), **texts)
+    try:
+        check_name(entry.path, where=name)
+    except PathError as error:
+        raise ValueError(error.what) from None
+    if entry_name(entry.path) != name:
+        raise ValueError(f"it is the entry of {entry.path!r}")
+    return entry
+
+
+class Replacement:
+    """A listed file that gets another content, in steps between which the writer may be killed.
+
+    Args:
+        root: the results folder.
+        path: the file in it, whose folder exists and is locked.
+        data: the new content; None to remove the file.
+        manifest: what the content says, if it is a manifest.
+    """
+
+    def __init__(self, root: Path, path: Path, data: bytes | None, manifest: Manifest | None = None) -> None:
+        self._path, self._data, self._manifest = path, data, manifest
+        self._name = path.relative_to(root).as_posix()
+        self._place = root / entry_name(self._name)
+        self._new = ABSENT if data is None else hash_bytes(data)
+        self._drafted = temporary_beside(path)
+        self.folder = self._place.parent
+
+    def draft(self) -> Path:
+        """Write the entry for both contents beside the file; it has yet to be synced."""
+        make_folder(self.folder)
+        try:
+            before = hash_bytes(self._path.read_bytes())
+        except FileNotFoundError:
+            before = ABSENT
+        draft_file(self._drafted, self._encode(self._new, before))
+        return self._drafted
+
+    def announce(self) -> None:
+        """Put the entry on the list; its folder has yet to be synced."""
+        self._drafted.replace(self._place)
+
+    def replace(self, *, when_written: Callable[[], None] | None = None) -> None:
+        """Replace the file, and leave only the new content on the list."""
+        if self._data is None:
+            self._path.unlink(missing_ok=True)
+        else:
+            replace_file(self._path, self._data, **({"when_written": when_written} if when_written else {}))
+        # Whether this is done or not, the list is right.
+        with suppress(OSError):
+            if self._data is None:
+                self._place.unlink()
+            else:
+                draft_file(self._drafted, self._encode(self._new))
+                self.announce()
+
+    def discard(self) -> None:
+        """Remove what a failed step left."""
+        with suppress(OSError):
+            self._drafted.unlink()
+
+    def _encode(self, *sha256: str) -> bytes:
+        return encode_entry(make_entry(self._name, *sha256, manifest=self._manifest))
+
+
+def replace_listed(root: Path, path: Path, data: bytes | None, manifest: Manifest | None = None) -> None:
+    """Replace or remove a file and say so on the list; arguments as of `Replacement`.
+
+    Raises:
+        OSError: the old file is untouched, or the new one is there.
+    """
+    replacement = Replacement(root, path, data, manifest)
+    try:
+        sync_files([replacement.draft()])
+        replacement.announce()
+        sync_folder(replacement.folder)
+        replacement.replace()
+    finally:
+        replacement.discard()
+
+
+def is_run_manifest(name: str) -> bool:
+    """Whether a name in the results is that of a run's manifest, if its folder is no generation."""
+    parts = name.split("/")
+    return parts[0] == "runs" and parts[-1] == MANIFEST and len(parts) in {3, 4}

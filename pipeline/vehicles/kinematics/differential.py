@@ -1,0 +1,57 @@
+"""Differential drive: wheels on either side at a speed a side; turning is the difference.
+
+    v_x = r (left + right) / 2        v_y = 0        v_w = r (right - left) / b
+
+Source: Samson, Baril, Lépine and Pomerleau 2024, eq. 2.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.vehicles.kinematics import Kinematics, Quantity
+
+if TYPE_CHECKING:
+    from pipeline.vehicles import Vehicle
+    from pipeline.vehicles.kinematics import Body, Floats, Inputs
+
+
+class Differential(Kinematics):
+    """Differential drive, also skid-steer and tracks."""
+
+    inputs = (
+        Quantity("left", "rad/s", "speed of the left wheels"),
+        Quantity("right", "rad/s", "speed of the right wheels"),
+    )
+    geometry = (
+        Quantity("wheel_radius_m", "m", "r"),
+        Quantity("track_width_m", "m", "b, between the middles of the left and right wheels"),
+        Quantity("controller_track_multiplier", "1", "the controller's track over b", required=False),
+    )
+
+    def forward(self, inputs: Inputs, vehicle: Vehicle) -> Body:
+        """See the formula above."""
+        return _roll(inputs, vehicle, vehicle.track_width_m or 1.0)
+
+    def asked(self, inputs: Inputs, vehicle: Vehicle) -> Body:
+        """As `forward`, with the track width that the controller believes in."""
+        return _roll(inputs, vehicle, _controller_track_m(vehicle))
+
+    def inverse(self, body: Body, vehicle: Vehicle) -> dict[str, Floats]:
+        """Wheel speeds of a body command with the controller's track width; it cannot move sideways."""
+        forward, _, turning = body
+        half = turning * _controller_track_m(vehicle) / 2.0
+        radius = vehicle.wheel_radius_m
+        return {"left": (forward - half) / radius, "right": (forward + half) / radius}
+
+
+def _roll(inputs: Inputs, vehicle: Vehicle, track_m: float) -> Body:
+    left, right, radius = inputs["left"], inputs["right"], vehicle.wheel_radius_m
+    forward = radius * (left + right) / 2.0
+    return forward, np.zeros_like(forward), radius * (right - left) / track_m
+
+
+def _controller_track_m(vehicle: Vehicle) -> float:
+    return (vehicle.track_width_m or 1.0) * vehicle.controller_track_multiplier

@@ -1,0 +1,77 @@
+"""Logs that are unchecked, huge or absurd, through the command line: one clear answer each."""
+
+from __future__ import annotations
+
+import json
+import struct
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from test_verbs import slip
+
+from pipeline.cli.screen import describe_run
+
+
+@pytest.fixture
+def unchecked(samples: Path, tmp_path: Path) -> Path:
+    """A log whose chunks and data section carry no checksum."""
+    content = bytearray((samples / "husky_tile.mcap").read_bytes())
+    starts = [8]
+    while starts[-1] < len(content) - 8:
+        starts.append(starts[-1] + 9 + struct.unpack_from("<Q", content, starts[-1] + 1)[0])
+    for start, _ in pairwise(starts):
+        if content[start] == 6:
+            content[start + 33 : start + 37] = bytes(4)
+        elif content[start] == 15:
+            content[start + 9 : start + 13] = bytes(4)
+    path = tmp_path / "unchecked.mcap"
+    path.write_bytes(content)
+    return path
+
+
+WORDS = "no checksum covers its messages: damage in them cannot be seen"
+
+
+def test_a_log_without_checksums_is_called_unchecked_wherever_its_health_is_shown(
+    unchecked: Path, tmp_path: Path
+) -> None:
+    seen = slip("inspect", unchecked)
+    assert seen.returncode == 0
+    assert f"complete, unchecked: {WORDS}" in seen.stdout
+    assert json.loads(slip("inspect", unchecked, "--json").stdout)["unchecked"] == WORDS
+    done = slip("analyze", unchecked, "--out", tmp_path / "out", "--no-diagnosis", "--json")
+    assert done.returncode == 0
+    (run,) = json.loads(done.stdout)["runs"]
+    assert f"complete (unchecked: {WORDS})" in describe_run(run, unchanged=False)
+    assert run["log"]["unchecked"] == WORDS
+    page = Path(run["report"]).read_text(encoding="utf-8")
+    assert "log unchecked" in page
+    assert "damage in them cannot be seen" in page
+
+
+def test_a_log_with_checksums_is_not_called_unchecked(samples: Path) -> None:
+    seen = slip("inspect", samples / "husky_tile.mcap", "--json")
+    assert json.loads(seen.stdout)["unchecked"] is None
+
+
+@pytest.mark.parametrize("verb", ["analyze", "diagnose"])
+def test_too_much_memory_ends_with_one_line(samples: Path, tmp_path: Path, verb: str) -> None:
+    log = samples / "husky_tile.mcap"
+    done = slip(verb, log, "--out", tmp_path / "out", "--memory", "60MB", "--json", "--quiet")
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"slip: {log}: it held 0.")
+    assert "more than 0.06 GB. Give it more with --memory" in line
+    content = json.loads(done.stdout)
+    assert content["runs"] == []
+    assert [error["code"] for error in content["errors"]] == ["out_of_memory"]
+    assert not list(tmp_path.rglob("manifest.json"))
+    after = slip("analyze", log, "--out", tmp_path / "out", "--no-diagnosis", "--no-report", "--quiet")
+    assert (after.returncode, after.stderr) == (0, "")
+
+
+def test_a_memory_that_is_no_size_is_refused(samples: Path, tmp_path: Path) -> None:
+    done = slip("analyze", samples / "husky_tile.mcap", "--out", tmp_path, "--memory", "much")
+    assert done.returncode == 1
+    assert done.stderr.splitlines() == ["slip: 'much' is no size. Write for example 500MB or 2GB."]

@@ -1,0 +1,124 @@
+"""The model verbs: what a model is fed with, and an error that rises is said to rise."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.cli import main
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.simulate import simulate_case
+
+RUN = "field/lagging"
+ERRORS = ("t_mrmse_m", "r_mrmse_rad")
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of a Husky whose wheels lag behind its commands."""
+    folder = tmp_path_factory.mktemp("lagging")
+    log = folder / "field" / "lagging.mcap"
+    simulate_case("ideal_husky", {"drive_lag": {"tau": 0.3}}, out=log, duration_s=40.0)
+    analyze_log(log, Options(out=folder / "results", report=False))
+    return folder / "results"
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    path = tmp_path / "husky.toml"
+    slip("model", "new", path, "--vehicle", "husky_a200", "--quiet")
+    return path
+
+
+def slip(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    assert ended.value.code == 0
+    return 0
+
+
+def change(
+    results: Path, capsys: pytest.CaptureFixture[str], verb: str, model: Path, *more: object
+) -> dict[str, Any]:
+    capsys.readouterr()
+    slip("model", verb, model, *more, "--on", RUN, "--out", results, "--json")
+    content: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return content
+
+
+def test_an_effect_of_the_drivetrain_is_fitted_from_the_command(
+    results: Path, model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = change(results, capsys, "add", model, "drive_lag")
+
+    assert found["input"] == "command"
+    assert found["input_reason"] == "drive_lag acts between command and wheels"
+    assert found["not_fitted"] == []
+    lag = found["parameters"]["drive_lag.tau"]
+    assert lag["low"] <= 0.3 <= lag["high"]
+    assert tomllib.loads(model.read_text())["fit"]["input"] == "command"
+
+
+def test_measured_wheels_are_refused_to_it_in_one_line(
+    results: Path, model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = "not fitted from measured wheels: drive_lag acts between command and wheels (--input command)"
+    found = change(results, capsys, "add", model, "drive_lag", "--input", "measured")
+    assert found["input"] == "measured"
+    assert found["input_reason"] == "as asked for"
+    assert found["not_fitted"] == ["drive_lag"]
+    assert said in found["warnings"]
+
+    slip("model", "fit", model, "--on", RUN, "--out", results, "--input", "measured")
+    printed = capsys.readouterr().out.splitlines()
+    assert printed.count(said) == 1
+    assert f"on measured of {RUN} (as asked for)" in printed
+
+
+def test_two_models_are_compared_on_one_input(
+    results: Path, model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other.toml"
+    slip("model", "new", other, "--vehicle", "husky_a200", "--effects", "drive_lag", "--quiet")
+    change(results, capsys, "fit", model, "--input", "measured")
+    found = change(results, capsys, "compare", model, other)
+
+    assert found["input"] == "command"
+    ideal = [row["ideal"] for row in found["compared"]]
+    assert ideal[0] == ideal[1], "both start from the same error"
+
+
+def test_a_diagnosis_says_its_input_and_why(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    slip("diagnose", RUN, "--out", results, "--json")
+    run = json.loads(capsys.readouterr().out)["runs"][0]
+    assert (run["input"], run["input_reason"]) == ("command", "the command leads where there is one")
+
+    slip("diagnose", RUN, "--out", results, "--input", "measured")
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.endswith("from the measured wheels (as asked for)")
+
+
+def test_an_error_that_rises_is_said_to_rise(
+    results: Path, model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change(results, capsys, "add", model, "drive_lag")
+    useless = ("slope_drift", "lateral_skid", "heading_skew", "turn_lag")
+    found = change(results, capsys, "add", model, *useless)
+
+    step = found["step"]
+    assert step["rises"] == [key for key in ERRORS if step[key][1] > 1.001 * step[key][0]]
+    assert step["rises"], "four effects that the vehicle lacks, fitted to 40 s, cost something on unseen data"
+    for below, rung in itertools.pairwise(found["ladder"]):
+        rises = [key for key in ERRORS if rung[key] > 1.001 * below[key]]
+        assert rung.get("rises", []) == rises
+
+    slip("model", "drop", model, "drive_lag", "--on", RUN, "--out", results)
+    printed = capsys.readouterr().out
+    assert "  ! position error rises 0." in printed
+    assert "done because asked for" in printed

@@ -1,0 +1,212 @@
+"""Verbs that read stored runs leave them as they are, and say what contradicts them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from pipeline.cli import main
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.simulate import simulate_case
+from pipeline.store import Store
+
+
+def slip(*arguments: object) -> int:
+    """Run the program in this process; its exit code."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    return int(ended.value.code or 0)
+
+
+def hash_tree(folder: Path) -> dict[str, str]:
+    """Hash of every file below a folder, by its path."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def analyzed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a log, its complete results in `results`, and a model of a Husky."""
+    folder = tmp_path_factory.mktemp("field")
+    simulate_case(
+        "ideal_husky", {"effective_track": {"k": 1.7}}, out=folder / "field" / "wide.mcap", duration_s=40.0
+    )
+    options = Options(out=folder / "results", report=False, diagnosis=True, overrides={
+        "run": {"dataset": "yard"}, "vehicle": {"preset": "husky_a200"},
+    })  # fmt: skip
+    analyze_log(folder / "field" / "wide.mcap", options)
+    assert slip("model", "new", folder / "husky.toml", "--vehicle", "husky_a200", "--quiet") == 0
+    return folder
+
+
+@pytest.fixture
+def place(analyzed: Path, tmp_path: Path) -> Path:
+    """A copy of it, so that what one test breaks, no other sees."""
+    shutil.copytree(analyzed, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+@pytest.mark.parametrize("name", ["field/wide.mcap", "field/wide"])
+def test_a_fit_leaves_stored_results_byte_for_byte(
+    place: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(place)
+    before = hash_tree(place / "results")
+
+    assert slip("model", "add", "husky.toml", "effective_track", "--on", name, "--quiet") == 0
+    assert slip("model", "fit", "husky.toml", "--on", name, "--predict", name, "--quiet") == 0
+    assert slip("model", "compare", "husky.toml", "husky.toml", "--on", name, "--quiet") == 0
+    assert hash_tree(place / "results") == before
+
+
+def test_a_copied_log_is_the_stored_run(place: Path) -> None:
+    before = hash_tree(place / "results")
+    (place / "elsewhere").mkdir()
+    log = shutil.copyfile(place / "field" / "wide.mcap", place / "elsewhere" / "other.mcap")
+
+    where = ("--on", log, "--out", place / "results", "--quiet")
+    assert slip("model", "add", place / "husky.toml", "effective_track", *where) == 0
+    assert hash_tree(place / "results") == before
+
+
+def test_a_log_that_is_not_stored_is_analyzed_with_its_own_vehicle_and_only_once(
+    tmp_path: Path, analyzed: Path
+) -> None:
+    log, model = analyzed / "field" / "wide.mcap", tmp_path / "mine.toml"
+    shutil.copyfile(analyzed / "husky.toml", model)
+    assert slip("model", "fit", model, "--on", log, "--out", tmp_path / "fitted", "--quiet") == 0
+    first = hash_tree(tmp_path / "fitted")
+    assert slip("model", "fit", model, "--on", log, "--out", tmp_path / "fitted", "--quiet") == 0
+    assert hash_tree(tmp_path / "fitted") == first
+
+    assert slip("analyze", log, "--no-report", "--out", tmp_path / "analyzed", "--quiet") == 0
+    assert hash_tree(tmp_path / "analyzed" / "runs") == hash_tree(tmp_path / "fitted" / "runs")
+
+
+@pytest.mark.parametrize("verb", ["add", "fit", "compare"])
+def test_a_model_of_another_vehicle_is_asked_about(
+    place: Path, capsys: pytest.CaptureFixture[str], verb: str
+) -> None:
+    before = hash_tree(place / "results")
+    model = place / "jackal.toml"
+    assert slip("model", "new", model, "--vehicle", "jackal", "--quiet") == 0
+    asked = {"add": [model, "effective_track"], "fit": [model], "compare": [model, model]}[verb]
+
+    code = slip("model", verb, *asked, "--on", place / "field" / "wide.mcap", "--out", place / "results")
+    told = capsys.readouterr().err.splitlines()
+    assert code == 1
+    (line,) = [one for one in told if one.startswith("slip: ")]
+    for word in ("field/wide", "Husky", "Jackal", "wheel_radius_m", "--vehicle-of model", "--vehicle-of run"):
+        assert word in line
+    assert hash_tree(place / "results") == before
+
+
+def test_the_vehicle_that_is_chosen_is_the_one_that_counts(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = hash_tree(place / "results")
+    tracks = {}
+    for whose in ("model", "run"):
+        model = place / f"{whose}.toml"
+        assert slip("model", "new", model, "--vehicle", "jackal", "--quiet") == 0
+        where = (
+            "--on",
+            "field/wide",
+            "--out",
+            place / "results",
+            "--vehicle-of",
+            whose,
+            "--input",
+            "command",
+        )
+        capsys.readouterr()
+        assert slip("model", "add", model, "effective_track", *where, "--json") == 0
+        found = json.loads(capsys.readouterr().out)
+        tracks[whose] = found["parameters"]["effective_track.k"]["value"]
+        assert slip("model", "show", model) == 0
+        assert ("Jackal" if whose == "model" else "Husky") in capsys.readouterr().out
+    # The log is a Husky's with a track 1.7 times its own.
+    assert tracks["run"] == pytest.approx(1.7, rel=0.02)
+    assert tracks["model"] != pytest.approx(1.7, rel=0.1)
+    assert hash_tree(place / "results") == before
+
+
+def test_a_diagnosis_with_other_choices_leaves_the_stored_run(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = hash_tree(place / "results")
+    log, out = place / "field" / "wide.mcap", place / "results"
+
+    assert slip("diagnose", log, "--out", out, "--input", "measured", "--quiet") == 0
+    assert slip("diagnose", "field/wide", "--out", out, "--quiet") == 0
+    capsys.readouterr()
+    assert slip("diagnose", log, "--out", out, "--vehicle", "jackal", "--json") == 0
+    jackal = json.loads(capsys.readouterr().out)["runs"][0]
+    assert slip("diagnose", log, "--out", out, "--json") == 0
+    husky = json.loads(capsys.readouterr().out)["runs"][0]
+    # Answered with the vehicle that was asked for: wheels of another radius give another ideal motion.
+    assert jackal["ladder"][0]["t_mrmse_m"] > 1.5 * husky["ladder"][0]["t_mrmse_m"]
+    assert hash_tree(out) == before
+
+
+def test_what_a_diagnosis_stores_does_not_depend_on_its_input(tmp_path: Path, analyzed: Path) -> None:
+    log = analyzed / "field" / "wide.mcap"
+    for name in ("command", "measured"):
+        assert slip("diagnose", log, "--out", tmp_path / name, "--input", name, "--quiet") == 0
+    assert hash_tree(tmp_path / "command" / "runs") == hash_tree(tmp_path / "measured" / "runs")
+
+
+def test_a_changed_configuration_is_said_and_the_stored_run_is_read(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = hash_tree(place / "results")
+    log = place / "field" / "wide.mcap"
+    log.with_name("run.toml").write_text("[velocity]\nwindow_s = 1.0\n", encoding="utf-8")
+
+    assert slip("model", "fit", place / "husky.toml", "--on", log, "--out", place / "results") == 0
+    assert f"slip analyze {log}" in capsys.readouterr().err
+    assert hash_tree(place / "results") == before
+
+
+def test_a_known_model_of_another_vehicle_is_asked_about_by_a_diagnosis(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = place / "jackal.toml"
+    assert slip("model", "new", model, "--vehicle", "jackal", "--quiet") == 0
+    asked = ("diagnose", "field/wide", "--out", place / "results", "--model", model)
+    assert slip(*asked, "--quiet") == 1
+    assert "--vehicle-of run" in capsys.readouterr().err
+    assert slip(*asked, "--vehicle-of", "run", "--quiet") == 0
+
+
+def test_no_verb_that_reads_writes_into_a_stored_run(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(place)
+    before = hash_tree(place / "results" / "runs")
+    for verb in (
+        ("compare", "results"),
+        ("compare", "results", "--by", "run", "--as-published"),
+        ("trend", "results"),
+        ("map", "results"),
+        ("explain", "field/wide", "slip.modulus"),
+        ("status", "results"),
+        ("verify", "results"),
+        ("query", "select count(*) from slip"),
+        ("diagnose", "field/wide", "--apply", "proposed.toml"),
+        ("export", "field/wide", "--to", "csv"),
+        ("export", "field/wide", "--to", "mcap", "--model", "husky.toml"),
+        ("export", "field/wide", "--to", "foxglove-layout"),
+        ("export", "field/wide", "--to", "plotjuggler-layout"),
+    ):
+        assert slip(*verb) == 0, (verb, capsys.readouterr().err)
+        assert hash_tree(place / "results" / "runs") == before, verb
+    assert Store(place / "results").verify() == ()

@@ -1,0 +1,233 @@
+"""What changed, went, or was put in the place of something else is noticed; a kill is none of these."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from itertools import cycle
+from typing import TYPE_CHECKING
+
+import pytest
+from store_samples import make_slip, read_seed, write_generation
+
+from pipeline.store import Store
+from pipeline.store.listing import LIST
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+RUN, OTHER = "2026/husky", "2026/warthog"
+
+
+@pytest.fixture
+def filled(store: Store) -> Store:
+    """Two runs, of one also an older generation, a table and a page over all, and a note."""
+    write_generation(store, RUN, "old", 1)
+    write_generation(store, RUN, "new", 2)
+    write_generation(store, OTHER, "key", 3)
+    store.write_results_text("comparison.html", "<p>pools</p>")
+    store.notes("batch/logs").write("log", {"state": "done"})
+    assert store.verify() == ()
+    return store
+
+
+def list_files(root: Path) -> list[Path]:
+    """Every file that holds something."""
+    found = [path for path in root.rglob("*") if path.is_file() and not path.is_symlink()]
+    return sorted(path for path in found if path.stat().st_size and "latest" not in path.parts)
+
+
+def is_held(path: Path) -> bool:
+    return path.name != ".lock"
+
+
+def test_a_changed_byte_is_noticed_wherever_it_is(filled: Store) -> None:
+    flips = cycle((0x01, 0x20, 0x80, 0xFF))
+    for path in filter(is_held, list_files(filled.root)):
+        whole = path.read_bytes()
+        # `tests/bench/damage_results.py` tries every byte.
+        for at in range(0, len(whole), 1 + len(whole) // 11):
+            path.write_bytes(whole[:at] + bytes([whole[at] ^ next(flips)]) + whole[at + 1 :])
+            assert filled.verify(), f"byte {at} of {path.relative_to(filled.root)}"
+        path.write_bytes(whole)
+    assert filled.verify() == ()
+
+
+def test_a_file_that_went_is_noticed_or_said_to_be_unlisted(filled: Store) -> None:
+    for path in filter(is_held, list_files(filled.root)):
+        if "batch" in path.parts:
+            # A note may go at any time, which costs a look at the log.
+            continue
+        whole = path.read_bytes()
+        path.unlink()
+        found = filled.examine()
+        assert found.problems or found.unlisted, path.relative_to(filled.root)
+        path.write_bytes(whole)
+    assert filled.verify() == ()
+
+
+def home_of(store: Store, run: str) -> Path:
+    manifest = store.manifest(run)
+    assert manifest is not None
+    return manifest.folder.parent
+
+
+def delete_run(store: Store) -> None:
+    shutil.rmtree(home_of(store, RUN))
+
+
+def delete_manifest(store: Store) -> None:
+    (home_of(store, RUN) / "manifest.json").unlink()
+
+
+def copy_another_run_over_it(store: Store) -> None:
+    home = home_of(store, RUN)
+    shutil.rmtree(home)
+    shutil.copytree(home_of(store, OTHER), home, symlinks=True)
+
+
+def swap_two_runs(store: Store) -> None:
+    one, other = home_of(store, RUN), home_of(store, OTHER)
+    one.rename(one.with_name("aside"))
+    other.rename(one)
+    one.with_name("aside").rename(other)
+
+
+def swap_two_manifests(store: Store) -> None:
+    one, other = (home_of(store, run) / "manifest.json" for run in (RUN, OTHER))
+    contents = one.read_bytes(), other.read_bytes()
+    one.write_bytes(contents[1])
+    other.write_bytes(contents[0])
+
+
+def put_the_manifest_of_another_folder_there(store: Store) -> None:
+    elsewhere = Store(store.root.parent / "elsewhere")
+    write_generation(elsewhere, RUN, "old", 1)
+    write_generation(elsewhere, RUN, "new", 7)
+    home = home_of(store, RUN)
+    shutil.rmtree(home)
+    shutil.copytree(home_of(elsewhere, RUN), home, symlinks=True)
+
+
+def delete_an_old_generation(store: Store) -> None:
+    shutil.rmtree(home_of(store, RUN) / "old")
+
+
+def swap_two_tables(store: Store) -> None:
+    one, other = store.manifest(RUN), store.manifest(OTHER)
+    assert one is not None
+    assert other is not None
+    shutil.copy(one.path("slip"), other.path("slip"))
+
+
+def delete_the_pool(store: Store) -> None:
+    (store.root / "comparison.html").unlink()
+
+
+def put_an_entry_in_the_place_of_another(store: Store) -> None:
+    one, other, *_ = sorted((store.root / LIST).iterdir())
+    shutil.copy(one, other)
+
+
+CHANGES = {
+    delete_run: "run_missing",
+    delete_manifest: "run_missing",
+    copy_another_run_over_it: "name_clash",
+    swap_two_runs: "name_clash",
+    swap_two_manifests: "name_clash",
+    put_the_manifest_of_another_folder_there: "manifest_swapped",
+    delete_an_old_generation: "old_generation",
+    swap_two_tables: "file_damaged",
+    delete_the_pool: "file_missing",
+    put_an_entry_in_the_place_of_another: "list_damaged",
+}
+
+
+@pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.__name__)
+def test_what_was_deleted_or_swapped_is_noticed(filled: Store, change: Callable[[Store], None]) -> None:
+    change(filled)
+    assert CHANGES[change] in {problem.code for problem in filled.verify()}
+
+
+def test_the_manifest_of_before_put_back_is_noticed(store: Store) -> None:
+    path = write_generation(store, RUN, "old", 1).folder.parent / "manifest.json"
+    before = path.read_bytes()
+    write_generation(store, RUN, "new", 2)
+    path.write_bytes(before)
+    assert read_seed(store, RUN) == 1
+    assert [problem.code for problem in store.verify()] == ["manifest_swapped"]
+    write_generation(store, RUN, "new", 3)
+    assert store.verify() == ()
+
+
+def test_a_run_from_other_results_is_not_on_the_list(store: Store, tmp_path: Path) -> None:
+    elsewhere = Store(tmp_path / "elsewhere")
+    write_generation(elsewhere, RUN, "k", 1)
+    write_generation(store, OTHER, "k", 2)
+    shutil.copytree(home_of(elsewhere, RUN), store.root / "runs" / RUN, symlinks=True)
+    assert [(problem.run, problem.code) for problem in store.verify()] == [(RUN, "not_listed")]
+    store.put_on_list(f"runs/{RUN}/manifest.json")
+    assert store.verify() == ()
+
+
+def make_old(root: Path) -> None:
+    """Results as they were before there were checksums and a list."""
+    shutil.rmtree(root / LIST)
+    for path in (*root.rglob("manifest.json"), *root.glob("batch/**/*.json")):
+        content = json.loads(path.read_bytes())
+        if content.pop("checksum", None):
+            path.write_text(json.dumps(content, indent=1, sort_keys=True))
+    for path in root.rglob(".generation"):
+        path.write_bytes(b"")
+
+
+def test_results_of_before_there_was_a_list_are_not_damaged(filled: Store) -> None:
+    make_old(filled.root)
+    found = filled.examine()
+    assert found.problems == ()
+    assert set(found.unlisted) == {
+        "comparison.html", f"runs/{RUN}/manifest.json", f"runs/{OTHER}/manifest.json",
+        f"runs/{RUN}/old/.generation",
+    }  # fmt: skip
+    assert filled.notes("batch/logs").read("log") == {"state": "done"}
+    assert read_seed(filled, RUN) == 2
+
+    write_generation(filled, RUN, "next", 4)
+    filled.write_results_text("comparison.html", "new")
+    filled.prune(0)
+    found = filled.examine()
+    assert (found.problems, found.unlisted) == ((), (f"runs/{OTHER}/manifest.json",))
+    path = filled.root / "runs" / OTHER / "key" / "summary.json"
+    path.write_text("x")
+    assert [problem.code for problem in filled.verify()] == ["file_damaged"]
+
+
+def test_a_generation_made_again_in_the_place_of_a_deleted_one_is_not_pruned(store: Store) -> None:
+    manifest = write_generation(store, RUN, "k", 1)
+    shutil.rmtree(manifest.folder)
+    write_generation(store, RUN, "k", 2)
+    store.prune(0)
+    assert read_seed(store, RUN) == 2
+    assert store.verify() == ()
+
+
+def test_a_table_of_results_with_broken_rows_is_on_the_list_with_them(store: Store) -> None:
+    store.write_results_table("slip", make_slip(RUN, 1))
+    assert store.examine().unlisted == ()
+    broken = make_slip(RUN, 1).with_columns(modulus=-1.0)
+    store.write_results_table("slip", broken)
+    assert (store.root / "quarantine_slip.parquet").exists()
+    store.write_results_table("slip", make_slip(RUN, 2))
+    assert not (store.root / "quarantine_slip.parquet").exists()
+    assert store.examine().problems == store.examine().unlisted == ()
+
+
+def test_a_note_that_was_changed_is_none(store: Store) -> None:
+    notes = store.notes("identities")
+    notes.write("log", {"sha256": "0" * 64, "size": 1})
+    path = notes.path_of("log")
+    assert notes.read("log") == {"sha256": "0" * 64, "size": 1}
+    path.write_bytes(path.read_bytes().replace(b'"size": 1', b'"size": 2'))
+    assert notes.read("log") is None
+    assert [problem.code for problem in store.verify()] == ["note_damaged"]
