@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from pipeline.cli.output import CLEAN, print_json, print_lines
+from pipeline.core.paths import resolve_inside
 
 if TYPE_CHECKING:
     from pipeline.motion import Model
@@ -61,7 +62,7 @@ def export(
     manifest = find_run(run, Store(out))
     chosen, named_on = _find_named(manifest) if model is None else (read_model(model).model, None)
     source = exports.ExportSource(manifest, chosen, input or named_on, frame)
-    path = file or Path(manifest.run.replace("/", "_") + _SUFFIXES[to])
+    path = file or resolve_inside(Path(), manifest.run.replace("/", "_") + _SUFFIXES[to])
     if to == "csv":
         written = exports.write_csv(source, path)
     else:
