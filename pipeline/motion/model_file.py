@@ -339,14 +339,9 @@ class _Reader:
             parameters.append(make_parameter(key, unit, (low, high), neutral=float(neutral)))
         lines = {key: self._place(at, key) for key in (*formulas, *numbers)}
         try:
-            return FormulaEffect(
-                name,
-                formulas,
-                tuple(parameters),
-                fixed=fixed,
-                where=self._place(at, next(iter(formulas))),
-                **values,
-            )
+            place = self._place(at, next(iter(formulas)))
+            effect = FormulaEffect(name, formulas, tuple(parameters), fixed=fixed, where=place)
+            return effect.change(**values)
         except MotionError as error:
             key = next(
                 (k for k in lines if f" {k} " in f" {error.where} {error.what} ".replace(".", " ")), ""

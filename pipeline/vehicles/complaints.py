@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _PLACE = re.compile(r"at `\$\.?([^`]*)`")
 _UNKNOWN = re.compile(r"unknown field `([^`]*)`")
 _VALUE = re.compile(r"value '([^']*)'")
+_WIDEST = 200
 _STEP = re.compile(r"[A-Za-z_]\w*|\[")
 _SECTION = re.compile(r"\s*\[+\s*([^\]]+?)\s*\]")
 
@@ -111,6 +112,11 @@ def _list_keys(steps: Iterable[str]) -> list[str]:
     return [field.encode_name for kind in structs for field in kind.fields]
 
 
+def name_key(source: Path, key: str) -> str:
+    """The file and, where it can be told, the line that sets a dotted key."""
+    return _name_line(str(source), source, key.split("."), "")
+
+
 def _name_line(where: str, source: Path | None, steps: list[str], value: str) -> str:
     number = None if source is None else _find_line(source, [step for step in steps if step != "["], value)
     return where if number is None else f"{where}, line {number}"
@@ -128,7 +134,7 @@ def _find_line(source: Path, names: list[str], value: str) -> int | None:
     key = re.compile(rf"\s*\"?{re.escape(names[-1])}\"?\s*=")
     section: list[str] = []
     for number, line in enumerate(lines, start=1):
-        opened = _SECTION.match(line)
+        opened = _SECTION.match(line[:_WIDEST])
         if opened:
             section = opened[1].split(".")
             if section[-len(names) :] == names and not value:
