@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from pipeline.core.toml import shorten
 from pipeline.vehicles.configuration import Configuration
 from pipeline.vehicles.errors import ConfigurationError
 from pipeline.vehicles.presets import find_preset, list_presets
@@ -43,7 +44,7 @@ def describe_fault(error: msgspec.ValidationError, where: str, source: Path | No
         hint = f"Write one of: {words}." if words else "README.md, Configuration, lists the keys and units."
     return ConfigurationError(
         "config_invalid",
-        f"the configuration is not valid: {_readable(message)}",
+        f"the configuration is not valid: {shorten(_readable(message))}",
         where=_name_line(where, source, steps, value),
         hint=hint,
     )
