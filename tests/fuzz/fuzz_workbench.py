@@ -37,11 +37,13 @@ SLOWEST_S = 30.0
 REQUESTS_A_ROUND = 40
 EFFECTS = ("effective_track", "drive_lag", "lateral_skid", "wheel_radius", "own", "magic", "../x", "")
 ACTIONS = (
-    "open", "add", "drop", "switch", "set", "preview", "lock", "fit", "formula", "undo", "redo", "try", "burn",
+    "open", "add", "drop", "switch", "set", "preview", "lock", "fit", "formula", "undo", "redo", "try",
+    "burn",
 )  # fmt: skip
 TEXTS = (
-    "", " ", "x", "k", "where", "id", "note", "v_x", "v_w", "self", "c", "\x00", "\n", "'", '"', "\\", "<b>", "\u00e9",
-    "../../etc/passwd", "/etc/passwd", "%00", "9" * 350, "-" * 300, "(" * 300, "a" * 5000, "null", "1e999",
+    "", " ", "x", "k", "where", "id", "note", "v_x", "v_w", "self", "c", "\x00", "\n", "'", '"', "\\", "<b>",
+    "\u00e9", "../../etc/passwd", "/etc/passwd", "%00", "9" * 350, "-" * 300, "(" * 300, "a" * 5000, "null",
+    "1e999",
     "c * w0", "c * v0 * w0", "c ** 0.5 * w0", "c / (w0 - w0)", "exp(exp(9)) * c", "c [1] -0.9 .. 0.5",
     "c [s] 0 .. 1", "c [m^99] 0 .. 1", "c [1] -1e308 .. 1e308", "k [1] 0 .. 1e-300", "c [1] 1 .. 0",
 )  # fmt: skip
@@ -179,8 +181,9 @@ def intrude(client: Client, rng: random.Random, _: bytes) -> None:
 
 
 def damage(client: Client, rng: random.Random, _: bytes) -> None:
-    """Flip bytes in the state of a desk, as a stranger's results may hold it."""
-    kept = sorted((client.server.results / "workbench").rglob("*.json"))
+    """Flip bytes in the state of a desk or in a summary, as a stranger's results may hold them."""
+    results = client.server.results
+    kept = sorted([*(results / "workbench").rglob("*.json"), *(results / "runs").rglob("summary.json")])
     if kept:
         path = rng.choice(kept)
         content = bytearray(path.read_bytes())
