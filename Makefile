@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader bench-real bench-workbench browser check clean compare damage damage-season format fuzz inspect lock map samples \
+.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader bench-real bench-workbench browser check clean compare damage damage-results damage-season format fuzz inspect lock map samples \
 	serve test test-long trend
 
 help: ## print this list
@@ -93,6 +93,9 @@ bench-analyze: $(VENV)/.ready-dev ## a whole analysis of a 10-minute log
 
 bench-batch: $(VENV)/.ready-dev ## batches of 10, 100 and 1,000 logs, on one and two processes [ARGS="--rounds 5"]
 	$(BIN)/python tests/bench/batch.py $$ARGS
+
+damage-results: $(VENV)/.ready-dev ## every byte of small results changed, files and runs deleted and swapped: noticed or not
+	$(BIN)/python tests/bench/damage_results.py $$ARGS
 
 bench-export: $(VENV)/.ready-dev ## exporting runs of 1, 3 and 10 hours as MCAP
 	$(BIN)/python tests/bench/export.py

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pipeline.batch.plan import Item
     from pipeline.batch.request import Request
 
-STOPPING = ("disk_full", "read_only", "no_locks")
+STOPPING = ("disk_full", "read_only", "no_locks", "cluster_lost")
 """Errors that every other log would meet as well."""
 
 _BUSY_PAUSE_S = 0.25

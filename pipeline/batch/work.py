@@ -71,7 +71,9 @@ def work_safely(work: Callable[[Task], Report], task: Task) -> Report:
     try:
         report = work(task)
         pickle.dumps(report)
-    except Exception as error:  # noqa: BLE001 - one log must not cost the others
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # noqa: BLE001 - one log must not cost the others; a panic of polars is this
         return Report(entry=_describe_surprise(entry, error))
     return report
 
@@ -142,7 +144,7 @@ def _describe_losses(outcome: Outcome) -> str:
     return "; ".join(texts)
 
 
-def _describe_surprise(entry: Entry, error: Exception) -> Entry:
+def _describe_surprise(entry: Entry, error: BaseException) -> Entry:
     """An error that nobody foresaw: where it happened is what whoever mends it needs."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     text = " ".join(str(error).split()) or "no message"

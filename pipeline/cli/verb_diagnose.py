@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -101,7 +100,6 @@ def _gather(
 ) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], bool]:
     """Recordings by vehicle; an error costs one log. ``at_work`` is told which log it is."""
     from pipeline.job.diagnosis import read_recording  # noqa: PLC0415 - heavy
-    from pipeline.job.options import INPUTS  # noqa: PLC0415
     from pipeline.job.stored import open_run  # noqa: PLC0415 - heavy
 
     gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
@@ -112,8 +110,7 @@ def _gather(
         try:
             with (
                 show_progress(Path(log).name, quiet=quiet) as progress,
-                # What a run is stored with does not depend on what is asked about it.
-                open_run(log, replace(options, inputs=INPUTS), progress) as opened,
+                open_run(log, options, progress) as opened,
             ):
                 vehicle, recording = read_recording(opened.manifest)
         except SlipError as error:

@@ -10,6 +10,7 @@ from cyclopts import App, Parameter
 
 from pipeline.cli.model_trust import TrustCode, open_model
 from pipeline.cli.output import CLEAN, print_json, print_lines
+from pipeline.core.paths import resolve_inside
 
 if TYPE_CHECKING:
     from pipeline.motion import Model
@@ -64,7 +65,7 @@ def export(
     known = None if model is None else open_model(model, trust_code=trust_code)
     chosen, named_on = _find_named(manifest) if known is None else (known.model, None)
     source = exports.ExportSource(manifest, chosen, input or named_on, frame)
-    path = file or Path(manifest.run.replace("/", "_") + _SUFFIXES[to])
+    path = file or resolve_inside(Path(), manifest.run.replace("/", "_") + _SUFFIXES[to])
     if to == "csv":
         written = exports.write_csv(source, path)
     else:

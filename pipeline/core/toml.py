@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 LONGEST = 2_000_000
 DEEPEST = 16
 _LARGEST = 2**63
+_READABLE = 300
 _LINE = re.compile(r"\(at line (\d+)")
 _PART = r"""(?:[\w-]++|"[^"\n]*"|'[^'\n]*')[ \t]*"""
 _LONG_KEY = re.compile(rf"(?<![\w-])(?:{_PART}\.[ \t]*){{{DEEPEST}}}")
@@ -33,9 +34,14 @@ class TomlError(Exception):
 
     def __init__(self, what: str, line: int | None = None, key: str = "") -> None:
         super().__init__(what)
-        self.what = what
+        self.what = shorten(what)
         self.line = line
         self.key = key
+
+
+def shorten(text: str) -> str:
+    """The beginning of what a text of any length says."""
+    return text if len(text) <= _READABLE else f"{text[:_READABLE]}..."
 
 
 def parse_toml(text: str) -> dict[str, object]:

@@ -15,6 +15,7 @@ from pipeline.core.errors import SlipError
 from pipeline.job.analyze import SUMMARY, analyze_log, update_datasets
 from pipeline.job.errors import JobError
 from pipeline.job.lookup import find_run, recorded_path
+from pipeline.job.options import INPUTS
 from pipeline.job.subject import describe_subject, name_run
 from pipeline.job.work import stored_contexts
 from pipeline.logs import hash_log
@@ -52,7 +53,7 @@ def open_run(text: str, options: Options, progress: Progress) -> Iterator[Opened
 
     Args:
         text: name of a run, or path of a log.
-        options: what the user chose.
+        options: what the user chose; results have both inputs, whichever is asked about.
         progress: told the name of each stage that is computed.
 
     Raises:
@@ -69,6 +70,10 @@ def open_run(text: str, options: Options, progress: Progress) -> Iterator[Opened
             yield OpenedRun(stored)
             return
         path = path if stored is None else _find_recorded(stored)
+    if stored is None and options.inputs != INPUTS:
+        # Only to complain before anything is computed where the log lacks the input.
+        describe_subject(path, options)
+    options = replace(options, inputs=INPUTS)
     if stored is None:
         outcome = analyze_log(path, options, progress)
         if outcome.computed:

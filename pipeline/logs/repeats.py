@@ -29,6 +29,8 @@ _DIGEST: Final = 16
 
 def share_times(log_time: Ints, publish_time: Ints) -> Ints:
     """Numbers of the messages that share both times [ns] with another, ascending."""
+    if (log_time[1:] > log_time[:-1]).all():
+        return np.empty(0, dtype=np.int64)
     order = np.lexsort((publish_time, log_time))
     log, publish = log_time[order], publish_time[order]
     same = (log[1:] == log[:-1]) & (publish[1:] == publish[:-1])

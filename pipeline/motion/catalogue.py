@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 EffectClass = type[Effect]
 
+_OWN = "slip_effects_"
+
 
 @functools.cache
 def list_effects() -> tuple[EffectClass, ...]:
@@ -85,7 +87,7 @@ def run_effects(code: bytes, path: Path) -> Mapping[str, EffectClass]:
     Raises:
         MotionError: ``effects_file``, it does not run, or defines no effect.
     """
-    module = ModuleType(f"slip_effects_{hash_code(code)}")
+    module = ModuleType(f"{_OWN}{hash_code(code)}")
     module.__file__ = str(path)
     sys.modules[module.__name__] = module
     try:
@@ -107,6 +109,11 @@ def run_effects(code: bytes, path: Path) -> Mapping[str, EffectClass]:
             hint="Derive a class from one of pipeline.motion's effect classes and give it an id.",
         )
     return found
+
+
+def is_own(kind: EffectClass) -> bool:
+    """Whether an effect comes from Python of the user's own."""
+    return kind.__module__.startswith(_OWN)
 
 
 def _effects_of(module: ModuleType) -> list[EffectClass]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.motion.catalogue import is_own
 from pipeline.motion.cells import make_cells
 from pipeline.motion.effect import Late, ReportEffect
 from pipeline.motion.errors import MotionError
@@ -160,9 +161,21 @@ class Comparison:
         return self._run(self._forward, effects, timing)
 
     def _run(self, forward: Forward, effects: Sequence[Effect], timing: Timing) -> Velocity:
-        if self.source is Input.COMMAND:
-            return forward.run_commands(effects, self._complete_timing(effects, timing))
-        return forward.run_wheels(effects, timing)
+        own = [effect.id for effect in effects if is_own(type(effect))]
+        # Formulas judge themselves; what Python of the user's own leaves without a value is said in one line.
+        with np.errstate(all="ignore" if own else None):
+            if self.source is Input.COMMAND:
+                velocity = forward.run_commands(effects, self._complete_timing(effects, timing))
+            else:
+                velocity = forward.run_wheels(effects, timing)
+        if own and not all(np.isfinite(part).all() for part in (velocity.x, velocity.y, velocity.w)):
+            raise MotionError(
+                "not_finite",
+                "an effect of your own gives a velocity that is no finite number",
+                where=", ".join(own),
+                hint="Mend its Python: it must give a number for every cell of the run.",
+            )
+        return velocity
 
     def _complete_timing(self, effects: Sequence[Effect], timing: Timing) -> Timing:
         """The delay of the encoders with what a body that follows late has hidden of it.

@@ -6,11 +6,15 @@ import json
 import math
 from typing import TYPE_CHECKING
 
+import yaml
+
+from pipeline.motion.catalogue import is_own
 from pipeline.motion.effect import Place
 from pipeline.motion.formula.formula_effect import FormulaEffect
 from pipeline.motion.python_text import write_function
 
 if TYPE_CHECKING:
+    from pipeline.motion.effect import Effect
     from pipeline.motion.model import Model
     from pipeline.motion.model_file import ModelFile
 
@@ -26,10 +30,10 @@ def export_ros2_control(file: ModelFile) -> str:
     else is listed in a comment, because no parameter would make the controller know it.
     """
     model = file.model
-    lines = [f"# Parameters for {model.vehicle.name}, from a fitted motion model."]
-    unmapped = [effect.id for effect in model if effect.id not in _MAPPED]
+    lines = [_comment(f"Parameters for {model.vehicle.name}, from a fitted motion model.")]
+    unmapped = [effect.id for effect in model if not _is_mapped(effect)]
     if unmapped:
-        lines.append(f"# No parameter of the controller stands for: {', '.join(unmapped)}.")
+        lines.append(_comment(f"No parameter of the controller stands for: {', '.join(unmapped)}."))
     track_m = model.vehicle.track_width_m
     if model.vehicle.kind != "differential" or track_m is None:
         return "\n".join([*lines, "# The vehicle is no differential drive: nothing maps.", ""])
@@ -37,33 +41,41 @@ def export_ros2_control(file: ModelFile) -> str:
     uneven = _value(model, "wheel_asymmetry", "e", 0.0)
     speed = _value(model, "body_speed_limit", "limit", math.inf)
     turn = _value(model, "body_turn_limit", "limit", math.inf)
-    lines += [
-        "diff_drive_controller:",
-        "  ros__parameters:",
-        f"    wheel_separation: {_write_double(track_m)}",
-        f"    wheel_radius: {_write_double(model.vehicle.wheel_radius_m)}",
-        f"    wheel_separation_multiplier: {_write_double(_value(model, 'effective_track', 'k', 1.0))}",
-        f"    left_wheel_radius_multiplier: {_write_double(radius * (1.0 - uneven / 2.0))}",
-        f"    right_wheel_radius_multiplier: {_write_double(radius * (1.0 + uneven / 2.0))}",
-    ]
+    controller: dict[str, object] = {
+        "wheel_separation": _round(track_m),
+        "wheel_radius": _round(model.vehicle.wheel_radius_m),
+        "wheel_separation_multiplier": _round(_value(model, "effective_track", "k", 1.0)),
+        "left_wheel_radius_multiplier": _round(radius * (1.0 - uneven / 2.0)),
+        "right_wheel_radius_multiplier": _round(radius * (1.0 + uneven / 2.0)),
+    }
     if math.isfinite(speed):
-        lines += [
-            f"    linear.x.max_velocity: {_write_double(speed)}",
-            f"    linear.x.min_velocity: {_write_double(-speed)}",
-        ]
+        controller |= {"linear.x.max_velocity": _round(speed), "linear.x.min_velocity": _round(-speed)}
     if math.isfinite(turn):
-        lines += [
-            f"    angular.z.max_velocity: {_write_double(turn)}",
-            f"    angular.z.min_velocity: {_write_double(-turn)}",
-        ]
+        controller |= {"angular.z.max_velocity": _round(turn), "angular.z.min_velocity": _round(-turn)}
+    nodes: dict[str, object] = {"diff_drive_controller": {"ros__parameters": controller}}
     if math.isfinite(speed) and math.isfinite(turn):
-        lines += [
-            "velocity_smoother:",
-            "  ros__parameters:",
-            f"    max_velocity: [{_write_double(speed)}, 0.0, {_write_double(turn)}]",
-            f"    min_velocity: [{_write_double(-speed)}, 0.0, {_write_double(-turn)}]",
-        ]
-    return "\n".join([*lines, ""])
+        most = {
+            "max_velocity": _Row((_round(speed), 0.0, _round(turn))),
+            "min_velocity": _Row((_round(-speed), 0.0, _round(-turn))),
+        }
+        nodes["velocity_smoother"] = {"ros__parameters": most}
+    text: str = yaml.dump(nodes, Dumper=_Dumper, sort_keys=False, default_flow_style=False)
+    return "\n".join([*lines, text])
+
+
+class _Row(tuple[float, ...]):
+    """Numbers that stand in one line."""
+
+    __slots__ = ()
+
+
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
+    """Plain YAML; every float is written as ROS 2 takes it for a double."""
+
+
+_Dumper.add_representer(
+    _Row, lambda dumper, row: dumper.represent_sequence("tag:yaml.org,2002:seq", row, flow_style=True)
+)
 
 
 def export_json(file: ModelFile) -> str:
@@ -114,15 +126,26 @@ def export_python(file: ModelFile) -> str:
     return write_function(file.model.keep(e.id for e in file.model if e.place is not Place.LOCALIZATION))
 
 
-def _write_double(value: float) -> str:
-    """A number that YAML reads as a double: ROS 2 refuses an integer for a parameter declared as one."""
-    text = repr(float(f"{value:.5g}"))
-    mantissa, mark, exponent = text.partition("e")
-    return text if not mark or "." in mantissa else f"{mantissa}.0e{exponent}"
+def _round(value: float) -> float:
+    return float(f"{value:.5g}")
+
+
+def _comment(text: str) -> str:
+    """A comment of one line, whatever names stand in it."""
+    return "# " + "".join(c if c.isprintable() else " " for c in text)
 
 
 def _value(model: Model, effect: str, name: str, otherwise: float) -> float:
-    return model.effect(effect).values[name] if effect in model else otherwise
+    return (
+        model.effect(effect).values[name]
+        if effect in model and _is_mapped(model.effect(effect))
+        else otherwise
+    )
+
+
+def _is_mapped(effect: Effect) -> bool:
+    """Whether the controller has its parameters; a formula or Python of that name is something else."""
+    return effect.id in _MAPPED and not isinstance(effect, FormulaEffect) and not is_own(type(effect))
 
 
 def _plain(value: object) -> object:

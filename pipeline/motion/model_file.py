@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.core.toml import TomlError, parse_toml, require_finite
+from pipeline.core.toml import TomlError, parse_toml, require_finite, shorten
 from pipeline.motion.catalogue import find_effect, run_effects
 from pipeline.motion.errors import MotionError
 from pipeline.motion.formula.formula_effect import CHANNELS, FormulaEffect, make_parameter
@@ -343,14 +343,9 @@ class _Reader:
             parameters.append(make_parameter(key, unit, (low, high), neutral=float(neutral)))
         lines = {key: self._place(at, key) for key in (*formulas, *numbers)}
         try:
-            return FormulaEffect(
-                name,
-                formulas,
-                tuple(parameters),
-                fixed=fixed,
-                where=self._place(at, next(iter(formulas))),
-                **values,
-            )
+            place = self._place(at, next(iter(formulas)))
+            effect = FormulaEffect(name, formulas, tuple(parameters), fixed=fixed, where=place)
+            return effect.change(**values)
         except MotionError as error:
             key = next(
                 (k for k in lines if f" {k} " in f" {error.where} {error.what} ".replace(".", " ")), ""
@@ -406,7 +401,7 @@ class _Reader:
         return tuple(value)
 
     def _error(self, code: str, what: str, hint: str, at: tuple[str, int] | None, key: str) -> MotionError:
-        return MotionError(code, what, where=self._place(at, key), hint=hint)
+        return MotionError(code, shorten(what), where=self._place(at, key), hint=hint)
 
     def _place(self, at: tuple[str, int] | None, key: str) -> str:
         return f"{self.path}:{find_line(self.lines, at, key)}"

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import msgspec
+import tomlkit
 
 from pipeline.motion.errors import MotionError
 from pipeline.motion.formula.formula_effect import FormulaEffect
@@ -72,14 +73,14 @@ def format_model(file: ModelFile) -> str:
         f"format = {FORMAT}",
     ]
     if file.note:
-        lines.append(f"note = {_text(file.note)}")
+        lines.append(f"note = {_value(file.note)}")
     if file.effect_files:
-        lines.append(f"effects = [{', '.join(_text(name) for name in file.effect_files)}]")
+        lines.append(f"effects = [{', '.join(_value(name) for name in file.effect_files)}]")
     lines += ["", *_format_vehicle(file.model.vehicle)]
     for effect in file.model:
-        lines += ["", "[[effect]]", f"id = {_text(effect.id)}"]
+        lines += ["", "[[effect]]", f"id = {_value(effect.id)}"]
         if isinstance(effect, FormulaEffect):
-            lines += [f"{channel} = {_text(text)}" for channel, text in effect.formulas.items()]
+            lines += [f"{channel} = {_value(text)}" for channel, text in effect.formulas.items()]
         lines += [_format_parameter(file, effect, parameter) for parameter in effect.parameters]
     if file.fit:
         lines += ["", "# What the values were fitted on.", *_format_table("fit", file.fit)]
@@ -91,29 +92,29 @@ def _format_vehicle(vehicle: Vehicle) -> list[str]:
     lines = ["[vehicle]"]
     values = msgspec.structs.asdict(vehicle)
     if preset is not None:
-        lines.append(f"preset = {_text(preset.id)}")
+        lines.append(f"preset = {_value(preset.id)}")
         known = msgspec.structs.asdict(preset)
-        return lines + [f"{key} = {_value(values[key])}" for key in _GEOMETRY if values[key] != known[key]]
-    lines += [f"name = {_text(vehicle.name)}", f"kind = {_text(vehicle.kind)}"]
-    return lines + [f"{key} = {_value(values[key])}" for key in _GEOMETRY if values[key] is not None]
+        return lines + [f"{key} = {_exactly(values[key])}" for key in _GEOMETRY if values[key] != known[key]]
+    lines += [f"name = {_value(vehicle.name)}", f"kind = {_value(vehicle.kind)}"]
+    return lines + [f"{key} = {_exactly(values[key])}" for key in _GEOMETRY if values[key] is not None]
 
 
 def _format_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> str:
     label, value = f"{effect.id}.{parameter.name}", effect.values[parameter.name]
-    parts = [] if math.isnan(value) else [f"value = {_value(value)}"]
+    parts = [] if math.isnan(value) else [f"value = {_round_within(value, parameter)}"]
     if label in file.intervals:
         low, high = file.intervals[label]
         parts += [f"low = {_value(low)}", f"high = {_value(high)}"]
-    parts.append(f"unit = {_text(parameter.unit)}")
+    parts.append(f"unit = {_value(parameter.unit)}")
     if isinstance(effect, FormulaEffect):
-        parts.append(f"bounds = [{_value(parameter.bounds[0])}, {_value(parameter.bounds[1])}]")
+        parts.append(f"bounds = [{', '.join(map(_exactly, parameter.bounds))}]")
         if parameter.neutral != 0.0:
-            parts.append(f"neutral = {_value(parameter.neutral)}")
+            parts.append(f"neutral = {_exactly(parameter.neutral)}")
     if parameter.name in effect.fixed:
         parts.append("fixed = true")
     if label in file.per_run or effect.id in file.per_run:
         parts.append("per_run = true")
-    return f"{parameter.name} = {{ {', '.join(parts)} }}"
+    return f"{_key(parameter.name)} = {{ {', '.join(parts)} }}"
 
 
 def _format_table(name: str, table: Mapping[str, object]) -> list[str]:
@@ -121,11 +122,15 @@ def _format_table(name: str, table: Mapping[str, object]) -> list[str]:
     lines = [f"[{name}]"]
     for key, value in table.items():
         if not _is_tables(value):
-            lines.append(f"{key} = {_value(value)}")
+            lines.append(f"{_key(key)} = {_value(value)}")
     for key, value in table.items():
         if _is_tables(value) and isinstance(value, Sequence):
             for row in value:
-                lines += ["", f"[[{name}.{key}]]", *(f"{k} = {_value(v)}" for k, v in row.items())]
+                lines += [
+                    "",
+                    f"[[{name}.{_key(key)}]]",
+                    *(f"{_key(k)} = {_value(v)}" for k, v in row.items()),
+                ]
     return lines
 
 
@@ -139,25 +144,29 @@ def _is_tables(value: object) -> bool:
 
 
 def _value(value: object) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, float):
-        return _number(value)
+    """A value in TOML; lists and tables stand in one line."""
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{k} = {_value(v)}" for k, v in value.items()) + " }"
+        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + " }"
     if isinstance(value, Sequence) and not isinstance(value, str):
         return "[" + ", ".join(_value(item) for item in value) + "]"
-    return str(value) if isinstance(value, int) else _text(str(value))
+    if isinstance(value, float):
+        value = _round(value)
+    return str(tomlkit.item(value).as_string())
 
 
-def _number(value: float) -> str:
-    if not math.isfinite(value):
-        return "nan" if math.isnan(value) else ("inf" if value > 0 else "-inf")
-    text = f"{value:.{_DIGITS}g}"
-    return text if any(mark in text for mark in ".en") else f"{text}.0"
+def _key(name: str) -> str:
+    return str(tomlkit.key(name).as_string())
 
 
-def _text(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    plain = "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in escaped)
-    return f'"{plain}"'
+def _exactly(value: float) -> str:
+    return str(tomlkit.item(float(value)).as_string())
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.{_DIGITS}g}")
+
+
+def _round_within(value: float, parameter: Parameter) -> str:
+    """A fitted value with the digits that mean something, unless that moves it out of its bounds."""
+    low, high = parameter.bounds
+    return _exactly(_round(value) if low <= _round(value) <= high and value != parameter.neutral else value)

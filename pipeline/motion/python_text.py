@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import ast
+import copy
 import math
-import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
+from pipeline.motion.catalogue import is_own
 from pipeline.motion.errors import MotionError
 from pipeline.motion.formula.formula_effect import FormulaEffect
 
 if TYPE_CHECKING:
     from pipeline.motion.effect import Effect
     from pipeline.motion.model import Model
+    from pipeline.vehicles import Vehicle
 
 # What each effect does in one step; `{k}` and the like become the fitted numbers.
 _ON_COMMAND = {
@@ -110,13 +113,13 @@ _ON_CENTRE = {
     "icr_offset": """
         v_y = v_y - {x_icr} * v_w""",
 }
+_PLAIN_NAMES = ("abs", "min", "max", "sign")
 _STAGES = (_ON_COMMAND, _ON_DRIVE, _ON_ROLLING, _ON_BODY, _ON_GROUND, _ON_CENTRE)
-_MATH = re.compile(r"\b(sin|cos|tan|asin|acos|atan|atan2|tanh|exp|log|sqrt|hypot|pi)\b")
-
-_HEAD = '''"""Motion of {name} from its commands. Made by `slip model export`; needs nothing but Python."""
+_HEAD = '''"""Motion of a vehicle from its commands. Made by `slip model export`; needs nothing but Python."""
 
 import math
 
+VEHICLE = {name}
 R = {radius}  # wheel radius [m]
 B = {track}  # track width [m]
 WHEELBASE = {wheelbase}  # [m]
@@ -176,14 +179,7 @@ def write_function(model: Model) -> str:
     """
     vehicle = model.vehicle
     delay = model.effect("transport_delay").values["d"] if "transport_delay" in model else 0.0
-    parts = [
-        _HEAD.replace("{name}", vehicle.name)
-        .replace("{radius}", repr(vehicle.wheel_radius_m))
-        .replace("{track}", repr(vehicle.track_width_m or 1.0))
-        .replace("{wheelbase}", repr(vehicle.wheelbase_m or 1.0))
-        .replace("{multiplier}", repr(vehicle.controller_track_multiplier))
-        .replace("{delay}", repr(delay))
-    ]
+    parts = [_write_head(vehicle, delay)]
     written = {"transport_delay"}
     for number, stage in enumerate(_STAGES):
         if number == _STAGES.index(_ON_ROLLING):
@@ -191,15 +187,16 @@ def write_function(model: Model) -> str:
         if number == _STAGES.index(_ON_BODY):
             parts.append("\n        v_x, v_y, v_w = v0, 0.0, w0")
         for effect in model:
-            if effect.id in stage:
+            if isinstance(effect, FormulaEffect):
+                if stage is _ON_GROUND:
+                    parts.append(_formula(effect))
+                    written.add(effect.id)
+            elif effect.id in stage and not is_own(type(effect)):
                 parts.append(
                     _fill(
                         effect, _CAR_TURN_LIMIT if _is_car_limit(effect, vehicle.kind) else stage[effect.id]
                     )
                 )
-                written.add(effect.id)
-            elif isinstance(effect, FormulaEffect) and stage is _ON_GROUND:
-                parts.append(_formula(effect))
                 written.add(effect.id)
     missing = [effect.id for effect in model if effect.id not in written]
     if missing:
@@ -213,6 +210,20 @@ def write_function(model: Model) -> str:
     if lever_m:
         parts.append(f"\n        v_y = v_y + {lever_m!r} * v_w")
     return "".join([*parts, _TAIL])
+
+
+def _write_head(vehicle: Vehicle, delay: float) -> str:
+    text = _HEAD
+    for key, number in (
+        ("radius", vehicle.wheel_radius_m),
+        ("track", vehicle.track_width_m or 1.0),
+        ("wheelbase", vehicle.wheelbase_m or 1.0),
+        ("multiplier", vehicle.controller_track_multiplier),
+        ("delay", delay),
+    ):
+        text = text.replace(f"{{{key}}}", _number(number))
+    # The name last: what stands in it is not looked at again.
+    return text.replace("{name}", ascii(vehicle.name))
 
 
 def _is_car_limit(effect: Effect, kind: str) -> bool:
@@ -243,16 +254,48 @@ def _number(value: float) -> str:
 
 def _formula(effect: FormulaEffect) -> str:
     lines = []
-    for channel, text in effect.formulas.items():
-        if re.search(r"\w+_rate\b", text):
+    for channel, expression in effect.expressions.items():
+        if any(name.endswith("_rate") for name in expression.names):
             raise MotionError(
                 "not_exportable",
                 f"{effect.id} uses the rate of a signal, which the exported function does not have",
                 where=effect.id,
                 hint="Export without it (slip model drop).",
             )
-        body = _MATH.sub(r"math.\1", text)
-        for name, value in effect.values.items():
-            body = re.sub(rf"\b{re.escape(name)}\b", _number(value), body)
+        body = ast.unparse(ast.fix_missing_locations(_Writer(effect).visit(copy.deepcopy(expression.tree))))
         lines.append(f"\n        {channel} = {channel} + ({body})")
     return "".join(lines)
+
+
+class _Writer(ast.NodeTransformer):
+    """Turns a formula's syntax into that of plain Python: numbers for parameters, functions of `math`."""
+
+    def __init__(self, effect: FormulaEffect) -> None:
+        self._values = effect.values
+
+    def visit_Constant(self, node: ast.Constant) -> ast.expr:
+        """A number, as the model computes with it: never a whole one of any length."""
+        return ast.Constant(float(str(node.value)))
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        """A parameter's number, the constant pi, or a signal."""
+        if node.id == "pi":
+            return _of_math("pi")
+        return ast.Constant(self._values[node.id]) if node.id in self._values else node
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
+        """Python's own power of a negative number is complex; that of `math` is an error, as in the model."""
+        left, right = self.visit(node.left), self.visit(node.right)
+        if isinstance(node.op, ast.Pow):
+            return ast.Call(_of_math("pow"), [left, right], [])
+        return ast.BinOp(left, node.op, right)
+
+    def visit_Call(self, node: ast.Call) -> ast.expr:
+        """A call of a function that is built in, stands above, or is one of `math`."""
+        name = cast("ast.Name", node.func).id
+        function = ast.Name(name) if name in _PLAIN_NAMES else _of_math(name)
+        return ast.Call(function, [self.visit(argument) for argument in node.args], [])
+
+
+def _of_math(name: str) -> ast.expr:
+    return ast.Attribute(ast.Name("math"), name)

@@ -70,11 +70,13 @@ class Generation:
         root: Path,
         home: Path,
         previous: Manifest | None,
+        keeps_previous: bool,
         watch: Callable[[str], None],
     ) -> None:
         self.run = run
         self.key = key
         self.previous = previous
+        self._keeps_previous = keeps_previous
         self._root = root
         self._home = home
         self._watch = watch
@@ -237,18 +239,20 @@ class Generation:
         if current is None or current.folder != self._folder:
             shutil.rmtree(self._folder, ignore_errors=True)
 
+    def _taken(self) -> tuple[str, ...]:
+        """Names of generations that the manifest of before knows."""
+        return () if self.previous is None else (self.previous.folder.name, *self.previous.earlier)
+
     def _describe(self, details: Mapping[str, JSON]) -> Manifest:
-        earlier: tuple[str, ...] = ()
-        if self.previous is not None:
-            earlier = (self.previous.folder.name, *self.previous.earlier)
         return Manifest(
             run=self.run,
             key=self.key,
-            folder=name_free_folder(self._home, self.key, earlier),
+            folder=name_free_folder(self._home, self.key, self._taken()),
             tables=self._tables,
             files=self._files,
             details=details,
-            earlier=earlier,
+            # What is made again because it is damaged is nothing to look back at.
+            earlier=self._taken() if self._keeps_previous else self._taken()[1:],
         )
 
     def _write(self, name: str, data: bytes) -> FileEntry:

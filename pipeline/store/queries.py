@@ -23,6 +23,9 @@ _READERS = re.compile(
 )
 """Names by which SQL opens files and addresses, wherever they stand: none is ever meant as a text."""
 
+_SHOWN = 500
+"""Characters of a query or of a complaint about it in an error."""
+
 RUNS_TABLE = "runs"
 """A table that is made of the manifests: one row a run."""
 
@@ -97,7 +100,7 @@ def answer_query(
         raise StoreError(
             "files_not_allowed",
             f"the query names {reader[0]}, which opens files outside the results",
-            where=sql,
+            where=_shorten(sql),
             hint="Ask the tables of the results only, or give --allow-files if the query is your own",
         )
     names = [contract.name for contract in list_contracts()]
@@ -111,10 +114,14 @@ def answer_query(
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
         raise StoreError(
             "bad_query",
-            f"the query cannot be answered: {str(error).partition(chr(10))[0]}",
-            where=sql,
+            f"the query cannot be answered: {_shorten(str(error).partition(chr(10))[0])}",
+            where=_shorten(sql),
             hint=f"The tables are: {', '.join((RUNS_TABLE, *names))}",
         ) from error
+
+
+def _shorten(text: str) -> str:
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]} ..."
 
 
 def _fit(frame: pl.LazyFrame, schema: pl.Schema) -> pl.LazyFrame:

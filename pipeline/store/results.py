@@ -147,7 +147,13 @@ class Store:
                 remove_leftovers(home)
                 remove_orphans(home, previous)
             generation = Generation(
-                run=run, key=key, root=self.root, home=home, previous=previous, watch=self._watch
+                run=run,
+                key=key,
+                root=self.root,
+                home=home,
+                previous=previous,
+                keeps_previous=previous is not None and not self.is_asked_again(previous),
+                watch=self._watch,
             )
             try:
                 yield generation

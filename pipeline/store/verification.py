@@ -219,11 +219,12 @@ class _Examiner:
         marker = self._files.read(f"{folder}/{MARKER}")
         if marker:
             try:
-                parse_marker(marker)
-            except ValueError as error:
-                yield self._problem(
-                    manifest.run, f"{folder}/{MARKER}", "file_damaged", f"the file is damaged: {error}"
-                )
+                is_right = parse_marker(marker) == manifest.hashes()
+            except ValueError:
+                is_right = False
+            if not is_right:
+                what = "the file is not what was written"
+                yield self._problem(manifest.run, f"{folder}/{MARKER}", "file_damaged", what)
         elif marker is None:
             self._unlisted.append(f"{folder}/{MARKER}")
         yield from self._compare(manifest.run, folder, manifest.hashes())

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from pipeline.core.toml import shorten
 from pipeline.vehicles.configuration import Configuration
 from pipeline.vehicles.errors import ConfigurationError
 from pipeline.vehicles.presets import find_preset, list_presets
@@ -41,7 +42,7 @@ def describe_fault(error: msgspec.ValidationError, where: str, source: Path | No
         hint = f"Write one of: {words}." if words else "README.md, Configuration, lists the keys and units."
     return ConfigurationError(
         "config_invalid",
-        f"the configuration is not valid: {_readable(message)}",
+        f"the configuration is not valid: {shorten(_readable(message))}",
         where=_name_line(where, source, steps, value),
         hint=hint,
     )
@@ -108,6 +109,11 @@ def _list_words(steps: Iterable[str]) -> list[object]:
 def _list_keys(steps: Iterable[str]) -> list[str]:
     structs = (kind for kind in _walk(steps) if isinstance(kind, msgspec.inspect.StructType))
     return [field.encode_name for kind in structs for field in kind.fields]
+
+
+def name_key(source: Path, key: str) -> str:
+    """The file and, where it can be told, the line that sets a dotted key."""
+    return _name_line(str(source), source, key.split("."), "")
 
 
 def _name_line(where: str, source: Path | None, steps: list[str], value: str) -> str:

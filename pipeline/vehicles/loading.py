@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import fnmatch
-import tomllib
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.vehicles.complaints import check_preset, describe_fault
+from pipeline.core.toml import TomlError, parse_toml, require_finite
+from pipeline.vehicles.complaints import check_preset, describe_fault, name_key
 from pipeline.vehicles.configuration import Configuration
 from pipeline.vehicles.errors import ConfigurationError
 from pipeline.vehicles.presets import find_preset
@@ -122,12 +122,18 @@ def read_toml(path: Path) -> dict[str, object]:
         ConfigurationError: the file is missing, unreadable or not TOML (with the line).
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        tree = parse_toml(path.read_text(encoding="utf-8"))
+        require_finite(tree)
     except FileNotFoundError:
         raise ConfigurationError(
             "config_not_found", "there is no such configuration file", where=str(path), hint="Check the path."
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except TomlError as error:
+        where = str(path) if error.line is None else f"{path}, line {error.line}"
+        if error.key:
+            where = name_key(path, error.key)
+        raise ConfigurationError("config_not_toml", error.what, where=where, hint="Mend that line.") from None
+    except UnicodeDecodeError as error:
         raise ConfigurationError(
             "config_not_toml", f"not a valid TOML file: {error}", where=str(path), hint="Mend that line."
         ) from None
@@ -138,6 +144,7 @@ def read_toml(path: Path) -> dict[str, object]:
             where=str(path),
             hint="Check its permissions.",
         ) from None
+    return tree
 
 
 def _checked(tree: dict[str, object], path: Path) -> dict[str, object]:

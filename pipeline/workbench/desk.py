@@ -131,7 +131,7 @@ class DeskFile:
         """The desk; None when there is none that can be read."""
         try:
             return msgspec.json.decode(self.path.read_bytes(), type=Desk)
-        except (OSError, msgspec.DecodeError):
+        except (OSError, ValueError, msgspec.DecodeError, RecursionError):
             return None
 
     def write(self, desk: Desk) -> None:

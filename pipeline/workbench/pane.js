@@ -215,7 +215,7 @@ export class Pane {
     const cards = desk.effects.map((effect) => this.card(effect));
     this.model.replaceChildren(
       h("h3", {}, "Model"),
-      desk.warnings.map((told) => h("p", { class: "doubts warning", role: "status" }, told)),
+      ...desk.warnings.map((told) => h("p", { class: "doubts warning", role: "status" }, told)),
       cards.length ? h("ul", { class: "cards" }, cards) : h("p", { class: "quiet" }, "The ideal model: no effect yet."),
       h("h3", {}, "Add an effect"),
       this.proposals(),

@@ -56,7 +56,7 @@ def counts(outcome: Outcome) -> dict[str, int]:
 
 
 def read_tables(out: Path) -> dict[str, bytes]:
-    """Every table and text of the results that people read, by its path; not locks, notes and links."""
+    """Every table and text of the results that people read, by its path."""
     return {
         str(path.relative_to(out)): path.read_bytes()
         for path in sorted(out.rglob("*"))
@@ -66,7 +66,7 @@ def read_tables(out: Path) -> dict[str, bytes]:
 
 def is_note(path: Path, out: Path) -> bool:
     inside = path.relative_to(out).parts
-    return inside[0] in {"batch", "identities"} or "latest" in inside
+    return inside[0] in {"batch", "identities", "listed"} or "latest" in inside
 
 
 def start_slip(*arguments: object) -> subprocess.Popen[str]:

@@ -16,11 +16,17 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
+class Panic(BaseException):
+    """What a library in Rust raises when it gives up: no exception that `except Exception` catches."""
+
+
 def work_poisoned(task: Task) -> Report:
     """As usual, but logs whose names say so are poison."""
     kind = task.path.stem
     if kind == "raises":
         raise RuntimeError("poison")
+    if kind == "panics":
+        raise Panic("poison")
     if kind == "hangs":
         time.sleep(3600.0)
     if kind == "eats":

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
+import socket
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -33,6 +37,36 @@ def scheduler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[str]:
         n_workers=2, threads_per_worker=1, protocol="tcp://", dashboard_address=None, silence_logs=50
     ) as cluster:
         yield cluster.scheduler_address
+
+
+CLUSTER = """
+import distributed, sys
+if __name__ == "__main__":
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, protocol="tcp://", dashboard_address=None, silence_logs=50
+    ) as cluster:
+        print(cluster.scheduler_address, flush=True)
+        sys.stdin.read()
+"""
+
+
+@contextlib.contextmanager
+def start_cluster() -> Iterator[tuple[str, int]]:
+    """A scheduler and a worker in a process of their own: its address and the process."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", CLUSTER],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    try:
+        yield process.stdout.readline().strip(), process.pid
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
 
 
 def kill_first_worker(begun: Path, killed: list[int]) -> None:
@@ -94,3 +128,52 @@ def test_a_scheduler_that_does_not_answer_is_said(
     assert caught.value.code == "cluster_not_reached"
     with pytest.raises(BatchError, match="no executor is called 'slurm'"):
         batch(season, tmp_path / "out", executor="slurm")
+
+
+def test_a_scheduler_that_is_silent_is_not_waited_for(
+    season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.batch.executors.cluster._CONNECT_S", 0.5)
+    started = time.monotonic()
+    with socket.create_server(("127.0.0.1", 0)) as place, pytest.raises(BatchError) as caught:
+        batch(season, tmp_path / "out", executor=f"tcp://127.0.0.1:{place.getsockname()[1]}")
+    assert caught.value.code == "cluster_not_reached"
+    for address in ("tcp://", "tls://127.0.0.1:9", "tcp://no.such.host:1"):
+        with pytest.raises(BatchError) as caught:
+            batch(season, tmp_path / "out", executor=address)
+        assert caught.value.code == "cluster_not_reached"
+        assert "\n" not in str(caught.value)
+    assert time.monotonic() - started < 10.0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("how", [signal.SIGSTOP, signal.SIGKILL])
+def test_a_scheduler_lost_in_the_middle_ends_the_batch(
+    how: signal.Signals, season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.batch.executors.cluster._CONNECT_S", 1.0)
+    monkeypatch.setattr("pipeline.batch.executors.cluster._LOST_S", 1.0)
+    monkeypatch.setattr("pipeline.batch.executors.cluster._LOOK_PERIOD_S", 0.1)
+    begun = tmp_path / "begun"
+    begun.mkdir()
+    monkeypatch.setenv("BEGUN", str(begun))
+    monkeypatch.setenv("PAUSE_S", "60")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(HERE), str(HERE.parents[1]))))
+    with start_cluster() as (address, pid):
+
+        def lose() -> None:
+            deadline = time.monotonic() + 60.0
+            while not list(begun.iterdir()) and time.monotonic() < deadline:
+                time.sleep(0.05)
+            os.kill(pid, how)
+
+        loser = threading.Thread(target=lose)
+        loser.start()
+        outcome = batch(season, tmp_path / "out", work=work_slowly, executor=address)
+        loser.join()
+    assert outcome.seconds < 60.0
+    states = sorted((line.state, line.code) for line in outcome.lines)
+    assert states == [("failed", "cluster_lost")] + [("left", "")] * 3
+    assert "does not answer any more" in next(line.reason for line in outcome.lines if line.code)
+    # None of them is to blame: the next batch does them all.
+    assert counts(batch(season, tmp_path / "out")) == {"done": 4}

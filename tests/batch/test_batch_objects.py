@@ -125,7 +125,9 @@ def list_published(store: fsspec.AbstractFileSystem, out: str) -> dict[str, byte
     store.invalidate_cache()
     start = len(out.removeprefix("s3://")) + 1
     names = [
-        name for name in store.find(out) if not name[start:].startswith("batch/") and "/." not in name[start:]
+        name
+        for name in store.find(out)
+        if not name[start:].startswith(("batch/", "listed/")) and "/." not in name[start:]
     ]
     return {name[start:]: store.cat_file(name) for name in names}
 
@@ -162,8 +164,17 @@ def test_results_in_a_bucket_are_those_of_a_folder(
 
     damaged = next(name for name in bucket.find(out) if name.endswith("velocities.parquet"))
     bucket.pipe_file(damaged, b"x")
+    gone = next(name for name in bucket.find(out) if name.endswith("season/d/manifest.json"))
+    bucket.rm(gone)
+    mirror.pull_index()
+    found = verify_results(mirror.store, mirror=mirror, logs=False, tell=print, repair=True)
+    assert sorted(problem.code for problem in found.files) == ["file_damaged", "run_missing"]
+    assert {repair.action for repair in found.repairs} == {"queued"}
+    mended = batch(season, tmp_path / "elsewhere", address=out)
+    assert counts(mended) == {"done": 2, "unchanged": 2}
+    mirror.pull_index()
     found = verify_results(mirror.store, mirror=mirror, logs=False, tell=print)
-    assert [problem.code for problem in found.files] == ["file_damaged"]
+    assert (found.files, found.unlisted) == ((), ())
 
 
 class FailingStore:

@@ -15,7 +15,7 @@ from pebble.pool.process import PoolManager
 
 from pipeline.batch import BatchError
 
-KINDS = ("raises", "hangs", "eats", "dies", "leaves", "unpicklable")
+KINDS = ("raises", "panics", "hangs", "eats", "dies", "leaves", "unpicklable")
 LIMITS = {"executor": "local", "timeout_s": 4.0, "memory_bytes": 700_000_000}
 
 
@@ -28,10 +28,11 @@ def test_each_kind_of_poison_is_named_and_the_others_are_done(season: Path, tmp_
         (season / f"{kind}.mcap").write_bytes((season / "a.mcap").read_bytes() + bytes(number + 1))
 
     outcome = batch(season, tmp_path / "out", work=work_poisoned, **LIMITS)
-    assert counts(outcome) == {"done": 2, "failed": 2, "quarantined": 4}
+    assert counts(outcome) == {"done": 2, "failed": 3, "quarantined": 4}
     found = {Path(line.path).stem: (line.state, line.code) for line in outcome.lines}
     assert {kind: found[kind] for kind in KINDS} == {
         "raises": ("failed", "unexpected_error"),
+        "panics": ("failed", "unexpected_error"),
         "hangs": ("quarantined", "timed_out"),
         "eats": ("quarantined", "out_of_memory"),
         "dies": ("quarantined", "worker_died"),

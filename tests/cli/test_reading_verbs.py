@@ -164,6 +164,17 @@ def test_what_a_diagnosis_stores_does_not_depend_on_its_input(tmp_path: Path, an
     assert hash_tree(tmp_path / "command" / "runs") == hash_tree(tmp_path / "measured" / "runs")
 
 
+def test_a_log_without_the_input_that_is_asked_for_is_said_to_lack_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = Path(__file__).parents[2] / "data_samples" / "mystery_2.mcap"
+    assert slip("diagnose", log, "--out", tmp_path, "--input", "measured", "--quiet") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "no topic can serve as measured wheels" in line
+    assert "/platform/odom" in line
+    assert not (tmp_path / "runs").exists()
+
+
 def test_a_changed_configuration_is_said_and_the_stored_run_is_read(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -345,8 +345,8 @@ def judge(  # noqa: PLR0911 - one of many things may be wrong
         return answer.err
     if "Warning" in answer.err or "panicked" in answer.err:
         return f"a warning reached the user: {answer.err[-2000:]}"
-    if answer.code == 1 and not answer.err.strip() and "--json" not in case.arguments:
-        return f"it failed without a word: {answer.out}"
+    if answer.code == 1 and not (answer.err + answer.out).strip():
+        return "it failed without a word"
     told = [line for line in answer.err.splitlines() if line.startswith("slip: ")]
     if answer.code == 1 and any(len(line) > 20_000 for line in told):
         return f"an error of {max(map(len, told))} characters"

@@ -3,8 +3,8 @@
     python tests/fuzz/fuzz_logs.py --minutes 60 [--seed 1] [--finds folder]
 
 Each case is a small valid log of some kind with a few bytes changed, removed, doubled or mixed with
-another log. Memory is limited, and a case that takes longer than 20 s ends the run with a traceback. A case
-that fails is kept in the folder of finds.
+another log. Memory is limited, a warning is an error, and a case that takes longer than 20 s ends the run
+with a traceback. A case that fails is kept in the folder of finds.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import resource
 import sys
 import tempfile
 import time
+import warnings
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -81,7 +82,9 @@ def write_seeds(folder: Path) -> list[bytes]:
         seeds.append(path.read_bytes())
     for options in (
         {"use_chunking": False},
+        {"use_chunking": False, "enable_data_crcs": True},
         {"enable_crcs": False, "compression": CompressionType.NONE},
+        {"enable_crcs": False, "compression": CompressionType.NONE, "enable_data_crcs": True},
         {"enable_crcs": False, "compression": CompressionType.ZSTD},
         {"index_types": IndexType.NONE, "use_statistics": False, "use_summary_offsets": False},
     ):
@@ -179,7 +182,8 @@ def run(seconds: float, seed: int, finds: Path | None) -> int:
     """
     rng = random.Random(seed)  # noqa: S311 - no secret
     cases = 0
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("error")
         seeds = write_seeds(Path(folder))
         path = Path(folder) / "case.mcap"
         end = time.monotonic() + seconds

@@ -14,6 +14,7 @@ from pipeline.logs.schema import SchemaError, parse_msg
 
 LINE = "=" * 80
 MANY = 100_000
+NINES = "9" * 5000
 
 
 def doubling(levels: int) -> str:
@@ -30,7 +31,7 @@ MSG = {
     + "".join(f"{LINE}\nMSG: demo/A{n}\ndemo/A{n + 1} a\n" for n in range(2000)),
     "2 to the 60 fields": doubling(60),
     "an array of 10 to the 12": "float64[1000000000000] x\n",
-    "an array of 5,000 digits": f"float64[{'9' * 5000}] x\n",
+    "an array of 5,000 digits": f"float64[{NINES}] x\n",
     "arrays of arrays": f"demo/A[10000] a\n{LINE}\nMSG: demo/A\n"
     f"demo/B[10000] b\n{LINE}\nMSG: demo/B\nfloat64 x\n",
     "a field of 100,000 letters that is none": "x" * MANY,
@@ -42,9 +43,9 @@ IDL = {
     + "long"
     + ">" * 5000
     + " x; }; };",
-    "an array of 5,000 digits": f"module demo {{ struct T {{ long x[{'9' * 5000}]; }}; }};",
+    "an array of 5,000 digits": f"module demo {{ struct T {{ long x[{NINES}]; }}; }};",
     "an array of many sides": "module demo { struct T { long x" + "[999999999]" * 5000 + "; }; };",
-    "a constant of 5,000 digits": f"const long N = {'9' * 5000}; module demo {{ struct T {{ long x[N]; }}; }};",
+    "a constant of 5,000 digits": f"const long N = {NINES}; module demo {{ struct T {{ long x[N]; }}; }};",
     "digits that are no number": "module demo { struct T { long x[\u00b2]; }; };",
     "comments that never end": "/*" * MANY,
     "strings that never end": '"' + '\\"' * MANY,

@@ -121,6 +121,10 @@ def swap_two_tables(store: Store) -> None:
     shutil.copy(one.path("slip"), other.path("slip"))
 
 
+def swap_two_markers(store: Store) -> None:
+    shutil.copy(home_of(store, RUN) / "new" / ".generation", home_of(store, OTHER) / "key" / ".generation")
+
+
 def delete_the_pool(store: Store) -> None:
     (store.root / "comparison.html").unlink()
 
@@ -139,6 +143,7 @@ CHANGES = {
     put_the_manifest_of_another_folder_there: "manifest_swapped",
     delete_an_old_generation: "old_generation",
     swap_two_tables: "file_damaged",
+    swap_two_markers: "file_damaged",
     delete_the_pool: "file_missing",
     put_an_entry_in_the_place_of_another: "list_damaged",
 }

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import tempfile
+import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
-from workbench_server import RUN, Workbench
+from workbench_server import RUN, TOKEN, Workbench
 
+from pipeline.cli.verb_serve import _open_browser
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
 from pipeline.job.peers import find_peers
 from pipeline.logs import LogWriter
+from pipeline.motion.model_file import ModelFile
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 
@@ -29,9 +33,8 @@ ERROR = "Number(document.querySelector('.number.r .value').textContent)"
 
 def look_for_trouble(chrome: Chrome) -> None:
     assert chrome.errors == []
-    assert {address.split("/")[2].split(":")[0] for address in chrome.requests if "//" in address} == {
-        "127.0.0.1"
-    }
+    asked = [address for address in chrome.requests if "//" in address and not address.startswith("file:")]
+    assert {address.split("/")[2].split(":")[0] for address in asked} == {"127.0.0.1"}
 
 
 def test_a_person_adds_the_hidden_effect_undoes_drops_a_log_and_reloads(
@@ -77,6 +80,59 @@ def test_a_person_adds_the_hidden_effect_undoes_drops_a_log_and_reloads(
     chrome.wait("[...document.querySelectorAll('.run')].length === 2")
     chrome.wait("(document.querySelector('.title h2')?.textContent ?? 'field/hidden') !== 'field/hidden'")
     chrome.wait(SHOWN)
+    look_for_trouble(chrome)
+
+
+def test_without_the_token_the_page_is_a_sentence_and_with_it_stays_open(
+    chrome: Chrome, workbench: Workbench, pictures: Path
+) -> None:
+    chrome.size(PHONE, 600)
+    chrome.open(f"{workbench.origin}/")
+    chrome.wait("document.readyState === 'complete' && document.body?.innerText")
+    assert "slip serve" in str(chrome.run("document.body.innerText"))
+    assert chrome.run("document.scripts.length") == 0
+    chrome.picture(pictures / "workbench_refused.png")
+    chrome.errors.clear()
+
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    # The token is in neither the address nor the reach of a script.
+    assert str(chrome.run("location.href")).startswith(f"{workbench.origin}/#")
+    assert TOKEN not in str(chrome.run("document.cookie + document.documentElement.outerHTML"))
+    chrome.run("location.reload()")
+    chrome.wait(f"document.readyState === 'complete' && {SHOWN}")
+    look_for_trouble(chrome)
+
+
+def test_a_link_in_a_file_opens_the_page_as_well(
+    chrome: Chrome, workbench: Workbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    _open_browser(workbench.address)
+    # Others can read the words of a command: the browser is given a file that only this user can read.
+    (file,) = tmp_path.glob("slip-*.html")
+    assert opened == [file.as_uri()]
+    assert file.stat().st_mode & 0o077 == 0
+    chrome.open(opened[0])
+    chrome.wait(SHOWN)
+    chrome.call("Page.reload")
+    chrome.wait(f"document.readyState === 'complete' && {SHOWN}")
+    look_for_trouble(chrome)
+
+
+def test_what_the_loader_of_models_warns_of_is_shown(
+    chrome: Chrome, workbench: Workbench, monkeypatch: pytest.MonkeyPatch, pictures: Path
+) -> None:
+    told = f"evil.py was not run {EVIL}"
+    monkeypatch.setattr(ModelFile, "warnings", (told,), raising=False)
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    assert chrome.run("document.querySelector('.model .warning').textContent") == told
+    chrome.picture(pictures / "workbench_warning.png")
     look_for_trouble(chrome)
 
 
@@ -184,7 +240,8 @@ def test_a_run_stands_beside_those_that_its_report_does(chrome: Chrome, workbenc
     assert len(find_peers(store, own)[own["leading_input"]]) == 2
     chrome.size(LAPTOP, 900)
     chrome.open(workbench.address)
-    chrome.wait(SHOWN)
+    chrome.wait("document.querySelector('.lead')?.textContent.includes('cannot be fitted')")
+    chrome.errors.clear()
     chrome.run(f"location.hash = 'a={RUN}'")
     chrome.run("location.reload()")
     chrome.wait(f"document.querySelector('.title h2')?.textContent === '{RUN}' && {SHOWN}")

@@ -104,9 +104,11 @@ def test_everything_is_there_again_after_the_server_was_started_anew(results: Pa
         second.close()
 
 
-def test_a_damaged_desk_is_begun_anew(workbench: Workbench) -> None:
+@pytest.mark.parametrize("content", [b'{"run": 3}', b'{"\xed": 1}', b"[" * 100_000, b""])
+def test_a_damaged_desk_is_begun_anew(workbench: Workbench, content: bytes) -> None:
     workbench.desk(RUN, "add", effect="effective_track")
-    (workbench.results / "workbench/desks/a/field/hidden.json").write_text('{"run": 3}')
+    (workbench.results / "workbench/desks/a/field/hidden.json").write_bytes(content)
+    assert workbench.refuse("/api/save", run=RUN)["code"] == "no_such_desk"
     assert effects(workbench.desk(RUN)) == []
 
 

@@ -106,7 +106,7 @@ def test_too_large_a_log_is_refused_before_it_comes(empty: Workbench) -> None:
     assert files_below(empty.results) == []
 
 
-def test_logs_that_wait_have_a_quota_in_number_and_size(tmp_path: Path, hidden_log: Path) -> None:
+def test_logs_that_wait_have_a_quota_in_number_and_size(tmp_path: Path) -> None:
     limits = replace(LIMITS, log_bytes=1_000_000, all_bytes=1_500_000, logs=2, silence_s=3.0)
     server = Workbench(tmp_path / "results", limits=limits)
     try:
@@ -143,7 +143,8 @@ def test_a_disk_that_fills_up_is_one_sentence_and_leaves_nothing(
 
     def open_full(path: Path, *words: str) -> object:
         # Every write to this one says: no space left on device.
-        return Path("/dev/full").open("wb", 0) if path.name == "log.mcap" else opened(path, *words)  # type: ignore[call-overload]
+        chosen = (Path("/dev/full"), "wb", 0) if path.name == "log.mcap" else (path, *words)
+        return opened(*chosen)  # type: ignore[call-overload]
 
     monkeypatch.setattr(Path, "open", open_full)
     status, _, body = empty.request("POST", "/api/upload?name=x.mcap", b"x" * 100_000)

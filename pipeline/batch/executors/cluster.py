@@ -3,12 +3,20 @@
 The scheduler gives the tasks of a lost worker to another one. A worker ends itself when its log takes too
 long or too much memory, so a log that does so costs its worker, and the nanny starts another. The scheduler
 suspects every task that the worker had; suspects are tried again alone, where there is no doubt.
+
+A scheduler that is gone or silent is not waited for: it is asked for its workers all the while, on a
+connection of its own each time, and half a minute without an answer ends the batch.
 """
 
 from __future__ import annotations
 
+import asyncio
+import logging
 import os
 import threading
+import time
+from concurrent.futures import Future, InvalidStateError
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, cast
 
@@ -21,7 +29,6 @@ from pipeline.store import Store
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from concurrent.futures import Future
 
     from distributed import Client
 
@@ -29,6 +36,9 @@ _SCHEMES = ("tcp://", "tls://", "ucx://")
 _DEATHS = "batch/deaths"
 _GUARD_PERIOD_S = 0.1
 _CONNECT_S = 20
+_LOOK_PERIOD_S = 2.0
+_LOST_S = 30.0
+"""A scheduler that has not answered for so long is lost."""
 
 
 def accepts(word: str) -> bool:
@@ -49,17 +59,43 @@ def open_executor(word: str, settings: Settings) -> ClusterExecutor:
             "no_dask", "dask is not installed", where=word, hint="pip install 'slip-pipeline[dask]'"
         ) from None
     if word == "dask":
-        return ClusterExecutor(_start_cluster(settings), settings, owns_cluster=True)
+        client = _start_cluster(settings)
+        address = str(client.scheduler_info()["address"])
+        return ClusterExecutor(client, settings, address=address, owns_cluster=True)
     try:
+        # A client that cannot connect hangs, and once more when the program ends: first somebody must answer.
+        count_threads(word)
         client = distributed.Client(word, timeout=_CONNECT_S, set_as_default=False)
-    except (OSError, TimeoutError) as error:
+    except Exception as error:  # noqa: BLE001 - a host, a port or a certificate: no two alike
+        said = " ".join(str(error).split())
         raise BatchError(
             "cluster_not_reached",
-            f"the scheduler does not answer ({type(error).__name__})",
+            f"the scheduler does not answer ({type(error).__name__}{': ' if said else ''}{said})",
             where=word,
             hint="Start one with `dask scheduler` and workers with `dask worker ADDRESS --nthreads 1`",
         ) from None
-    return ClusterExecutor(client, settings, owns_cluster=False)
+    return ClusterExecutor(client, settings, address=word, owns_cluster=False)
+
+
+def count_threads(address: str) -> int:
+    """Ask a scheduler for the threads of all its workers, on a connection of its own.
+
+    Raises:
+        Exception: whatever keeps it from an answer, `TimeoutError` where nothing does for too long.
+    """
+    from distributed.core import rpc  # noqa: PLC0415 - an extra
+    from distributed.security import Security  # noqa: PLC0415 - likewise
+
+    async def ask() -> int:
+        arguments = Security().get_connection_args("client")
+        async with rpc(address, timeout=_CONNECT_S, connection_args=arguments) as scheduler:
+            threads: dict[str, int] = await scheduler.ncores()
+            return sum(threads.values())
+
+    async def ask_for_a_while() -> int:
+        return await asyncio.wait_for(ask(), _CONNECT_S)
+
+    return asyncio.run(ask_for_a_while())
 
 
 def _start_cluster(settings: Settings) -> Client:
@@ -90,17 +126,29 @@ def _start_cluster(settings: Settings) -> Client:
         return Client(cluster, set_as_default=False)
 
 
+class SchedulerLostError(Exception):
+    """The scheduler does not answer any more."""
+
+
 class ClusterExecutor:
     """The workers of a dask cluster."""
 
-    def __init__(self, client: Client, settings: Settings, *, owns_cluster: bool) -> None:
+    def __init__(self, client: Client, settings: Settings, *, address: str, owns_cluster: bool) -> None:
         self._client = client
         self._settings = settings
+        self._address = address
         self._owns_cluster = owns_cluster
         self._pool = client.get_executor(pure=False)
         self._work = partial(
             run_guarded, settings.work, timeout_s=settings.timeout_s, memory_bytes=settings.memory_bytes
         )
+        self._threads = 1
+        self._waiting: set[Future[Report]] = set()
+        self._closing = threading.Event()
+        self._is_lost = False
+        # What goes wrong is told by this program; dask would tell it as well, in many lines.
+        logging.disable(logging.CRITICAL)
+        threading.Thread(target=self._look_after_scheduler, name="scheduler", daemon=True).start()
 
     @property
     def spreads_blame(self) -> bool:
@@ -110,15 +158,23 @@ class ClusterExecutor:
     @property
     def depth(self) -> int:
         """Threads of all workers, which may come and go."""
-        threads: dict[str, int] = self._client.nthreads()
-        return max(1, sum(threads.values()))
+        return max(1, self._threads)
 
     def expect(self, tasks: int) -> None:
         """The workers are there already."""
 
     def submit(self, task: Task) -> Future[Report]:
         """Work on a task some time."""
-        return cast("Future[Report]", self._pool.submit(self._work, task))
+        waiting: Future[Report] = Future()
+        self._waiting.add(waiting)
+        if self._is_lost:
+            self._settle(waiting, error=SchedulerLostError())
+            return waiting
+        try:
+            self._pool.submit(self._work, task).add_done_callback(partial(self._hand_over, waiting))
+        except Exception as error:  # noqa: BLE001 - it is told where the report is waited for
+            self._settle(waiting, error=error)
+        return waiting
 
     def blame(self, task: Task, error: BaseException) -> Blame:
         """What the exception of a future means."""
@@ -130,15 +186,54 @@ class ClusterExecutor:
             notes.remove(task.log.path)
             reason = str(death.get("reason", "its workers died"))
             return Blame(str(death.get("code", "worker_died")), reason, 1)
+        if self._is_lost:
+            return Blame("cluster_lost", f"the scheduler at {self._address} does not answer any more", 0)
         return Blame("no_result", f"it gave no result: {type(error).__name__}: {error}", 1)
 
     def close(self) -> None:
         """Leave the cluster; one that was started for this batch ends."""
+        self._closing.set()
+        if self._is_lost:
+            # It would wait for an answer, and once more when the program ends.
+            self._client.status = "closed"
+            return
+        logging.disable(logging.NOTSET)
         self._pool.shutdown(wait=False)
         cluster = self._client.cluster if self._owns_cluster else None
         self._client.close()
         if cluster is not None:
             cluster.close()
+
+    def _look_after_scheduler(self) -> None:
+        answered = time.monotonic()
+        while not self._closing.is_set():
+            try:
+                self._threads = count_threads(self._address)
+                answered = time.monotonic()
+            except Exception:  # noqa: BLE001 - no answer, for whatever reason
+                self._is_lost = time.monotonic() - answered > _LOST_S
+            if self._is_lost:
+                for waiting in tuple(self._waiting):
+                    self._settle(waiting, error=SchedulerLostError())
+                return
+            self._closing.wait(_LOOK_PERIOD_S)
+
+    def _hand_over(self, waiting: Future[Report], given: Future[object]) -> None:
+        try:
+            self._settle(waiting, report=cast("Report", given.result()))
+        except BaseException as error:  # noqa: BLE001 - whatever a worker can die of
+            self._settle(waiting, error=error)
+
+    def _settle(
+        self, waiting: Future[Report], *, report: Report | None = None, error: BaseException | None = None
+    ) -> None:
+        self._waiting.discard(waiting)
+        # Whoever waits may have been told already that the scheduler is lost.
+        with suppress(InvalidStateError):
+            if report is not None:
+                waiting.set_result(report)
+            else:
+                waiting.set_exception(error)
 
 
 def run_guarded(work: Callable[[Task], Report], task: Task, *, timeout_s: float, memory_bytes: int) -> Report:

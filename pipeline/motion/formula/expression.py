@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -19,6 +20,11 @@ Evaluate = Callable[[Values], "Floats | float"]
 
 _LONGEST = 500
 _LARGEST_POWER = 16
+_DEEPEST = 40
+
+# Nothing else gets as far as Python's parser: no text, no comment, no attribute, no number run into a word.
+_TOKEN = re.compile(r"(?:(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?![\w.])|[^\W\d]\w*|[-+*/^(),]|\s)", re.ASCII)
+_WORD = re.compile(r"[^\W\d]\w*")
 
 
 @dataclass(frozen=True)
@@ -29,13 +35,42 @@ class Expression:
         text: as it was written.
         unit: of its value.
         names: signals and parameters it uses.
-        evaluate: its value from theirs.
+        tree: its syntax: numbers, names, + - * / **, and calls of functions by name.
+        where: file and line, for error messages.
     """
 
     text: str
     unit: Unit
     names: frozenset[str]
-    evaluate: Evaluate
+    tree: ast.expr
+    where: str
+    _evaluate: Evaluate
+
+    def evaluate(self, values: Values) -> Floats | float:
+        """The formula's value from those of its names.
+
+        NaN goes through it: what is not known stays unknown. What is no finite number by itself is an error.
+
+        Raises:
+            MotionError: ``not_finite``, a division by zero, a root of less than zero, an overflow.
+        """
+        exact = {
+            name: value if isinstance(value, np.ndarray) else np.float64(value)
+            for name, value in values.items()
+        }
+        try:
+            with np.errstate(divide="raise", over="raise", invalid="raise", under="ignore"):
+                return self._evaluate(exact)
+        except FloatingPointError as error:
+            at = ", ".join(
+                f"{name} = {value:g}" for name, value in exact.items() if not isinstance(value, np.ndarray)
+            )
+            raise _bad(
+                self.where,
+                f"{self.text!r} is not always a finite number: {error}" + (f", at {at}" if at else ""),
+                "Keep away from there, as x / max(y, 0.1) does, or narrow the bounds of a parameter.",
+                "not_finite",
+            ) from None
 
 
 @dataclass(frozen=True)
@@ -92,15 +127,42 @@ def parse_expression(text: str, known: Mapping[str, Unit], where: str) -> Expres
     """
     if len(text) > _LONGEST:
         raise _bad(where, f"the formula is longer than {_LONGEST} characters", "Split it into two effects.")
+    _require_tokens(text, where)
     try:
-        tree = ast.parse(text.strip().replace("^", "**"), mode="eval")
+        tree = ast.parse(" ".join(text.split()).replace("^", "**"), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         raise _bad(
             where, f"{text!r} is no formula", "Write arithmetic over signals, as k * sin(yaw)."
         ) from None
+    _require_shallow(tree, text, where)
     parser = _Parser(known, where, text)
-    node = parser.parse(tree.body)
-    return Expression(text, node.unit, frozenset(parser.names), node.evaluate)
+    node = parser.parse(tree)
+    return Expression(text, node.unit, frozenset(parser.names), tree, where, node.evaluate)
+
+
+def _require_tokens(text: str, where: str) -> None:
+    place = 0
+    while place < len(text):
+        found = _TOKEN.match(text, place) or _WORD.match(text, place)
+        if found is None:
+            raise _bad(
+                where,
+                f"{text!r} is no formula: {text[place : place + 8]!r} has no meaning there",
+                "Write arithmetic over signals, as k * sin(yaw).",
+            )
+        place = found.end()
+
+
+def _require_shallow(tree: ast.expr, text: str, where: str) -> None:
+    """Refuse what would take another recursion than the parser's own to its limits."""
+    level: list[ast.AST] = [tree]
+    for _ in range(_DEEPEST):
+        level = [
+            inner for node in level for inner in ast.iter_child_nodes(node) if isinstance(inner, ast.expr)
+        ]
+        if not level:
+            return
+    raise _bad(where, f"{text!r} is nested more than {_DEEPEST} deep", "Split it into two effects.")
 
 
 def _bad(where: str, what: str, hint: str, code: str = "bad_formula") -> MotionError:
@@ -143,14 +205,16 @@ class _Parser:
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise _bad(self.where, f"{value!r} is no number", "Use plain numbers.")
         try:
-            number = float(value)
+            number = np.float64(value)
         except OverflowError:
-            raise _bad(self.where, "a number is too large", "Use plain numbers.") from None
-        return _Node(PLAIN, lambda _values: number, number)
+            number = np.float64(np.inf)
+        if not np.isfinite(number):
+            raise _bad(self.where, "the formula holds a number beyond 1e308", "Write a smaller number.")
+        return _Node(PLAIN, lambda _values: number, float(number))
 
     def _name(self, name: str) -> _Node:
         if name == "pi":
-            return _Node(PLAIN, lambda _values: float(np.pi), float(np.pi))
+            return _Node(PLAIN, lambda _values: np.float64(np.pi), float(np.pi))
         if name not in self.known:
             raise _bad(
                 self.where,

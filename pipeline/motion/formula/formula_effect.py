@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import functools
+import keyword
 import math
+import unicodedata
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -45,6 +47,9 @@ SIGNAL_UNITS: Mapping[str, str] = {
 }
 """Signals that a formula may use, and their units; ``<name>_rate`` is the time derivative."""
 
+_TAKEN = {"id", "note", "pi", "self", "name", "formulas", "parameters", "fixed", "where"}
+"""Words that mean something else in a model file or in the effect itself."""
+
 CHANNELS: Mapping[str, str] = {"v_x": "m/s", "v_y": "m/s", "v_w": "rad/s"}
 
 
@@ -80,10 +85,16 @@ class FormulaEffect(AddedEffect):
         self.parameters = parameters
         self.formulas = dict(formulas)
         self._where = where or name
+        self._check_names()
         self._expressions = {channel: self._parse(channel, text) for channel, text in self.formulas.items()}
         self._check_parameters()
         super().__init__(fixed=fixed, **values)
         self._check_neutral()
+
+    @property
+    def expressions(self) -> Mapping[str, Expression]:
+        """The parsed formulas by channel."""
+        return self._expressions
 
     @property
     def key(self) -> tuple[object, ...]:
@@ -118,14 +129,6 @@ class FormulaEffect(AddedEffect):
 
     def _parse(self, channel: str, text: str) -> Expression:
         own = {p.name: parse_unit(p.unit, self._where) for p in self.parameters}
-        clash = sorted(set(own) & set(SIGNAL_UNITS))
-        if clash:
-            raise MotionError(
-                "name_taken",
-                f"the parameter {clash[0]!r} has the name of a signal",
-                where=self._where,
-                hint="Choose another name.",
-            )
         expression = parse_expression(text, {**_parse_signal_units(), **own}, self._where)
         wanted = parse_unit(CHANNELS[channel], self._where)
         if expression.unit != wanted:
@@ -136,6 +139,19 @@ class FormulaEffect(AddedEffect):
                 hint="Mend the formula or the unit of a parameter.",
             )
         return expression
+
+    def _check_names(self) -> None:
+        for name in (p.name for p in self.parameters):
+            proper = name.isidentifier() and unicodedata.is_normalized("NFKC", name)
+            if proper and name not in {*SIGNAL_UNITS, *CHANNELS, *_TAKEN} and not keyword.iskeyword(name):
+                continue
+            what = "is taken" if proper else "is no name"
+            raise MotionError(
+                "name_taken",
+                f"the parameter {name[:80]!r} cannot be called so: the name {what}",
+                where=self._where,
+                hint="Choose another name, of letters, digits and _.",
+            )
 
     def _check_parameters(self) -> None:
         used = frozenset[str]().union(*(e.names for e in self._expressions.values()))
@@ -154,8 +170,7 @@ class FormulaEffect(AddedEffect):
         signals = {name: generator.uniform(0.1, 1.0, 8) for name in SIGNAL_UNITS}
         neutral = {p.name: p.neutral for p in self.parameters}
         for channel, expression in self._expressions.items():
-            with np.errstate(all="ignore"):
-                value = np.asarray(expression.evaluate({**signals, **neutral}))
+            value = np.asarray(expression.evaluate({**signals, **neutral}))
             if not np.allclose(value, 0.0, atol=1e-12):
                 raise MotionError(
                     "not_neutral",

@@ -8,9 +8,8 @@ from fractions import Fraction
 
 from pipeline.motion.errors import MotionError
 
-_TOKEN = re.compile(r"\s*(?:([A-Za-z]+|1)(?:\s*(?:\^|\*\*)\s*(-?\d{1,3}))?|([*/]))\s*")
-_LONGEST = 100
-"""Characters of a unit; a longer one is none."""
+_TOKEN = re.compile(r"\s*(?:([A-Za-z]+|1)(?:\s*(?:\^|\*\*)\s*(-?\d{1,2}))?|([*/]))\s*")
+_LONGEST = 60
 
 
 @dataclass(frozen=True)
@@ -68,8 +67,7 @@ def parse_unit(text: str, where: str) -> Unit:
         MotionError: ``bad_unit``.
     """
     unit, place, divide, expect = PLAIN, 0, False, True
-    text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
-    while place < len(text):
+    while place < len(text) <= _LONGEST:
         found = _TOKEN.match(text, place)
         if found is None or (found.group(3) is None) != expect:
             break
@@ -87,7 +85,7 @@ def parse_unit(text: str, where: str) -> Unit:
             return unit
     raise MotionError(
         "bad_unit",
-        f"{text!r} is not a unit",
+        f"{text[:_LONGEST]!r} is not a unit",
         where=where,
         hint=f"Write products and powers of {', '.join(_KNOWN)}, for example m/s^2.",
     )

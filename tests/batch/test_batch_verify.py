@@ -1,0 +1,123 @@
+"""`slip verify --repair`: what can be made again is, by the next batch; nothing that is whole is touched."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from typing import TYPE_CHECKING
+
+from batch_tools import batch, counts, read_tables
+
+from pipeline.batch.verification import verify_results
+from pipeline.cli import main
+from pipeline.store import Store
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import pytest
+
+    from pipeline.batch.verification import Verification
+
+
+def verify(out: Path, *, repair: bool = False) -> Verification:
+    return verify_results(Store(out), logs=False, tell=print, repair=repair)
+
+
+def test_what_is_damaged_is_made_again_by_the_next_batch(season: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    batch(season, out)
+    whole = read_tables(out)
+    assert (verify(out).files, verify(out).unlisted) == ((), ())
+    homes = {name: out / "runs" / "season" / name for name in "abcd"}
+    next(homes["a"].glob("*/slip.parquet")).write_bytes(b"x")
+    (homes["b"] / "manifest.json").write_text("{")
+    shutil.rmtree(homes["c"])
+    shutil.copytree(homes["a"], homes["c"], symlinks=True)
+    shutil.rmtree(homes["d"])
+    (out / "datasets.parquet").write_bytes(b"x")
+    next(out.glob("batch/logs/*/*.json")).write_text('{"state": ')
+
+    found = verify(out, repair=True)
+    assert {(problem.run, problem.code) for problem in found.files} == {
+        ("season/a", "file_damaged"), ("season/b", "manifest_damaged"), ("season/c", "name_clash"),
+        ("season/d", "run_missing"), ("", "file_damaged"), ("", "note_damaged"),
+    }  # fmt: skip
+    actions = {repair.subject: repair.action for repair in found.repairs}
+    assert {actions[f"season/{name}"] for name in "abcd"} == {"queued"}
+    assert actions["datasets.parquet"] == "queued"
+    assert all(str(season) in repair.what for repair in found.repairs if "season" in repair.subject)
+    # What may still be of use is there until something better is.
+    assert Store(out).read("season/a", "aggregates").height
+
+    again = batch(season, out)
+    assert counts(again) == {"done": 4}
+    assert again.problems == ()
+    assert (verify(out).files, verify(out).unlisted) == ((), ())
+    tables = read_tables(out)
+    for name, content in whole.items():
+        if name.endswith(("datasets.parquet", "slip.parquet")):
+            assert content in tables.values()
+    assert tables["datasets.parquet"] == whole["datasets.parquet"]
+    assert counts(batch(season, out)) == {"unchanged": 4}
+
+
+def test_what_cannot_be_made_again_is_said_and_stays(
+    season: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    for name in "cd":
+        (season / f"{name}.mcap").unlink()
+    batch(season, out)
+    home = out / "runs" / "season"
+    (home / "b" / "manifest.json").write_text("{")
+    shutil.rmtree(home / "a")
+    for name in "ab":
+        (season / f"{name}.mcap").unlink()
+    before = {path: path.read_bytes() for path in (home / "b").rglob("*.parquet")}
+
+    def ask(*more: str) -> tuple[int, dict[str, list[dict[str, str]]]]:
+        try:
+            main(["verify", str(out), "--no-logs", "--json", *more])
+        except SystemExit as ended:
+            return int(ended.code or 0), json.loads(capsys.readouterr().out)
+        raise AssertionError("it ends")
+
+    code, said = ask("--repair")
+    assert code == 1
+    assert [repair["action"] for repair in said["repairs"]] == ["lost", "lost"]
+    assert all("gone" in repair["what"] for repair in said["repairs"])
+    assert {path: path.read_bytes() for path in (home / "b").rglob("*.parquet")} == before
+    assert (home / "b" / "manifest.json").exists()
+    code, said = ask()
+    assert code == 1
+    assert [problem["code"] for problem in said["files"]] == ["manifest_damaged"]
+    assert "repairs" not in said
+
+
+def test_older_results_are_put_on_the_list_when_asked_to(season: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    batch(season, out)
+    shutil.rmtree(out / "listed")
+    for path in (out / "runs").rglob("manifest.json"):
+        content = json.loads(path.read_bytes())
+        del content["checksum"]
+        path.write_text(json.dumps(content))
+    found = verify(out)
+    assert found.is_clean
+    assert len(found.unlisted) == 6
+    assert {repair.action for repair in verify(out, repair=True).repairs} == {"listed"}
+    assert (verify(out).files, verify(out).unlisted) == ((), ())
+    assert counts(batch(season, out)) == {"unchanged": 4}
+    (out / "runs" / "season" / "a" / "manifest.json").unlink()
+    assert [problem.code for problem in verify(out).files] == ["run_missing"]
+
+
+def test_logs_in_the_results_of_a_stranger_are_only_files(season: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    batch(season / "a.mcap", out)
+    (season / "a.mcap").unlink()
+    os.mkfifo(season / "a.mcap")
+    found = verify_results(Store(out), logs=True, tell=print)
+    assert [problem.code for problem in found.gone] == ["log_gone"]
