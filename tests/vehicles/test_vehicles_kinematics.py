@@ -159,7 +159,7 @@ def test_what_a_controller_asked_comes_back_from_the_inputs_of_every_kind(
 
 
 def test_a_kind_that_nobody_knows_is_named_with_those_there_are() -> None:
-    with pytest.raises(LookupError, match="'hovercraft'; there are ackermann, differential"):
+    with pytest.raises(LookupError, match="'hovercraft'; there are differential, ackermann"):
         find_kinematics("hovercraft")
 
 
