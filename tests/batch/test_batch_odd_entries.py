@@ -137,6 +137,7 @@ def test_a_name_that_is_no_text_passes_through_everything(
         ["status", "--json"],
         ["query", "SELECT * FROM runs"],
         ["explain", run],
+        ["explain", str(odd)],
         ["batch", str(odd)],
     ):
         with pytest.raises(SystemExit) as caught:
