@@ -97,11 +97,11 @@ def verify_results(
 
 
 def _check_log(run: str, path: str, sha256: str) -> LogProblem | None:
-    location = to_location(path)
-    # Results may be a stranger's: of what stands under that path, only files are opened.
-    if not (location.is_file() or location.is_dir()):
-        return LogProblem(run=run, path=path, code="log_gone", what="the log is not there any more")
     try:
+        location = to_location(path)
+        # Results may be a stranger's: of what stands under that path, only files are opened.
+        if not (location.is_file() or location.is_dir()):
+            return LogProblem(run=run, path=path, code="log_gone", what="the log is not there any more")
         content = hash_log(path)
     except SlipError as error:
         return LogProblem(run=run, path=path, code=error.code, what=error.what)

@@ -63,7 +63,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     options = build_options(choices)
     known = None if model is None else open_model(model, trust_code=trust_code)
     diagnoses: list[Diagnosis] = []
-    at_work = [""]
+    at_work = [logs[0]]
 
     def conclude(error: SlipError) -> None:
         if json:

@@ -44,7 +44,9 @@ def resolve_inside(root: AnyPath, name: str, *, follow_links: bool = False) -> A
             character or a part that is or may be taken for ``.`` or ``..``, is too long for a file, or a link
             leads out of the folder.
     """
-    check_name(name, where=str(root))
+    problem = _find_problem(name)
+    if problem:
+        raise _outside(str(root), name, problem)
     path = root / name
     if len(os.fsencode(path)) > _LONGEST_PATH:
         raise _outside(str(root), name, "is too long")

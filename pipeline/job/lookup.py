@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.job.errors import JobError
+from pipeline.logs import spell_location, to_location
 from pipeline.store import Store
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ def find_run(text: str, store: Store) -> Manifest:
         JobError: nothing fits, or several runs do.
     """
     manifests = store.survey().manifests
-    path = str(Path(text).resolve())
+    path = spell_location(Path(text).resolve())
     fitting = [
         manifest
         for manifest in manifests
@@ -42,7 +43,7 @@ def find_log(text: str, out: Path) -> Path:
     if path.exists() or path.suffix:
         return path
     manifest = find_run(text, Store(out))
-    log = Path(recorded_path(manifest))
+    log = to_location(recorded_path(manifest))
     if not log.exists():
         raise JobError(
             "log_gone",

@@ -158,7 +158,7 @@ def read_topics(
             mismatch = section.judge(unchecked, told=told)
             if mismatch is not None:
                 losses[mismatch] = None
-            coverage.unchecked += 0 if section.holds() else unchecked
+            coverage.unchecked += unchecked if unchecked and not section.holds() else 0
         repeated = _find_repeated(list(zip(index.parts, sources, strict=True)), jobs, workers)
         found = digest.result() if digest is not None else (sha256 or "")
         fetched = index.fetched_bytes + count_fetched(sources)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence  # noqa: TC003 - msgspec evaluates the annotations
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -15,6 +16,7 @@ from pipeline.store.errors import StoreError
 from pipeline.store.names import place_inside
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     import polars as pl
@@ -151,11 +153,25 @@ def read_parquet(path: Path) -> pl.DataFrame:
     """
     import polars as pl  # noqa: PLC0415 - heavy, and `slip --help` imports this room
 
-    try:
+    with name_damage(path):
         return pl.read_parquet(path, glob=False)
+
+
+@contextmanager
+def name_damage(path: Path) -> Iterator[None]:
+    """Say what is wrong with a table's file that is being read.
+
+    Raises:
+        StoreError: ``file_missing`` or ``table_damaged``.
+    """
+    import polars as pl  # noqa: PLC0415 - heavy, and `slip --help` imports this room
+
+    try:
+        yield
     except FileNotFoundError as error:
         raise file_missing(path) from error
-    except (pl.exceptions.PolarsError, OSError) as error:
+    # Arrow's errors are errors of values and of files.
+    except (pl.exceptions.PolarsError, OSError, ValueError) as error:
         raise StoreError(
             "table_damaged",
             f"the table cannot be read: {str(error).splitlines()[0]}",

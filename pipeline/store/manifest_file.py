@@ -73,10 +73,14 @@ def parse_manifest(data: bytes, home: Path) -> Manifest:
 
     path = home / MANIFEST
     try:
-        written_in = msgspec.json.decode(data, type=_Header).format
-        stored = msgspec.json.decode(data, type=_Stored) if written_in <= FORMAT else None
-        folder = home
-        if stored is not None:
+        try:
+            stored = msgspec.json.decode(data, type=_Stored)
+            written_in = stored.format
+        except msgspec.ValidationError:
+            written_in = msgspec.json.decode(data, type=_Header).format
+            if written_in <= FORMAT:
+                raise
+        if written_in <= FORMAT:
             _check_names(stored)
             check_seal(data)
             folder = resolve_inside(home, stored.folder)
@@ -88,7 +92,7 @@ def parse_manifest(data: bytes, home: Path) -> Manifest:
             where=str(path),
             hint="Delete this one file and analyze its log again",
         ) from error
-    if stored is None:
+    if written_in > FORMAT:
         raise StoreError(
             "manifest_too_new",
             f"the results are in format {written_in}, this version reads up to {FORMAT}",
@@ -132,6 +136,7 @@ class _Header:
 
 @dataclass(frozen=True)
 class _Stored:
+    format: int
     run: str
     key: str
     folder: str
@@ -143,9 +148,8 @@ class _Stored:
 
 def _check_names(stored: _Stored) -> None:
     # Files are read and old folders removed by these names: an edited one must not lead elsewhere.
-    parts = (stored.folder, *stored.earlier, *stored.tables)
-    for name in (*parts, *stored.files, *(entry.file for entry in stored.tables.values())):
-        if not is_file_name(name) or (name in parts and "/" in name):
+    for name in (stored.folder, *stored.earlier, *stored.tables, *stored.files):
+        if not is_file_name(name) or ("/" in name and name not in stored.files):
             raise ValueError(f"it names {name!r}")
     for table, entry in stored.tables.items():
         if entry.file != f"{table}.parquet":

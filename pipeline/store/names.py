@@ -26,7 +26,7 @@ _HASH_DIGITS = 16
 _RESERVED = ("manifest.json", "latest")
 _UNSAFE = frozenset('%~/\\*?"<>|')
 _KEY = re.compile(r"[0-9A-Za-z][0-9A-Za-z_-]{0,63}")
-_FILE_PART = re.compile(r"[0-9A-Za-z_][0-9A-Za-z_. -]{0,99}")
+_FILE_NAME = re.compile(r"[0-9A-Za-z_][0-9A-Za-z_. -]{0,99}(?:/[0-9A-Za-z_][0-9A-Za-z_. -]{0,99})*")
 
 
 def encode_run(run: str) -> PurePosixPath:
@@ -123,7 +123,7 @@ def place_inside(folder: Path, name: str) -> Path:
 
 def is_file_name(name: str) -> bool:
     """Whether a name stays inside its folder: plain parts with ``/`` between them."""
-    return all(_FILE_PART.fullmatch(part) for part in name.split("/"))
+    return _FILE_NAME.fullmatch(name) is not None
 
 
 def _is_writable(text: str) -> bool:

@@ -30,8 +30,9 @@ def seal(content: Mapping[str, object], *, indent: int | None = None) -> bytes:
         ValueError: a number that JSON has no word for.
         TypeError: something else that it has none for.
     """
-    text = json.dumps(content, allow_nan=False, ensure_ascii=False, indent=indent, sort_keys=True)
-    body = text.encode()
+    # Names of files need not be text: what is none stands escaped.
+    text = json.dumps(content, allow_nan=False, indent=indent, sort_keys=True)
+    body = text.encode("ascii")
     return _START + hash_bytes(body).encode() + _END + body[1:]
 
 

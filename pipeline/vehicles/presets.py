@@ -11,7 +11,7 @@ import msgspec
 
 from pipeline.vehicles.configuration import Kind, Positive, VehicleSection
 from pipeline.vehicles.errors import ConfigurationError
-from pipeline.vehicles.kinematics import Kinematics, find_kinematics
+from pipeline.vehicles.kinematics import USUAL_KIND, Kinematics, find_kinematics
 
 
 class UsualTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -107,7 +107,7 @@ def resolve_vehicle(section: VehicleSection, *, recorded: str | None, where: str
                 hint=_how_to_choose(),
             )
         label = str(values.pop("name", None) or recorded or "vehicle")
-        values = {"kind": "differential", "id": _plain(label), "name": label, **values}
+        values = {"kind": USUAL_KIND, "id": _plain(label), "name": label, **values}
         return _check_geometry(msgspec.convert(values, Vehicle), where)
     if "name" in values:
         values["id"] = _plain(str(values["name"]))

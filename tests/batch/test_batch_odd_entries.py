@@ -47,7 +47,10 @@ def test_everything_at_once_costs_itself_and_nothing_else(mess: Path, tmp_path: 
     for number, words in expected.items():
         assert len(states[number]) == len(words.split())
         for state in states[number]:
-            assert any(state in same.get(word, {word}) for word in words.split()), list(KINDS)[int(number)]
+            assert any(state in same.get(word, {word}) for word in words.split()), (
+                list(KINDS)[int(number)],
+                state,
+            )
     assert found["skipped"] == sum("skipped" in kind.state for kind in KINDS.values())
 
 
@@ -137,6 +140,7 @@ def test_a_name_that_is_no_text_passes_through_everything(
         ["status", "--json"],
         ["query", "SELECT * FROM runs"],
         ["explain", run],
+        ["explain", str(odd)],
         ["batch", str(odd)],
     ):
         with pytest.raises(SystemExit) as caught:

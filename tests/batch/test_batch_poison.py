@@ -14,6 +14,10 @@ from batch_works import work_poisoned
 from pebble.pool.process import PoolManager
 
 from pipeline.batch import BatchError
+from pipeline.batch.executors import Settings, find_executor
+from pipeline.batch.work import Task
+from pipeline.job import Options
+from pipeline.store import LogSighting
 
 KINDS = ("raises", "panics", "hangs", "eats", "dies", "leaves", "unpicklable")
 LIMITS = {"executor": "local", "timeout_s": 4.0, "memory_bytes": 700_000_000}
@@ -96,3 +100,25 @@ def test_processes_that_cannot_be_started_cost_no_log(
     assert caught.value.code == "no_workers"
     monkeypatch.undo()
     assert counts(batch(season, tmp_path / "out")) == {"done": 4}
+
+
+def test_a_worker_that_died_is_known_although_the_next_log_was_offered_to_it(tmp_path: Path) -> None:
+    settings = Settings(jobs=1, timeout_s=60.0, memory_bytes=1 << 40, work=work_poisoned)
+    executor = find_executor("local", settings)
+    try:
+        tasks = [
+            Task(path=tmp_path / f"{name}.mcap", log=unseen(name), basis="", options=Options(out=tmp_path))
+            for name in ("dies", "raises")
+        ]
+        first = executor.submit(tasks[0])
+        error = first.exception(timeout=60.0)
+        assert error is not None
+        second = executor.submit(tasks[1])
+        assert executor.blame(tasks[0], error).code == "worker_died"
+        assert second.result(timeout=60.0).entry.code == "unexpected_error"
+    finally:
+        executor.close()
+
+
+def unseen(name: str) -> LogSighting:
+    return LogSighting(path=name, size=0, mtime_ns=0, inode=0, seen_ns=0)

@@ -11,32 +11,25 @@ kept, and the run goes on: it ends with a table of verbs and exit codes, and wit
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
 import random
 import re
-import resource
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-import traceback
 from collections import Counter
 from dataclasses import dataclass, field
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
+from cli_worker import Answer, Worker  # noqa: E402 - the repository is put on the path first
 from fuzz_logs import mutate  # noqa: E402 - the repository is put on the path first
 
-HANG_S = 60.0
-MEMORY = 8 << 30
-CASES_A_WORKER = 400
 EXIT_CODES = {0, 1, 2, 3, 4}
 ODD_TEXTS = (
     *(
@@ -154,16 +147,6 @@ class Case:
     folder: Path
     arguments: list[str]
     damaged: str
-
-
-@dataclass(frozen=True)
-class Answer:
-    """What came of a case: exit code (None for a crash or a hang), both outputs, the traceback of a crash."""
-
-    code: int | None
-    out: str = ""
-    err: str = ""
-    crash: str = ""
 
 
 @dataclass
@@ -364,82 +347,6 @@ def judge(  # noqa: PLR0911 - one of many things may be wrong
     return f"files outside the out folder: {strange}" if strange else ""
 
 
-def work(pipe: Connection, home: str) -> None:
-    """A worker: runs cases until it is told to stop."""
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    os.environ |= {"HOME": home, "XDG_CACHE_HOME": f"{home}/.cache", "POLARS_MAX_THREADS": "1"}
-    from pipeline.cli.app import main as slip  # noqa: PLC0415 - after the environment is set
-
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        os.dup2(out.fileno(), 1)
-        os.dup2(err.fileno(), 2)
-        while (given := pipe.recv()) is not None:
-            folder, arguments = given
-            os.chdir(folder)
-            code: object = None
-            crash = ""
-            try:
-                slip(arguments)
-            except SystemExit as end:
-                code = 0 if end.code is None else end.code
-            except BaseException:  # noqa: BLE001 - that is what is looked for
-                crash = traceback.format_exc()
-            sys.stdout.flush()
-            sys.stderr.flush()
-            texts = []
-            for stream in (out, err):
-                stream.seek(0)
-                texts.append(stream.read().decode("utf-8", "replace"))
-                stream.seek(0)
-                stream.truncate()
-            pipe.send(Answer(code if isinstance(code, int) else None, *texts, crash or f"exit code {code!r}"))
-
-
-class Worker:
-    """A process that runs cases, started anew when it hangs, dies or has run many."""
-
-    def __init__(self, home: Path) -> None:
-        self._home = home
-        self._cases = 0
-        self._start()
-
-    def _start(self) -> None:
-        context = get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=work, args=(theirs, str(self._home)), daemon=True)
-        self._process.start()
-        theirs.close()
-
-    def run(self, case: Case) -> Answer:
-        """Run one case."""
-        self._cases += 1
-        if self._cases % CASES_A_WORKER == 0:
-            self.end()
-            self._start()
-        answer = Answer(None, crash=f"it hung for {HANG_S:g} s")
-        try:
-            self._pipe.send((str(case.folder), case.arguments))
-            if self._pipe.poll(HANG_S):
-                found: Answer = self._pipe.recv()
-                return found
-        except (EOFError, OSError):
-            self._process.join(10.0)
-            answer = Answer(None, crash=f"the process died with {self._process.exitcode}")
-        self.end()
-        self._start()
-        return answer
-
-    def end(self) -> None:
-        """End the process."""
-        with contextlib.suppress(OSError):
-            self._pipe.send(None)
-        self._process.join(2.0)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
-        self._pipe.close()
-
-
 def name_find(wrong: str) -> str:
     """A find by its place in the program, so that one defect counts once."""
     places = re.findall(r'File ".*?/((?:pipeline|schemas)/[^"]+)", line \d+, in (\w+)', wrong)
@@ -466,7 +373,7 @@ def run(seconds: float, seed: int, finds: Path | None, *, most: int | None = Non
             before = list_files(case.folder) | {
                 f"home/{name}": said for name, said in list_files(place / "home").items()
             }
-            answer = worker.run(case)
+            answer = worker.run(case.folder, case.arguments)
             after = list_files(case.folder) | {
                 f"home/{name}": said for name, said in list_files(place / "home").items()
             }

@@ -51,7 +51,7 @@ def test_a_chunk_that_grows_as_no_recording_does_is_refused_unseen(size: int) ->
 
 def write_bomb(path: Path, chunks: int, size: int) -> None:
     """Chunks of a few kilobytes that each inflate to much."""
-    message = struct.pack("<BQHIQQ", 5, size - 31, 1, 0, START, START) + bytes(4)
+    message = struct.pack("<BQHIQQ", 5, size - 9, 1, 0, START, START) + bytes(4)
     schema = struct.pack("<BQHI", 3, 2 + 4 + 4 + 4 + 7 + 4 + 12, 1, 4) + b"demo"
     schema += struct.pack("<I", 7) + b"ros2msg" + struct.pack("<I", 12) + b"uint8[] data"
     channel = struct.pack("<BQHHI", 4, 2 + 2 + 4 + 2 + 4 + 3 + 4, 1, 1, 2) + b"/x"

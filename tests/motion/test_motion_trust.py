@@ -221,7 +221,7 @@ def test_a_model_out_of_a_results_folder_runs_nothing_in_the_workbench_and_says_
     desk = Desk(run="run", key="k", input="command", steps=[step], at=0)
     shown = show_desk(desk, file.parse(step.model))
     assert not has_run(model)
-    assert "left out: tilt" in str(shown["said"])
+    assert "left out: tilt" in str(shown["warnings"])
     assert [card["id"] for card in shown["effects"]] == ["effective_track"]  # type: ignore[attr-defined]
 
 

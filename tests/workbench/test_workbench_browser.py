@@ -17,7 +17,7 @@ from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
 from pipeline.job.peers import find_peers
 from pipeline.logs import LogWriter
-from pipeline.motion.model_file import ModelFile
+from pipeline.motion import model_file
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 
@@ -127,7 +127,7 @@ def test_what_the_loader_of_models_warns_of_is_shown(
     chrome: Chrome, workbench: Workbench, monkeypatch: pytest.MonkeyPatch, pictures: Path
 ) -> None:
     told = f"evil.py was not run {EVIL}"
-    monkeypatch.setattr(ModelFile, "warnings", (told,), raising=False)
+    monkeypatch.setattr(model_file._Reader, "_warn", lambda _reader: (told,))
     chrome.size(LAPTOP, 900)
     chrome.open(workbench.address)
     chrome.wait(SHOWN)

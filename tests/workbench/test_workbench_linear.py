@@ -12,7 +12,6 @@ import pytest
 from pipeline.core.errors import SlipError
 from pipeline.logs import fields, idl, index, schema
 from pipeline.motion.formula.units import parse_unit
-from pipeline.report.words import build_table
 from pipeline.stages.extract import drive
 from pipeline.vehicles import complaints, topics
 from pipeline.workbench.formulas import make_formula
@@ -34,7 +33,6 @@ READERS: dict[str, tuple[str, Callable[[str], object]]] = {
     "file name": ("_", lambda text: index._split_number(Path(text))),
     "indexed field": ("[", fields._INDEXED.match),
     "unit": ("m", lambda text: parse_unit(text, "")),
-    "table head": ("<", lambda text: build_table([text, text], [], caption="")),
     "configuration": ("[", complaints._read_header),
     "complaint": ("at `$", lambda text: complaints._find(complaints._PLACE, text)),
     "topic": ("/", topics._LOCALIZED.search),

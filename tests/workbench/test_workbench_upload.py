@@ -141,10 +141,10 @@ def test_a_disk_that_fills_up_is_one_sentence_and_leaves_nothing(
 
     opened = Path.open
 
-    def open_full(path: Path, *words: str) -> object:
+    def open_full(path: Path, *words: str, **more: str) -> object:
         # Every write to this one says: no space left on device.
         chosen = (Path("/dev/full"), "wb", 0) if path.name == "log.mcap" else (path, *words)
-        return opened(*chosen)  # type: ignore[call-overload]
+        return opened(*chosen, **more)  # type: ignore[call-overload]
 
     monkeypatch.setattr(Path, "open", open_full)
     status, _, body = empty.request("POST", "/api/upload?name=x.mcap", b"x" * 100_000)

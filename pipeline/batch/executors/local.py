@@ -114,8 +114,10 @@ class LocalExecutor:
         """What the exception of a future means."""
         if not isinstance(error, TimeoutError | ProcessExpired | BrokenProcessPool):
             return Blame("no_result", f"it gave no result: {type(error).__name__}: {error}", 1)
-        worker = next(worker for worker in self._workers if worker.task == task)
-        self._end_worker(worker)
+        # One that died before it was asked what of may have been offered the next task, and be ended already.
+        worker = next(worker for worker in (*self._workers, *self._ended[::-1]) if worker.task == task)
+        if worker in self._workers:
+            self._end_worker(worker)
         if isinstance(error, TimeoutError):
             return Blame("timed_out", f"it was not done within {self._settings.timeout_s:g} s", 1)
         pid, exit_code = worker.tell_end()
@@ -211,11 +213,11 @@ class _Worker:
         """
         if not self._is_alive():
             raise RuntimeError("the process has died")
+        given = self._pool.submit(work_safely, settings.timeout_s, settings.work, task)
         self.task = task
         self.count += 1
         self._looks_dead = 0
         self._future = Future()
-        given = self._pool.submit(work_safely, settings.timeout_s, settings.work, task)
         given.add_done_callback(partial(_hand_over, self._future))
         return self._future
 

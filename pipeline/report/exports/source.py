@@ -12,6 +12,7 @@ import polars as pl
 
 from pipeline.report.exports.feed import Feed
 from pipeline.report.run import INPUTS
+from pipeline.store.manifest import name_damage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -51,7 +52,8 @@ class ExportSource:
 
         if table not in self.manifest.tables:
             return
-        with pq.ParquetFile(self.manifest.path(table), buffer_size=1 << 16, pre_buffer=False) as file:
+        path = self.manifest.path(table)
+        with name_damage(path), pq.ParquetFile(path, buffer_size=1 << 16, pre_buffer=False) as file:
             for batch in file.iter_batches(
                 BATCH_ROWS, use_threads=False, columns=list(columns) if columns else None
             ):
@@ -92,7 +94,9 @@ class ExportSource:
 
     def columns(self, table: str) -> list[str]:
         """Names of a table's columns."""
-        return pl.scan_parquet(self.manifest.path(table), glob=False).collect_schema().names()
+        path = self.manifest.path(table)
+        with name_damage(path):
+            return pl.scan_parquet(path, glob=False).collect_schema().names()
 
     @cached_property
     def inputs(self) -> list[str]:

@@ -44,7 +44,9 @@ class Track:
 
 def normalize_quaternions(quaternion: Floats, topic: str) -> tuple[Floats, Flags, list[Finding]]:
     """Scale quaternions (n, 4) to unit length; say which are none at all and which were far from it."""
-    length = np.linalg.norm(quaternion, axis=1)
+    # What is too large to be squared is infinite, and no orientation.
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = np.linalg.norm(quaternion, axis=1)
     usable = np.isfinite(length) & (length > 1e-6)  # noqa: PLR2004 - an all-zero quaternion, up to rounding
     scaled = np.where(usable[:, None], quaternion / np.where(usable, length, 1.0)[:, None], quaternion)
     off = int((usable & (np.abs(length - 1.0) > _UNIT_FORGIVEN)).sum())

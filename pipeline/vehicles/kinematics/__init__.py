@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     Inputs: TypeAlias = Mapping[str, Floats]
     Body: TypeAlias = tuple[Floats, Floats, Floats]
 
+USUAL_KIND = "differential"
+
 
 @dataclass(frozen=True)
 class Quantity:
@@ -80,8 +82,9 @@ class Kinematics(ABC):
 
 
 def list_kinds() -> tuple[str, ...]:
-    """The kinds there are a file for."""
-    return tuple(sorted(module.name for module in pkgutil.iter_modules(__path__)))
+    """The kinds there are a file for, the usual one first."""
+    found = (module.name for module in pkgutil.iter_modules(__path__))
+    return tuple(sorted(found, key=lambda kind: (kind != USUAL_KIND, kind)))
 
 
 @functools.cache
