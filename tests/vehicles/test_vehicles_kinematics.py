@@ -195,7 +195,7 @@ for more in ("", "wheelbase_m = 0.3\\n"):
         print(error)
 turns = dict(front_left=[-2.0], front_right=[2.0], rear_left=[2.0], rear_right=[-2.0])
 table = pl.DataFrame({"t": [0.0], "active": [True], **turns})
-print(hold_commands(np.array([0.1]), table, vehicle, None).velocity.round(9).tolist())
+print(hold_commands(np.array([0.1]), table, vehicle, 0.5).velocity.round(9).tolist())
 """
 
 
