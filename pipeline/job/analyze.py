@@ -218,7 +218,7 @@ def _read_summary(manifest: Manifest, options: Options) -> dict[str, JSON]:
     """The stored summary with the report's place in this results folder."""
     if SUMMARY not in manifest.files or options.through != STAGES[-1]:
         return {}
-    summary: dict[str, JSON] = json.loads(manifest.path(SUMMARY).read_text(encoding="utf-8"))
+    summary = manifest.read_json(SUMMARY)
     has_report = REPORT in manifest.files
     summary["report"] = str(manifest.path(REPORT)) if has_report else None
     return summary

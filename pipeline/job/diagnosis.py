@@ -55,7 +55,7 @@ def diagnose_work(work: Work) -> dict[str, JSON] | None:
         for table in _WRITTEN:
             if table in previous.tables:
                 generation.reuse_table(table)
-        content: dict[str, JSON] = json.loads(previous.path(DIAGNOSIS).read_text(encoding="utf-8"))
+        content = previous.read_json(DIAGNOSIS)
     elif work.options.diagnosis:
         work.progress(STAGE)
         content = _diagnose(work)

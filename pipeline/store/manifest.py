@@ -7,6 +7,7 @@ the same generation take the manifest once and read them all through it.
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping, Sequence  # noqa: TC003 - msgspec evaluates the annotations
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -124,6 +125,29 @@ class Manifest:
             StoreError: ``no_such_table``; ``file_missing`` when it was pruned or deleted meanwhile.
         """
         return read_parquet(self.path(table))
+
+    def read_json(self, name: str) -> dict[str, JSON]:
+        """A JSON object of exactly this generation.
+
+        Raises:
+            StoreError: ``no_such_table``, it names no such file; ``file_missing``; ``file_damaged``, it is
+                not what was written.
+        """
+        path = self.path(name)
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError as error:
+            raise file_missing(path) from error
+        except (OSError, ValueError, RecursionError):
+            content = None
+        if not isinstance(content, dict):
+            raise StoreError(
+                "file_damaged",
+                "the file is not what was written",
+                where=str(path),
+                hint="Analyze the log again with --force; `slip verify --repair` lists what else is damaged",
+            )
+        return content
 
     def with_earlier(self, earlier: Sequence[str]) -> Manifest:
         """The same manifest with another list of older generations."""

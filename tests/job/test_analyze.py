@@ -284,3 +284,14 @@ def test_a_log_that_was_moved_is_no_copy(log: Path, out: Path, tmp_path: Path) -
     second = analyze(after, out)
     assert (second.computed, second.twin) == ((), "")
     assert second.manifest.run == first.manifest.run
+
+
+def test_a_summary_that_was_damaged_is_one_clear_error_and_made_anew_with_force(log: Path, out: Path) -> None:
+    path = analyze(log, out).manifest.path("summary.json")
+    whole = path.read_bytes()
+    for damaged in (whole[:-9], b"[]", b"[" * 5000, b"\xff" + whole[1:]):
+        path.write_bytes(damaged)
+        with pytest.raises(SlipError, match="not what was written") as caught:
+            analyze(log, out)
+        assert caught.value.code == "file_damaged"
+    assert analyze(log, out, force=True).summary["run"]

@@ -36,7 +36,7 @@ from pipeline.report.exports import (
 from pipeline.report.exports import derived as derived_module
 from pipeline.report.motion_run import load_vehicle
 from pipeline.simulate import simulate_case
-from pipeline.store import Store
+from pipeline.store import Store, StoreError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -347,3 +347,14 @@ def test_the_examples_run(
     monkeypatch.setattr(sys, "argv", [name, *arguments])
     runpy.run_path(str(ROOT / "examples" / name))
     assert words in capsys.readouterr().out
+
+
+def test_a_table_that_is_cut_is_one_clear_error(results: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    shutil.copytree(results, folder)
+    (manifest,) = Store(folder).manifests()
+    path = manifest.path("velocities")
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(StoreError, match="cannot be read") as caught:
+        write_csv(ExportSource(manifest), tmp_path / "csv")
+    assert caught.value.code == "table_damaged"
