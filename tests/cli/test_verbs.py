@@ -234,7 +234,7 @@ def test_explain_says_where_numbers_come_from(field: Path, tmp_path: Path) -> No
         assert word in done.stdout
     details = json.loads(slip("explain", "good", "--out", tmp_path, "--json").stdout)
     assert details["vehicle"]["track_width_m"] == 0.55
-    assert details["stages"].keys() == {"extract", "velocity", "slip", "aggregate"}
+    assert details["stages"].keys() == {"extract", "align", "velocity", "slip", "aggregate"}
     wrong = slip("explain", "nobody", "--out", tmp_path)
     assert wrong.returncode == 1
     assert run["run"] in wrong.stderr
@@ -268,7 +268,7 @@ def test_a_stage_alone(field: Path, tmp_path: Path) -> None:
     assert set(json.loads(done.stdout)["rows"]) == {"commands", "wheels", "poses", "imu", "findings"}
 
     by_run = slip("stage", "slip", "good", "--out", tmp_path, "--json")
-    assert json.loads(by_run.stdout)["computed"] == ["velocity", "slip"]
+    assert json.loads(by_run.stdout)["computed"] == ["align", "velocity", "slip"]
 
 
 def test_simulate_writes_a_log_with_the_effect_asked_for(tmp_path: Path) -> None:

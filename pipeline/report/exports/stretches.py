@@ -57,7 +57,7 @@ class ModelFeed:
         self._feeds: dict[str, Sequence[Feed]] = {
             name: [source.feed(name, "t", columns)]
             for name, columns in COLUMNS.items()
-            if name in tables and name != "slip"
+            if name in tables and "t" in columns and name != "slip"
         }
         if "slip" in tables:
             self._feeds["slip"] = [source.feed("slip", "t", COLUMNS["slip"], name) for name in source.inputs]
@@ -106,6 +106,8 @@ class ModelFeed:
 
     def _load(self, low: float, high: float) -> MotionRun:
         tables = {}
+        if "alignments" in self._source.manifest.tables:
+            tables["alignments"] = self._source.manifest.read("alignments")
         for name, feeds in self._feeds.items():
             parts = [feed.take(low - _BEFORE_S, high + _AFTER_S) for feed in feeds]
             found = [part for part in parts if part is not None]
