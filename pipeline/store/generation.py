@@ -11,6 +11,7 @@ from pipeline.store.files import (
     link_or_copy,
     make_folder,
     sync_files,
+    sync_folder,
     temporary_beside,
 )
 from pipeline.store.homes import name_free_folder, point_latest
@@ -218,7 +219,9 @@ class Generation:
             self._folder.rename(manifest.folder)
             self._folder = manifest.folder
             replacement.announce()
-            sync_files([self._home, replacement.folder])
+            # One after the other: the disk takes the second name together with the first.
+            sync_folder(self._home)
+            sync_folder(replacement.folder)
             self._watch("folder_renamed")
             replacement.replace(when_written=lambda: self._watch("manifest_written"))
             self._watch("manifest_replaced")

@@ -177,7 +177,8 @@ class _Examiner:
             try:
                 data = self._files.read(name)
                 problems = self._judge_run(name, data, entry)
-                if not problems or not (self._has_newer_entry(name) or self._files.read(name) != data):
+                is_clean = not problems and len(self._unlisted) == unlisted
+                if is_clean or not (self._has_newer_entry(name) or self._files.read(name) != data):
                     return problems
             except OSError as error:
                 return [self._problem(_place_of(name), name, "disk_error", _say(error))]

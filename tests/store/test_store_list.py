@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from conftest import StartWriter
+
 RUN, OTHER = "2026/husky", "2026/warthog"
 
 
@@ -164,6 +166,18 @@ def test_the_manifest_of_before_put_back_is_noticed(store: Store) -> None:
     assert [problem.code for problem in store.verify()] == ["manifest_swapped"]
     write_generation(store, RUN, "new", 3)
     assert store.verify() == ()
+
+
+def test_results_that_are_being_written_are_not_damaged(store: Store, start_writer: StartWriter) -> None:
+    write_generation(store, RUN, "k", 1)
+    writers = [start_writer("loop", store.root, run, 2, 10) for run in (RUN, OTHER)]
+    looks = 0
+    while any(writer.poll() is None for writer in writers):
+        found = store.examine()
+        assert (found.problems, found.unlisted) == ((), ())
+        looks += 1
+    assert [writer.returncode for writer in writers] == [0, 0]
+    assert looks > 5
 
 
 def test_a_run_from_other_results_is_not_on_the_list(store: Store, tmp_path: Path) -> None:
