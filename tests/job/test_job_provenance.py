@@ -46,6 +46,7 @@ def test_a_checkout_that_is_not_installed_says_its_version(tmp_path: Path) -> No
         capture_output=True,
         text=True,
         check=True,
+        cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
     )
     assert done.stdout.strip() == "7.8.9"
