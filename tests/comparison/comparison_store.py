@@ -217,6 +217,8 @@ def _integrate(t: np.ndarray, speed: np.ndarray, turn: np.ndarray, start_ns: int
             "q_y": zero,
             "q_z": np.sin(yaw / 2.0),
             "q_w": np.cos(yaw / 2.0),
+            "latency": zero,
+            "outlier": zero > 1.0,
             "held": zero > 1.0,
             "active": zero < 1.0,
         }

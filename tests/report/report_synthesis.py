@@ -132,7 +132,8 @@ def make_tables(
     zero = np.zeros(t.size)
     velocity = {"v_x": body[:, 0], "v_y": body[:, 1], "v_w": body[:, 2]}
     pose = {"x": x, "y": y, "z": zero, "roll": zero, "pitch": zero, "yaw": yaw}
-    velocities = _frame(identity, {**grid, **pose, **velocity, "v_w_imu": body[:, 2]})
+    whole = {"v_w_imu": body[:, 2], "outlier": np.zeros(t.size, dtype=bool)}
+    velocities = _frame(identity, {**grid, **pose, **velocity, **whole})
     ideal = {"command": command} | ({"measured": wheels} if measured else {})
     slip = pl.concat([_slip(identity, grid, name, f, body) for name, f in ideal.items()])
     tables = {
