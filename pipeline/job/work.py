@@ -84,6 +84,12 @@ class Work:
         multiplier = self.alignment.track_multiplier
         return msgspec.structs.replace(self.subject.vehicle, controller_track_multiplier=multiplier)
 
+    @property
+    def _is_body_commanded(self) -> bool:
+        """Whether the command is a body command, which the controller turns into wheel speeds."""
+        source = self.subject.sources.command
+        return source is not None and source.form in {DriveForm.BODY, DriveForm.BODY_SIGNALS}
+
     def run_stages(self) -> None:
         """Run every stage up to the last one asked for, reusing what has not changed."""
         stages: Mapping[str, Callable[[], StageOutcome]] = {
@@ -200,12 +206,11 @@ class Work:
                 for name in EXTRACTED
                 if name in previous.tables
             }
-        source = self.subject.sources.command
         made = align_tables(
             {name: checked.valid for name, checked in self._extracted.items()},
             self.subject.vehicle,
             hold_s=self.subject.configuration.command.hold_s,
-            body_commanded=source is not None and source.form in {DriveForm.BODY, DriveForm.BODY_SIGNALS},
+            body_commanded=self._is_body_commanded,
             where=str(self.subject.path),
         )
         for name, checked in self._extracted.items():
@@ -251,9 +256,9 @@ class Work:
         table, left_out = self._set_against_model(made.slip)
         self.write("slip", table)
         self.write("windows", made.windows)
-        command = subject.sources.command
-        body = command is not None and command.form in {DriveForm.BODY, DriveForm.BODY_SIGNALS}
-        samples = checks.gather_samples(velocities, made.inputs, made.cut, body_commanded=body)
+        samples = checks.gather_samples(
+            velocities, made.inputs, made.cut, body_commanded=self._is_body_commanded
+        )
         return StageOutcome((*made.findings, *left_out, *checks.run_checks(samples, vehicle)))
 
     def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:

@@ -84,7 +84,7 @@ def align_tables(
         hold = timegrid.usual_hold(commands["t"].to_numpy()) if hold_s is None else hold_s
     velocities, _ = differentiate_poses(tables["poses"], _GRID, where=where)
     known = keep_known(read_inputs(velocities["t"].to_numpy(), commands, wheels, vehicle, hold))
-    grid = _Grid(velocities, known, np.zeros(velocities.height, dtype=bool), pl.DataFrame())
+    grid = _Grid(velocities, np.zeros(velocities.height, dtype=bool), pl.DataFrame())
     scale = CommandScale(1.0, vehicle.controller_track_multiplier)
     findings: list[Finding] = []
     if known:
@@ -92,7 +92,7 @@ def align_tables(
         bad, findings = find_bad_stretches(
             velocities, {name: ideal.velocity for name, ideal in known.items()}, cut.step
         )
-        grid = _Grid(velocities, known, bad, _tabulate_steps(velocities, known, cut.step, bad))
+        grid = _Grid(velocities, bad, _tabulate_steps(velocities, known, cut.step, bad))
         samples = gather_samples(velocities, known, cut, body_commanded=body_commanded)
         scale = measure_command_scale(samples, vehicle)
         independent = check_independence(samples, vehicle)
@@ -116,7 +116,6 @@ class _Grid:
 
     Attributes:
         velocities: table `velocities`.
-        inputs: ideal velocities by input.
         bad: in a stretch in which the localization reports what no vehicle does, shape (n,).
         steps: columns of table `slip` that say where steps begin and what must not be scored.
         recorded: median slip modulus with L = 1 m by input [m/s].
@@ -124,7 +123,6 @@ class _Grid:
     """
 
     velocities: pl.DataFrame
-    inputs: Mapping[str, Ideal]
     bad: Flags
     steps: pl.DataFrame
     recorded: Mapping[str, float | None] = field(default_factory=dict)
@@ -189,12 +187,10 @@ def _align_poses(
         run = make_run({**tables, "slip": grid.steps}, vehicle, alignment, name=where)
     except MotionError:
         # A log that is too poor for a model has its slip all the same.
-        columns = (pl.Series("latency", latency), pl.Series("outlier", outlier))
-        return poses.with_columns(columns), alignment
-    raw = run.track.times
+        return _correct_poses(poses, latency, outlier), alignment
     if not grid.is_localization:
-        columns = (pl.Series("latency", latency), pl.Series("outlier", outlier))
-        return poses.with_columns(columns), _with_gyro(run).alignment
+        return _correct_poses(poses, latency, outlier), _with_gyro(run).alignment
+    raw = run.track.times
     own, spread = estimate_latency(run)
     run = replace(run, track=replace(run.track, times=raw - own))
     run = _with_gyro(run)
@@ -207,7 +203,11 @@ def _align_poses(
         rows, known = poses["segment"].to_numpy() == segment, run.track.segment == segment
         latency[rows] = np.interp(times[rows], raw[known], own[known])
     alignment = replace(run.alignment, latency_spread_s=spread, outlier_s=float(at_fault.size * SAMPLE_S))
-    return poses.with_columns(pl.Series("latency", latency), pl.Series("outlier", outlier)), alignment
+    return _correct_poses(poses, latency, outlier), alignment
+
+
+def _correct_poses(poses: pl.DataFrame, latency: Floats, outlier: Flags) -> pl.DataFrame:
+    return poses.with_columns(pl.Series("latency", latency), pl.Series("outlier", outlier))
 
 
 def _with_gyro(run: MotionRun) -> MotionRun:
