@@ -219,14 +219,19 @@ def _work_through(
         return Result(reports=(), left=())
     executor = crew.call(len(todo))
     # This process only waits while the others work.
-    threading.Thread(target=load_libraries, name="libraries", daemon=True).start()
-    return run_items(
-        todo,
-        executor,
-        request=request,
-        ledger=ledger,
-        tell=lambda report, item: watch.tell(_describe_report(report), item.log.size),
-    )
+    loading = threading.Thread(target=load_libraries, name="libraries", daemon=True)
+    loading.start()
+    try:
+        return run_items(
+            todo,
+            executor,
+            request=request,
+            ledger=ledger,
+            tell=lambda report, item: watch.tell(_describe_report(report), item.log.size),
+        )
+    finally:
+        # Two threads that import the same modules in another order may each see half of them.
+        loading.join()
 
 
 def _describe_plan(plan: Plan) -> list[Line]:
