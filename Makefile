@@ -72,42 +72,42 @@ samples: $(VENV)/.ready ## make the logs in data_samples again
 
 hidden-effect: $(VENV)/.ready-dev ## SEED=7: draw logs by seed, diagnose them, open the answers [CATEGORY=all, EFFECT=, SCORES=file, ARGS=]
 	@[ -n "$$SEED" ] || { echo "Say which seed: make hidden-effect SEED=7, or SEED=7-12" >&2; exit 2; }
-	@$(BIN)/python tests/hidden/play.py --category "$${CATEGORY:-all}" --seeds "$$SEED" \
+	@$(BIN)/python benchmarks/hidden/play.py --category "$${CATEGORY:-all}" --seeds "$$SEED" \
 		$${EFFECT:+--effect "$$EFFECT"} $${SCORES:+--out "$$SCORES" --resume} $$ARGS
 
 hidden-table: $(VENV)/.ready-dev ## SCORES=scores.jsonl: the score of what was played, without playing more
 	@[ -n "$$SCORES" ] || { echo "Say which: make hidden-table SCORES=scores.jsonl" >&2; exit 2; }
-	@$(BIN)/python tests/hidden/play.py --table "$$SCORES"
+	@$(BIN)/python benchmarks/hidden/play.py --table "$$SCORES"
 
 mysteries: $(VENV)/.ready-dev ## make the mystery logs in data_samples again, and their seals
-	$(BIN)/python tests/hidden/mystery.py write data_samples
+	$(BIN)/python benchmarks/hidden/mystery.py write data_samples
 
 reveal: $(VENV)/.ready-dev ## LOG=data_samples/mystery_1.mcap: open the seal of a mystery log
 	@[ -n "$$LOG" ] || { echo "Say which log: make reveal LOG=data_samples/mystery_1.mcap" >&2; exit 2; }
-	@$(BIN)/python tests/hidden/mystery.py open "$${LOG%.mcap}.sealed"
+	@$(BIN)/python benchmarks/hidden/mystery.py open "$${LOG%.mcap}.sealed"
 
 bench: bench-reader bench-analyze bench-batch bench-export bench-workbench ## all benchmarks but that on the real recordings
 
 bench-analyze: $(VENV)/.ready-dev ## a whole analysis of a 10-minute log
-	$(BIN)/python tests/bench/analyze.py
+	$(BIN)/python benchmarks/analyze.py
 
 bench-batch: $(VENV)/.ready-dev ## batches of 10, 100 and 1,000 logs, on one and two processes [ARGS="--rounds 5"]
-	$(BIN)/python tests/bench/batch.py $$ARGS
+	$(BIN)/python benchmarks/batch.py $$ARGS
 
 damage-results: $(VENV)/.ready-dev ## every byte of small results changed, files and runs deleted and swapped: noticed or not
-	$(BIN)/python tests/bench/damage_results.py $$ARGS
+	$(BIN)/python benchmarks/damage_results.py $$ARGS
 
 bench-export: $(VENV)/.ready-dev ## exporting runs of 1, 3 and 10 hours as MCAP
-	$(BIN)/python tests/bench/export.py
+	$(BIN)/python benchmarks/export.py
 
 bench-real: $(VENV)/.ready-dev ## the right effects on the real recordings, beside METHODS' table [ARGS="--ladders"]
-	$(BIN)/python tests/bench/recordings.py $$ARGS
+	$(BIN)/python benchmarks/recordings.py $$ARGS
 
 bench-workbench: $(VENV)/.ready-dev ## answers of the workbench on a 10-minute log
-	$(BIN)/python tests/bench/workbench.py
+	$(BIN)/python benchmarks/workbench.py
 
 bench-reader: $(VENV)/.ready-dev ## reading a 1 GB log: ours, its peers, and the bound
-	$(BIN)/python tests/bench/reader.py
+	$(BIN)/python benchmarks/reader.py
 
 damage-season: $(VENV)/.ready-dev ## what becomes of each kind of odd entry in a season of logs
 	$(BIN)/python tests/batch/damage_season.py
@@ -117,7 +117,7 @@ fuzz: $(VENV)/.ready-dev ## damaged files for every part of the program, for MIN
 	for script; do echo "$$script for $$each minutes"; $(BIN)/python "$$script" --minutes "$$each" || failed=1; done; \
 	exit $$failed
 damage: $(VENV)/.ready-dev ## every byte of small logs damaged, and what the reader makes of it [ARGS="--step 7"]
-	$(BIN)/python tests/bench/damage.py $$ARGS
+	$(BIN)/python benchmarks/damage.py $$ARGS
 
 browser: ## install Debian's Chromium, for the tests that look at the report and the workbench
 	apt-get update && apt-get install --yes --no-install-recommends chromium

@@ -8,7 +8,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from pipeline.motion import Input, Model, Problem, climb, find_effect
+from pipeline.identification import Input, Problem, climb
+from pipeline.models import Model, find_effect
 from pipeline.report.motion_run import load_motion_run, load_vehicle
 from pipeline.store import Store
 

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.job import diagnosis
-from pipeline.job.keys import VERSIONS, hash_json
+from pipeline.analysis import diagnosis
+from pipeline.analysis.keys import VERSIONS, hash_json
 from pipeline.vehicles import list_configuration_files, list_presets
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.job import Options
+    from pipeline.analysis import Options
 
 
 _WITHOUT_INFLUENCE = ("out", "run", "config", "fleet", "report", "figures", "force")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.job.keys import hash_json
+from pipeline.analysis.keys import hash_json
 
 if TYPE_CHECKING:
     from pipeline.store import Mirror, Store
@@ -51,9 +51,6 @@ def load_libraries() -> None:
     """Load what pooling needs, for whoever has time to do so before."""
     import scipy.special  # noqa: F401, PLC0415 - intervals of pooled runs
 
-    import pipeline.batch.catalogue  # noqa: PLC0415
-    import pipeline.job.material  # noqa: F401, PLC0415
-
 
 def refresh_remote_pools(mirror: Mirror) -> None:
     """As `refresh_pools`, for results on an object store, with the runs that other machines have added."""
@@ -76,8 +73,8 @@ def _hash_runs(store: Store) -> str:
 
 def _write_pools(store: Store) -> None:
     # A batch with nothing to do needs none of these.
+    from pipeline.analysis.analyze import update_datasets  # noqa: PLC0415
     from pipeline.batch.catalogue import render_catalogue  # noqa: PLC0415
-    from pipeline.job.analyze import update_datasets  # noqa: PLC0415
 
     update_datasets(store)
     store.write_results_text("index.html", render_catalogue(store))

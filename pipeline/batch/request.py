@@ -15,7 +15,7 @@ from pipeline.batch.errors import BatchError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from pipeline.job import Options
+    from pipeline.analysis import Options
 
 _SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)i?b?\s*", re.IGNORECASE)
 _SHARD = re.compile(r"(\d+)/(\d+)")

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from pipeline.job import Options
-    from pipeline.job.analyze import Outcome
+    from pipeline.analysis import Options
+    from pipeline.analysis.analyze import Outcome
     from pipeline.store import LogSighting
 
 
@@ -107,7 +107,7 @@ def work_on(task: Task) -> Report:
 
 def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bool]:
     # Workers that find nothing to do need no table library.
-    from pipeline.job.analyze import REPORT, analyze_log  # noqa: PLC0415
+    from pipeline.analysis.analyze import REPORT, analyze_log  # noqa: PLC0415
 
     if mirror is not None:
         mirror.pull_run(entry.run)
@@ -133,7 +133,7 @@ def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bo
 
 
 def _describe_losses(outcome: Outcome) -> str:
-    from pipeline.job.work import stored_contexts  # noqa: PLC0415 - heavy
+    from pipeline.analysis.work import stored_contexts  # noqa: PLC0415 - heavy
 
     losses = stored_contexts(outcome.manifest).get("extract", {}).get("losses")
     texts = (

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline.job.options import INPUTS, FigureFormat, Options
+from pipeline.analysis.options import INPUTS, FigureFormat, Options
 
 
 @dataclass(frozen=True, kw_only=True)

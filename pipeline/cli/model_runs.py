@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.job.geometry import Owner
-    from pipeline.motion.recording import MotionRun
+    from pipeline.analysis.geometry import Owner
+    from pipeline.runs.recording import MotionRun
     from pipeline.vehicles import Vehicle
 
 
@@ -31,10 +31,10 @@ def gather_runs(
     Raises:
         SlipError: a log cannot be read, there is no such run, or its vehicle contradicts the model's.
     """
+    from pipeline.analysis.geometry import agree_on_vehicle  # noqa: PLC0415 - heavy
+    from pipeline.analysis.options import Options  # noqa: PLC0415
+    from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
     from pipeline.cli.output import say, show_progress  # noqa: PLC0415
-    from pipeline.job.geometry import agree_on_vehicle  # noqa: PLC0415 - heavy
-    from pipeline.job.options import Options  # noqa: PLC0415
-    from pipeline.job.stored import open_run  # noqa: PLC0415 - heavy
     from pipeline.report.motion_run import load_motion_run, load_vehicle  # noqa: PLC0415 - heavy
 
     options = Options(out=out, report=False, diagnosis=True)

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from pipeline.cli.output import CLEAN, print_json, print_lines, say
 
 if TYPE_CHECKING:
-    from pipeline.motion.model_file import ModelFile
+    from pipeline.models.model_file import ModelFile
 
 TrustCode = Annotated[
     bool,
@@ -28,8 +28,8 @@ def trust_named(path: Path | None, *, wanted: bool) -> None:
     """
     if path is None or not wanted:
         return
-    from pipeline.motion.model_file import list_code  # noqa: PLC0415 - heavy
-    from pipeline.motion.trust import trust as trust_hashes  # noqa: PLC0415
+    from pipeline.models.model_file import list_code  # noqa: PLC0415 - heavy
+    from pipeline.models.trust import trust as trust_hashes  # noqa: PLC0415
 
     trust_hashes(list_code(path))
 
@@ -40,7 +40,7 @@ def open_model(path: Path, *, trust_code: bool) -> ModelFile:
     Raises:
         MotionError: the file is wrong.
     """
-    from pipeline.motion.model_file import read_model  # noqa: PLC0415 - heavy
+    from pipeline.models.model_file import read_model  # noqa: PLC0415 - heavy
 
     trust_named(path, wanted=trust_code)
     file = read_model(path)
@@ -58,8 +58,8 @@ def trust(files: Annotated[list[Path], Parameter(negative=())], /, *, json: bool
         files: model files, or Python files.
         json: print one JSON object.
     """
-    from pipeline.motion.model_file import list_code  # noqa: PLC0415 - heavy
-    from pipeline.motion.trust import trust as trust_hashes  # noqa: PLC0415
+    from pipeline.models.model_file import list_code  # noqa: PLC0415 - heavy
+    from pipeline.models.trust import trust as trust_hashes  # noqa: PLC0415
 
     found = {code: name for path in files for code, name in list_code(path).items()}
     trust_hashes(found)
@@ -73,8 +73,8 @@ def untrust(codes: Annotated[list[str], Parameter(negative=())], /, *, json: boo
         codes: model files, Python files, or hashes (or how they begin) as `slip model trusted` lists them.
         json: print one JSON object.
     """
-    from pipeline.motion.model_file import list_code  # noqa: PLC0415 - heavy
-    from pipeline.motion.trust import distrust, list_trusted  # noqa: PLC0415
+    from pipeline.models.model_file import list_code  # noqa: PLC0415 - heavy
+    from pipeline.models.trust import distrust, list_trusted  # noqa: PLC0415
 
     gone: dict[str, str] = {}
     known = list_trusted()
@@ -95,7 +95,7 @@ def trusted(*, json: bool = False) -> int:
     Args:
         json: print one JSON object.
     """
-    from pipeline.motion.trust import list_trusted  # noqa: PLC0415 - heavy
+    from pipeline.models.trust import list_trusted  # noqa: PLC0415 - heavy
 
     return _print(list_trusted(), "no Python is trusted", json=json)
 

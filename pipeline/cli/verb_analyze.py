@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
+from pipeline.analysis.options import FigureFormat, Options
 from pipeline.cli.choices import Choices, build_options
 from pipeline.cli.memory_limit import limited_memory
 from pipeline.cli.model_trust import TrustCode, trust_named
 from pipeline.cli.output import describe_error, exit_code, print_error, print_json, print_lines, show_progress
 from pipeline.core.errors import SlipError
-from pipeline.job.options import FigureFormat, Options
 
 if TYPE_CHECKING:
-    from pipeline.job.analyze import Outcome
+    from pipeline.analysis.analyze import Outcome
 
 
 def register(app: App) -> None:
@@ -96,7 +96,7 @@ def _analyze_all(
     """Analyze one log after the other into outcomes and errors; an error costs one log."""
     if options.report:
         _warm_report()
-    from pipeline.job.analyze import analyze_log, update_datasets  # noqa: PLC0415 - heavy
+    from pipeline.analysis.analyze import analyze_log, update_datasets  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     for log in logs:

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
+from pipeline.analysis.options import FigureFormat
 from pipeline.cli.output import CLEAN, print_json, print_lines
-from pipeline.job.options import FigureFormat
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.job.compare import Answer
+    from pipeline.analysis.compare import Answer
 
 _NAME = 34
 
@@ -56,8 +56,8 @@ def compare(  # noqa: D417 - arguments document themselves
         json: print one JSON object in place of the tables.
         quiet: print nothing.
     """
-    from pipeline.job.compare import Question, compare_results  # noqa: PLC0415 - heavy
-    from pipeline.job.compare_files import describe_answer, write_answer  # noqa: PLC0415 - heavy
+    from pipeline.analysis.compare import Question, compare_results  # noqa: PLC0415 - heavy
+    from pipeline.analysis.compare_files import describe_answer, write_answer  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     store = Store(out or results)

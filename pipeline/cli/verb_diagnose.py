@@ -22,10 +22,10 @@ from pipeline.cli.output import (
 from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
+    from pipeline.analysis.geometry import Owner
+    from pipeline.analysis.options import Options
     from pipeline.diagnosis import Diagnosis, Recording
-    from pipeline.job.geometry import Owner
-    from pipeline.job.options import Options
-    from pipeline.motion import ModelFile
+    from pipeline.models import ModelFile
     from pipeline.vehicles import Vehicle
 
 
@@ -99,8 +99,8 @@ def _gather(
     logs: list[str], options: Options, at_work: list[str], *, quiet: bool
 ) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], bool]:
     """Recordings by vehicle; an error costs one log. ``at_work`` is told which log it is."""
-    from pipeline.job.diagnosis import read_recording  # noqa: PLC0415 - heavy
-    from pipeline.job.stored import open_run  # noqa: PLC0415 - heavy
+    from pipeline.analysis.diagnosis import read_recording  # noqa: PLC0415 - heavy
+    from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
 
     gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
     errors: list[dict[str, str]] = []
@@ -125,7 +125,7 @@ def _gather(
 
 
 def _agree(known: ModelFile, vehicle: Vehicle, recordings: list[Recording], owner: Owner | None) -> Vehicle:
-    from pipeline.job.geometry import agree_on_vehicle  # noqa: PLC0415 - heavy
+    from pipeline.analysis.geometry import agree_on_vehicle  # noqa: PLC0415 - heavy
 
     return agree_on_vehicle(known.model.vehicle, {one.name: vehicle for one in recordings}, owner)
 
@@ -152,7 +152,7 @@ def _judge(
 
 
 def _apply(proposals: list[ModelFile | None], path: Path, *, quiet: bool) -> None:
-    from pipeline.motion import write_model  # noqa: PLC0415 - heavy
+    from pipeline.models import write_model  # noqa: PLC0415 - heavy
 
     proposal = next((found for found in proposals if found is not None), None)
     if proposal is None:

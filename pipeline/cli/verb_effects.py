@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 from pipeline.cli.output import CLEAN, print_json
 
 if TYPE_CHECKING:
-    from pipeline.motion.effect import Effect
+    from pipeline.models.effect import Effect
 
 
 def register(app: App) -> None:
@@ -31,8 +31,8 @@ def effects(  # noqa: D417 - the arguments document themselves
         json: print one JSON object.
         quiet: print nothing but errors.
     """
-    from pipeline.motion.catalogue import find_effect, list_effects  # noqa: PLC0415 - heavy
-    from pipeline.motion.describe import describe_effect, list_pages  # noqa: PLC0415 - heavy
+    from pipeline.identification.describe import describe_effect, list_pages  # noqa: PLC0415 - heavy
+    from pipeline.models.catalogue import find_effect, list_effects  # noqa: PLC0415 - heavy
 
     chosen = list_effects() if effect is None else (find_effect(effect),)
     if json:
@@ -44,7 +44,7 @@ def effects(  # noqa: D417 - the arguments document themselves
 
 
 def _as_json(effect: type[Effect]) -> dict[str, object]:
-    from pipeline.motion.describe import describe_effect  # noqa: PLC0415 - heavy
+    from pipeline.identification.describe import describe_effect  # noqa: PLC0415 - heavy
 
     return {
         "id": effect.id,

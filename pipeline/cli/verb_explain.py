@@ -35,7 +35,7 @@ def explain(  # noqa: D417 - arguments document themselves
         out: results folder.
         json: print one JSON object.
     """
-    from pipeline.job.lookup import find_run  # noqa: PLC0415 - heavy
+    from pipeline.analysis.lookup import find_run  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     manifest = find_run(run, Store(out))

@@ -13,7 +13,7 @@ from pipeline.cli.output import CLEAN, print_json, print_lines
 from pipeline.core.paths import resolve_inside
 
 if TYPE_CHECKING:
-    from pipeline.motion import Model
+    from pipeline.models import Model
     from pipeline.store import Manifest
 
 _SUFFIXES = {
@@ -57,7 +57,7 @@ def export(
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.lookup import find_run  # noqa: PLC0415 - heavy
+    from pipeline.analysis.lookup import find_run  # noqa: PLC0415 - heavy
     from pipeline.report import exports  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
@@ -85,7 +85,7 @@ def export(
 
 def _find_named(manifest: Manifest) -> tuple[Model | None, str | None]:
     """The model that the run's diagnosis named, and what it is fed with; None where there is none."""
-    from pipeline.job.diagnosis import DIAGNOSIS  # noqa: PLC0415 - heavy
+    from pipeline.analysis.diagnosis import DIAGNOSIS  # noqa: PLC0415 - heavy
     from pipeline.report.diagnosed import name_model  # noqa: PLC0415 - heavy
     from pipeline.report.motion_run import load_vehicle  # noqa: PLC0415 - heavy
 

@@ -14,7 +14,7 @@ from pipeline.cli.screen import format_duration
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.job.inspection import Inspection, TopicHealth
+    from pipeline.analysis.inspection import Inspection, TopicHealth
 
 _ROLES = ("command", "wheels", "pose", "imu", "interval")
 
@@ -32,7 +32,7 @@ def inspect(
     json: bool = False,
 ) -> int:
     """Show topics, rates, gaps, clocks and damage of a log, and which topics would serve, and why."""
-    from pipeline.job.inspection import inspect_log  # noqa: PLC0415 - heavy
+    from pipeline.analysis.inspection import inspect_log  # noqa: PLC0415 - heavy
 
     options = build_options(choices)
     seen = inspect_log(log, config=options.config, overrides=options.overrides)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
+from pipeline.analysis.options import FigureFormat
 from pipeline.cli.output import CLEAN, print_json, print_lines
-from pipeline.job.options import FigureFormat
 
 if TYPE_CHECKING:
     import polars as pl
@@ -46,7 +46,7 @@ def draw(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.map import draw_up_map, write_map  # noqa: PLC0415 - heavy
+    from pipeline.analysis.map import draw_up_map, write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     store = Store(out or results)
@@ -87,7 +87,7 @@ def add(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.comparison.deployments import add_deployment, write_deployments  # noqa: PLC0415 - heavy
+    from pipeline.fleet.deployments import add_deployment, write_deployments  # noqa: PLC0415 - heavy
 
     table = add_deployment(to, entry)
     write_deployments(table, to)
@@ -110,7 +110,7 @@ def merge(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.comparison.deployments import merge_deployments, write_deployments  # noqa: PLC0415 - heavy
+    from pipeline.fleet.deployments import merge_deployments, write_deployments  # noqa: PLC0415 - heavy
 
     table = merge_deployments(first, second)
     write_deployments(table, to)

@@ -15,12 +15,12 @@ from pipeline.cli.output import CLEAN, print_json, print_lines, say
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.motion.inputs import InputChoice
-    from pipeline.motion.model_file import ModelFile
-    from pipeline.motion.recording import MotionRun
-    from pipeline.motion.score import Errors
-    from pipeline.motion.transfer import Transfer
-    from pipeline.motion.workshop import Judgement
+    from pipeline.identification.inputs import InputChoice
+    from pipeline.identification.judgement import Judgement
+    from pipeline.identification.scoring import Errors
+    from pipeline.identification.transfer import Transfer
+    from pipeline.models.model_file import ModelFile
+    from pipeline.runs.recording import MotionRun
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,11 +71,11 @@ def new(
         force: replace a file that is there.
         quiet: print nothing.
     """
-    from pipeline.motion.catalogue import find_effect  # noqa: PLC0415 - heavy
-    from pipeline.motion.errors import MotionError  # noqa: PLC0415
-    from pipeline.motion.model import Model  # noqa: PLC0415
-    from pipeline.motion.model_file import ModelFile  # noqa: PLC0415
-    from pipeline.motion.model_text import write_model  # noqa: PLC0415
+    from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
+    from pipeline.models.model import Model  # noqa: PLC0415
+    from pipeline.models.model_file import ModelFile  # noqa: PLC0415
+    from pipeline.models.model_text import write_model  # noqa: PLC0415
+    from pipeline.runs.errors import MotionError  # noqa: PLC0415
     from pipeline.vehicles import resolve_vehicle  # noqa: PLC0415
     from pipeline.vehicles.configuration import VehicleSection  # noqa: PLC0415
 
@@ -99,9 +99,9 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
         trust_code: trust the Python that the model file names, now and later.
         json: print one JSON object.
     """
-    from pipeline.motion.describe import describe_parameters, parameters_as_json  # noqa: PLC0415 - heavy
-    from pipeline.motion.export import export_json  # noqa: PLC0415
-    from pipeline.motion.intervals import NOTHING  # noqa: PLC0415
+    from pipeline.identification.describe import describe_parameters, parameters_as_json  # noqa: PLC0415 - heavy
+    from pipeline.identification.intervals import NOTHING  # noqa: PLC0415
+    from pipeline.models.export import export_json  # noqa: PLC0415
 
     file = open_model(model, trust_code=trust_code)
     if json:
@@ -127,7 +127,7 @@ def add(  # noqa: D417 - the shared options document themselves
         model: the model file.
         effects: ids of effects, as `slip effects` lists them.
     """
-    from pipeline.motion.catalogue import find_effect  # noqa: PLC0415 - heavy
+    from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
 
     file = open_model(model, trust_code=spoken.trust_code)
     changed = file.model
@@ -184,8 +184,8 @@ def compare(  # noqa: D417 - the shared options document themselves
         model: a model file.
         other: another one.
     """
-    from pipeline.motion.inputs import choose_input  # noqa: PLC0415 - heavy
-    from pipeline.motion.transfer import carry_over  # noqa: PLC0415
+    from pipeline.identification.inputs import choose_input  # noqa: PLC0415 - heavy
+    from pipeline.identification.transfer import carry_over  # noqa: PLC0415
 
     opened = [open_model(path, trust_code=spoken.trust_code) for path in (model, other)]
     left_out = [text for file in opened for text in file.warnings]
@@ -228,7 +228,7 @@ def export(  # noqa: D417 - the options document themselves
         model: the model file.
         to: controller and nav2 parameters, JSON, or a Python function without dependencies.
     """
-    from pipeline.motion import export as exports  # noqa: PLC0415 - heavy
+    from pipeline.models import export as exports  # noqa: PLC0415 - heavy
 
     write = {
         "ros2_control": exports.export_ros2_control,
@@ -247,11 +247,11 @@ def _change(
     path: Path, before: ModelFile, after: ModelFile, spoken: On, *, predict: Sequence[str] = ()
 ) -> int:
     """Judge a model before and after a change, fit it, write its file, and print."""
-    from pipeline.motion.inputs import choose_input  # noqa: PLC0415 - heavy
-    from pipeline.motion.model_text import format_model, write_model  # noqa: PLC0415
-    from pipeline.motion.problem import Problem  # noqa: PLC0415
-    from pipeline.motion.transfer import carry_over  # noqa: PLC0415
-    from pipeline.motion.workshop import judge_model, note_fit  # noqa: PLC0415
+    from pipeline.identification.inputs import choose_input  # noqa: PLC0415 - heavy
+    from pipeline.identification.judgement import judge_model, note_fit  # noqa: PLC0415
+    from pipeline.identification.problem import Problem  # noqa: PLC0415
+    from pipeline.identification.transfer import carry_over  # noqa: PLC0415
+    from pipeline.models.model_text import format_model, write_model  # noqa: PLC0415
 
     # What was left out would be lost from the file: that is said before a long fit, not after it.
     format_model(after)
@@ -307,14 +307,14 @@ def _as_json(
     carried: Sequence[Transfer],
     warnings: Sequence[str],
 ) -> Mapping[str, object]:
-    from pipeline.motion.describe import (  # noqa: PLC0415 - heavy
+    from pipeline.identification.describe import (  # noqa: PLC0415 - heavy
         correlations_as_json,
         errors_as_json,
         ladder_as_json,
         parameters_as_json,
         step_as_json,
     )
-    from pipeline.motion.score import measure_by_terrain  # noqa: PLC0415
+    from pipeline.identification.scoring import measure_by_terrain  # noqa: PLC0415
 
     problem, fitted = new_one.problem, new_one.fitted
     floor = _choose_floor(old, new_one)
@@ -355,7 +355,7 @@ def _as_json(
 
 
 def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
-    from pipeline.motion.describe import errors_as_json  # noqa: PLC0415 - heavy
+    from pipeline.identification.describe import errors_as_json  # noqa: PLC0415 - heavy
 
     return {
         "model": name,
@@ -370,7 +370,7 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
 
 
 def _describe(old: Judgement, new_one: Judgement, chosen: InputChoice) -> list[str]:
-    from pipeline.motion.describe import (  # noqa: PLC0415 - heavy
+    from pipeline.identification.describe import (  # noqa: PLC0415 - heavy
         describe_ladder,
         describe_parameters,
         describe_recordings,
@@ -399,7 +399,7 @@ def _choose_floor(old: Judgement, new_one: Judgement) -> Errors:
 
 
 def _describe_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
-    from pipeline.motion.describe import describe_errors  # noqa: PLC0415 - heavy
+    from pipeline.identification.describe import describe_errors  # noqa: PLC0415 - heavy
 
     lines = [describe_errors("held-out error of", None)]
     for name, item in rows:

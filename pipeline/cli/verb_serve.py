@@ -49,8 +49,8 @@ def serve(  # noqa: D417 - the hidden spelling of the folder documents itself
         quiet: print nothing.
     """
     from pipeline.batch import measure_memory, parse_size  # noqa: PLC0415 - heavy
-    from pipeline.workbench import Limits, is_loopback  # noqa: PLC0415 - heavy
-    from pipeline.workbench import serve as serve_workbench  # noqa: PLC0415 - heavy
+    from pipeline.web import Limits, is_loopback  # noqa: PLC0415 - heavy
+    from pipeline.web import serve as serve_workbench  # noqa: PLC0415 - heavy
 
     def tell(address: str, token: str) -> None:
         whole = f"{address}?token={token}"

@@ -34,8 +34,8 @@ def stage(  # noqa: D417 - the shared choices document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.analyze import analyze_log  # noqa: PLC0415 - heavy
-    from pipeline.job.lookup import find_log  # noqa: PLC0415 - heavy
+    from pipeline.analysis.analyze import analyze_log  # noqa: PLC0415 - heavy
+    from pipeline.analysis.lookup import find_log  # noqa: PLC0415 - heavy
 
     options = build_options(choices, force=force, through=name)
     path = find_log(log, options.out)

@@ -12,7 +12,7 @@ from pipeline.cli.output import CLEAN, print_json, print_lines
 from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
-    from pipeline.job.trend import Trend
+    from pipeline.analysis.trend import Trend
 
 ALERT = 4
 
@@ -48,7 +48,7 @@ def trend(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.trend import describe_trend, follow_trend, write_trend  # noqa: PLC0415 - heavy
+    from pipeline.analysis.trend import describe_trend, follow_trend, write_trend  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     store = Store(out or results)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.problem import Problem
     from pipeline.diagnosis.screen import Candidate, Proposal, Trial
     from pipeline.diagnosis.state import State
-    from pipeline.motion.evidence import Evidence, Largest
+    from pipeline.models.evidence import Evidence, Largest
 
 Floats = NDArray[np.float64]
 

@@ -18,12 +18,14 @@ from pipeline.diagnosis.plausibility import find_implausible
 from pipeline.diagnosis.rating import rate_effects
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.where import map_errors, pick_regions
-from pipeline.motion import Input, ModelFile, MotionError, find_effect
-from pipeline.motion.describe import errors_as_json, ladder_as_json
-from pipeline.motion.effect import Late, find_late
-from pipeline.motion.ladder import compare_losses
-from pipeline.motion.windows import WINDOW_S
-from pipeline.motion.workshop import note_fit
+from pipeline.identification import Input
+from pipeline.identification.describe import errors_as_json, ladder_as_json
+from pipeline.identification.judgement import note_fit
+from pipeline.identification.ladder import compare_losses
+from pipeline.models import ModelFile, find_effect
+from pipeline.models.effect import Late, find_late
+from pipeline.runs import MotionError
+from pipeline.runs.windows import WINDOW_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -34,8 +36,8 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.naming_rules import Clocks
     from pipeline.diagnosis.problem import Problem
     from pipeline.diagnosis.subject import Recording
-    from pipeline.motion import Effect, Timing
-    from pipeline.motion.workshop import Judgement
+    from pipeline.identification.judgement import Judgement
+    from pipeline.models import Effect, Timing
 
 _DRAWS = 400
 _WORTH = 0.01

@@ -23,7 +23,7 @@ from pipeline.diagnosis.unexplained import (
     find_places,
     search_formula,
 )
-from pipeline.motion import Input, choose_input
+from pipeline.identification import Input, choose_input
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.ground import Ground
     from pipeline.diagnosis.subject import Recording
     from pipeline.diagnosis.undecided import Undecided
-    from pipeline.motion import Effect, InputChoice, Model
+    from pipeline.identification import InputChoice
+    from pipeline.models import Effect, Model
     from pipeline.vehicles import Vehicle
 
 

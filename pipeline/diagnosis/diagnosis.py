@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 from pipeline.diagnosis.where import tabulate_regions
-from pipeline.motion import find_effect
-from pipeline.motion.intervals import stands_at_bound
+from pipeline.identification.intervals import stands_at_bound
+from pipeline.models import find_effect
 
 if TYPE_CHECKING:
     import polars as pl
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.excitation import Unobservable
     from pipeline.diagnosis.undecided import Undecided
     from pipeline.diagnosis.where import Region
-    from pipeline.motion import ModelFile
+    from pipeline.models import ModelFile
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 

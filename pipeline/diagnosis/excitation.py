@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from pipeline.diagnosis.judge import LEAST_STRETCHES, SHORT_S
 from pipeline.diagnosis.problem import number_units
-from pipeline.motion.effect import Excitation
+from pipeline.models.effect import Excitation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.diagnosis.arena import Arena, Contender
     from pipeline.diagnosis.screen import Candidate
-    from pipeline.motion.effect import Effect
+    from pipeline.models.effect import Effect
 
 Floats = NDArray[np.float64]
 _STANDARD_ERRORS = 4.0

@@ -10,18 +10,18 @@ import numpy as np
 from pipeline.diagnosis.errors import DiagnosisError
 from pipeline.diagnosis.problem import BodyProblem, WheelProblem
 from pipeline.diagnosis.timing import YawDelay
-from pipeline.motion.catalogue import list_effects
-from pipeline.motion.comparison import Comparison, Input
-from pipeline.motion.effect import Place
-from pipeline.motion.evidence import LEAST_DELAY_S, Evidence, Largest
-from pipeline.motion.forward import Timing
-from pipeline.motion.signals import name_inputs
+from pipeline.identification.comparison import Comparison, Input
+from pipeline.models.catalogue import list_effects
+from pipeline.models.effect import Place
+from pipeline.models.evidence import LEAST_DELAY_S, Evidence, Largest
+from pipeline.models.forward import Timing
+from pipeline.runs.signals import name_inputs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.diagnosis.screen import Candidate
-    from pipeline.motion.recording import MotionRun
+    from pipeline.runs.recording import MotionRun
     from pipeline.vehicles import Vehicle
 
 # Cell means of held commands are exact: finer cells change residuals in the sixth digit.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.diagnosis.polish import solve_step
 from pipeline.diagnosis.problem import number_units
-from pipeline.motion.effect import Search
+from pipeline.models.effect import Search
 
 if TYPE_CHECKING:
     from pipeline.diagnosis.metric import Metric

@@ -13,14 +13,14 @@ from pipeline.diagnosis.diagnosis import Unexplained
 from pipeline.diagnosis.library import join_formula
 from pipeline.diagnosis.unexplained import collect_terms, describe_windows, is_explainable
 from pipeline.diagnosis.where import CHANNELS
-from pipeline.motion.persistence import split_residuals
+from pipeline.identification.persistence import split_residuals
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis.diagnose import Explored
     from pipeline.diagnosis.diagnosis import Json, Named
-    from pipeline.motion.persistence import Makeup
+    from pipeline.identification.persistence import Makeup
 
 Floats = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.diagnosis.screen import TERM
-from pipeline.motion.effect import ANY, Parameter, Search
-from pipeline.motion.formula.formula_effect import FormulaEffect
+from pipeline.models.effect import ANY, Parameter, Search
+from pipeline.models.formula.formula_effect import FormulaEffect
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

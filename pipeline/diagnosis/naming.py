@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Literal
 from pipeline.diagnosis.arena import open_arena
 from pipeline.diagnosis.search import search_effects
 from pipeline.diagnosis.state import State
-from pipeline.motion.comparison import Input
-from pipeline.motion.effect import Place
+from pipeline.identification.comparison import Input
+from pipeline.models.effect import Place
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.diagnosis.arena import Arena, Contender
     from pipeline.diagnosis.ground import Ground
-    from pipeline.motion.effect import Effect
+    from pipeline.models.effect import Effect
 
 _LEAST_SHARE = 0.01
 

@@ -9,16 +9,16 @@ import numpy as np
 
 from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.diagnosis.undecided import Undecided
-from pipeline.motion.catalogue import find_late_effect, list_effects
-from pipeline.motion.effect import Late, find_late
-from pipeline.motion.evidence import LEAST_DELAY_S
+from pipeline.models.catalogue import find_late_effect, list_effects
+from pipeline.models.effect import Late, find_late
+from pipeline.models.evidence import LEAST_DELAY_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis.ground import Ground
     from pipeline.diagnosis.naming import Search
-    from pipeline.motion.effect import Effect
+    from pipeline.models.effect import Effect
 
 _SKEWED_CLOCK = 0.03
 _HELD_SHARE = 0.2

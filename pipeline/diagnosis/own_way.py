@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.diagnosis.diagnosis import Value
-from pipeline.motion.effect import Search
+from pipeline.models.effect import Search
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis.naming import Search as Found
     from pipeline.diagnosis.timing import YawDelay
-    from pipeline.motion import Effect, Estimates
+    from pipeline.identification import Estimates
+    from pipeline.models import Effect
 
 _SURE = 1.96
 

@@ -6,8 +6,8 @@ import math
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pipeline.motion.effect import Effect, Parameter
-    from pipeline.motion.evidence import Evidence
+    from pipeline.models.effect import Effect, Parameter
+    from pipeline.models.evidence import Evidence
 
 _AT_BOUND = 1e-3
 

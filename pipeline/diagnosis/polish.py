@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.diagnosis.problem import differentiate
-from pipeline.motion.effect import Search
+from pipeline.models.effect import Search
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.motion.forward import Timing
+from pipeline.models.forward import Timing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.diagnosis.state import DelayName, Slot, State
-    from pipeline.motion.comparison import Comparison
-    from pipeline.motion.signals import Velocity
+    from pipeline.identification.comparison import Comparison
+    from pipeline.runs.signals import Velocity
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -5,16 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.motion import HeadingSource, Input, Model, Problem, Timing
-from pipeline.motion.effect import Late, find_late
-from pipeline.motion.workshop import judge_model
+from pipeline.identification import Input, Problem
+from pipeline.identification.judgement import judge_model
+from pipeline.models import Model, Timing
+from pipeline.models.effect import Late, find_late
+from pipeline.runs import HeadingSource
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.diagnosis.ground import Ground
-    from pipeline.motion.effect import Effect
-    from pipeline.motion.workshop import Judgement
+    from pipeline.identification.judgement import Judgement
+    from pipeline.models.effect import Effect
 
 _RATE_HZ = 50.0
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.motion.effect import Effect, Parameter, Search
+from pipeline.models.effect import Effect, Parameter, Search
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.polish import Fitted
     from pipeline.diagnosis.problem import Problem
     from pipeline.diagnosis.state import State
-    from pipeline.motion.evidence import Largest
+    from pipeline.models.evidence import Largest
 
 Floats = NDArray[np.float64]
 EffectClass = type[Effect]

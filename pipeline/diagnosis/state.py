@@ -6,13 +6,13 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
-from pipeline.motion.effect import Search
+from pipeline.models.effect import Search
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from pipeline.motion.effect import Effect
-    from pipeline.motion.forward import Timing
+    from pipeline.models.effect import Effect
+    from pipeline.models.forward import Timing
 
 _DELAY_STEP = 5e-3
 _LARGEST_DELAY = 0.6

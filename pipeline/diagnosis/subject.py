@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from pipeline.motion import load_run
+from pipeline.runs import load_run
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     import polars as pl
 
-    from pipeline.motion import MotionRun
+    from pipeline.runs import MotionRun
     from pipeline.vehicles import Vehicle
 
 # Where one of these stands, a fit means nothing: no effect is named.

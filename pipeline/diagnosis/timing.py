@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.motion.evidence import LEAST_DELAY_S
+from pipeline.models.evidence import LEAST_DELAY_S
 
 _SURE = 4.0
 

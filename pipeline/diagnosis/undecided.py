@@ -11,7 +11,7 @@ from pipeline.diagnosis.excitation import suggest_manoeuvre
 
 if TYPE_CHECKING:
     from pipeline.diagnosis.arena import Arena, Contender
-    from pipeline.motion.effect import Effect
+    from pipeline.models.effect import Effect
 
 _LOOKED_AT = 6
 _AS_GOOD = 0.01

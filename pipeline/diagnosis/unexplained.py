@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.diagnosis.arena import Arena, Contender
-    from pipeline.motion.comparison import Comparison
-    from pipeline.motion.formula.formula_effect import FormulaEffect
+    from pipeline.identification.comparison import Comparison
+    from pipeline.models.formula.formula_effect import FormulaEffect
 
 Floats = NDArray[np.float64]
 
@@ -173,7 +173,7 @@ def describe_windows(comparisons: Sequence[Comparison]) -> tuple[Floats, tuple[s
 
 
 def _describe(comparison: Comparison) -> tuple[Floats, tuple[str, ...]]:
-    from pipeline.motion.forward import Timing  # noqa: PLC0415 - only here
+    from pipeline.models.forward import Timing  # noqa: PLC0415 - only here
 
     around, cells = comparison.surroundings, comparison.cells
     velocity = comparison.predict_velocity((), Timing())

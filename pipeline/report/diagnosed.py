@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.motion import Model, MotionError, Problem, choose_input, find_effect, fit_model, load_run
+from pipeline.identification import Problem, choose_input, fit_model
+from pipeline.models import Model, find_effect
 from pipeline.report.motion_view import MotionStage, MotionView
 from pipeline.report.run import mapping_in, number_in, objects_in
+from pipeline.runs import MotionError, load_run
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     import polars as pl
 
-    from pipeline.motion import Effect
+    from pipeline.models import Effect
     from pipeline.vehicles import Vehicle
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-    from pipeline.motion import MotionRun
+    from pipeline.runs import MotionRun
     from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
 
@@ -59,7 +59,7 @@ def make_motion_run(manifest: Manifest, vehicle: Vehicle, tables: Mapping[str, p
         MotionError: ``no_poses``.
         ReportError: ``no_poses``, there is no table of poses.
     """
-    from pipeline.motion import load_run  # noqa: PLC0415 - heavy
+    from pipeline.runs import load_run  # noqa: PLC0415 - heavy
 
     if "poses" not in tables:
         raise ReportError(

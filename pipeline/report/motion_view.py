@@ -14,13 +14,14 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.motion import Timing, fit_model, predict_from
+from pipeline.identification import fit_model, predict_from
+from pipeline.models import Timing
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.motion import Fitted, Problem, State
-    from pipeline.motion.comparison import Reach
+    from pipeline.identification import Fitted, Problem, State
+    from pipeline.identification.comparison import Reach
 
 Floats = NDArray[np.float64]
 
@@ -85,7 +86,7 @@ class MotionStage:
     @cached_property
     def ideal(self) -> Fitted:
         """The ideal model with the recording's delays."""
-        from pipeline.motion import Model  # noqa: PLC0415 - only here
+        from pipeline.models import Model  # noqa: PLC0415 - only here
 
         return fit_model(self.problem, Model(self.problem.vehicle))
 

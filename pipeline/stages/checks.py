@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.motion.catalogue import find_late_effect
-from pipeline.motion.effect import Late
+from pipeline.models.catalogue import find_late_effect
+from pipeline.models.effect import Late
 from pipeline.stages.delays import estimate_delay
 from pipeline.stages.finding import Finding
 from pipeline.stages.samples import Samples, gather_samples

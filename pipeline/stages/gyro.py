@@ -13,7 +13,7 @@ from pipeline.stages.finding import Finding
 if TYPE_CHECKING:
     import polars as pl
 
-    from pipeline.motion.recording import GyroFit
+    from pipeline.runs.recording import GyroFit
 
 Floats = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from pipeline.stages.finding import Finding
 from pipeline.stages.gyro import smooth_gyro
 
 if TYPE_CHECKING:
-    from pipeline.motion.recording import GyroFit
+    from pipeline.runs.recording import GyroFit
     from pipeline.vehicles.configuration import VelocitySection
 
 Floats = NDArray[np.float64]

@@ -135,7 +135,8 @@ class Manifest:
         """
         path = self.path(name)
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            data = path.read_bytes()
+            content = json.loads(data) if hash_bytes(data) == self.files[path.name].sha256 else None
         except FileNotFoundError as error:
             raise file_missing(path) from error
         except (OSError, ValueError, RecursionError):

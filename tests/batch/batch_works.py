@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.analysis import analyze
 from pipeline.batch.work import Report, Task, work_on
-from pipeline.job import analyze
 from pipeline.store import Store
 
 if TYPE_CHECKING:

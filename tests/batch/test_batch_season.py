@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,12 +13,12 @@ from typing import TYPE_CHECKING
 import polars as pl
 from batch_tools import Watch, ask, batch, counts, read_tables
 
+from pipeline.analysis import keys
+from pipeline.analysis.analyze import analyze_log, update_datasets
 from pipeline.batch import Pruning, Shard, basis, measure_memory, parse_shard, parse_size
 from pipeline.batch.season import run_batch
 from pipeline.batch.status import tell_status
 from pipeline.batch.verification import verify_results
-from pipeline.job import keys
-from pipeline.job.analyze import analyze_log, update_datasets
 from pipeline.store import Partition, Store
 
 if TYPE_CHECKING:
@@ -252,6 +254,21 @@ def test_the_catalogue_names_every_run_safely(season: Path, tmp_path: Path) -> N
     assert "&lt;b&gt;&amp;" in page
     assert page.count("<tr>") == 5
     assert "http" not in page.replace("http-equiv", "")
+
+
+def test_pooling_waits_for_the_imports_that_began_beside_the_work(
+    season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded = threading.Event()
+
+    def load_slowly() -> None:
+        time.sleep(1.0)
+        loaded.set()
+
+    monkeypatch.setattr("pipeline.batch.season.load_libraries", load_slowly)
+    monkeypatch.setattr("pipeline.batch.season.refresh_pools", lambda *_: loaded.is_set() or pytest.fail("early"))
+    batch(season, tmp_path / "out")
+    assert loaded.is_set()
 
 
 def test_sizes_and_shards_are_read() -> None:

@@ -106,7 +106,7 @@ sys.path.pop(0)
 import json
 from pathlib import Path
 from pipeline.store import Store
-from pipeline.workbench.diagnoses import read_diagnosis, write_diagnosis
+from pipeline.web.diagnoses import read_diagnosis, write_diagnosis
 results = Path("results")
 (name,) = Store(results).runs()
 manifest = Store(results).manifest(name)

@@ -202,7 +202,7 @@ def test_an_interrupt_says_what_became_of_the_results(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pipeline.motion.catalogue.list_effects", interrupt)
+    monkeypatch.setattr("pipeline.models.catalogue.list_effects", interrupt)
     with pytest.raises(SystemExit) as left:
         main(["effects"])
 

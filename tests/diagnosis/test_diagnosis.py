@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.options import Options
 from pipeline.diagnosis import Diagnosis, Recording, Value, diagnose_runs
 from pipeline.diagnosis.own_way import rescale_values
 from pipeline.diagnosis.plausibility import find_implausible, is_nameable
 from pipeline.diagnosis.words import describe, list_lines
-from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
-from pipeline.motion import Model, find_effect, read_model
-from pipeline.motion.errors import MotionError
-from pipeline.motion.evidence import Evidence, Largest
+from pipeline.models import Model, find_effect, read_model
+from pipeline.models.evidence import Evidence, Largest
+from pipeline.runs.errors import MotionError
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.diagnosis import read_recording
+from pipeline.analysis.options import Options
 from pipeline.diagnosis import RunDiagnosis, diagnose_runs
 from pipeline.diagnosis.plausibility import find_implausible
-from pipeline.job.analyze import analyze_log
-from pipeline.job.diagnosis import read_recording
-from pipeline.job.options import Options
-from pipeline.motion import find_effect
+from pipeline.models import find_effect
 
 _LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.options import Options
 from pipeline.diagnosis import Recording, RunDiagnosis, diagnose_runs
-from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,

@@ -28,11 +28,11 @@ import numpy as np  # noqa: E402 - the repository is put on the path first
 import yaml  # noqa: E402
 
 from pipeline.core.errors import SlipError  # noqa: E402
-from pipeline.motion import list_effects  # noqa: E402
-from pipeline.motion.export import export_json, export_python, export_ros2_control  # noqa: E402
-from pipeline.motion.formula import SIGNAL_UNITS, parse_expression, parse_unit  # noqa: E402
-from pipeline.motion.model_file import parse_model  # noqa: E402
-from pipeline.motion.model_text import format_model  # noqa: E402
+from pipeline.models import list_effects  # noqa: E402
+from pipeline.models.export import export_json, export_python, export_ros2_control  # noqa: E402
+from pipeline.models.formula import SIGNAL_UNITS, parse_expression, parse_unit  # noqa: E402
+from pipeline.models.model_file import parse_model  # noqa: E402
+from pipeline.models.model_text import format_model  # noqa: E402
 from pipeline.vehicles import load_configuration, resolve_vehicle  # noqa: E402
 
 HANG_S = 10

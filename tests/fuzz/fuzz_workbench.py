@@ -25,12 +25,12 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import quote, urlencode
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "workbench"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "web"))
 
 from workbench_server import LIMITS, RUN, TOKEN, Workbench
 
-from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.options import Options
 from pipeline.simulate import simulate_case
 
 SLOWEST_S = 30.0

@@ -33,8 +33,8 @@ def test_the_wheel_carries_presets_contracts_and_pages(wheel: Path) -> None:
         ("pipeline/report", "*.js"),
         ("pipeline/report/templates", "**/*.html"),
         ("pipeline/batch", "catalogue.*"),
-        ("pipeline/workbench", "page.*"),
-        ("pipeline/workbench", "*.js"),
+        ("pipeline/web", "page.*"),
+        ("pipeline/web", "*.js"),
     ):
         kept = {str(path.relative_to(ROOT)) for path in (ROOT / folder).glob(pattern)}
         assert kept

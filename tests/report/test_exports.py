@@ -20,11 +20,11 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.options import Options
 from pipeline.logs import LogWriter
 from pipeline.logs.spool import Spool
-from pipeline.motion import Model, MotionError, find_effect
+from pipeline.models import Model, find_effect
 from pipeline.report import ReportError
 from pipeline.report.exports import (
     ExportSource,
@@ -35,6 +35,7 @@ from pipeline.report.exports import (
 )
 from pipeline.report.exports import derived as derived_module
 from pipeline.report.motion_run import load_vehicle
+from pipeline.runs import MotionError
 from pipeline.simulate import simulate_case
 from pipeline.store import Store, StoreError
 

@@ -7,7 +7,8 @@ import polars as pl
 import pytest
 from report_synthesis import make_report
 
-from pipeline.motion import Input, Model, Problem, State, Timing, find_effect, load_run, predict
+from pipeline.identification import Input, Problem, State, predict
+from pipeline.models import Model, Timing, find_effect
 from pipeline.report.diagnosed import name_model
 from pipeline.report.figures.autocorrelation import correlate
 from pipeline.report.figures.ladder import list_rungs
@@ -15,6 +16,7 @@ from pipeline.report.figures.residuals import choose_signal
 from pipeline.report.figures.step_response import find_steps
 from pipeline.report.motion_view import SIGNALS, MotionStage, MotionView
 from pipeline.report.scene import Scene
+from pipeline.runs import load_run
 from pipeline.simulate import simulate_case
 from pipeline.vehicles import Vehicle, find_preset
 
@@ -92,8 +94,8 @@ def test_a_diagnosis_becomes_the_model_it_names() -> None:
 
 
 def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFactory) -> None:
-    from pipeline.job.analyze import analyze_log  # noqa: PLC0415 - only this test needs a whole run
-    from pipeline.job.options import Options  # noqa: PLC0415
+    from pipeline.analysis.analyze import analyze_log  # noqa: PLC0415 - only this test needs a whole run
+    from pipeline.analysis.options import Options  # noqa: PLC0415
 
     folder = tmp_path_factory.mktemp("view")
     log = simulate_case("husky_tile", out=folder / "run.mcap", duration_s=40.0)

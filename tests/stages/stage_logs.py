@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.job.work import as_recorded
+from pipeline.analysis.work import as_recorded
 from pipeline.logs import open_log, read_topics
 from pipeline.simulate import (
     Disturbance,

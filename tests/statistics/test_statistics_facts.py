@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from pipeline import statistics as ps
+from pipeline.fleet import statistics as ps
 
 NUMBERS = st.floats(-100.0, 100.0, allow_nan=False).map(lambda value: round(value, 3))
 SIDE = st.lists(NUMBERS, min_size=1, max_size=5)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from simulated_runs import RATE, simulate_runs
 
-from pipeline import statistics as ps
+from pipeline.fleet import statistics as ps
 
 SPREAD = 0.1
 

@@ -296,7 +296,7 @@ def prepare_worker(parent: int) -> None:
 
 def load_libraries() -> None:
     """Load what every log needs, so that it is not part of the time of the first."""
-    import pipeline.job.analyze  # noqa: PLC0415 - only in workers
+    import pipeline.analysis.analyze  # noqa: PLC0415 - only in workers
     import pipeline.store.tables  # noqa: F401, PLC0415 - likewise
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pipeline.fleet.statistics import kendall_tau, list_swaps
 from pipeline.report.elements import Cell, Column, Table
 from pipeline.report.words import MISSING, say_number
-from pipeline.statistics import kendall_tau, list_swaps
 
 if TYPE_CHECKING:
     import polars as pl

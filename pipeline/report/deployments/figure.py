@@ -7,7 +7,7 @@ import math
 import altair as alt
 import polars as pl
 
-from pipeline.comparison.place import ZONES
+from pipeline.fleet.place import ZONES
 from pipeline.report import theme
 from pipeline.report.deployments.labels import Box, place_labels
 from pipeline.report.figures import Drawing

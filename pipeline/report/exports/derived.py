@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.identification import Prediction
     from pipeline.logs.normalize import Given
-    from pipeline.motion import Prediction
     from pipeline.report.exports.source import ExportSource
 
 _BODY = "base_link"

@@ -17,7 +17,7 @@ from pipeline.store.manifest import name_damage
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from pipeline.motion import Model
+    from pipeline.models import Model
     from pipeline.store import Manifest
 
 BATCH_ROWS = 16_384

@@ -9,17 +9,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.motion import Comparison, MotionError, Timing, choose_input, predict_at_from, predict_from
+from pipeline.identification import Comparison, choose_input, predict_at_from, predict_from
+from pipeline.models import Timing
 from pipeline.report.motion_run import COLUMNS, make_motion_run
+from pipeline.runs import MotionError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from pipeline.motion import Effect, Model, MotionRun, Prediction
+    from pipeline.identification import Prediction
+    from pipeline.models import Effect, Model
     from pipeline.report.exports.feed import Feed
     from pipeline.report.exports.source import ExportSource
+    from pipeline.runs import MotionRun
 
     Floats = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import altair as alt
 import polars as pl
 
-from pipeline.comparison.trend import describe_step
+from pipeline.fleet.trend import describe_step
 from pipeline.report import theme
 from pipeline.report.elements import Picture
 from pipeline.report.figures import Drawing
@@ -19,7 +19,7 @@ from pipeline.report.words import begin_large
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.comparison.trend import Alert, Series
+    from pipeline.fleet.trend import Alert, Series
 
 _FEWEST_POINTS = 3
 _LATER = ("finding ", "suspect share", "warnings")

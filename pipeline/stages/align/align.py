@@ -11,9 +11,9 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import timegrid
-from pipeline.motion.errors import MotionError
-from pipeline.motion.heading import fit_gyro
-from pipeline.motion.recording import Alignment, MotionRun, make_run, tabulate_alignment
+from pipeline.runs.errors import MotionError
+from pipeline.runs.heading import fit_gyro
+from pipeline.runs.recording import Alignment, MotionRun, make_run, tabulate_alignment
 from pipeline.stages.align.command_scale import CommandScale, measure_command_scale
 from pipeline.stages.align.outliers import SAMPLE_S, find_outliers
 from pipeline.stages.align.pose_latency import estimate_latency

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import timegrid
-from pipeline.motion.heading import align_heading, has_barred, mark_barred
-from pipeline.motion.signals import name_inputs
+from pipeline.runs.heading import align_heading, has_barred, mark_barred
+from pipeline.runs.signals import name_inputs
 
 if TYPE_CHECKING:
-    from pipeline.motion.recording import DriveSeries, MotionRun
+    from pipeline.runs.recording import DriveSeries, MotionRun
     from pipeline.vehicles import Vehicle
 
 Floats = NDArray[np.float64]

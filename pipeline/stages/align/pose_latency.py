@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.motion.heading import align_heading, fit_gyro, mark_barred
+from pipeline.runs.heading import align_heading, fit_gyro, mark_barred
 
 if TYPE_CHECKING:
-    from pipeline.motion.recording import GyroFit, MotionRun, Track
+    from pipeline.runs.recording import GyroFit, MotionRun, Track
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

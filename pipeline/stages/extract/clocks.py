@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.motion.catalogue import find_late_effect
-from pipeline.motion.effect import Late
+from pipeline.models.catalogue import find_late_effect
+from pipeline.models.effect import Late
 from pipeline.stages.finding import Finding
 
 if TYPE_CHECKING:

@@ -1,0 +1,236 @@
+"""What `slip verify` notices: every byte of small results changed, files and runs deleted and swapped.
+
+    python benchmarks/damage_results.py [--every 97] [--bucket]
+
+Results of two short simulated logs, one of them analyzed twice, with reports, pools and a comparison. Each
+change is made alone and undone. Of manifests, lists, notes and other JSON every byte is changed, of tables
+and pages, which a hash covers as a whole, every n-th: in turn one bit, the sign bit, all bits. *Unlisted*
+counts what verify tells without calling it damage: nothing says what the file should be.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import tempfile
+from collections import Counter
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.analysis import Options
+from pipeline.batch import Request
+from pipeline.batch.season import run_batch
+from pipeline.simulate import simulate_case
+from pipeline.store import Mirror, Store
+from pipeline.store import verification as room
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+FLIPS = (0x01, 0x80, 0xFF)
+ADDRESS = "memory://damage/results"
+
+
+class Watch:
+    """Is told, and says nothing."""
+
+    def plan(self, todo: int, settled: int, size: int) -> None: ...
+
+    def tell(self, line: object, size: int) -> None: ...
+
+
+class Table:
+    """Changes and what was noticed of them, by kind of file."""
+
+    def __init__(self) -> None:
+        self.changes: Counter[str] = Counter()
+        self.unlisted: Counter[str] = Counter()
+        self.missed: Counter[str] = Counter()
+
+    def count(self, kind: str, found: room.Examination, before: room.Examination) -> None:
+        self.changes[kind] += 1
+        if found.problems:
+            return
+        self.unlisted[kind] += found.unlisted != before.unlisted
+        self.missed[kind] += found.unlisted == before.unlisted
+
+    def show(self, title: str) -> None:
+        print(f"\n{title:<44}{'changes':>9}{'noticed':>9}{'unlisted':>10}{'not noticed':>13}")
+        for kind, count in self.changes.items():
+            noticed = count - self.unlisted[kind] - self.missed[kind]
+            print(f"{kind:<44}{count:>9}{noticed:>9}{self.unlisted[kind]:>10}{self.missed[kind]:>13}")
+        print(
+            f"{'all':<44}{self.changes.total():>9}"
+            f"{self.changes.total() - self.unlisted.total() - self.missed.total():>9}"
+            f"{self.unlisted.total():>10}{self.missed.total():>13}",
+            flush=True,
+        )
+
+
+class Remembering:
+    """The files of results, of which those that have not changed are hashed once."""
+
+    def __init__(self, files: room.Files) -> None:
+        self._files = files
+        self._names = files.names()
+        self._contents: dict[str, bytes | None] = {}
+        self._hashes: dict[str, str] = {}
+
+    def change(self, name: str, content: bytes | None) -> None:
+        self._contents[name] = content
+        self._hashes.pop(name, None)
+        self._names = {*self._names, name} if content is not None else set(self._names) - {name}
+
+    def names(self) -> Iterable[str]:
+        return self._names
+
+    def read(self, name: str) -> bytes | None:
+        if name not in self._contents:
+            self._contents[name] = self._files.read(name)
+        return self._contents[name]
+
+    def hash(self, name: str) -> str:
+        if name not in self._hashes:
+            data = self.read(name)
+            self._hashes[name] = "" if data is None else room.hash_bytes(data)
+        return self._hashes[name]
+
+    def place(self, name: str) -> Path:
+        return self._files.place(name)
+
+
+def make_results(folder: Path, address: str | None) -> Path:
+    """Results of two logs; of one there is an older generation."""
+    logs, out = folder / "logs", folder / "out"
+    simulate_case("husky_tile", out=logs / "a.mcap", duration_s=6.0, seed=1)
+    simulate_case("warthog_ice", out=logs / "b.mcap", duration_s=6.0, seed=2)
+    for rate in ("20.0", "10.0"):
+        (logs / "a.toml").write_text(f"[velocity]\nrate_hz = {rate}\n")
+        options = Options(out=out, report=address is None)
+        request = Request(
+            targets=(str(logs),), options=options, executor="inline", settle_s=0.0, address=address
+        )
+        outcome = run_batch(request, Watch())
+        if outcome.has_failed:
+            raise SystemExit(f"the batch failed: {outcome}")
+    if address is None:
+        Store(out).write_results_text("comparison.html", "<p>written by slip compare</p>")
+    return out
+
+
+def name_kind(name: str, current: set[str]) -> str:
+    """What a file of the results is."""
+    parts = name.split("/")
+    kinds = {"batch": "notes on logs", "identities": "notes on identities", "listed": "entries of the list"}
+    if parts[0] in kinds:
+        return kinds[parts[0]]
+    if len(parts) == 1:
+        return f"over all runs: *{Path(name).suffix}"
+    if parts[-1] == "manifest.json":
+        return "manifests"
+    age = "" if "/".join(parts[:-1]) in current else "old generations: "
+    return f"{age}{'marker' if parts[-1] == '.generation' else '*' + Path(name).suffix}"
+
+
+def flip_bytes(files: Remembering, names: list[str], current: set[str], every: int) -> Table:
+    """Every byte of JSON, every n-th of other files."""
+    table, flips = Table(), cycle(FLIPS)
+    before = room.examine_files(files)
+    for name in sorted(names, key=lambda name: (name_kind(name, current), name)):
+        whole = files.read(name)
+        if not whole:
+            continue
+        for at in range(0, len(whole), 1 if whole[:1] == b"{" else every):
+            files.change(name, whole[:at] + bytes([whole[at] ^ next(flips)]) + whole[at + 1 :])
+            table.count(name_kind(name, current), room.examine_files(files), before)
+        files.change(name, whole)
+    return table
+
+
+class Exchange:
+    """Files deleted, cut, and put in the place of others, and what was noticed of it."""
+
+    def __init__(self, files: Remembering, names: list[str], current: set[str]) -> None:
+        self.table = Table()
+        self._files, self._names, self._current = files, names, current
+        self._before = room.examine_files(files)
+
+    def try_all(self) -> Table:
+        for name in self._names:
+            if self._files.read(name):
+                self._try_file(name)
+        homes = sorted({name.rpartition("/")[0] for name in self._names if name.endswith("/manifest.json")})
+        for home in homes:
+            inside = self._list(home)
+            self._judge("runs: deleted", dict.fromkeys(inside))
+            for other in homes:
+                copied = {f"{other}{name.removeprefix(home)}": self._files.read(name) for name in inside}
+                self._judge("runs: copied over", {**dict.fromkeys(self._list(other)), **copied})
+        return self.table
+
+    def _try_file(self, name: str) -> None:
+        whole = self._files.read(name) or b""
+        kind = name_kind(name, self._current)
+        self._judge(f"{kind}: cut", {name: whole[: len(whole) // 2]})
+        # A note may go, or be that of another name, at any time: it costs a look at the log.
+        if not kind.startswith("notes"):
+            self._judge(f"{kind}: deleted", {name: None})
+            for other in self._names:
+                if name_kind(other, self._current) == kind:
+                    self._judge(f"{kind}: copied over", {other: whole})
+
+    def _list(self, home: str) -> list[str]:
+        return [name for name in self._names if name.startswith(f"{home}/")]
+
+    def _judge(self, kind: str, contents: Mapping[str, bytes | None]) -> None:
+        kept = {name: self._files.read(name) for name in contents}
+        if kept == contents:
+            return
+        for name, content in contents.items():
+            self._files.change(name, content)
+        self.table.count(kind, room.examine_files(self._files), self._before)
+        for name, content in kept.items():
+            self._files.change(name, content)
+
+
+def list_contents(files: room.Files) -> list[str]:
+    """Files that hold something: no locks, and nothing that another program keeps there."""
+    return sorted(name for name in files.names() if not name.endswith(".lock") and "/claims/" not in name)
+
+
+def run(every: int, *, in_bucket: bool) -> int:
+    """Print the tables; how many changes were not noticed."""
+    folder = Path(tempfile.mkdtemp(prefix="damage-"))
+    try:
+        address = ADDRESS if in_bucket else None
+        out = make_results(folder, address)
+        store = Store(out)
+        source: room.Files = room.DiskFiles(out) if address is None else Mirror(address, out)
+        files = Remembering(source)
+        current = {manifest.folder.relative_to(out).as_posix() for manifest in store.manifests()}
+        names = list_contents(files)
+        found = room.examine_files(files)
+        print(f"{'object store' if in_bucket else 'folder'}: {len(names)} files, ", end="")
+        print(f"{sum(len(files.read(name) or b'') for name in names)} bytes; ", end="")
+        print(f"unchanged: {len(found.problems)} problems, {len(found.unlisted)} unlisted")
+        one = flip_bytes(files, names, current, every)
+        one.show(f"changed bytes (of tables, pages: every {every}.)")
+        other = Exchange(files, names, current).try_all()
+        other.show("files and runs")
+        return one.missed.total() + other.missed.total() + len(found.problems)
+    finally:
+        shutil.rmtree(folder)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
+    parser.add_argument("--every", type=int, default=97, help="of tables and pages only every n-th byte")
+    parser.add_argument("--bucket", action="store_true", help="results on an object store in memory")
+    asked = parser.parse_args()
+    raise SystemExit(os.EX_OK if run(asked.every, in_bucket=asked.bucket) == 0 else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""The held-out errors of the ideal model, of the true one, and of what was named: after the seal was opened.
+
+The true model has the effects that were simulated, begins at their values and is fitted as any other; all
+models are fitted to and judged on the same windows. The recording's own delays are those of the generator:
+zero, unless a clock is what was hidden.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from draw import Answer  # noqa: TC002 - it runs as a script, too
+
+from pipeline.diagnosis import Recording  # noqa: TC001
+from pipeline.diagnosis.subject import load_recording
+from pipeline.identification import Input, Problem, fit_model, hold_out
+from pipeline.models import Effect, Model, ModelFile, Timing, find_effect
+from pipeline.models.model_file import parse_model
+from pipeline.models.model_text import format_model
+from pipeline.runs import HeadingSource, MotionError
+from pipeline.vehicles import Vehicle  # noqa: TC001
+
+Json = Mapping[str, object]
+
+_RATE_HZ = 50.0
+_COARSE_HZ = 25.0
+_LONG_S = 400.0
+_SUBTLE = 0.05
+_LEAST_M = 1e-6
+
+
+@dataclass(frozen=True)
+class Held:
+    """Held-out errors: over 2 s [m] and [rad], and of the velocity over 0.5 s [m/s, m/s, rad/s]."""
+
+    t_m: float
+    r_rad: float
+    x: float
+    y: float
+    w: float
+
+    def falls_below(self, other: Held, share: float = _SUBTLE) -> bool:
+        """Whether the 2 s error of position or of yaw is lower than another's by a share."""
+        return self.t_m <= (1.0 - share) * other.t_m or self.r_rad <= (1.0 - share) * other.r_rad
+
+    def ratio(self, other: Held) -> float:
+        """The larger of the two ratios of the 2 s errors."""
+        return max(self.t_m / max(other.t_m, _LEAST_M), self.r_rad / max(other.r_rad, _LEAST_M))
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Models of one log side by side; None where there is nothing to fit.
+
+    Attributes:
+        ideal: without effects.
+        true: with all that was simulated.
+        named: with all that was named.
+        formula: with what was named and the pasted formula.
+        without: the true model less one of its effects, where it has several.
+    """
+
+    ideal: Held | None = None
+    true: Held | None = None
+    named: Held | None = None
+    formula: Held | None = None
+    without: Mapping[str, Held] = field(default_factory=dict)
+
+    def is_weak(self, effect: str) -> bool:
+        """Whether the true model lowers the held-out error by less than 5 % for having this effect."""
+        beside = self.without.get(effect, self.ideal)
+        return self.true is not None and beside is not None and not self.true.falls_below(beside)
+
+
+def check_models(vehicle: Vehicle, recording: Recording, told: Json, answer: Answer) -> Checked:
+    """Fit and judge the true model and the named one on a diagnosed log.
+
+    Args:
+        vehicle: as the stages found it.
+        recording: the run.
+        told: what the diagnosis said of it.
+        answer: what was hidden.
+    """
+    entries = [item for item in _list(told, "effects") if isinstance(item, Mapping)]
+    named = [_restore(entry) for entry in entries]
+    ids = set(answer.effects) | {effect.id for effect in named}
+    run = load_recording(recording, vehicle)
+    vehicle = run.correct_vehicle(vehicle)
+    try:
+        problem = Problem(
+            [run],
+            vehicle,
+            Input.COMMAND,
+            # A skew of the reported heading shows against the reported heading only.
+            heading=HeadingSource.POSE if "heading_skew" in ids else HeadingSource.AUTO,
+            timing=[Timing()],
+            rate_hz=_COARSE_HZ if run.duration_s > _LONG_S else _RATE_HZ,
+        )
+    except MotionError:
+        return Checked()
+    true = [_build(name, values) for name, values in answer.effects.items()]
+    true = [_place_change(effect, run.duration_s) for effect in true]
+    ideal = _judge(problem, Model(vehicle))
+    best = _judge(problem, Model(vehicle, tuple(true))) if true else None
+    found = _judge(problem, Model(vehicle, tuple(named))) if named else ideal
+    without = {}
+    if len(true) > 1:
+        without = {
+            effect.id: _judge(problem, Model(vehicle, tuple(e for e in true if e is not effect)))
+            for effect in true
+        }
+    return Checked(ideal, best, found, _judge_formula(problem, Model(vehicle, tuple(named)), told), without)
+
+
+def _judge(problem: Problem, model: Model) -> Held:
+    errors = hold_out(problem, fit_model(problem, model)).pooled
+    return Held(errors.t_mrmse_m, errors.r_mrmse_rad, *errors.velocity_rms)
+
+
+def _judge_formula(problem: Problem, model: Model, told: Json) -> Held | None:
+    """The model file with the formula pasted at its end, as a user would."""
+    flagged = told.get("unexplained")
+    formula = flagged.get("formula") if isinstance(flagged, Mapping) else None
+    if not isinstance(formula, str):
+        return None
+    pasted = parse_model(format_model(ModelFile(model)) + "\n" + formula, Path("pasted.toml"))
+    return _judge(problem, pasted.model)
+
+
+def _build(name: str, values: Mapping[str, float]) -> Effect:
+    """An effect at given values, brought inside its bounds."""
+    effect = find_effect(name)()
+    inside = {}
+    for key, value in values.items():
+        low, high = effect.parameter(key).bounds
+        inside[key] = value if math.isnan(value) else min(max(value, low), high)
+    return effect.change(**inside)
+
+
+def _place_change(effect: Effect, duration_s: float) -> Effect:
+    """A simulated terrain changes half-way; a fit has to find the place again, as a diagnosis had to."""
+    return effect.change(at_s=0.5 * duration_s) if effect.id == "terrain_change" else effect
+
+
+def _restore(entry: Json) -> Effect:
+    """A named effect at the values that were told."""
+    parameters = entry.get("parameters")
+    values = {
+        str(name): float(item["value"])
+        for name, item in (parameters.items() if isinstance(parameters, Mapping) else ())
+        if isinstance(item.get("value"), int | float)
+    }
+    return _build(str(entry["id"]), values)
+
+
+def _list(content: Json, key: str) -> Sequence[object]:
+    found = content.get(key)
+    return found if isinstance(found, list | tuple) else ()

@@ -1,0 +1,80 @@
+"""What the right effects, given by hand, leave of the ideal model's error on the real recordings.
+
+Run: python benchmarks/recordings.py [--ladders] [WORD...]. Every recording under ../shared/logs whose name
+holds one of the words (all without any), from measured wheels and from commands: held-out errors after the
+effects over those of the ideal model, beside the table "On the real recordings" of METHODS.md section 5. With
+--ladders the effects are climbed one by one and every rung's 2 s error is printed: it falls, or it stops.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "models"))
+
+from real_recordings import CASES, Reached, Recordings, make_model, measure
+
+from pipeline.identification import Problem, climb
+
+LOGS = Path(__file__).parents[2] / "shared" / "logs"
+
+
+def describe_values(reached: Reached) -> str:
+    timing = reached.fitted.state.timing[0]
+    parts = [
+        f"{effect.id} " + " ".join(f"{name}={value:.3g}" for name, value in effect.values.items())
+        for effect in reached.fitted.model.effects
+    ]
+    return "; ".join((*parts, f"poses {timing.pose_delay_s:.2f} s late, wheels {timing.wheel_delay_s:.2f} s"))
+
+
+def print_row(name: str, values: tuple[float, ...]) -> None:
+    sys.stdout.write(f"  {name:<18}" + "".join(f"{value:8.3f}" for value in values) + "\n")
+
+
+def main() -> None:
+    words = [word for word in sys.argv[1:] if not word.startswith("-")]
+    chosen = [case for case in CASES if not words or any(word in case.log for word in words)]
+    worst: list[tuple[float, str]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        recordings = Recordings(LOGS, Path(folder))
+        for case in chosen:
+            run, vehicle = recordings.load(case.log)
+            if "--ladders" in sys.argv:
+                ladder = climb(Problem([run], vehicle, case.source), make_model(vehicle, case.effects))
+                errors = [rung.errors.t_mrmse_m for rung in ladder.rungs]
+                fell = "falls" if errors == sorted(errors, reverse=True) else "RISES"
+                names = ["ideal", *ladder.rungs[-1].effects]
+                steps = "  ".join(f"{error:.4f}" for error in errors)
+                sys.stdout.write(f"{case.log} {case.source.value}: {fell}  {steps}  m  {' + '.join(names)}")
+                sys.stdout.write(f"  left out: {', '.join(ladder.idle) or 'none'}\n")
+                sys.stdout.flush()
+                continue
+            reached = measure(run, vehicle, case.source, case.effects)
+            sys.stdout.write(
+                f"{case.log}, {case.source.value}: {reached.windows} windows, "
+                f"ideal {reached.t_before_m:.3f} m {reached.r_before_rad:.3f} rad, "
+                f"latencies vary {run.alignment.latency_spread_s:.3f} s, "
+                f"outliers {run.alignment.outlier_s:.1f} s of {run.duration_s:.0f} s\n"
+                f"  {describe_values(reached)}\n"
+                f"  {'':<18}{'x':>8}{'y':>8}{'w':>8}{'T':>8}{'R':>8}{'R turns':>8}\n"
+            )
+            ours = np.array((*reached.ratios, reached.turned))
+            table = np.array((*case.table, case.table[4]))
+            print_row("ours", tuple(ours.tolist()))
+            print_row("METHODS", tuple(table.tolist()))
+            print_row("ours / METHODS", tuple((ours / table).tolist()))
+            sys.stdout.flush()
+            for channel, share in zip("xywTR", (ours / table)[:5].tolist(), strict=True):
+                if share > 1.1:
+                    worst.append((share, f"{channel} of {case.log}, {case.source.value}"))
+    for share, what in sorted(worst, reverse=True):
+        sys.stdout.write(f"beyond 1.1: {share:.2f}  {what}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""How fast the workbench answers on a 10-minute log: a value moved by hand, an effect added, dropped, undone.
+
+    python benchmarks/workbench.py [--log LOG] [--vehicle V] [--runs N]
+
+Asks a server over HTTP as the page does, numbers and figures, and prints the median and the slowest answer
+in seconds. Promised are 0.5 s for a value moved by hand and 2 s for a refit. The peer in the same run answers
+the same question with nothing kept ready: tables, grid and score anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import tempfile
+import time
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.options import Options
+from pipeline.identification import Problem, choose_input, fit_model
+from pipeline.identification.scoring import score
+from pipeline.models import Model, find_effect
+from pipeline.report.motion_run import load_motion_run, load_vehicle
+from pipeline.simulate import simulate_case
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "web"))
+
+from workbench_server import Workbench
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pipeline.store import Manifest
+
+EFFECTS = ("effective_track", "drive_lag", "lateral_skid")
+
+
+class Desk:
+    """A desk as the page uses it."""
+
+    def __init__(self, server: Workbench, run: str) -> None:
+        self._server = server
+        self._run = run
+        self._values = cycle((1.5, 1.6, 1.7))
+
+    def ask(self, action: str, **more: object) -> dict[str, object]:
+        return self._server.desk(self._run, action, **more)
+
+    def draw(self) -> None:
+        self._server.post("/api/figures", run=self._run)
+
+    def change(self, action: str, **more: object) -> None:
+        """A change of structure: the model is fitted anew, and what it moves in the figures is sent."""
+        self.ask(action, **more)
+        self._server.post("/api/rows", run=self._run)
+
+    def slide(self) -> None:
+        """A value moved by hand."""
+        self.ask("preview", effect="effective_track", parameter="k", value=next(self._values))
+
+    def try_all(self) -> None:
+        self.ask("try")
+
+    def is_trying(self) -> bool:
+        trial = cast("dict[str, int] | None", self.ask("open")["trial"])
+        return trial is not None and trial["tried"] < trial["total"]
+
+
+def measure(
+    act: Callable[[], object], runs: int, undo: Callable[[], object] | None = None
+) -> list[tuple[float, float]]:
+    """Wall and CPU seconds of each of several times; the server works in this process."""
+    taken = []
+    for _ in range(runs):
+        start, worked = time.perf_counter(), time.process_time()
+        act()
+        taken.append((time.perf_counter() - start, time.process_time() - worked))
+        if undo is not None:
+            undo()
+    return taken
+
+
+def answer_anew(manifest: Manifest) -> None:
+    """What a moved value does to the error, with nothing kept ready."""
+    vehicle = load_vehicle(manifest)
+    run = load_motion_run(manifest, vehicle)
+    problem = Problem([run], vehicle, choose_input([run]).source)
+    ideal = fit_model(problem, Model(vehicle))
+    model = Model(vehicle, (find_effect("effective_track")(k=1.6),))
+    score(problem, problem.start_state(model), ideal.weights)
+
+
+def show(title: str, taken: list[tuple[float, float]]) -> None:
+    wall, cpu = zip(*taken, strict=True)
+    print(
+        f"{title:<44}{statistics.median(wall):>8.2f}{max(wall):>9.2f}{statistics.median(cpu):>8.2f}",
+        flush=True,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--log", type=Path, help="log to open; by default one of 10 minutes is simulated")
+    parser.add_argument("--vehicle", help="its vehicle, where the log does not say it")
+    parser.add_argument("--runs", type=int, default=5)
+    chosen = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        log = chosen.log or simulate_case("husky_tile", out=Path(name) / "ten_minutes.mcap", duration_s=600.0)
+        overrides = {"vehicle": {"preset": chosen.vehicle}} if chosen.vehicle else {}
+        options = Options(out=Path(name) / "results", report=False, diagnosis=False, overrides=overrides)
+        manifest = analyze_log(log, options).manifest
+        server = Workbench(options.out)
+        try:
+            desk = Desk(server, manifest.run)
+            print(f"{log.name}, median and slowest of {chosen.runs}")
+            print(f"{'':<44}{'median s':>8}{'slowest':>9}{'CPU s':>8}")
+            show("open a run (once)", measure(lambda: desk.ask("open"), 1))
+            show("draw all figures, the first time", measure(desk.draw, 1))
+            for effect in EFFECTS:
+                add = measure(lambda name=effect: desk.change("add", effect=name), 1)
+                show(f"add {effect}: refit, numbers, figures", add)
+            undo, redo = (lambda action=action: desk.change(action) for action in ("undo", "redo"))
+            show("undo", measure(undo, chosen.runs, redo))
+            show(f"fit all {len(EFFECTS)} effects anew", measure(lambda: desk.change("fit"), 1))
+            show("move a value: numbers and figures", measure(desk.slide, chosen.runs))
+            desk.try_all()
+            show("the same while every effect is tried", measure(desk.slide, chosen.runs))
+            show(
+                "peer: the error alone, nothing kept ready",
+                measure(lambda: answer_anew(manifest), chosen.runs),
+            )
+            print("" if desk.is_trying() else "(the trial of every effect ended before the measurement did)")
+        finally:
+            server.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,243 @@
+"""One log through all stages, its summary and its report."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import msgspec
+
+from pipeline.analysis.diagnosis import diagnose_work, has_diagnosis, key_diagnosis
+from pipeline.analysis.keys import hash_json, key_stages
+from pipeline.analysis.options import STAGES
+from pipeline.analysis.peers import find_peers
+from pipeline.analysis.provenance import list_versions
+from pipeline.analysis.relative import hash_model
+from pipeline.analysis.subject import Subject, describe_subject, name_run
+from pipeline.analysis.summary import summarize_run
+from pipeline.analysis.work import Progress, Work, read_subject, stored_contexts, stored_keys
+from pipeline.core.version import read_version
+from pipeline.logs import spell_location, to_location
+from pipeline.store import JSON, LogIdentities, Manifest, Store, see_log
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.analysis.options import FigureFormat, Options
+    from pipeline.logs import LogData
+    from pipeline.report import RunReport
+    from pipeline.store import Generation
+
+SUMMARY = "summary.json"
+REPORT = "report.html"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one log.
+
+    Attributes:
+        summary: the JSON object of the run; empty when a single stage was run.
+        manifest: the generation that is current now.
+        computed: stages that were computed; empty when nothing had changed.
+        twin: another log of the same content, whose run this one shares; empty where there is none.
+    """
+
+    summary: Mapping[str, JSON]
+    manifest: Manifest
+    computed: tuple[str, ...]
+    twin: str = ""
+
+    @property
+    def lossy(self) -> bool:
+        """Whether the log had losses."""
+        return bool(stored_contexts(self.manifest).get("extract", {}).get("losses"))
+
+
+def _ignore(stage: str) -> None:
+    del stage
+
+
+def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> Outcome:
+    """Take one log through the stages, reusing what has not changed.
+
+    Args:
+        path: the recording.
+        options: what the user asked for.
+        progress: told the name of each stage that is computed.
+
+    Raises:
+        SlipError: the log, the configuration or a stage cannot go on; nothing of this run is changed then.
+    """
+    store = Store(options.out)
+    subject = describe_subject(path, options)
+    sha256, data = _identify(path, subject, store, progress)
+    run = options.run or name_run(path, sha256, store)
+    keys = key_stages(run, sha256, subject, options.inputs, hash_model(options.model))
+    current = store.manifest(run)
+    if current is not None and store.is_asked_again(current):
+        options = replace(options, force=True)
+    twin = _find_twin(path, sha256, current)
+    if current is not None and not options.force and _is_done(current, keys, options):
+        return Outcome(_read_summary(current, options), current, (), twin)
+    done = keys[options.through]
+    with store.open_generation(run, hash_json([done, options.through])) as generation:
+        previous = generation.previous
+        if previous is not None and not options.force and _is_done(previous, keys, options):
+            # Another writer of this run came first, and what it wrote is what is wanted.
+            return Outcome(_read_summary(previous, options), previous, (), twin)
+        work = Work(run, subject, options, generation, keys, sha256, data, progress)
+        work.run_stages()
+        log = _describe_log(subject, sha256, work)
+        if options.through == STAGES[-1]:
+            _write_outputs(work, log, options, progress, diagnose_work(work))
+        manifest = generation.commit(_details(work, log, sha256))
+    return Outcome(_read_summary(manifest, options), manifest, tuple(work.computed), twin)
+
+
+def _find_twin(path: Path, sha256: str, current: Manifest | None) -> str:
+    """The log that made the results there are, where it is another file of that content and still there."""
+    log = current.details.get("log") if current is not None else None
+    if not isinstance(log, dict) or log.get("sha256") != sha256:
+        return ""
+    recorded = to_location(str(log.get("path")))
+    return str(recorded) if recorded != path.resolve() and recorded.exists() else ""
+
+
+def _identify(path: Path, subject: Subject, store: Store, progress: Progress) -> tuple[str, LogData | None]:
+    """Hash of the log: remembered, or computed beside reading it."""
+    identities = LogIdentities(store)
+    known = identities.lookup(path)
+    if known is not None:
+        return known, None
+    progress("read")
+    seen = see_log(path)
+    data = read_subject(subject)
+    identities.remember(path, data.sha256, seen=seen)
+    return data.sha256, data
+
+
+def _is_done(manifest: Manifest, keys: Mapping[str, str], options: Options) -> bool:
+    """Whether the results there are hold all that is asked for."""
+    wanted = STAGES[: STAGES.index(options.through) + 1]
+    stored = stored_keys(manifest)
+    if any(stored.get(stage) != keys[stage] for stage in wanted):
+        return False
+    if options.through != STAGES[-1]:
+        return True
+    files = set(manifest.files)
+    has_report = REPORT in files or not options.report
+    figures = options.figures
+    has_figures = figures is None or any(name.endswith(f".{figures}") for name in files)
+    diagnosed = not options.diagnosis or has_diagnosis(manifest, key_diagnosis(keys))
+    return SUMMARY in files and has_report and has_figures and diagnosed
+
+
+def _describe_log(subject: Subject, sha256: str, work: Work) -> dict[str, JSON]:
+    losses = work.contexts["extract"].get("losses", [])
+    return {
+        "path": spell_location(subject.path.resolve()),
+        "sha256": sha256,
+        "bytes": subject.index.size_bytes,
+        "duration_s": round(subject.index.duration_s, 6),
+        "complete": not losses,
+        "losses": losses,
+        "unchecked": work.contexts["extract"].get("unchecked"),
+        "fetched_bytes": work.contexts["extract"].get("fetched_bytes"),
+    }
+
+
+def _write_outputs(
+    work: Work,
+    log: Mapping[str, JSON],
+    options: Options,
+    progress: Progress,
+    diagnosis: Mapping[str, JSON] | None,
+) -> None:
+    """Summary, report and figures of a finished run."""
+    summary = summarize_run(work, log)
+    summary["diagnosis"] = diagnosis
+    summary["report"] = REPORT if options.report else None
+    summary["provenance"] = {
+        "version": read_version(),
+        "versions": list_versions(work),
+        "keys": dict(work.keys),
+        "configuration": _configuration(work),
+    }
+    generation = work.generation
+    if options.report or options.figures:
+        # Drawing is most of the start-up time; who wants neither does not pay for it.
+        from pipeline.report import RunReport, render_report, view_diagnosis  # noqa: PLC0415
+
+        progress("report")
+        tables = {name: generation.read_table(name) for name in generation.table_names}
+        motion = view_diagnosis(tables, work.vehicle, diagnosis or {})
+        peers = find_peers(Store(options.out), summary)
+        report = RunReport(summary, tables, diagnosis or {}, motion, peers)
+        if options.report:
+            generation.write_text(REPORT, render_report(report))
+        if options.figures:
+            _write_figures(report, options.figures, generation)
+    generation.write_text(SUMMARY, json.dumps(summary, indent=1, sort_keys=False) + "\n")
+
+
+def _write_figures(report: RunReport, kind: FigureFormat, generation: Generation) -> None:
+    import tempfile  # noqa: PLC0415 - only where figures are asked for
+
+    from pipeline.report import write_figures  # noqa: PLC0415 - heavy
+
+    with tempfile.TemporaryDirectory() as folder:
+        for path in write_figures(report, Path(folder), kind):
+            generation.write_bytes(f"figures/{path.name}", path.read_bytes())
+
+
+def _details(work: Work, log: Mapping[str, JSON], sha256: str) -> dict[str, JSON]:
+    stages: dict[str, JSON] = {
+        stage: {"key": work.keys[stage], "context": dict(context)} for stage, context in work.contexts.items()
+    }
+    return {
+        "log": {**log, "sha256": sha256},
+        "stages": stages,
+        "inputs": list(work.options.inputs),
+        "configuration": _configuration(work),
+        "vehicle": msgspec.to_builtins(work.vehicle),
+        "terrain": work.subject.terrain,
+        "dataset": work.subject.dataset,
+        "versions": cast("JSON", list_versions(work)),
+    }
+
+
+def _configuration(work: Work) -> JSON:
+    plain: JSON = msgspec.to_builtins(work.subject.configuration)
+    return plain
+
+
+def _read_summary(manifest: Manifest, options: Options) -> dict[str, JSON]:
+    """The stored summary with the report's place in this results folder."""
+    if SUMMARY not in manifest.files or options.through != STAGES[-1]:
+        return {}
+    summary = manifest.read_json(SUMMARY)
+    has_report = REPORT in manifest.files
+    summary["report"] = str(manifest.path(REPORT)) if has_report else None
+    return summary
+
+
+def update_datasets(store: Store) -> None:
+    """Pool the runs of the results into `datasets.parquet`; equal content counts once.
+
+    What only `slip compare` works out is null until it is asked for.
+    """
+    import polars as pl  # noqa: PLC0415 - heavy
+
+    from pipeline.analysis.material import find_material  # noqa: PLC0415 - heavy
+    from pipeline.fleet import gather_runs, pool_runs  # noqa: PLC0415 - heavy
+
+    material = find_material(store, ("dataset",), trusted_only=False, tables=("aggregates",))
+    if not material.manifests and not material.notes:
+        return
+    runs = list(material.manifests)
+    aggregates = material.scan("aggregates").filter(pl.col("run").is_in(runs)).collect()
+    pooled = pool_runs(gather_runs(aggregates, material.labels), ("dataset",))
+    store.write_results_table("datasets", pooled)

@@ -1,0 +1,259 @@
+"""Deployments side by side: from the results to tables, one page, and the answer of `slip compare`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from pipeline.analysis.errors import JobError
+from pipeline.analysis.material import Material, find_material, keep_runs
+from pipeline.analysis.samples import follow_published_runs, read_moduli, read_norms
+from pipeline.fleet import (
+    Group,
+    add_measures,
+    bound_run,
+    compare_groups,
+    gather_runs,
+    measure_difficulty,
+    pool_runs,
+)
+from pipeline.fleet.boxes import spread_windows
+from pipeline.fleet.datasets import OVER_RUNS, THIS_RUN
+from pipeline.fleet.statistics import bound_typical
+from pipeline.fleet.tables import tabulate_pairs
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.fleet import Pair, Samples
+    from pipeline.fleet.statistics import Interval
+    from pipeline.store import Store
+
+_WINDOW_COLUMNS = {
+    "run": pl.String,
+    "input": pl.String,
+    "suspect": pl.Boolean,
+    "window_norm": pl.Float64,
+}
+NOT_VALID = (
+    "p_uncorrected is the plain Mann-Whitney test of published work over all samples; it is not valid here, "
+    "because samples of one run are correlated"
+)
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is to be compared.
+
+    Attributes:
+        by: columns that make a dataset.
+        input: what u is; None: the command where every run has one, else the measured wheels.
+        as_published: compare the published chain's window norms in place of the median modulus.
+    """
+
+    by: tuple[str, ...] = ("dataset",)
+    input: str | None = None
+    as_published: bool = False
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came of it.
+
+    Attributes:
+        datasets: table `datasets`, both inputs.
+        comparisons: table `comparisons`.
+        runs: one row a run and input with all its numbers.
+        input: what u is in the comparisons.
+        quantity: what was compared.
+        intervals: ``dataset``, ``value``, ``low``, ``high``, ``interval`` of what was compared.
+        windows: box plot numbers of the window norms, as of `spread_windows`.
+        notes: what must be known: runs left out, pairs that cannot be told apart.
+    """
+
+    datasets: pl.DataFrame
+    comparisons: pl.DataFrame
+    runs: pl.DataFrame
+    input: str
+    quantity: str
+    intervals: pl.DataFrame
+    windows: pl.DataFrame
+    notes: tuple[str, ...]
+
+
+def compare_results(store: Store, question: Question) -> Answer:
+    """Compare the datasets of the results; nothing is written.
+
+    Raises:
+        JobError: ``nothing_to_compare``.
+        ComparisonError: ``no_such_column``.
+    """
+    material = find_material(store, question.by, trusted_only=True)
+    runs = _gather(material)
+    material, runs, notes = _agree_on_scale(material, runs)
+    if runs.is_empty():
+        raise JobError(
+            "nothing_to_compare",
+            "there is no run whose numbers can be compared" + "".join(f"; {note}" for note in material.notes),
+            where=str(store.root),
+            hint="Analyze logs first: slip analyze LOG... --out RESULTS --terrain NAME.",
+        )
+    chosen = question.input or _choose_input(runs)
+    runs = add_measures(runs, measure_difficulty(_scan_slip(material), _describe_vehicles(material, runs)))
+    quantity = "median_modulus"
+    if question.as_published:
+        chosen, quantity = "command", "published_norm"
+    moduli = samples = read_moduli(material, chosen)
+    if question.as_published:
+        samples, runs, told = follow_published_runs(material, runs)
+        notes += told
+    elif chosen == "command":
+        notes += _doubt_commands(material)
+    missing = sorted(set(material.manifests) - set(samples))
+    if missing:
+        notes.append(f"{', '.join(missing)} not compared: no {quantity.replace('_', ' ')} on {chosen}")
+    groups = _group(material, samples)
+    pairs = compare_groups(groups)
+    single = _find_single(material)
+    datasets = pool_runs(
+        runs,
+        question.by,
+        within=_bound_single(moduli, single, chosen),
+        norms_within=_bound_single(read_norms(material, chosen), single, chosen),
+    )
+    comparisons = tabulate_pairs(
+        pairs, by=question.by, input_name=chosen, quantity=quantity, keys=_keys(material)
+    )
+    windows = _tabulate_windows(samples, chosen) if question.as_published else material.scan("windows")
+    boxes = spread_windows(windows, material.labels.select("run", "group"))
+    all_notes = (*material.notes, *notes, *_sum_up(pairs, groups))
+    intervals = _list_intervals(groups, datasets, chosen, quantity)
+    return Answer(datasets, comparisons, runs, chosen, quantity, intervals, boxes, all_notes)
+
+
+def _gather(material: Material) -> pl.DataFrame:
+    if not material.manifests:
+        return pl.DataFrame()
+    aggregates = material.scan("aggregates").filter(pl.col("run").is_in(list(material.manifests))).collect()
+    return gather_runs(aggregates, material.labels).filter(
+        pl.col("median_modulus").is_not_null(), pl.col("median_modulus").is_finite()
+    )
+
+
+def _agree_on_scale(material: Material, runs: pl.DataFrame) -> tuple[Material, pl.DataFrame, list[str]]:
+    """Leave out runs with another length scale than most: their moduli are other quantities."""
+    if runs.is_empty():
+        return material, runs, []
+    scales = runs.unique("run")["length_scale"]
+    usual = float(np.min(scales.drop_nulls().mode().to_numpy()))
+    kept = runs.filter(pl.col("length_scale") == usual)["run"].unique().to_list()
+    material = keep_runs(
+        material, kept, f"its length scale is not the {usual:g} m of most runs, or it has no slip"
+    )
+    return material, runs.filter(pl.col("run").is_in(kept)), [NOT_VALID]
+
+
+def _choose_input(runs: pl.DataFrame) -> str:
+    on_command = runs.filter(pl.col("input") == "command")["run"].n_unique()
+    return "command" if on_command == runs["run"].n_unique() else "measured"
+
+
+def _doubt_commands(material: Material) -> list[str]:
+    """Runs whose recorded command is known to be scaled wrongly: their slip on it is no slip."""
+    found = material.scan("findings").filter(
+        pl.col("id") == "command_scale", pl.col("run").is_in(list(material.manifests))
+    )
+    runs = found.select("run").unique().sort("run").collect()["run"].to_list()
+    if not runs:
+        return []
+    return [
+        f"read with care, the recorded command is scaled wrongly (use --input measured): {', '.join(runs)}"
+    ]
+
+
+def _scan_slip(material: Material) -> pl.LazyFrame:
+    return material.scan("slip").filter(pl.col("run").is_in(list(material.manifests)))
+
+
+def _describe_vehicles(material: Material, runs: pl.DataFrame) -> pl.DataFrame:
+    scales = runs.unique("run").select("run", "length_scale")
+    return material.labels.select("run", "mass", "inertia").join(scales, on="run")
+
+
+def _group(material: Material, samples: Mapping[str, Samples]) -> list[Group]:
+    members: dict[str, list[Samples]] = {}
+    for run, group in material.labels.select("run", "group").sort("group", "run").iter_rows():
+        if run in samples:
+            members.setdefault(group, []).append(samples[run])
+    return [Group(name, tuple(runs)) for name, runs in members.items()]
+
+
+def _find_single(material: Material) -> list[str]:
+    """Runs that are alone in their dataset."""
+    alone = material.labels.filter(pl.len().over("group") == 1)
+    return alone["run"].to_list()
+
+
+def _bound_single(
+    samples: Mapping[str, Samples], single: Sequence[str], chosen: str
+) -> dict[tuple[str, str], Interval]:
+    """Intervals of runs that are alone in their dataset."""
+    return {(run, chosen): bound_run(samples[run]) for run in single if run in samples}
+
+
+def _list_intervals(
+    groups: Sequence[Group], datasets: pl.DataFrame, chosen: str, quantity: str
+) -> pl.DataFrame:
+    """Value and interval of what was compared, one row a dataset."""
+    own = datasets.filter(pl.col("input") == chosen)
+    if quantity == "median_modulus":
+        return own.select("dataset", pl.col(quantity).alias("value"), "low", "high", "interval")
+    rows = []
+    for group in groups:
+        several = len(group.runs) > 1
+        found = bound_typical(group.medians) if several else bound_run(group.runs[0])
+        says = OVER_RUNS if several else THIS_RUN
+        rows.append((group.name, float(np.median(group.medians)), found.low, found.high, says))
+    kinds = {
+        "dataset": pl.String,
+        **dict.fromkeys(("value", "low", "high"), pl.Float64),
+        "interval": pl.String,
+    }
+    return pl.DataFrame(rows, schema=kinds, orient="row")
+
+
+def _keys(material: Material) -> dict[str, str]:
+    """Run/generation of every run of a group, separated by spaces."""
+    named = material.labels.with_columns(pl.concat_str("run", "key", separator="/").alias("place"))
+    joined = named.group_by("group").agg(pl.col("place").sort().str.join(" "))
+    return dict(zip(joined["group"].to_list(), joined["place"].to_list(), strict=True))
+
+
+def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group]) -> list[str]:
+    if len(groups) < 2:  # noqa: PLR2004 - a pair
+        return ["there is one dataset only: nothing to compare it with"]
+    hopeless = sorted({pair.note for pair in pairs if "cannot be significant" in pair.note})
+    single = sorted(group.name for group in groups if len(group.runs) == 1)
+    told = [f"{note}" for note in hopeless]
+    if single:
+        told.append(
+            f"one run only: {', '.join(single)}; intervals there speak of this run, not of the terrain"
+        )
+    return told
+
+
+def _tabulate_windows(samples: Mapping[str, Samples], input_name: str) -> pl.LazyFrame:
+    """Window norms of the published chain in the columns of the table `windows`."""
+    frames = [
+        pl.DataFrame({"window_norm": own.values}).select(
+            pl.lit(run).alias("run"),
+            pl.lit(input_name).alias("input"),
+            pl.lit(value=False).alias("suspect"),
+            "window_norm",
+        )
+        for run, own in samples.items()
+    ]
+    return pl.concat(frames).lazy() if frames else pl.LazyFrame(schema=_WINDOW_COLUMNS)

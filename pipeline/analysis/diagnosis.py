@@ -1,0 +1,126 @@
+"""The diagnosis of one run inside an analysis: made once, kept as a table and a JSON file, then reused."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+from pipeline.analysis.keys import hash_json
+from pipeline.core.errors import SlipError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    import polars as pl
+
+    from pipeline.analysis.work import Work
+    from pipeline.diagnosis import Recording
+    from pipeline.store import JSON, Manifest
+    from pipeline.vehicles import Vehicle
+
+STAGE = "diagnosis"
+DIAGNOSIS = "diagnosis.json"
+_TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
+VERSION = 4
+_WRITTEN = ("ladder", "parameters")
+
+
+def key_diagnosis(keys: Mapping[str, str]) -> str:
+    """Key of the diagnosis of a run whose stages have these keys."""
+    from schemas import contract_of  # noqa: PLC0415 - brings a table library along
+
+    return hash_json([keys["slip"], STAGE, VERSION, *(contract_of(table).version for table in _WRITTEN)])
+
+
+def has_diagnosis(manifest: Manifest | None, key: str) -> bool:
+    """Whether results hold this very diagnosis."""
+    if manifest is None or DIAGNOSIS not in manifest.files:
+        return False
+    stages = manifest.details.get("stages")
+    stored = stages.get(STAGE) if isinstance(stages, dict) else None
+    return isinstance(stored, dict) and stored.get("key") == key
+
+
+def diagnose_work(work: Work) -> dict[str, JSON] | None:
+    """The run's diagnosis: taken over where nothing has changed, else made where it is asked for.
+
+    Returns:
+        The JSON object of the run as in ``slip diagnose --json``, and its lines for the screen; None where it
+        is neither there nor asked for.
+    """
+    generation, key = work.generation, key_diagnosis(work.keys)
+    previous = generation.previous
+    if previous is not None and has_diagnosis(previous, key) and not work.options.force:
+        generation.reuse_file(DIAGNOSIS)
+        for table in _WRITTEN:
+            if table in previous.tables:
+                generation.reuse_table(table)
+        content = previous.read_json(DIAGNOSIS)
+    elif work.options.diagnosis:
+        work.progress(STAGE)
+        content = _diagnose(work)
+        generation.write_text(DIAGNOSIS, json.dumps(content, indent=1) + "\n")
+        work.computed.append(STAGE)
+    else:
+        return None
+    work.keys = {**work.keys, STAGE: key}
+    work.contexts[STAGE] = {}
+    return content
+
+
+def _diagnose(work: Work) -> dict[str, JSON]:
+    from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy
+    from pipeline.diagnosis.words import list_lines  # noqa: PLC0415 - heavy
+
+    generation, subject = work.generation, work.subject
+    recording = _make_recording(
+        work.run,
+        (generation.table_names, generation.read_table),
+        {"sha256": work.sha256, "path": str(subject.path)},
+    )
+    try:
+        diagnosis = diagnose_runs([recording], work.vehicle, inputs=work.options.inputs)
+    except SlipError as error:
+        # A log too poor to diagnose has its slip all the same.
+        finding = {"id": error.code, "severity": "warning", "text": str(error), "where": "diagnosis"}
+        return {"run": work.run, "effects": [], "undecided": [], "findings": [finding], "ladder": [],
+                "lines": [["missing", f"nothing can be named: {error.what}"]]}  # fmt: skip
+    for table, frame in (
+        ("ladder", diagnosis.tabulate_ladder(work.run)),
+        ("parameters", diagnosis.tabulate_parameters(work.run)),
+    ):
+        if not frame.is_empty():
+            work.write(table, frame)
+    return {**diagnosis.to_json()[0], "lines": [list(line) for line in list_lines(diagnosis.runs[0])]}
+
+
+def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
+    """A stored run as it is diagnosed, and its vehicle."""
+    import msgspec  # noqa: PLC0415 - only for stored runs
+
+    from pipeline.vehicles import Vehicle  # noqa: PLC0415 - heavy
+
+    log = manifest.details.get("log")
+    recording = _make_recording(
+        manifest.run,
+        (manifest.tables, manifest.read),
+        log if isinstance(log, dict) else {},
+    )
+    return msgspec.convert(manifest.details["vehicle"], Vehicle), recording
+
+
+def _make_recording(
+    run: str,
+    tables: tuple[Iterable[str], Callable[[str], pl.DataFrame]],
+    log: Mapping[str, JSON],
+) -> Recording:
+    """The tables that a diagnosis reads, with where they came from."""
+    from pipeline.diagnosis import Recording  # noqa: PLC0415 - heavy
+
+    names, read = tables
+    return Recording(
+        run,
+        {name: read(name) for name in names if name in _TABLES},
+        sha256=str(log.get("sha256", "")),
+        path=str(log.get("path", "")),
+    )

@@ -1,0 +1,69 @@
+"""Keys of stages: a stage is done when its key is that of the results there are.
+
+A key is a hash of the keys above it, of the stage's own configuration and of the stage's version, a number
+that is raised by whoever changes what the stage computes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from pipeline.analysis.options import STAGES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.analysis.subject import Subject
+
+VERSIONS: Mapping[str, int] = {"extract": 3, "align": 1, "velocity": 2, "slip": 3, "aggregate": 1}
+EXTRACTED = ("commands", "wheels", "poses", "imu")
+TABLES: Mapping[str, tuple[str, ...]] = {
+    "extract": EXTRACTED,
+    "align": (*EXTRACTED, "alignments"),
+    "velocity": ("velocities",),
+    "slip": ("slip", "windows"),
+    "aggregate": ("aggregates",),
+}
+_DIGITS = 16
+
+
+def key_stages(
+    run: str, sha256: str, subject: Subject, inputs: tuple[str, ...], model: str | None = None
+) -> dict[str, str]:
+    """Key of every stage of a run, in order; ``model`` is the hash of the model that slip is set against."""
+    # The contracts bring a table library along, which help and usage errors do without.
+    from schemas import contract_of  # noqa: PLC0415
+
+    plain = msgspec.to_builtins(subject.configuration)
+    pose_limits = {name: plain["velocity"][name] for name in ("jump_m", "jump_rad", "gap_s")}
+    own = {
+        "extract": {
+            "log": sha256,
+            "run": [run, subject.dataset, subject.terrain],
+            "vehicle": msgspec.to_builtins(subject.vehicle),
+            "roles": [plain[role] for role in ("command", "wheels", "pose", "imu", "interval")],
+            "use_intervals": plain["use_intervals"],
+            "limits": pose_limits,
+        },
+        "align": {},
+        "velocity": plain["velocity"],
+        "slip": {"slip": plain["slip"], "inputs": inputs, "model": model},
+        "aggregate": {},
+    }
+    keys: dict[str, str] = {}
+    above = ""
+    for stage in STAGES:
+        contracts = {table: contract_of(table).version for table in (*TABLES[stage], "findings")}
+        above = hash_json([above, stage, VERSIONS[stage], own[stage], contracts])
+        keys[stage] = above
+    return keys
+
+
+def hash_json(content: object) -> str:
+    """First sixteen hexadecimal digits of the SHA-256 of a JSON value with sorted keys."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]

@@ -1,0 +1,60 @@
+"""From what a user types, a log or a run, to the log or the results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.analysis.errors import JobError
+from pipeline.logs import spell_location, to_location
+from pipeline.store import Store
+
+if TYPE_CHECKING:
+    from pipeline.store import Manifest
+
+
+def find_run(text: str, store: Store) -> Manifest:
+    """The current results of a run, by its name, its stem, or the path of its log.
+
+    Raises:
+        JobError: nothing fits, or several runs do.
+    """
+    manifests = store.survey().manifests
+    path = spell_location(Path(text).resolve())
+    fitting = [
+        manifest
+        for manifest in manifests
+        if text in {manifest.run, manifest.run.rsplit("/", 1)[-1]} or recorded_path(manifest) == path
+    ]
+    if len(fitting) == 1:
+        return fitting[0]
+    names = ", ".join(manifest.run for manifest in (fitting or manifests)) or "none yet"
+    what = f"several runs are called {text!r}" if fitting else f"there is no run {text!r}"
+    raise JobError("no_such_run", what, where=str(store.root), hint=f"Say which of: {names}.")
+
+
+def find_log(text: str, out: Path) -> Path:
+    """The log that a user means: a path, or the name of a run that has results.
+
+    Raises:
+        JobError: neither fits, or the run's log has gone.
+    """
+    path = Path(text)
+    if path.exists() or path.suffix:
+        return path
+    manifest = find_run(text, Store(out))
+    log = to_location(recorded_path(manifest))
+    if not log.exists():
+        raise JobError(
+            "log_gone",
+            "the log of this run is not there any more",
+            where=str(log),
+            hint="Give the path it has now.",
+        )
+    return log
+
+
+def recorded_path(manifest: Manifest) -> str:
+    """Path of the log that a run was made of."""
+    log = manifest.details.get("log")
+    return str(log.get("path", "")) if isinstance(log, dict) else ""

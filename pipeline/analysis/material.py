@@ -1,0 +1,198 @@
+"""The runs of the results that can be compared, and why the others cannot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+import polars as pl
+
+from pipeline.fleet import label_runs, read_day
+from pipeline.store.queries import scan_table
+from schemas import contract_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.store import Manifest, Store
+
+_EARLIEST_YEAR = 2000
+_TABLES = ("aggregates", "slip")
+_SCHEMA = {
+    "run": pl.String,
+    "key": pl.String,
+    "dataset": pl.String,
+    "vehicle": pl.String,
+    "terrain": pl.String,
+    "day": pl.String,
+    "start": pl.Int64,
+    "mass": pl.Float64,
+    "inertia": pl.Float64,
+}
+
+
+@dataclass(frozen=True)
+class Material:
+    """Runs to compare.
+
+    Attributes:
+        labels: one row a run: labels, ``key``, ``group``, ``mass`` [kg], ``inertia`` [kg m^2].
+        manifests: their generations by run.
+        root: the results folder.
+        notes: which runs were left out, and why.
+    """
+
+    labels: pl.DataFrame
+    manifests: Mapping[str, Manifest]
+    store: Store
+    notes: tuple[str, ...]
+
+    def scan(self, table: str) -> pl.LazyFrame:
+        """A table over these runs."""
+        return scan_table(table, root=self.store.root, manifests=list(self.manifests.values()))
+
+
+def find_material(
+    store: Store, by: Sequence[str], *, trusted_only: bool, tables: Sequence[str] = _TABLES
+) -> Material:
+    """The current runs of the results, each recording once.
+
+    Left out, with a note: damaged results, a log that another run holds too, tables of another contract
+    version, and runs without a group; with ``trusted_only`` also runs with a finding that forbids
+    conclusions.
+
+    Args:
+        store: the results.
+        by: columns that make a group.
+        trusted_only: whether findings of severity `error` leave a run out.
+        tables: tables that a run must have.
+
+    Raises:
+        ComparisonError: ``by`` names no column.
+    """
+    survey = store.survey()
+    notes = [f"left out, damaged: {error}" for error in survey.errors]
+    kept: dict[str, Manifest] = {}
+    holders: dict[str, str] = {}
+    for manifest in survey.manifests:
+        digest = _read_digest(manifest)
+        reason = _doubt(manifest, tables)
+        if digest in holders:
+            reason = f"the same recording as {holders[digest]}"
+        if reason:
+            notes.append(f"left out, {reason}: {manifest.run}")
+            continue
+        holders[digest] = manifest.run
+        kept[manifest.run] = manifest
+    rows = pl.DataFrame([_label_run(manifest) for manifest in kept.values()], schema=_SCHEMA, orient="row")
+    dated = rows.with_columns(
+        pl.col("day").str.slice(0, 7).alias("month"), pl.col("day").str.slice(0, 4).alias("year")
+    )
+    labels = label_runs(dated, by)
+    material = Material(labels, kept, store, tuple(notes))
+    reason = f"{' and '.join(by)} unknown, not pooled"
+    material = _leave_out(material, pl.col("group").is_null(), reason)
+    return _leave_out_untrusted(material) if trusted_only else material
+
+
+def keep_runs(material: Material, runs: Sequence[str], reason: str) -> Material:
+    """The material with only these runs, and a note on the others."""
+    return _leave_out(material, ~pl.col("run").is_in(list(runs)), reason)
+
+
+def _leave_out(material: Material, which: pl.Expr, reason: str) -> Material:
+    gone = material.labels.filter(which)["run"].to_list()
+    if not gone:
+        return material
+    kept = {run: manifest for run, manifest in material.manifests.items() if run not in set(gone)}
+    note = f"left out, {reason}: {', '.join(gone)}"
+    return Material(material.labels.filter(~which), kept, material.store, (*material.notes, note))
+
+
+def _leave_out_untrusted(material: Material) -> Material:
+    if not material.manifests:
+        return material
+    grave = (
+        material.scan("findings")
+        .filter(pl.col("severity") == "error", pl.col("run").is_in(list(material.manifests)))
+        .select("run", "id")
+        .unique()
+        .sort("run", "id")
+        .collect()
+    )
+    for (finding,), rows in sorted(grave.partition_by("id", as_dict=True).items()):
+        material = _leave_out(material, pl.col("run").is_in(rows["run"].to_list()), f"finding {finding}")
+    return material
+
+
+def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
+    """Why a run's tables cannot be compared; empty when they can."""
+    for name in tables:
+        entry = manifest.tables.get(name)
+        if entry is None:
+            return f"it has no table {name}; analyze it again"
+        if entry.contract_version != contract_of(name).version:
+            return (
+                f"its table {name} has contract version {entry.contract_version} instead of "
+                f"{contract_of(name).version}; analyze it again"
+            )
+        if not (manifest.folder / entry.file).exists():
+            return f"its table {name} is gone; analyze it again with --force"
+    return ""
+
+
+def _read_digest(manifest: Manifest) -> str:
+    log = manifest.details.get("log")
+    return str(log.get("sha256")) if isinstance(log, dict) else manifest.run
+
+
+def _label_run(manifest: Manifest) -> dict[str, str | float | int | None]:
+    details = manifest.details
+    vehicle = details.get("vehicle")
+    facts = vehicle if isinstance(vehicle, dict) else {}
+    mass, inertia = _weigh(facts)
+    return {
+        "run": manifest.run,
+        "key": manifest.key,
+        "dataset": str(details.get("dataset") or "unknown"),
+        "vehicle": str(facts.get("id") or "unknown"),
+        "terrain": str(details.get("terrain") or "unknown"),
+        "day": read_day(manifest.run) or _read_day_of(_read_start(manifest)),
+        "start": _read_start(manifest),
+        "mass": mass,
+        "inertia": inertia,
+    }
+
+
+def _weigh(vehicle: Mapping[str, object]) -> tuple[float | None, float | None]:
+    """Mass [kg] and yaw inertia [kg m^2] of a plate as wide as the track and as long as the wheelbase."""
+    mass = vehicle.get("mass_kg")
+    if not isinstance(mass, (int, float)):
+        return None, None
+    sides = [vehicle.get(name) for name in ("track_width_m", "wheelbase_m")]
+    known = [float(side) for side in sides if isinstance(side, (int, float))]
+    if not known:
+        return float(mass), None
+    squared = known[0] ** 2 + known[-1] ** 2
+    return float(mass), float(mass) * squared / 12.0
+
+
+def _read_start(manifest: Manifest) -> int | None:
+    """Stamp of the log's first sample [ns]."""
+    stages = manifest.details.get("stages")
+    extract = stages.get("extract") if isinstance(stages, dict) else None
+    context = extract.get("context") if isinstance(extract, dict) else None
+    start = context.get("start_ns") if isinstance(context, dict) else None
+    return start if isinstance(start, int) else None
+
+
+def _read_day_of(start: int | None) -> str | None:
+    """Day of a stamp (UTC); None for clocks that were never set."""
+    if start is None:
+        return None
+    try:
+        day = datetime.fromtimestamp(start / 1e9, UTC)
+    except (OverflowError, OSError, ValueError):
+        return None
+    return day.strftime("%Y-%m-%d") if day.year >= _EARLIEST_YEAR else None

@@ -1,0 +1,52 @@
+"""What computed the numbers of a run: this program, Python, and the packages that took part."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import version
+from typing import TYPE_CHECKING
+
+from pipeline.core.version import PACKAGE, read_version
+from pipeline.stages.extract import list_wanted
+
+if TYPE_CHECKING:
+    from pipeline.analysis.subject import Subject
+    from pipeline.analysis.work import Work
+
+_Packages = Mapping[str, tuple[str, ...]]
+_ALWAYS = ("numpy", "scipy", "polars", "pyarrow")
+_COMPRESSION: _Packages = {"zstd": ("zstandard",), "lz4": ("pyarrow",)}
+_ENCODING: _Packages = {"protobuf": ("mcap", "mcap-protobuf-support")}
+# How much of the error can be explained at all is found by boosted trees, wherever there is a ladder.
+_CEILING = ("scikit-learn",)
+
+
+def list_versions(work: Work) -> dict[str, str]:
+    """Versions of the packages that read this log and computed its numbers.
+
+    Args:
+        work: after its stages and its diagnosis.
+    """
+    names = {*_ALWAYS, *_list_readers(work.subject)}
+    if "ladder" in work.generation.table_names:
+        names.update(_CEILING)
+    versions = {name: _look_up(name) for name in sorted(names)}
+    return {"python": platform.python_version(), PACKAGE: read_version(), **versions}
+
+
+def _list_readers(subject: Subject) -> set[str]:
+    """Packages that inflate or decode what a run takes from its log."""
+    index = subject.index
+    types = {channel.topic: channel.type_name for channel in index.channels}
+    wanted = {one.topic for one in list_wanted(subject.sources, types)}
+    encodings = {channel.message_encoding for channel in index.channels if channel.topic in wanted}
+    used = [_COMPRESSION.get(name, ()) for name in index.compressions]
+    used += [_ENCODING.get(name, ()) for name in encodings]
+    return {name for names in used for name in names}
+
+
+@cache
+def _look_up(name: str) -> str:
+    return version(name)

@@ -1,0 +1,135 @@
+"""The subject of a job: one log, its configuration, its vehicle and its name among the runs."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from pipeline.analysis.errors import JobError
+from pipeline.logs import LogIndex, open_log, spell_location
+from pipeline.vehicles import (
+    Configuration,
+    Sources,
+    Vehicle,
+    choose_sources,
+    load_configuration,
+    resolve_vehicle,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pipeline.analysis.options import Options
+    from pipeline.store import Store
+
+UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Everything known about a log before its messages are read."""
+
+    path: Path
+    index: LogIndex
+    configuration: Configuration
+    vehicle: Vehicle
+    terrain: str
+    dataset: str
+    sources: Sources
+
+
+def describe_subject(path: Path, options: Options) -> Subject:
+    """Open a log and settle configuration, vehicle and topics.
+
+    Args:
+        path: the recording.
+        options: what the user asked for.
+
+    Raises:
+        LogError: the log cannot be read.
+        ConfigurationError: the configuration is wrong or the vehicle unknown.
+        JobError: the log has no pose, or neither command nor measured wheels.
+    """
+    index = open_log(path)
+    path = index.path
+    configuration = load_configuration(
+        path, given=options.config, fleet=options.fleet, overrides=options.overrides
+    )
+    recorded = index.deployment
+    if not index.channels:
+        raise JobError(
+            "log_without_messages",
+            f"no message of the log can be read{_blame_damage(index)}"
+            if index.losses
+            else "the log holds no message",
+            where=str(path),
+            hint="Check that the recording was not cut off before its first message.",
+        )
+    vehicle = resolve_vehicle(configuration.vehicle, recorded=recorded.get("vehicle"), where=str(path))
+    terrain = configuration.run.terrain or recorded.get("terrain") or UNKNOWN
+    dataset = configuration.run.dataset or f"{vehicle.id}_{terrain}"
+    sources = choose_sources(index.channels, configuration, vehicle, where=str(path))
+    _require_sources(sources, index, options)
+    return Subject(path, index, configuration, vehicle, terrain, dataset, sources)
+
+
+def _require_sources(sources: Sources, index: LogIndex, options: Options) -> None:
+    there = ", ".join(sorted({f"{channel.topic} ({channel.type_name})" for channel in index.channels}))
+    if sources.pose is None:
+        raise JobError(
+            "no_pose",
+            "no topic can serve as pose (Odometry, PoseStamped, PoseWithCovarianceStamped or transforms)"
+            + _blame_damage(index),
+            where=str(index.path),
+            hint=f"Name it in run.toml ([pose] topic = ...). The log has: {there}.",
+        )
+    wanted = {"command": sources.command, "measured": sources.wheels}
+    if all(wanted[name] is None for name in options.inputs):
+        roles = " or ".join("command" if name == "command" else "measured wheels" for name in options.inputs)
+        raise JobError(
+            "no_command",
+            f"no topic can serve as {roles}{_blame_damage(index)}",
+            where=str(index.path),
+            hint="Name it in run.toml ([command] topic = ..., or left_topic and right_topic). "
+            f"The log has: {there}.",
+        )
+
+
+def _blame_damage(index: LogIndex) -> str:
+    """What was lost of the log, for sentences about what is not there; empty where nothing was."""
+    more = f" and {len(index.losses) - 1} more" if len(index.losses) > 1 else ""
+    return f" (the log is damaged: {index.losses[0].text}{more})" if index.losses else ""
+
+
+def name_plainly(path: Path) -> str:
+    r"""Name of the run of a log where no other run has it: folder/stem.
+
+    Bytes of a file name that are no UTF-8 are spelt ``\xe9`` in it.
+    """
+    name = f"{path.parent.name}/{path.stem}" if path.parent.name else path.stem
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
+
+
+def name_run(path: Path, sha256: str, store: Store) -> str:
+    """Name of the run of a log: folder/stem, with eight digits of its hash where another run has that name.
+
+    Equal content counts once: a copy of a log that has results already gets their name.
+    """
+    absolute = path.resolve()
+    plain = name_plainly(absolute)
+    manifest = store.manifest(plain)
+    if manifest is None:
+        for known in store.survey().manifests:
+            if _log_of(known.details).get("sha256") == sha256:
+                return known.run
+        return plain
+    before = _log_of(manifest.details)
+    if before.get("sha256") == sha256 or before.get("path") == spell_location(absolute):
+        return plain
+    return f"{plain}-{sha256[:8]}"
+
+
+def _log_of(details: object) -> dict[str, object]:
+    log = details.get("log") if isinstance(details, dict) else None
+    return log if isinstance(log, dict) else {}

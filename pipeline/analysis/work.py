@@ -1,0 +1,340 @@
+"""The stages of one run at work: each reads the tables of the one before and writes its own.
+
+A stage whose key has not changed is not computed: its tables and findings are taken over as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import msgspec
+import polars as pl
+
+from pipeline.analysis.keys import EXTRACTED, TABLES
+from pipeline.analysis.options import STAGES
+from pipeline.analysis.relative import add_model
+from pipeline.logs import LogData, Loss, read_topics
+from pipeline.runs.recording import Alignment, read_alignment
+from pipeline.stages import aggregate, checks, slip, velocity
+from pipeline.stages.align import align_tables
+from pipeline.stages.extract import extract_tables, list_wanted
+from pipeline.stages.finding import Finding, tabulate_findings
+from pipeline.store.tables import check_table
+from pipeline.vehicles import DriveForm
+from schemas import contract_of
+
+if TYPE_CHECKING:
+    from pipeline.analysis.options import Options
+    from pipeline.analysis.subject import Subject
+    from pipeline.store import JSON, Generation, Manifest, TableReport
+    from pipeline.store.tables import CheckedTable
+    from pipeline.vehicles import Vehicle
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class StageOutcome:
+    """What a stage gives beside its tables: findings and facts for the summary."""
+
+    findings: tuple[Finding, ...]
+    context: Mapping[str, JSON] = field(default_factory=dict)
+
+
+@dataclass
+class Work:
+    """One run's stages in progress.
+
+    Attributes:
+        run: name of the run.
+        subject: the log and its configuration.
+        options: what the user asked for.
+        generation: where tables go.
+        keys: key of every stage.
+        sha256: hash of the log.
+        data: columns of the log, where they have been read already.
+        progress: told what is being done.
+    """
+
+    run: str
+    subject: Subject
+    options: Options
+    generation: Generation
+    keys: Mapping[str, str]
+    sha256: str
+    data: LogData | None
+    progress: Progress
+    contexts: dict[str, Mapping[str, JSON]] = field(default_factory=dict)
+    findings: list[pl.DataFrame] = field(default_factory=list)
+    computed: list[str] = field(default_factory=list)
+    _extracted: dict[str, CheckedTable] = field(default_factory=dict)
+
+    @property
+    def alignment(self) -> Alignment:
+        """How the run was put right; there once it is aligned."""
+        return read_alignment(self.generation.read_table("alignments"))
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The vehicle, with the controller's track multiplier that the run shows once it is aligned."""
+        if "alignments" not in self.generation.table_names:
+            return self.subject.vehicle
+        multiplier = self.alignment.track_multiplier
+        return msgspec.structs.replace(self.subject.vehicle, controller_track_multiplier=multiplier)
+
+    @property
+    def _is_body_commanded(self) -> bool:
+        """Whether the command is a body command, which the controller turns into wheel speeds."""
+        source = self.subject.sources.command
+        return source is not None and source.form in {DriveForm.BODY, DriveForm.BODY_SIGNALS}
+
+    def run_stages(self) -> None:
+        """Run every stage up to the last one asked for, reusing what has not changed."""
+        stages: Mapping[str, Callable[[], StageOutcome]] = {
+            "extract": self._extract,
+            "align": self._align,
+            "velocity": self._velocity,
+            "slip": self._slip,
+            "aggregate": self._aggregate,
+        }
+        before = self.generation.previous
+        done = stored_keys(before)
+        for stage in STAGES[: STAGES.index(self.options.through) + 1]:
+            if before is not None and done.get(stage) == self.keys[stage] and not self.options.force:
+                self._take_over(stage, before)
+                continue
+            self.progress(stage)
+            outcome = stages[stage]()
+            self.contexts[stage] = outcome.context
+            self.computed.append(stage)
+            self._keep_findings(stage, outcome.findings)
+        for table in self._extracted.values():
+            self.generation.write_checked(table)
+        self.write("findings", pl.concat(self.findings))
+
+    def _take_over(self, stage: str, before: Manifest) -> None:
+        for table in TABLES[stage]:
+            # What was extracted is taken over as it was aligned, or is aligned anew.
+            if table in before.tables and (stage != "extract" or self.options.through == "extract"):
+                self.generation.reuse_table(table)
+        self.contexts[stage] = stored_contexts(before).get(stage, {})
+        self.findings.append(before.read("findings").filter(pl.col("stage") == stage))
+
+    def _keep_findings(self, stage: str, findings: tuple[Finding, ...]) -> None:
+        frame = tabulate_findings(stage, findings)
+        self.findings.append(self._identify("findings", frame))
+
+    def write(self, table: str, frame: pl.DataFrame) -> TableReport:
+        """Write a table of this run, with the run's own columns."""
+        return self.generation.write_table(table, self._identify(table, frame))
+
+    def _identify(self, table: str, frame: pl.DataFrame) -> pl.DataFrame:
+        who = {
+            "run": self.run,
+            "dataset": self.subject.dataset,
+            "vehicle": self.subject.vehicle.id,
+            "terrain": self.subject.terrain,
+        }
+        columns = contract_of(table).schema.column_names()
+        labelled = frame.with_columns(pl.lit(text).alias(name) for name, text in who.items())
+        return labelled.select(columns)
+
+    def _read(self, table: str) -> pl.DataFrame:
+        """A table of the stages before; an empty frame where the log has nothing for it."""
+        if table in self.generation.table_names:
+            return self.generation.read_table(table)
+        return pl.DataFrame()
+
+    def _extract(self) -> StageOutcome:
+        data = self.data if self.data is not None else read_subject(self.subject, self.sha256)
+        subject = self.subject
+        made = extract_tables(
+            data, subject.sources, subject.configuration, subject.vehicle, where=str(subject.path)
+        )
+        self._extracted = {
+            name: check_table(name, self._identify(name, as_recorded(name, frame)))
+            for name, frame in made.tables.items()
+            if not frame.is_empty()
+        }
+        reports = {name: checked.report for name, checked in self._extracted.items()}
+        broken = {name: report for name, report in reports.items() if report.quarantined}
+        found = [
+            Finding(
+                "quarantined_rows",
+                "warning",
+                f"{report.quarantined} rows of {name} break the contract "
+                f"({', '.join(sorted(report.rules))}): they stand in quarantine_{name}",
+                where=name,
+                count=report.quarantined,
+            )
+            for name, report in broken.items()
+        ]
+        notes = [Finding("log_note", "info", note, where="log") for note in data.notes]
+        notes += [Finding("log_unchecked", "info", data.unchecked, where="log")] if data.unchecked else []
+        notes += [
+            Finding(
+                "repeated_messages",
+                "warning",
+                f"{count} messages of {topic} stand in the log again, byte for byte: each was counted once",
+                where=topic,
+                count=count,
+            )
+            for topic, count in data.repeated.items()
+        ]
+        held = made.tables["poses"]["held"] if not made.tables["poses"].is_empty() else pl.Series([0])
+        context: dict[str, JSON] = {
+            "start_ns": made.start_ns,
+            "clocks": {topic: dict(clock) for topic, clock in made.clocks.items()},
+            "held_poses": round(float(held.mean() or 0.0), 6),  # type: ignore[arg-type]
+            "quarantined": {
+                name: {"rows": report.quarantined, "rules": dict(report.rules)}
+                for name, report in broken.items()
+            },
+            "fetched_bytes": data.fetched_bytes or None,
+            "losses": [describe_loss(loss, data.index.start_ns) for loss in data.losses],
+            "unchecked": data.unchecked or None,
+        }
+        return StageOutcome((*made.findings, *found, *notes), context)
+
+    def _align(self) -> StageOutcome:
+        previous = self.generation.previous
+        if not self._extracted and previous is not None:
+            self._extracted = {
+                name: check_table(name, as_recorded(name, previous.read(name)))
+                for name in EXTRACTED
+                if name in previous.tables
+            }
+        made = align_tables(
+            {name: checked.valid for name, checked in self._extracted.items()},
+            self.subject.vehicle,
+            hold_s=self.subject.configuration.command.hold_s,
+            body_commanded=self._is_body_commanded,
+            where=str(self.subject.path),
+        )
+        for name, checked in self._extracted.items():
+            aligned = self._identify(name, made.tables[name])
+            self.generation.write_checked(replace(checked, valid=aligned))
+        self._extracted = {}
+        self.write("alignments", made.tables["alignments"])
+        fit = made.alignment.gyro
+        gyro = None if fit is None else {
+            "usable": True,
+            "sign": -1 if fit.signed_scale < 0.0 else 1,
+            "scale": round(abs(fit.signed_scale), 6),
+            "bias_radps": round(fit.bias, 6),
+            "pose_delay_s": round(fit.yaw_delay_s, 4),
+            "residual": round(fit.residual, 4),
+        }  # fmt: skip
+        return StageOutcome(made.findings, {"gyro": gyro})
+
+    def _velocity(self) -> StageOutcome:
+        made = velocity.compute_velocities(
+            self._read("poses"),
+            self._read("imu"),
+            self.alignment.gyro,
+            self.subject.configuration.velocity,
+            where=str(self.subject.path),
+        )
+        self.write("velocities", made.table)
+        return StageOutcome(made.findings)
+
+    def _slip(self) -> StageOutcome:
+        subject, vehicle = self.subject, self.vehicle
+        velocities = self._read("velocities")
+        made = slip.compute_slip(
+            velocities,
+            self._read("commands"),
+            self._read("wheels"),
+            vehicle=vehicle,
+            configuration=subject.configuration,
+            hold_s=self.alignment.hold_s,
+            inputs=self.options.inputs,
+            where=str(subject.path),
+        )
+        table, left_out = self._set_against_model(made.slip)
+        self.write("slip", table)
+        self.write("windows", made.windows)
+        samples = checks.gather_samples(
+            velocities, made.inputs, made.cut, body_commanded=self._is_body_commanded
+        )
+        return StageOutcome((*made.findings, *left_out, *checks.run_checks(samples, vehicle)))
+
+    def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
+        """Table `slip` with the velocity of the model that was given, as it is without one."""
+        path, configuration = self.options.model, self.subject.configuration
+        if path is None:
+            return table, ()
+        read = {name: self._read(name) for name in TABLES["align"]}
+        return add_model(
+            table,
+            {name: frame for name, frame in read.items() if not frame.is_empty()},
+            path,
+            self.vehicle,
+            length=configuration.slip.length_scale_m,
+        )
+
+    def _aggregate(self) -> StageOutcome:
+        made = aggregate.aggregate_run(
+            self._read("slip"),
+            self._read("windows"),
+            self._read("velocities"),
+            vehicle=self.vehicle,
+            length=self.subject.configuration.slip.length_scale_m,
+        )
+        self.write("aggregates", made)
+        return StageOutcome(())
+
+
+def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:
+    """An extracted table before it is aligned: nothing is corrected yet."""
+    if table == "poses":
+        return frame.with_columns(pl.lit(0.0).alias("latency"), pl.lit(value=False).alias("outlier"))
+    if table == "commands":
+        return frame.with_columns(
+            pl.col(name).alias(f"{name}_aligned") for name in ("left", "right", "speed")
+        )
+    return frame
+
+
+def read_subject(subject: Subject, sha256: str | None = None) -> LogData:
+    """Read the columns that a run needs; the hash is computed beside it unless it is known."""
+    types = {channel.topic: channel.type_name for channel in subject.index.channels}
+    return read_topics(subject.index, list_wanted(subject.sources, types), sha256=sha256)
+
+
+def describe_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:
+    """A loss as JSON, its times in seconds since the log's start."""
+
+    def since(stamp: int | None) -> float | None:
+        return None if stamp is None else round((stamp - start_ns) / 1e9, 6)
+
+    return {
+        "kind": loss.kind,
+        "bytes": loss.bytes,
+        "chunks": loss.chunks,
+        "start_s": since(loss.start_ns),
+        "end_s": since(loss.end_ns),
+        "text": loss.text,
+    }
+
+
+def stored_keys(manifest: Manifest | None) -> dict[str, str]:
+    """Stage keys of the results there are."""
+    stages = manifest.details.get("stages") if manifest is not None else None
+    if not isinstance(stages, dict):
+        return {}
+    return {name: str(entry["key"]) for name, entry in stages.items() if isinstance(entry, dict)}
+
+
+def stored_contexts(manifest: Manifest) -> dict[str, Mapping[str, JSON]]:
+    """Stage contexts of the results there are."""
+    stages = manifest.details.get("stages")
+    if not isinstance(stages, dict):
+        return {}
+    return {
+        name: entry["context"]
+        for name, entry in stages.items()
+        if isinstance(entry, dict) and isinstance(entry.get("context"), dict)
+    }

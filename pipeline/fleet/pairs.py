@@ -1,0 +1,225 @@
+"""Groups of runs compared pair by pair, with the correction for asking often."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.fleet.statistics import (
+    DRAWS,
+    MOST_GROUPS,
+    adjust_holm,
+    adjust_max_t,
+    bootstrap_median,
+    compare_blocks,
+    compare_runs,
+    cut_blocks,
+    mann_whitney,
+    name_delta,
+    runs_needed,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.fleet.statistics import Blocks, Comparison, Interval
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+LEVEL = 0.05
+RUNS = "runs"
+BLOCKS = "blocks"
+_FEW_GROUPS = 6
+_FEWER_DRAWS = 1_999
+_MANY_PAIRS = 200
+ABOUT_BLOCKS = "this run against that run, not the terrain"
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The samples of one run.
+
+    Attributes:
+        values: what is compared, ascending in time, shape (n,).
+        ticks: number of each sample on its uniform grid, shape (n,).
+        pieces: segment of each sample, shape (n,).
+        step: usual length of a command step [grid steps].
+    """
+
+    values: Floats
+    ticks: Integers
+    pieces: Integers
+    step: float
+
+    @property
+    def median(self) -> float:
+        """Median of the run."""
+        return float(np.median(self.values))
+
+
+@dataclass(frozen=True)
+class Group:
+    """A dataset as the tests see it: its runs."""
+
+    name: str
+    runs: tuple[Samples, ...]
+
+    @property
+    def medians(self) -> Floats:
+        """Median of each run."""
+        return np.array([run.median for run in self.runs])
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two groups compared.
+
+    Attributes:
+        a: one group.
+        b: the other.
+        comparison: shift, interval, effect size and the pair's own test.
+        p_adjusted: corrected over the family of pairs with the same unit.
+        smallest_p: the smallest corrected p that the counts allow, whatever the difference.
+        unit: `RUNS` or `BLOCKS`.
+        method: test and correction in words.
+        p_uncorrected: plain Mann-Whitney over all samples; not valid.
+        note: what must be known to read it; may be empty.
+    """
+
+    a: Group
+    b: Group
+    comparison: Comparison
+    p_adjusted: float
+    smallest_p: float
+    unit: str
+    method: str
+    p_uncorrected: float
+    note: str
+
+    @property
+    def size(self) -> str:
+        """Cliff's delta in a word."""
+        return name_delta(self.comparison.delta)
+
+
+def compare_groups(groups: Sequence[Group]) -> list[Pair]:
+    """Compare every pair of groups.
+
+    Two groups of one run each are compared block by block, and say only that this run differs from that one;
+    they form a family of their own, corrected after Holm. All other pairs permute whole runs; their family is
+    corrected by max-T, or after Holm where there are more than eight groups.
+
+    Args:
+        groups: at least one run each, with samples.
+    """
+    numbered = list(itertools.combinations(range(len(groups)), 2))
+    single = [(i, j) for i, j in numbered if len(groups[i].runs) == len(groups[j].runs) == 1]
+    several = [pair for pair in numbered if pair not in set(single)]
+    return sorted(
+        [*_compare_runs(groups, several), *_compare_blocks(groups, single)],
+        key=lambda pair: (pair.a.name, pair.b.name),
+    )
+
+
+def bound_run(run: Samples) -> Interval:
+    """Interval of one run's median from its blocks: what this run says of itself, not of its terrain."""
+    return bootstrap_median(run.values, cut_run(run).numbers)
+
+
+def cut_run(run: Samples) -> Blocks:
+    """The run in blocks."""
+    return cut_blocks(run.values, run.ticks, run.pieces, step=run.step)
+
+
+def _compare_runs(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> list[Pair]:
+    compared = [compare_runs(groups[i].medians, groups[j].medians) for i, j in pairs]
+    by_max_t = len(groups) <= MOST_GROUPS
+    own = [found.test.p for found in compared]
+    draws = DRAWS if len(groups) <= _FEW_GROUPS or not by_max_t else _FEWER_DRAWS
+    if by_max_t and pairs:
+        positive = all(np.all(group.medians > 0.0) for group in groups)
+        units = [np.log(group.medians) if positive else group.medians for group in groups]
+        matrix = adjust_max_t(units, draws=draws)
+        adjusted = [max(float(matrix[i, j]), p) for (i, j), p in zip(pairs, own, strict=True)]
+    else:
+        adjusted = adjust_holm(own).tolist()
+    factor = 1 if by_max_t else len(pairs)
+    correction = _name_correction("max-T" if by_max_t else "Holm", len(pairs))
+    found_pairs = []
+    for (i, j), found, p in zip(pairs, compared, adjusted, strict=True):
+        smallest = min(max(found.test.smallest_p, 1.0 / (draws + 1)) * factor, 1.0)
+        kind = "exact" if found.test.exact else "random"
+        found_pairs.append(
+            Pair(
+                a=groups[i],
+                b=groups[j],
+                comparison=found,
+                p_adjusted=p,
+                smallest_p=smallest,
+                unit=RUNS,
+                method=f"{kind} permutation of whole runs{correction}",
+                p_uncorrected=_ask_published(groups[i], groups[j]),
+                note=_note_runs(groups[i], groups[j], smallest, 1 if by_max_t else len(pairs)),
+            )
+        )
+    return found_pairs
+
+
+def _compare_blocks(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> list[Pair]:
+    needed = {i for pair in pairs for i in pair}
+    blocks = {i: cut_run(groups[i].runs[0]) for i in needed}
+    draws = DRAWS if len(pairs) <= _MANY_PAIRS else _FEWER_DRAWS
+    compared = [compare_blocks(blocks[i].medians, blocks[j].medians, draws=draws) for i, j in pairs]
+    adjusted = adjust_holm([found.test.p for found in compared]).tolist()
+    correction = _name_correction("Holm", len(pairs))
+    return [
+        Pair(
+            a=groups[i],
+            b=groups[j],
+            comparison=found,
+            p_adjusted=p,
+            smallest_p=min(found.test.smallest_p * len(pairs), 1.0),
+            unit=BLOCKS,
+            method=f"permutation of {blocks[i].medians.size} and {blocks[j].medians.size} blocks{correction}",
+            p_uncorrected=_ask_published(groups[i], groups[j]),
+            note=_note_blocks(groups[i], groups[j], found.test.smallest_p, len(pairs)),
+        )
+        for (i, j), found, p in zip(pairs, compared, adjusted, strict=True)
+    ]
+
+
+def _name_correction(name: str, pairs: int) -> str:
+    return f", {name} over {pairs} pairs" if pairs > 1 else ""
+
+
+def _ask_published(a: Group, b: Group) -> float:
+    """The test of published work, over all samples."""
+    return mann_whitney(*(np.concatenate([run.values for run in group.runs]) for group in (a, b)))
+
+
+def _note_runs(a: Group, b: Group, smallest: float, family: int) -> str:
+    notes = _note_scatter(a.medians, b.medians)
+    if smallest > LEVEL:
+        counts = {len(a.runs), len(b.runs)}
+        have = f"{counts.pop()} runs a side" if len(counts) == 1 else f"{len(a.runs)} and {len(b.runs)} runs"
+        notes.append(f"cannot be significant with {have}; {runs_needed(family)} a side would do")
+    return "; ".join(notes)
+
+
+def _note_blocks(a: Group, b: Group, smallest: float, pairs: int) -> str:
+    notes = [ABOUT_BLOCKS, *_note_scatter(a.runs[0].values, b.runs[0].values)]
+    if smallest > LEVEL:
+        notes.append("cannot be significant: too short for enough independent blocks")
+    elif smallest * pairs > LEVEL:
+        notes.append(f"cannot be significant among {pairs} pairs; compare fewer")
+    return "; ".join(notes)
+
+
+def _note_scatter(a: Floats, b: Floats) -> list[str]:
+    still = [values for values in (a, b) if values.size > 1 and float(np.ptp(values)) == 0.0]
+    return ["a side does not vary at all"] if still else []

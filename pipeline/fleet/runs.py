@@ -1,0 +1,137 @@
+"""What each run brings into a comparison: its labels, its medians, its measures of difficulty."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import polars as pl
+
+from pipeline.fleet.errors import ComparisonError
+from pipeline.fleet.unpredictability import measure_unpredictability
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+LABELS = ("dataset", "vehicle", "terrain", "run", "day", "month", "year")
+UNKNOWN = "unknown"
+_MOVING_MPS = 0.1
+_FEWEST = 10
+_CALM_SAMPLES = 21
+_FASTEST = 0.99
+
+_MEASURES = {
+    "relative_slip": pl.Float64,
+    "slip_energy": pl.Float64,
+    "unpredictability": pl.Float64,
+    "transitory_slip": pl.Float64,
+    "published_norm": pl.Float64,
+}
+
+
+def label_runs(runs: pl.DataFrame, by: Sequence[str]) -> pl.DataFrame:
+    """Give every run the group it is counted in.
+
+    Args:
+        runs: one row a run with the columns `LABELS`.
+        by: columns that make a group.
+
+    Returns:
+        The runs with ``group``: the labels joined by ` / `, null where one of them is not known.
+
+    Raises:
+        ComparisonError: ``no_such_column``.
+    """
+    unknown = [name for name in by if name not in LABELS]
+    if unknown or not by:
+        raise ComparisonError(
+            "no_such_column",
+            f"runs cannot be grouped by {', '.join(unknown) or 'nothing'}",
+            hint=f"Use one or several of {', '.join(LABELS)}, with commas between them",
+        )
+    known = [pl.col(name).is_not_null() & (pl.col(name) != UNKNOWN) for name in by]
+    if "dataset" in by:
+        known.append(pl.col("terrain") != UNKNOWN)
+    label = pl.concat_str(*by, separator=" / ")
+    return runs.with_columns(pl.when(pl.all_horizontal(known)).then(label).alias("group"))
+
+
+def gather_runs(aggregates: pl.DataFrame, labels: pl.DataFrame) -> pl.DataFrame:
+    """One row a run and input from the tables `aggregates`; measures that need more than them are null.
+
+    Args:
+        aggregates: table `aggregates`.
+        labels: one row a run: `LABELS`, ``key``, ``group``.
+    """
+    halves = [
+        aggregates.filter(pl.col("subset") == name).select(
+            "run", "input", pl.col("median_modulus").alias(f"{name}_median_modulus")
+        )
+        for name in ("transitory", "steady")
+    ]
+    whole = aggregates.filter(pl.col("subset") == "all").drop("subset", "dataset", "vehicle", "terrain")
+    # A height that never changes is one that was never measured.
+    whole = whole.with_columns(pl.col("height_rate").replace(0.0, None))
+    for half in halves:
+        whole = whole.join(half, on=["run", "input"], how="left")
+    return (
+        whole.join(labels, on="run")
+        .with_columns(pl.lit(None, kind).alias(name) for name, kind in _MEASURES.items())
+        .sort("run", "input")
+    )
+
+
+def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFrame:
+    """Measures of difficulty that stay fair between vehicles, one row a run and input.
+
+    - ``relative_slip`` [1]: median of modulus / ||(f_x, f_y, L f_w)||, over steps whose ideal speed is above
+      0.1 m/s: what share of what was asked did not become motion.
+    - ``slip_energy`` [J]: median of 1/2 m |g_xy|^2 + 1/2 I g_w^2, the kinetic energy of the slip velocity.
+      I is that of a plate as wide as the track and as long as the wheelbase, m (b^2 + l^2) / 12.
+    - ``transitory_slip`` [m]: median over command steps of the integral of modulus minus the step's steady
+      median over its transitory span: the slip path that a change of command costs on top of steady driving.
+    - ``largest_kinetic_energy`` [J]: 1/2 m v^2 of the 99th percentile of the speed's running median over one
+      second: the jitter of held poses and single jumps are no motion.
+    - ``unpredictability`` [m/s]: see `measure_unpredictability`.
+
+    Args:
+        slip: table `slip` of all runs; only the columns needed are read, suspect rows are left out.
+        vehicles: one row a run: ``run``, ``mass`` [kg], ``inertia`` [kg m^2] (null where unknown),
+            ``length_scale`` [m].
+
+    Returns:
+        ``run``, ``input`` and the five measures.
+    """
+    sound = slip.filter(~pl.col("suspect")).join(vehicles.lazy(), on="run")
+    squared_yaw = (pl.col("length_scale") * pl.col("f_w")) ** 2
+    ideal = (pl.col("f_x") ** 2 + pl.col("f_y") ** 2 + squared_yaw).sqrt()
+    moved = pl.col("g_x") ** 2 + pl.col("g_y") ** 2
+    energy = 0.5 * pl.col("mass") * moved + 0.5 * pl.col("inertia") * pl.col("g_w") ** 2
+    speed = (pl.col("v_x") ** 2 + pl.col("v_y") ** 2).sqrt()
+    calm = speed.rolling_median(_CALM_SAMPLES, min_samples=3)
+    simple = sound.group_by("run", "input").agg(
+        (pl.col("modulus") / ideal).filter(ideal > _MOVING_MPS).median().alias("relative_slip"),
+        energy.median().alias("slip_energy"),
+        (0.5 * pl.col("mass").first() * calm.quantile(_FASTEST) ** 2).alias("largest_kinetic_energy"),
+    )
+    fresh, late = pl.col("transitory"), ~pl.col("transitory")
+    level = pl.col("modulus").filter(late).median()
+    period = (pl.col("t").last() - pl.col("t").first()) / (pl.len() - 1)
+    steps = (
+        sound.group_by("run", "input", "step")
+        .agg(
+            ((pl.col("modulus").filter(fresh) - level).sum() * period).alias("excess"),
+            pl.min_horizontal(fresh.sum(), late.sum()).alias("samples"),
+        )
+        .filter(pl.col("samples") >= _FEWEST)
+        .group_by("run", "input")
+        .agg(pl.col("excess").median().alias("transitory_slip"))
+    )
+    joined, left = pl.collect_all(
+        [simple.join(steps, on=["run", "input"], how="left"), measure_unpredictability(sound)]
+    )
+    return joined.join(left, on=["run", "input"], how="left").sort("run", "input")
+
+
+def add_measures(runs: pl.DataFrame, measures: pl.DataFrame) -> pl.DataFrame:
+    """The runs with the measures that were worked out put in."""
+    return runs.update(measures.with_columns(pl.col("input").cast(runs.schema["input"])), on=["run", "input"])

@@ -1,0 +1,75 @@
+"""Medians, intervals, permutation tests and effect sizes: functions of arrays, usable alone.
+
+Slip is correlated from sample to sample, so samples are not what is counted: runs are, or blocks of one run
+where there is only one. Nothing here knows of logs, tables or vehicles.
+"""
+
+from pipeline.fleet.statistics.changes import Change, find_changes
+from pipeline.fleet.statistics.correlation import (
+    TIMES_PER_BLOCK,
+    count_effective,
+    integrated_time,
+    number_blocks,
+)
+from pipeline.fleet.statistics.effect_sizes import cliffs_delta, name_delta, shift_between
+from pipeline.fleet.statistics.errors import StatisticsError
+from pipeline.fleet.statistics.families import (
+    MOST_GROUPS,
+    adjust_holm,
+    adjust_max_t,
+    runs_needed,
+    runs_needed_against,
+)
+from pipeline.fleet.statistics.intervals import (
+    Interval,
+    bootstrap_median,
+    bound_mean,
+    bound_shift,
+    bound_typical,
+)
+from pipeline.fleet.statistics.orders import kendall_tau, list_swaps
+from pipeline.fleet.statistics.pairs import Blocks, Comparison, compare_blocks, compare_runs, cut_blocks
+from pipeline.fleet.statistics.permutation import (
+    DRAWS,
+    PermutationTest,
+    permute_means,
+    permute_studentized,
+    smallest_p,
+)
+from pipeline.fleet.statistics.ranks import mann_whitney
+
+__all__ = [
+    "DRAWS",
+    "MOST_GROUPS",
+    "TIMES_PER_BLOCK",
+    "Blocks",
+    "Change",
+    "Comparison",
+    "Interval",
+    "PermutationTest",
+    "StatisticsError",
+    "adjust_holm",
+    "adjust_max_t",
+    "bootstrap_median",
+    "bound_mean",
+    "bound_shift",
+    "bound_typical",
+    "cliffs_delta",
+    "compare_blocks",
+    "compare_runs",
+    "count_effective",
+    "cut_blocks",
+    "find_changes",
+    "integrated_time",
+    "kendall_tau",
+    "list_swaps",
+    "mann_whitney",
+    "name_delta",
+    "number_blocks",
+    "permute_means",
+    "permute_studentized",
+    "runs_needed",
+    "runs_needed_against",
+    "shift_between",
+    "smallest_p",
+]

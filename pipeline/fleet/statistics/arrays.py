@@ -1,0 +1,44 @@
+"""What the functions of this room are given: plain arrays, checked once."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.fleet.statistics.errors import StatisticsError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+def check_values(values: ArrayLike, *, what: str, fewest: int = 1) -> Floats:
+    """The values as a flat array of finite numbers.
+
+    Args:
+        values: any numbers, shape (n,).
+        what: how to call them in an error.
+        fewest: how many there must be.
+
+    Raises:
+        StatisticsError: ``not_finite`` or ``too_few_values``.
+    """
+    checked = np.asarray(values, dtype=np.float64).ravel()
+    wrong = int(np.count_nonzero(~np.isfinite(checked)))
+    if wrong:
+        raise StatisticsError(
+            "not_finite",
+            f"{wrong} of {checked.size} {what} are not finite numbers",
+            hint="Leave them out before, and say so",
+        )
+    if checked.size < fewest:
+        raise StatisticsError(
+            "too_few_values",
+            f"there are {checked.size} {what}, and {fewest} are needed",
+            hint="Add runs, or compare what there is run against run",
+        )
+    return checked

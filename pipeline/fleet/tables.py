@@ -1,0 +1,153 @@
+"""Comparisons as tables: for the store, for spreadsheets, and for papers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import polars as pl
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.fleet.pairs import Pair
+
+_INPUTS = pl.Enum(["command", "measured"])
+_UNITS = pl.Enum(["runs", "blocks"])
+
+_LATEX: dict[str, tuple[tuple[str, str, int], ...]] = {
+    "datasets": (
+        ("dataset", "dataset", 0),
+        ("runs", "runs", 0),
+        ("samples", "samples", 0),
+        ("distance", "distance [m]", 0),
+        ("median_modulus", "median $\\|g\\|$ [m/s]", 3),
+        ("low", "low", 3),
+        ("high", "high", 3),
+        ("median_window_norm", "window norm [m/s]", 2),
+        ("published_norm", "as published", 2),
+    ),
+    "comparisons": (
+        ("a", "a", 0),
+        ("b", "b", 0),
+        ("unit_of_analysis", "unit", 0),
+        ("shift", "shift [m/s]", 3),
+        ("low", "low", 3),
+        ("high", "high", 3),
+        ("cliffs_delta", "$\\delta$", 2),
+        ("p", "$p$", 4),
+        ("p_adjusted", "$p$ corrected", 4),
+        ("smallest_p", "smallest $p$", 4),
+    ),
+}
+_SPECIAL = {mark: rf"\{mark}" for mark in "&%$#_{}"} | {
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "\\": r"\textbackslash{}",
+}
+
+
+def tabulate_pairs(
+    pairs: Sequence[Pair], *, by: Sequence[str], input_name: str, quantity: str, keys: Mapping[str, str]
+) -> pl.DataFrame:
+    """Table `comparisons`.
+
+    Args:
+        pairs: as of `compare_groups`.
+        by: columns that make a dataset.
+        input_name: what u was.
+        quantity: what was compared.
+        keys: run/generation of the runs of every group.
+    """
+    rows = [
+        {
+            "run": "*",
+            "dataset": f"{pair.a.name} | {pair.b.name}",
+            "vehicle": "*",
+            "terrain": "*",
+            "by": ",".join(by),
+            "input": input_name,
+            "quantity": quantity,
+            "a": pair.a.name,
+            "b": pair.b.name,
+            "runs_a": len(pair.a.runs),
+            "runs_b": len(pair.b.runs),
+            "shift": pair.comparison.shift,
+            "low": None if pair.comparison.interval is None else pair.comparison.interval.low,
+            "high": None if pair.comparison.interval is None else pair.comparison.interval.high,
+            "cliffs_delta": pair.comparison.delta,
+            "size": pair.size,
+            "p": pair.comparison.test.p,
+            "p_adjusted": pair.p_adjusted,
+            "smallest_p": pair.smallest_p,
+            "method": pair.method,
+            "unit_of_analysis": pair.unit,
+            "p_uncorrected": pair.p_uncorrected,
+            "note": pair.note,
+            "keys": f"{keys[pair.a.name]} {keys[pair.b.name]}",
+        }
+        for pair in pairs
+    ]
+    numbers = ("shift", "low", "high", "cliffs_delta", "p", "p_adjusted", "smallest_p", "p_uncorrected")
+    texts = (
+        "run",
+        "dataset",
+        "vehicle",
+        "terrain",
+        "by",
+        "quantity",
+        "a",
+        "b",
+        "size",
+        "method",
+        "note",
+        "keys",
+    )
+    schema = {
+        **dict.fromkeys(texts, pl.String()),
+        **dict.fromkeys(numbers, pl.Float64()),
+        **dict.fromkeys(("runs_a", "runs_b"), pl.Int64()),
+        "input": _INPUTS,
+        "unit_of_analysis": _UNITS,
+    }
+    return pl.DataFrame(rows, schema=pl.Schema(schema), orient="row")
+
+
+def write_csv(frame: pl.DataFrame) -> str:
+    """A table as CSV with a line of names; six significant digits."""
+    return frame.with_columns(pl.col(pl.Enum).cast(pl.String)).write_csv(float_precision=6)
+
+
+def write_latex(name: str, frame: pl.DataFrame) -> str:
+    """The columns of `datasets` or `comparisons` that a paper shows, as a LaTeX tabular (booktabs).
+
+    Columns without any value are left out.
+
+    Args:
+        name: `datasets` or `comparisons`.
+        frame: that table.
+    """
+    columns = [
+        column for column in _LATEX[name] if frame.is_empty() or frame[column[0]].null_count() < frame.height
+    ]
+    kinds = "".join("l" if frame.schema[column] in (pl.String, _UNITS) else "r" for column, _, _ in columns)
+    lines = [
+        f"\\begin{{tabular}}{{{kinds}}}",
+        "\\toprule",
+        " & ".join(title for _, title, _ in columns) + " \\\\",
+        "\\midrule",
+        *(
+            " & ".join(_write_cell(row[column], digits) for column, _, digits in columns) + " \\\\"
+            for row in frame.iter_rows(named=True)
+        ),
+        "\\bottomrule",
+        "\\end{tabular}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _write_cell(value: object, digits: int) -> str:
+    if value is None:
+        return "--"
+    if isinstance(value, float):
+        return f"{value:.{digits}f}"
+    return "".join(_SPECIAL.get(mark, mark) for mark in str(value))

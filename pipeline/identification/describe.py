@@ -1,0 +1,261 @@
+"""Models, ladders and errors as plain numbers for JSON and as lines for people."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from typing import TYPE_CHECKING
+
+from pipeline.identification.ladder import list_rises
+from pipeline.models.effect import Search
+from pipeline.models.formula.formula_effect import FormulaEffect
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.identification.intervals import Estimates
+    from pipeline.identification.ladder import Ladder, Rung
+    from pipeline.identification.scoring import Errors
+    from pipeline.models.effect import Effect, Parameter
+    from pipeline.models.model import Model
+    from pipeline.runs.recording import MotionRun
+
+_DIGITS = 6
+_STRONG = 0.8
+_HEADS = ("x m/s", "y m/s", "w rad/s", "T 2s m", "R 2s rad")
+
+
+def errors_as_json(errors: Errors) -> dict[str, object]:
+    """The promised error keys and the published variant beside them."""
+    return {
+        "velocity_rms": [_round(value) for value in errors.velocity_rms],
+        "velocity_spread": [_round(value) for value in errors.velocity_spread],
+        "t_mrmse_m": _round(errors.t_mrmse_m),
+        "r_mrmse_rad": _round(errors.r_mrmse_rad),
+        "published_t_mean_m": _round(errors.t_mean_m),
+        "published_r_mean_rad": _round(errors.r_mean_rad),
+        "t_median_m": _round(errors.t_median_m),
+        "r_median_rad": _round(errors.r_median_rad),
+        "windows": errors.windows,
+    }
+
+
+def ladder_as_json(ladder: Ladder, floor: Errors | None = None) -> list[dict[str, object]]:
+    """Rungs with their errors and the share of the removable error that is gone; `rises` where one rises."""
+    rungs: list[dict[str, object]] = []
+    below = ladder.rungs[0].errors
+    for rung, share in zip(ladder.rungs, ladder.explained_shares(floor), strict=True):
+        rises = list_rises(below, rung.errors)
+        rungs.append(
+            {
+                "effects": list(rung.effects),
+                **errors_as_json(rung.errors),
+                "explained_share": None if share is None else _round(share),
+                **({"rises": list(rises)} if rises else {}),
+            }
+        )
+        below = rung.errors
+    return rungs
+
+
+def step_as_json(before: Rung, after: Rung) -> dict[str, object]:
+    """Errors over 2 s of all effects together before and after a change, and which of them rise."""
+    return {
+        "effects": [list(before.effects), list(after.effects)],
+        "t_mrmse_m": [_round(before.errors.t_mrmse_m), _round(after.errors.t_mrmse_m)],
+        "r_mrmse_rad": [_round(before.errors.r_mrmse_rad), _round(after.errors.r_mrmse_rad)],
+        "rises": list(list_rises(before.errors, after.errors)),
+    }
+
+
+def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str, object]]:
+    """Every parameter by ``effect.name``: value, 95 % interval, unit, and whether it was fitted."""
+    found: dict[str, dict[str, object]] = {}
+    for effect in model:
+        for parameter in effect.parameters:
+            value = effect.values[parameter.name]
+            found[f"{effect.id}.{parameter.name}"] = {
+                "value": _round(value),
+                "low": None,
+                "high": None,
+                "unit": parameter.unit,
+                "fitted": False,
+            }
+    for item in estimates.items:
+        if not item.free.effect:
+            continue
+        label = item.free.label
+        entry: dict[str, object] = {
+            "value": _round(item.value),
+            "low": _round(item.low),
+            "high": _round(item.high),
+            "unit": item.free.parameter.unit if item.free.parameter else "s",
+            "fitted": True,
+            "at_bound": item.at_bound,
+            "observable": item.observable,
+        }
+        if item.free.run is None:
+            found[label] = entry
+        else:
+            found.setdefault(label, {"unit": entry["unit"], "fitted": True}).setdefault("runs", [])
+            runs = found[label]["runs"]
+            if isinstance(runs, list):
+                runs.append({"run": item.free.run, **entry})
+    return found
+
+
+def correlations_as_json(estimates: Estimates) -> list[dict[str, object]]:
+    """Pairs of parameters that the data hardly tell apart."""
+    found: list[dict[str, object]] = []
+    for i, one in enumerate(estimates.items):
+        for j in range(i):
+            value = float(estimates.correlation[i, j])
+            if abs(value) > _STRONG:
+                pair = [estimates.items[j].free.label, one.free.label]
+                found.append({"parameters": pair, "correlation": _round(value)})
+    return found
+
+
+def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
+    """The ladder as a table for people."""
+    lines = [f"{describe_errors('held-out error of', None)}{'gone':>7}"]
+    for number, (rung, share) in enumerate(zip(ladder.rungs, ladder.explained_shares(floor), strict=True)):
+        name = "ideal" if number == 0 else f"+ {_added(ladder.rungs[number - 1], rung)}"
+        gone = "" if share is None else f"{share:7.0%}"
+        lines.append(f"{name:<34}{_columns(rung.errors)}{gone}")
+        lines += _describe_rises(ladder.rungs[max(number - 1, 0)].errors, rung.errors, "taken")
+    if floor is not None:
+        lines.append(f"{'noise floor (estimated)':<34}{_columns(floor)}")
+    if ladder.idle:
+        lines.append(f"no rung, no help on unseen data:  {', '.join(ladder.idle)}")
+    return lines
+
+
+def describe_step(before: Rung, after: Rung) -> list[str]:
+    """What a change did to the errors of all effects together, and which of them rise."""
+    old, new = before.errors, after.errors
+    position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
+    heading = f"{old.r_mrmse_rad:.4f} -> {new.r_mrmse_rad:.4f} rad"
+    done = "taken" if set(after.effects) > set(before.effects) else "done"
+    line = f"{'all effects, before -> after':<34}{position}   {heading}"
+    return [line, *_describe_rises(old, new, done)]
+
+
+def _describe_rises(below: Errors, errors: Errors, done: str) -> list[str]:
+    names = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
+    return [
+        f"  ! {names[key][0]} error rises {getattr(below, key):.4f} -> {getattr(errors, key):.4f} "
+        f"{names[key][1]}: {done} because asked for"
+        for key in list_rises(below, errors)
+    ]
+
+
+def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:
+    """What was put right or left out of the poses before anything was compared; empty where nothing was."""
+    lines = []
+    for run in runs:
+        spread, outlier_s = run.alignment.latency_spread_s, run.alignment.outlier_s
+        if spread > 0.0:
+            lines.append(f"{run.name}: latencies of poses vary by {spread:.2g} s, put right by the gyro")
+        if outlier_s > 0.0:
+            lines.append(
+                f"{run.name}: {outlier_s:.3g} s left out, the localization goes where the wheels did not"
+            )
+    return lines
+
+
+def describe_errors(name: str, errors: Errors | None) -> str:
+    """One row of errors, or the heads of the columns."""
+    if errors is not None:
+        return f"{name:<34}{_columns(errors)}"
+    return f"{name:<34}{''.join(f'{head:>9}' for head in _HEADS)}"
+
+
+def _added(before: Rung, rung: Rung) -> str:
+    return ", ".join(name for name in rung.effects if name not in before.effects)
+
+
+def _columns(errors: Errors) -> str:
+    values = (*errors.velocity_rms, errors.t_mrmse_m, errors.r_mrmse_rad)
+    return "".join(f"{'-' if math.isnan(value) else f'{value:.4f}':>9}" for value in values)
+
+
+def describe_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[str]:
+    """Parameters with intervals, one a line."""
+    lines = []
+    for label, entry in parameters.items():
+        rows = entry.get("runs")
+        for row in rows if isinstance(rows, list) else [entry]:
+            text = f"  {label:<32}{_show(row.get('value')):>12} {entry['unit']:<8}"
+            if row.get("low") is not None:
+                text += f"95 %: {_show(row['low'])} to {_show(row['high'])}"
+            if row.get("at_bound"):
+                text += "  (at its bound)"
+            if row.get("observable") is False:
+                text += "  (no trace in these runs)"
+            if "run" in row:
+                text += f"  run {row['run']}"
+            lines.append(text.rstrip())
+    return lines
+
+
+def describe_effect(effect: type[Effect] | Effect) -> str:
+    """An effect's page: docstring, parameters, what shows it, and what it cannot be told from."""
+    if isinstance(effect, FormulaEffect):
+        page = effect.describe()
+    else:
+        module = inspect.getmodule(effect if inspect.isclass(effect) else type(effect))
+        page = inspect.cleandoc((module.__doc__ if module else None) or effect.__doc__ or "")
+    lines = [page, "", f"id            {effect.id}", f"acts on       {effect.place.name.lower()}"]
+    lines.append(f"vehicles      {', '.join(effect.kinds)}")
+    for parameter in effect.parameters:
+        low, high = parameter.bounds
+        how = " (searched on a grid)" if parameter.search is Search.GRID else ""
+        lines.append(
+            f"parameter     {parameter.name} [{parameter.unit}]: {parameter.about}; {low:g} to {high:g}, "
+            f"neutral {parameter.neutral:g}, usually about {parameter.typical:g}{how}"
+        )
+        lines += [f"{'':<14}{text}" for text in _describe_sizes(parameter)]
+    lines.append(f"shown by      {', '.join(need.value for need in effect.needs)}")
+    if effect.equivalent_to:
+        lines.append(f"same as       {', '.join(effect.equivalent_to)} ({effect.equivalent_when})")
+    if effect.contains:
+        lines.append(f"contains      {', '.join(effect.contains)}")
+    if effect.parts:
+        lines.append(f"searched as   {', '.join(part.effect for part in effect.parts)}")
+    if effect.confused_with:
+        lines.append(f"looks like    {', '.join(effect.confused_with)}")
+    return "\n".join(lines)
+
+
+def _describe_sizes(parameter: Parameter) -> list[str]:
+    """What is too small to be named, and what vehicles show."""
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    lines = []
+    if parameter.least is not None:
+        least = parameter.least
+        lines.append(f"too small below {least.size:g}{unit} off neutral: {least.reason}")
+    if parameter.plausible is not None:
+        range_ = parameter.plausible
+        lines.append(f"vehicles show {range_.low:g} to {range_.high:g}{unit}: {range_.source}")
+    if parameter.one_sign:
+        lines.append("named where it is positive: the other sign is no physics")
+    return lines
+
+
+def list_pages(effects: Sequence[type[Effect]]) -> list[str]:
+    """The catalogue: one line an effect."""
+    lines = []
+    for effect in effects:
+        module = inspect.getmodule(effect)
+        title = ((module.__doc__ if module else None) or "").strip().splitlines()[0]
+        lines.append(f"{effect.id:<20}{effect.place.name.lower():<14}{title.split(': ', 1)[-1]}")
+    return lines
+
+
+def _show(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, int | float) else "-"
+
+
+def _round(value: float) -> float | None:
+    return None if not math.isfinite(value) else float(f"{value:.{_DIGITS}g}")

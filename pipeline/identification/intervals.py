@@ -1,0 +1,256 @@
+"""How sure a fit is of its numbers: a block bootstrap, because residuals repeat each other in time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.identification.problem import Free, needs_search
+from pipeline.identification.robust import weigh_system
+from pipeline.models.effect import Late, find_late
+
+if TYPE_CHECKING:
+    from pipeline.identification.fit import Fitted
+    from pipeline.identification.problem import Problem
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_DRAWS = 1000
+_HUBER = 3.0
+_SHORTEST_BLOCK_S = 6.0
+_TAUS = 5.0
+_DELAY_STEP = 5e-3
+_RISEN = 1.92
+_SEED = 20240513
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A fitted number with its 95 % interval.
+
+    Attributes:
+        free: which number.
+        value: the estimate.
+        low, high: ends of the interval.
+        standard_error: of the estimate.
+        at_bound: whether it stopped at a bound, so that the interval means little.
+        observable: whether the data move with it at all.
+    """
+
+    free: Free
+    value: float
+    low: float
+    high: float
+    standard_error: float
+    at_bound: bool
+    observable: bool
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """All numbers of a fit: `items`, their `correlation` (p, p), and how many `blocks` stand behind them."""
+
+    items: tuple[Estimate, ...]
+    correlation: Floats
+    blocks: int
+
+    def find(self, label: str) -> Estimate:
+        """The estimate of ``effect.name``.
+
+        Raises:
+            KeyError: it was not fitted.
+        """
+        for item in self.items:
+            if item.free.label == label:
+                return item
+        raise KeyError(label)
+
+
+NOTHING = Estimates((), np.zeros((0, 0)), 0)
+"""Estimates of a model that was not fitted."""
+
+
+def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
+    """Intervals of all numbers of a fit.
+
+    Whole blocks are drawn with replacement and the fit is repeated through its derivatives. Blocks are
+    command steps; where those are short against the correlation of the residuals, several are joined, to
+    at least five integrated autocorrelation times and six seconds. The interval is symmetric, with Student's
+    t for the number of blocks.
+
+    Args:
+        problem: the runs.
+        fitted: a converged fit.
+    """
+    from scipy.stats import t as student  # noqa: PLC0415 - heavy
+
+    count = len(fitted.free)
+    if count == 0:
+        return NOTHING
+    block = join_blocks(problem, fitted)
+    pieces = int(block.max()) + 1
+    normals, gradients = _sum_blocks(problem, fitted, block, pieces)
+    total = normals.sum(axis=0)
+    size = np.sqrt(np.maximum(np.diag(total), 0.0))
+    observable = size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)
+    rows = np.flatnonzero(observable)
+    errors = np.full(count, np.nan)
+    correlation = np.full((count, count), np.nan)
+    if rows.size:
+        draws = _draw(normals, gradients, rows, size, pieces)
+        spread = np.cov(draws, rowvar=False).reshape(rows.size, rows.size)
+        errors[rows] = np.sqrt(np.diag(spread))
+        deviation = np.maximum(np.outer(errors[rows], errors[rows]), 1e-300)
+        correlation[np.ix_(rows, rows)] = spread / deviation
+    freedom = max(pieces - rows.size, 2)
+    wide = float(student.ppf(0.975, freedom)) * np.sqrt(pieces / max(pieces - rows.size, 1))
+    errors[rows] = np.hypot(errors[rows], _carry_delays(problem, fitted, total, rows, size))
+    items = []
+    for index, number in enumerate(fitted.free):
+        value = fitted.state.get(number)
+        half = wide * float(errors[index])
+        if needs_search(number):
+            half = _widen(problem, fitted, number)
+        items.append(
+            Estimate(
+                number,
+                value,
+                value - half,
+                value + half,
+                float(errors[index]),
+                at_bound=stands_at_bound(value, number.bounds),
+                observable=bool(observable[index]),
+            )
+        )
+    return Estimates(tuple(items), correlation, pieces)
+
+
+def stands_at_bound(value: float, bounds: tuple[float, float]) -> bool:
+    """Whether a number stopped because it may go no further."""
+    low, high = bounds
+    margin = 1e-6 * (abs(low) + abs(high)) if np.isfinite(low + high) else 0.0
+    return not low + margin < value < high - margin
+
+
+def _carry_delays(problem: Problem, fitted: Fitted, total: Floats, rows: Integers, size: Floats) -> Floats:
+    """Standard errors that come from not knowing the delay of the poses exactly, shape (rows,)."""
+    carried = np.zeros(rows.size)
+    if problem.given_timing is not None or rows.size == 0:
+        return carried
+    scaled = total[np.ix_(rows, rows)] / np.outer(size[rows], size[rows]) + 1e-9 * np.eye(rows.size)
+    for run, comparison in enumerate(problem.comparisons):
+        gyro = comparison.heading.gyro
+        if gyro is None or find_late(fitted.model, Late.POSES) is not None:
+            continue
+        delay = Free("", "pose_delay_s", run, (-1.0, 1.0), _DELAY_STEP)
+        column = problem.differentiate(fitted.state, [delay], fitted.residuals)
+        jacobian = np.concatenate((fitted.jacobian, column), axis=2)
+        normal, _ = weigh_system(problem, fitted.residuals, jacobian, fitted.weights, fitted.used)
+        shift = np.linalg.solve(scaled, normal[rows, -1] / size[rows]) / size[rows]
+        carried = np.hypot(carried, np.abs(shift) * gyro.delay_error_s)
+    return carried
+
+
+def _widen(problem: Problem, fitted: Fitted, number: Free) -> float:
+    """Half-width for a number that is not smooth: where the loss has risen by what chance would allow.
+
+    The likelihood ratio, divided by how often a residual repeats itself.
+    """
+    value, (low, high) = fitted.state.get(number), number.bounds
+    base = _sum_losses(problem, fitted, fitted.residuals)
+    stride = float(np.median(np.diff(problem.times.mean(axis=1))))
+    repeats = max(integrate_correlation(problem, fitted) / max(stride, 1e-3), 1.0)
+    ends = []
+    for side in (-1.0, 1.0):
+        width = number.step / 16.0
+        while width < 64.0 * number.step:
+            moved = fitted.state.set(number, float(np.clip(value + side * width, low, high)))
+            if _sum_losses(problem, fitted, problem.find_residuals(moved)) - base > _RISEN * repeats:
+                break
+            width *= 1.5
+        ends.append(width)
+    return max(ends)
+
+
+def _sum_losses(problem: Problem, fitted: Fitted, residuals: Floats) -> float:
+    size = np.abs(fitted.weights.normalise(residuals, problem))[fitted.used]
+    return float(np.where(size <= _HUBER, 0.5 * size**2, _HUBER * (size - 0.5 * _HUBER)).sum())
+
+
+def join_blocks(problem: Problem, fitted: Fitted) -> Integers:
+    """Number of the bootstrap block of every window: command steps, joined where they are too short."""
+    length = max(_SHORTEST_BLOCK_S, _TAUS * integrate_correlation(problem, fitted))
+    joined = np.empty(problem.block_of.size, dtype=np.int64)
+    number = -1
+    begin, last_run, last_block = -np.inf, -1, -1
+    middle = problem.times.mean(axis=1)
+    for index, (run, block) in enumerate(
+        zip(problem.run_of.tolist(), problem.block_of.tolist(), strict=True)
+    ):
+        if run != last_run or (block != last_block and middle[index] - begin >= length - 1.0):
+            number += 1
+            begin = middle[index]
+        last_run, last_block = run, block
+        joined[index] = number
+    return joined
+
+
+def integrate_correlation(problem: Problem, fitted: Fitted) -> float:
+    """Integrated autocorrelation time [s] of the residuals: the longest of the three channels."""
+    normal = np.clip(fitted.weights.normalise(fitted.residuals, problem), -_HUBER, _HUBER)
+    middle = problem.times.mean(axis=1)
+    step = float(np.median(np.diff(middle)))
+    near = (np.diff(middle) < 2.0 * step) & (np.diff(problem.run_of) == 0)
+    label = np.concatenate(([0], np.cumsum(~near)))
+    longest = 0.0
+    for channel in normal.T:
+        centred = channel - channel.mean()
+        power = float(np.mean(centred**2))
+        if power <= 0.0:
+            continue
+        total = 0.5
+        for lag in range(1, min(int(20.0 / step), centred.size // 4)):
+            same = label[lag:] == label[:-lag]
+            if same.sum() < 50:  # noqa: PLR2004 - too few pairs to know
+                break
+            value = float(np.mean(centred[lag:][same] * centred[:-lag][same])) / power
+            if value < 0.05:  # noqa: PLR2004 - from here on it is noise
+                break
+            total += value
+        longest = max(longest, 2.0 * total * step)
+    return longest
+
+
+def _sum_blocks(problem: Problem, fitted: Fitted, block: Integers, pieces: int) -> tuple[Floats, Floats]:
+    """Normal matrix and gradient of every block."""
+    used = fitted.used
+    normal = fitted.weights.normalise(fitted.residuals, problem)[used]
+    size = np.abs(normal)
+    robust = np.sqrt(np.where(size <= _HUBER, 1.0, _HUBER / np.maximum(size, _HUBER)))
+    columns = fitted.jacobian[used] * (robust / fitted.weights.scale[problem.run_of[used]])[:, :, None]
+    products = np.einsum("ncp,ncq->npq", columns, columns)
+    pulls = np.einsum("ncp,nc->np", columns, normal * robust)
+    normals = np.zeros((pieces, *products.shape[1:]))
+    gradients = np.zeros((pieces, pulls.shape[1]))
+    np.add.at(normals, block[used], products)
+    np.add.at(gradients, block[used], pulls)
+    return normals, gradients
+
+
+def _draw(normals: Floats, gradients: Floats, rows: Integers, size: Floats, pieces: int) -> Floats:
+    """Bootstrapped changes of the numbers, shape (draws, rows)."""
+    generator = np.random.default_rng(_SEED)
+    counts = generator.multinomial(pieces, np.full(pieces, 1.0 / pieces), size=_DRAWS).astype(np.float64)
+    scale = size[rows]
+    small = normals[:, rows][:, :, rows] / np.outer(scale, scale)
+    pull = gradients[:, rows] / scale
+    # At the solution the pulls cancel; what is left of them is not part of the spread.
+    pull = pull - pull.mean(axis=0)
+    matrices = np.einsum("dk,kpq->dpq", counts, small) + 1e-9 * np.eye(rows.size)
+    sums = counts @ pull
+    steps: Floats = -np.linalg.solve(matrices, sums[:, :, None])[:, :, 0] / scale
+    return steps

@@ -1,0 +1,123 @@
+"""What one does with a model and runs: judge it, fit it, note in its file what it was fitted on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from pipeline.identification.describe import errors_as_json
+from pipeline.identification.fit import Fitted, fit_model
+from pipeline.identification.floor import estimate_floor, hold_below
+from pipeline.identification.intervals import Estimates, estimate_intervals
+from pipeline.identification.ladder import Ladder, Rung, climb, compare_losses
+from pipeline.identification.scoring import hold_out
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.identification.problem import Problem
+    from pipeline.identification.scoring import Errors
+    from pipeline.models.model import Model
+    from pipeline.models.model_file import ModelFile
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A model on runs.
+
+    Attributes:
+        problem: the runs.
+        ladder: held-out errors from the ideal model up, over the effects that help.
+        whole: all effects of the model, fitted together, with their held-out errors.
+        estimates: its numbers with intervals.
+        floor: the noise floor, from the best of all these.
+    """
+
+    problem: Problem
+    ladder: Ladder
+    whole: Rung
+    estimates: Estimates
+    floor: Errors
+
+    @property
+    def fitted(self) -> Fitted:
+        """The fit of all effects."""
+        return self.whole.fitted
+
+
+def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Judgement:
+    """Fit a model, climb its ladder and estimate the floor.
+
+    Args:
+        problem: the runs.
+        model: its effects at neutral values are searched, others start from their values.
+        per_run: labels whose values belong to each run alone.
+    """
+    ladder = climb(problem, model, per_run=per_run)
+    top = ladder.rungs[-1]
+    wanted = {effect.id for effect in problem.active_effects(model)}
+    if wanted == set(top.effects):
+        fitted, held_out = top.fitted, top.held_out
+    else:
+        fitted = fit_model(problem, model.keep(wanted), per_run=per_run)
+        held_out = hold_out(problem, fitted)
+    whole = Rung(fitted, held_out)
+    best = whole if compare_losses(held_out, top.held_out) < 1.0 else top
+    floor = hold_below(estimate_floor(problem, best.held_out), top.errors)
+    return Judgement(problem, ladder, whole, estimate_intervals(problem, fitted), floor)
+
+
+def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
+    """The model file with fitted values, intervals, and what they were fitted on.
+
+    Effects that do not act on the input keep the values they had.
+    """
+    fitted = judgement.fitted.model
+    model = file.model.swap(*(effect for effect in fitted if effect.id in file.model))
+    intervals = {
+        label: interval
+        for label, interval in file.intervals.items()
+        if not any(label.startswith(f"{effect.id}.") for effect in fitted)
+    }
+    problem, estimates = judgement.problem, judgement.estimates
+    for item in estimates.items:
+        if item.free.effect and item.free.run is None:
+            intervals[item.free.label] = (item.low, item.high)
+    fit: dict[str, object] = {
+        "input": problem.source.value,
+        "blocks": estimates.blocks,
+        "noise_floor": errors_as_json(judgement.floor),
+        "runs": [
+            {
+                "run": comparison.run.name,
+                "sha256": comparison.run.sha256,
+                "terrain": comparison.run.terrain,
+                "pose_delay_s": timing.pose_delay_s,
+                "wheel_delay_s": timing.wheel_delay_s,
+            }
+            for comparison, timing in zip(problem.comparisons, judgement.fitted.state.timing, strict=True)
+        ],
+        "ladder": [
+            {
+                "effects": list(rung.effects),
+                "velocity_rms": list(rung.errors.velocity_rms),
+                "t_mrmse_m": rung.errors.t_mrmse_m,
+                "r_mrmse_rad": rung.errors.r_mrmse_rad,
+            }
+            for rung in judgement.ladder.rungs
+        ],
+    }
+    own = [
+        {
+            "run": problem.names[item.free.run],
+            "parameter": item.free.label,
+            "value": item.value,
+            "low": item.low,
+            "high": item.high,
+        }
+        for item in estimates.items
+        if item.free.effect and item.free.run is not None
+    ]
+    if own:
+        fit["own"] = own
+    return replace(file, model=model, intervals=intervals, fit=fit)

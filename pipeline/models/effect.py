@@ -1,0 +1,485 @@
+"""What an effect is: declared parameters, a place on the command's way, and one method that acts there.
+
+An effect's docstring is its manual page: what happens, the formula, the parameters, the source. Effects are
+values: changing a parameter makes another effect.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
+
+from pipeline.runs.errors import MotionError
+from pipeline.vehicles.kinematics import list_kinds
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from pipeline.models.evidence import Evidence, Largest, Relative
+    from pipeline.runs.signals import Commands, Floats, Rolling, Surroundings, Velocity, Wheels
+
+INF = math.inf
+NAN = math.nan
+
+_USUAL_LIMIT = 0.7
+_USUAL_MOMENT = 0.5
+
+
+class Place(enum.IntEnum):
+    """Where on a command's way an effect acts, in this order."""
+
+    COMMAND = 1
+    DRIVE = 2
+    KINEMATICS = 3
+    BODY = 4
+    GROUND = 5
+    CENTRE = 6
+    LOCALIZATION = 7
+
+
+class Excitation(enum.Enum):
+    """What a run must contain for an effect to leave a trace of its own."""
+
+    DRIVING = "driving"
+    TURNING = "turning both ways"
+    SPEED_SPREAD = "several speeds"
+    BOTH_SIGNS = "driving forward and backward"
+    CHANGES = "changes of command"
+    SLOPE = "slopes in several directions"
+    LARGE = "commands near the limits"
+    SMALL = "commands near zero"
+    LONG = "a run of several minutes"
+    STEERING = "steering to both sides"
+
+
+class Search(enum.Enum):
+    """How a parameter is found: from one start, from several, or on a shrinking grid if it is not smooth."""
+
+    DIRECT = "direct"
+    STARTS = "starts"
+    GRID = "grid"
+
+
+class Late(enum.Enum):
+    """What an effect makes late whose only number is a delay: sensors may know that delay beforehand."""
+
+    POSES = "poses are stamped late"
+    HEADING = "the heading is older than its position"
+    BODY = "the body follows its wheels late, which hides a delay of the encoders"
+
+
+@dataclass(frozen=True)
+class Least:
+    """The smallest size of a number that is worth a name.
+
+    Attributes:
+        size: distance from the neutral value, in the parameter's unit.
+        reason: what makes as much of nothing, however small the interval is.
+        sampled: whether sampling the wheels does too: then its delay is the least.
+    """
+
+    size: float
+    reason: str
+    sampled: bool = False
+
+
+STAMPS = "stamps are off by as much"
+MOUNTING = "sensors are mounted no better"
+DATA_SHEET = "a data sheet allows as much"
+
+
+@dataclass(frozen=True)
+class Plausible:
+    """The range that vehicles show, wider than was ever seen: outside, a name stands for something else.
+
+    Attributes:
+        low, high: ends of the range, in the parameter's unit.
+        source: where it comes from.
+    """
+
+    low: float
+    high: float
+    source: str
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an effect.
+
+    Attributes:
+        name: as in the formula.
+        unit: SI, `1` for a plain number.
+        bounds: smallest and largest value.
+        neutral: value at which the effect changes nothing; NaN for a number that only says where it acts.
+        about: what it is.
+        typical: a usual size.
+        search: how it is found.
+        starts: values to start or to begin the grid from.
+        relative_to: what the starts are shares of: the largest commanded `speed`, `turn` or `wheel` speed,
+            the run's `duration`, or its way along x (`place`); empty where they are values.
+        step: change used for numerical derivatives.
+        least: smallest size worth a name; None where every size is, or where `Effect.is_degenerate` tells.
+        plausible: what vehicles show; None for all within the bounds.
+        one_sign: whether physics has positive values only: the other sign is a clock or chance.
+        instead_of: the parameter that counts no more once this one is given; this one is not searched alone.
+    """
+
+    name: str
+    unit: str
+    bounds: tuple[float, float]
+    neutral: float
+    about: str
+    typical: float
+    search: Search = Search.DIRECT
+    starts: tuple[float, ...] = ()
+    relative_to: Relative = ""
+    step: float = 1e-4
+    least: Least | None = None
+    plausible: Plausible | None = None
+    one_sign: bool = False
+    instead_of: str = ""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A number of an effect that is searched as that of another effect.
+
+    Attributes:
+        name: of the number.
+        effect, parameter: under which it is searched.
+        factor: what that is multiplied with.
+    """
+
+    name: str
+    effect: str
+    parameter: str
+    factor: float
+
+
+DIFFERENTIAL = ("differential",)
+ACKERMANN = ("ackermann",)
+ANY = list_kinds()
+
+
+class Effect(ABC):
+    """One physical reason why the velocity differs from the ideal one.
+
+    Attributes:
+        id: stable name.
+        place: where it acts; `rank` orders the effects of one place.
+        parameters: its numbers.
+        kinds: kinds of vehicles it exists on.
+        needs: what a run must contain to show it.
+        confused_with: effects that look alike at first order or under poor driving.
+        equivalent_to: effects that cannot be told from it at all, under `equivalent_when`, which
+            `is_equivalent` looks for in recordings.
+        same_in_one_motion: effects that cannot be told from it by driving straight only, or turning only.
+        contains: effects that are special cases of it: it explains whatever they explain.
+        parts: numbers of other effects under which it is searched; found together, they are named as it.
+        late: what it makes late, where its only number is a delay.
+        price: share of the held-out error that it must take away before it counts.
+        values: the numbers themselves.
+        fixed: names of parameters that a fit leaves alone.
+    """
+
+    id: str
+    place: Place
+    rank: ClassVar[int] = 0
+    parameters: tuple[Parameter, ...]
+    kinds: tuple[str, ...] = ANY
+    needs: tuple[Excitation, ...] = (Excitation.DRIVING,)
+    confused_with: tuple[str, ...] = ()
+    equivalent_to: tuple[str, ...] = ()
+    equivalent_when: str = ""
+    same_in_one_motion: tuple[str, ...] = ()
+    contains: tuple[str, ...] = ()
+    parts: tuple[Part, ...] = ()
+    late: Late | None = None
+    price: float = 0.0
+
+    def __init__(self, *, fixed: Iterable[str] = (), **values: float) -> None:
+        self.values: Mapping[str, float] = self._complete(values)
+        self.fixed = frozenset(fixed)
+
+    def __repr__(self) -> str:
+        numbers = ", ".join(f"{name}={value:g}" for name, value in self.values.items())
+        return f"{self.id}({numbers})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Effect) and self.key == other.key and self.fixed == other.fixed
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What the effect does, as a hashable value."""
+        return (self.id, *(None if math.isnan(value) else value for value in self.values.values()))
+
+    @property
+    def is_neutral(self) -> bool:
+        """Whether every parameter that can be neutral is."""
+        return all(math.isnan(p.neutral) or self.values[p.name] == p.neutral for p in self.parameters)
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether it is something that the whole vehicle does late: several such effects imitate one."""
+        return Excitation.CHANGES in self.needs and Excitation.STEERING not in self.needs
+
+    @property
+    def delay(self) -> float:
+        """The number of an effect that makes something late, its only one [s]."""
+        (value,) = self.values.values()
+        return value
+
+    @classmethod
+    def of_delay(cls, seconds: float) -> Self:
+        """The effect, of one that makes something late, with a delay brought inside its bounds [s]."""
+        (parameter,) = cls.parameters
+        low, high = parameter.bounds
+        return cls().change(**{parameter.name: min(max(seconds, low), high)})
+
+    @property
+    def searched_as(self) -> frozenset[str]:
+        """Ids under which it is searched."""
+        return frozenset(part.effect for part in self.parts) or frozenset({self.id})
+
+    @classmethod
+    def join(cls, found: Mapping[str, Effect]) -> Self:
+        """The effect made of its parts, by id."""
+        return cls().change(
+            **{part.name: part.factor * found[part.effect].values[part.parameter] for part in cls.parts}
+        )
+
+    def can_show(self, evidence: Evidence) -> bool:
+        """Whether sensors and driving let it be told at all."""
+        del evidence
+        return True
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """Whether it is, with these numbers, nothing in these runs or another effect in disguise."""
+        del evidence
+        return False
+
+    def is_equivalent(self, evidence: Evidence) -> bool:
+        """Whether nothing in these runs tells it from those that it is equivalent to."""
+        del evidence
+        return True
+
+    def collapse(self) -> Effect | None:
+        """The simpler effect that it has become when it is degenerate; None where there is none."""
+        return None
+
+    def list_softer(self, largest: Largest) -> tuple[Effect, ...]:
+        """Effects that bend where this one breaks, to be tried as such though they have more numbers."""
+        del largest
+        return ()
+
+    def scale_without(self, other: Effect) -> float:
+        """What its numbers are to be multiplied with where another effect is left out of the same motion."""
+        del other
+        return 1.0
+
+    def is_used(self, parameter: Parameter) -> bool:
+        """Whether a parameter takes part: of two that stand for each other only the one that is given."""
+        if parameter.instead_of:
+            return math.isfinite(self.values[parameter.name])
+        return not any(
+            p.instead_of == parameter.name and math.isfinite(self.values[p.name]) for p in self.parameters
+        )
+
+    def make_usual(self, largest: Largest) -> Self:
+        """The same effect at a usual size, brought inside its bounds."""
+        values = self._list_usual(largest)
+        bounds = {p.name: p.bounds for p in self.parameters}
+        return self.change(
+            **{name: min(max(value, bounds[name][0]), bounds[name][1]) for name, value in values.items()}
+        )
+
+    def _list_usual(self, largest: Largest) -> dict[str, float]:
+        """Usual values: a limit below what was asked for, a moment in the middle of the run."""
+        shares = {"": None, "duration": _USUAL_MOMENT}
+        usual = {}
+        for p in self.parameters:
+            share = shares.get(p.relative_to, _USUAL_LIMIT)
+            if not p.instead_of:
+                usual[p.name] = p.typical if share is None else largest.take(share, p.relative_to)
+        return usual
+
+    def parameter(self, name: str) -> Parameter:
+        """The declared parameter.
+
+        Raises:
+            MotionError: ``unknown_parameter``.
+        """
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return parameter
+        known = ", ".join(f"{p.name} [{p.unit}]" for p in self.parameters)
+        raise MotionError(
+            "unknown_parameter",
+            f"the effect {self.id} has no parameter {name!r}",
+            where=f"{self.id}.{name}",
+            hint=f"It has: {known}.",
+        )
+
+    def change(self, **values: float) -> Self:
+        """The same effect with other values.
+
+        Raises:
+            MotionError: ``unknown_parameter`` or ``out_of_bounds``.
+        """
+        return self._copy({**self.values, **values}, self.fixed)
+
+    def fix(self, *names: str) -> Self:
+        """The same effect with parameters that a fit must leave alone.
+
+        Raises:
+            MotionError: ``unknown_parameter``.
+        """
+        return self._copy(self.values, self.fixed | {self.parameter(name).name for name in names})
+
+    def loosen(self, *names: str) -> Self:
+        """The same effect with parameters that a fit may change again.
+
+        Raises:
+            MotionError: ``unknown_parameter``.
+        """
+        return self._copy(self.values, self.fixed - {self.parameter(name).name for name in names})
+
+    def _copy(self, values: Mapping[str, float], fixed: Iterable[str]) -> Self:
+        return type(self)(fixed=fixed, **values)
+
+    def _complete(self, given: Mapping[str, float]) -> dict[str, float]:
+        for name, value in given.items():
+            parameter = self.parameter(name)
+            low, high = parameter.bounds
+            neutral = value == parameter.neutral or (math.isnan(value) and math.isnan(parameter.neutral))
+            if not neutral and not math.isfinite(value):
+                raise MotionError(
+                    "out_of_bounds",
+                    f"{name} = {value:g} is no finite number",
+                    where=f"{self.id}.{name}",
+                    hint="Give a value inside the bounds.",
+                )
+            if not neutral and not low <= value <= high:
+                unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+                raise MotionError(
+                    "out_of_bounds",
+                    f"{name} = {value:g}{unit} is outside of {low:g} to {high:g}",
+                    where=f"{self.id}.{name}",
+                    hint="Give a value inside the bounds.",
+                )
+        return {p.name: float(given.get(p.name, p.neutral)) for p in self.parameters}
+
+
+class CommandEffect(Effect):
+    """Acts on commands at their own stamps."""
+
+    place = Place.COMMAND
+
+    @abstractmethod
+    def change_commands(self, commands: Commands, around: Surroundings) -> Commands:
+        """What the drive is told in place of these commands."""
+
+
+class DriveEffect(Effect):
+    """Acts between what the drive is told and what the wheels do."""
+
+    place = Place.DRIVE
+
+    @abstractmethod
+    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+        """What the wheels do in place of this."""
+
+
+class KinematicEffect(Effect):
+    """Acts between the wheels and the body velocity before the ground acts."""
+
+    place = Place.KINEMATICS
+
+    @abstractmethod
+    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+        """The body velocity before the ground, in place of this."""
+
+
+class BodyEffect(Effect):
+    """Makes the body's velocity out of the rolling velocity."""
+
+    place = Place.BODY
+
+    @abstractmethod
+    def move_body(self, rolling: Rolling, around: Surroundings) -> Velocity:
+        """Velocity of the body before ground effects are added."""
+
+
+Column = tuple["Floats | float", "Floats | float", "Floats | float"]
+
+
+class AddedEffect(Effect):
+    """Adds something to the velocity, made of the model and never of measurements."""
+
+    place = Place.GROUND
+
+    @abstractmethod
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Velocity:
+        """Add the effect to ``total``.
+
+        Args:
+            total: velocity so far, other effects of this place included.
+            rolling: v0, w0 of the model.
+            velocity: what this place acts on; ground effects, which act in parallel, must not use it.
+            around: the run.
+        """
+
+
+class LinearEffect(AddedEffect):
+    """Adds parameter times column."""
+
+    @abstractmethod
+    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+        """What one unit of each parameter adds to v_x, v_y, v_w.
+
+        Args:
+            rolling: v0, w0 of the model.
+            velocity: what this place acts on; ground effects, which act in parallel, must not use it.
+            around: the run.
+        """
+
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Velocity:
+        """Add all columns, each times its parameter."""
+        for name, (x, y, w) in self.columns(rolling, velocity, around).items():
+            value = self.values[name]
+            total = total.add(
+                *(None if isinstance(part, float) and part == 0.0 else value * part for part in (x, y, w))
+            )
+        return total
+
+
+class ReportEffect(Effect):
+    """Acts on what the localization reports."""
+
+    place = Place.LOCALIZATION
+
+    @abstractmethod
+    def report(self, velocity: Velocity, around: Surroundings) -> Velocity:
+        """Velocity as the reported poses show it."""
+
+    def delay_s(self) -> float:
+        """How late the reported position is stamped beyond its heading, or beyond what is known [s]."""
+        return 0.0
+
+    def report_gyro(self, velocity: Velocity, around: Surroundings) -> Velocity:
+        """As `report`, where the heading is a gyro's and not the poses' own."""
+        return self.report(velocity, around)
+
+
+Declared = TypeVar("Declared", Effect, type[Effect])
+
+
+def find_late(effects: Iterable[Declared], late: Late) -> Declared | None:
+    """The effect that makes this late, None without."""
+    return next((effect for effect in effects if effect.late is late), None)

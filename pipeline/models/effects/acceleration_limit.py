@@ -1,0 +1,61 @@
+"""Acceleration limit: wheels change their speed no faster than the drive can.
+
+    abs(dOmega/dt) <= limit, each wheel
+
+limit [rad/s^2]. Ask for large steps of speed: small ones are reached at once and do not show it.
+
+Source: acceleration limits of a ros2_control diff_drive_controller; torque limit of the motor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import INF, DriveEffect, Excitation, Parameter, Search
+from pipeline.models.filters import limit_rate
+
+if TYPE_CHECKING:
+    from pipeline.models.evidence import Evidence, Largest
+    from pipeline.runs.signals import Surroundings, Wheels
+
+# A limit that the largest wheel speed is reached under in less shows in no pose.
+_LEAST_RAMP_S = 0.08
+
+
+class AccelerationLimit(DriveEffect):
+    """Acceleration limit: wheels change their speed no faster than the drive can."""
+
+    id = "acceleration_limit"
+    rank = 10
+    parameters = (
+        Parameter(
+            "limit",
+            "rad/s^2",
+            (0.05, 500.0),
+            INF,
+            "largest wheel acceleration",
+            3.0,
+            search=Search.STARTS,
+            starts=(1.0, 2.5, 6.0, 12.0, 25.0),
+            step=1e-2,
+        ),
+    )
+    needs = (Excitation.CHANGES, Excitation.LARGE)
+    confused_with = ("drive_lag", "body_inertia")
+
+    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+        """See the formula above."""
+        limit, resets, step = self.values["limit"], around.wheels, around.step_s
+        return replace(
+            wheels,
+            left=limit_rate(wheels.left, limit, step, resets, resets.start[:, 0]),
+            right=limit_rate(wheels.right, limit, step, resets, resets.start[:, 1]),
+        )
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """Steps of the command are reached at once."""
+        return not self.values["limit"] * _LEAST_RAMP_S < evidence.largest.wheel
+
+    def _list_usual(self, largest: Largest) -> dict[str, float]:
+        return {"limit": largest.wheel}

@@ -1,0 +1,66 @@
+"""Body inertia: with little grip the body follows its wheels late and slides on in turns.
+
+    dv_x/dt = (v0 - v_x)/tau + v_y*w,  dv_y/dt = -v_y/tau - v_x*w,  dw/dt = (w0 - w)/tau
+
+tau [s], 0.2 to 1 on ice. Change speed while turning.
+
+Source: Newton's law of a body in viscous contact, written in its own turning frame; the ice runs of Samson et
+al. 2024.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models.effect import STAMPS, BodyEffect, Excitation, Late, Least, Parameter, Plausible, Search
+from pipeline.models.filters import lag_signal
+from pipeline.runs.signals import Velocity
+
+if TYPE_CHECKING:
+    from pipeline.models.evidence import Evidence
+    from pipeline.runs.signals import Rolling, Surroundings
+
+
+class BodyInertia(BodyEffect):
+    """Body inertia: with little grip the body follows its wheels late and slides on in turns."""
+
+    id = "body_inertia"
+    parameters = (
+        Parameter(
+            "tau",
+            "s",
+            (0.0, 10.0),
+            0.0,
+            "time constant of the body on the ground",
+            0.5,
+            search=Search.STARTS,
+            starts=(0.15, 0.4, 0.9, 1.6),
+            step=5e-3,
+            least=Least(0.02, STAMPS),
+            plausible=Plausible(0.0, 3.0, "wider than the 0.2 to 1 s of ice"),
+        ),
+    )
+    needs = (Excitation.CHANGES, Excitation.TURNING)
+    confused_with = ("lateral_skid", "drive_lag", "acceleration_limit", "heading_skew")
+    equivalent_to = ("drive_lag",)
+    equivalent_when = "never turning, or only turning on the spot"
+    late = Late.BODY
+
+    def move_body(self, rolling: Rolling, around: Surroundings) -> Velocity:
+        """See the formula above."""
+        tau, resets, step = self.values["tau"], around.body, around.step_s
+        if tau <= 0.0:
+            return Velocity(rolling.v0, np.zeros_like(rolling.v0), rolling.w0)
+        w = lag_signal(rolling.w0, tau, step, resets, resets.start[:, 2])
+        heading = (np.cumsum(w) - 0.5 * w) * step
+        # In a frame that does not turn the two equations of v_x and v_y are one lag of a complex number.
+        frame = np.exp(1j * heading)
+        start = (resets.start[:, 0] + 1j * resets.start[:, 1]) * frame[resets.at]
+        slide = lag_signal(rolling.v0 * frame, tau, step, resets, start) * np.conj(frame)
+        return Velocity(slide.real, slide.imag, w)
+
+    def is_equivalent(self, evidence: Evidence) -> bool:
+        """Encoders tell a wheel from a body; without them only driving and turning at once does."""
+        return not (evidence.encoders or evidence.largest.moves_both_ways)

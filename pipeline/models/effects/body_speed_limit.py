@@ -1,0 +1,55 @@
+"""Body speed limit: the controller clips the commanded forward speed before it reaches the wheels.
+
+    f_x_commanded = clip(f_x_commanded, -limit, limit)
+
+limit [m/s], 1 on a Husky, 5 on a Warthog. A limit that no command reaches is only bounded from below.
+
+Source: velocity limits of a ros2_control diff_drive_controller; measured on the DRIVE recordings.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter, Search
+
+if TYPE_CHECKING:
+    from pipeline.models.evidence import Evidence
+    from pipeline.runs.signals import Commands, Surroundings
+
+
+class BodySpeedLimit(CommandEffect):
+    """Body speed limit: the controller clips the commanded forward speed before it reaches the wheels."""
+
+    id = "body_speed_limit"
+    rank = 10
+    parameters = (
+        Parameter(
+            "limit",
+            "m/s",
+            (0.01, 50.0),
+            INF,
+            "largest commanded speed",
+            0.7,
+            search=Search.STARTS,
+            starts=(0.3, 0.5, 0.7, 0.85, 0.95),
+            relative_to="speed",
+            step=1e-3,
+        ),
+    )
+    needs = (Excitation.LARGE, Excitation.SPEED_SPREAD)
+    confused_with = ("wheel_speed_limit", "speed_slip")
+
+    def change_commands(self, commands: Commands, around: Surroundings) -> Commands:
+        """See the formula above."""
+        limit = self.values["limit"]
+        radius = around.vehicle.wheel_radius_m
+        forward = 0.5 * radius * (commands.left + commands.right)
+        excess = (forward - np.clip(forward, -limit, limit)) / radius
+        return commands.change_wheels(commands.left - excess, commands.right - excess)
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """No command reaches it."""
+        return not evidence.largest.reaches(self.values["limit"], "speed")

@@ -1,0 +1,69 @@
+"""Body turn limit: the controller clips the commanded yaw rate before it reaches the wheels.
+
+    f_w_commanded = clip(f_w_commanded, -limit, limit)
+
+limit [rad/s], 1 on a Husky, 4 to 5 on a Warthog. On a car the steering angle is held to what gives that yaw
+rate at the commanded speed. A limit that no command reaches is only bounded from below.
+
+Source: velocity limits of a ros2_control diff_drive_controller; measured on the DRIVE recordings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter, Search
+from pipeline.models.effects.turn_droop import TurnDroop
+
+if TYPE_CHECKING:
+    from pipeline.models.effect import Effect
+    from pipeline.models.evidence import Evidence, Largest
+    from pipeline.runs.signals import Commands, Surroundings
+
+
+class BodyTurnLimit(CommandEffect):
+    """Body turn limit: the controller clips the commanded yaw rate before it reaches the wheels."""
+
+    id = "body_turn_limit"
+    rank = 20
+    parameters = (
+        Parameter(
+            "limit",
+            "rad/s",
+            (0.01, 50.0),
+            INF,
+            "largest commanded yaw rate",
+            0.6,
+            search=Search.STARTS,
+            starts=(0.3, 0.5, 0.7, 0.85, 0.95),
+            relative_to="turn",
+            step=1e-3,
+        ),
+    )
+    needs = (Excitation.LARGE, Excitation.TURNING)
+    confused_with = ("wheel_speed_limit", "turn_droop")
+
+    def change_commands(self, commands: Commands, around: Surroundings) -> Commands:
+        """See the formula above."""
+        limit, vehicle = self.values["limit"], around.vehicle
+        if vehicle.kind == "ackermann":
+            forward = 0.5 * vehicle.wheel_radius_m * (commands.left + commands.right)
+            moving = np.maximum(np.abs(forward), 1e-9)
+            widest = np.arctan(limit * (vehicle.wheelbase_m or 1.0) / moving)
+            return replace(commands, steering=np.clip(commands.steering, -widest, widest))
+        # The clip acts on the body command, which the controller turns into wheel speeds with its own track.
+        to_wheels = 0.5 * around.track_m * vehicle.controller_track_multiplier / vehicle.wheel_radius_m
+        turning = 0.5 * (commands.right - commands.left) / to_wheels
+        excess = (turning - np.clip(turning, -limit, limit)) * to_wheels
+        return commands.change_wheels(commands.left + excess, commands.right - excess)
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """No command reaches it."""
+        return not evidence.largest.reaches(self.values["limit"], "turn")
+
+    def list_softer(self, largest: Largest) -> tuple[Effect, ...]:
+        """A droop of a usual gain, where only one turn beyond the limit was asked for."""
+        return (TurnDroop().make_usual(largest).fix("gain"),)

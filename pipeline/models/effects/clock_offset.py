@@ -1,0 +1,68 @@
+"""Clock offset: reported poses are stamped late, or early.
+
+    reported pose(t) = pose(t - d)
+
+d [s]; d < 0 is a clock that runs ahead, which no physics can do. Encoders or a gyro with their own stamps
+tell it from a delay of the drive.
+
+Source: header stamps against log times; measured on the DRIVE recordings.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import STAMPS, Excitation, Late, Least, Parameter, Plausible, ReportEffect, Search
+from pipeline.models.evidence import LEAST_DELAY_S
+
+if TYPE_CHECKING:
+    from pipeline.models.evidence import Evidence
+    from pipeline.runs.signals import Surroundings, Velocity
+
+
+class ClockOffset(ReportEffect):
+    """Clock offset: reported poses are stamped late, or early."""
+
+    id = "clock_offset"
+    rank = 40
+    parameters = (
+        Parameter(
+            "d",
+            "s",
+            (-1.0, 1.0),
+            0.0,
+            "how late poses are stamped",
+            -0.15,
+            search=Search.STARTS,
+            starts=(-0.3, -0.1, 0.1, 0.3),
+            step=5e-3,
+            least=Least(LEAST_DELAY_S, STAMPS, sampled=True),
+            plausible=Plausible(-0.8, 0.8, "wider than the clocks of the DRIVE recordings"),
+        ),
+    )
+    needs = (Excitation.CHANGES,)
+    confused_with = ("drive_lag", "body_inertia")
+    equivalent_to = ("transport_delay",)
+    equivalent_when = "the input is the command and there are neither encoders, gyro nor another clock"
+    late = Late.POSES
+
+    def report(self, velocity: Velocity, around: Surroundings) -> Velocity:
+        """See the formula above."""
+        del around
+        return velocity
+
+    def delay_s(self) -> float:
+        """How late the reported poses are stamped [s]."""
+        return self.values["d"]
+
+    def can_show(self, evidence: Evidence) -> bool:
+        """With a gyro the delay of encoders is free: only driving and turning at once tell it from this."""
+        return evidence.largest.moves_both_ways or not (evidence.encoders and evidence.gyro)
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """A late clock is the drive's delay without encoders, and beyond the gyro's clock a late body."""
+        return self.values["d"] > 0.0 and (evidence.gyro or not evidence.encoders)
+
+    def is_equivalent(self, evidence: Evidence) -> bool:
+        """Only an early clock can be nothing else."""
+        return self.values["d"] >= 0.0 and not (evidence.encoders or evidence.gyro)

@@ -1,0 +1,60 @@
+"""Deadband: wheels stand still for commands that are too small.
+
+    Omega = 0 where r * abs(u) < d, else u
+
+d [m/s] at the rim, 0.04 to 0.3. Drive slowly, and turn slowly while driving.
+
+Source: static friction of a geared drive; Siciliano and Khatib, Springer Handbook of Robotics, chapter 24.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models.effect import CommandEffect, Excitation, Parameter, Search
+
+if TYPE_CHECKING:
+    from pipeline.models.evidence import Evidence, Largest
+    from pipeline.runs.signals import Commands, Surroundings
+
+# Of the largest speed: less is passed through in one step of a command.
+_LEAST_SHARE = 0.02
+
+
+class Deadband(CommandEffect):
+    """Deadband: wheels stand still for commands that are too small."""
+
+    id = "deadband"
+    rank = 30
+    parameters = (
+        Parameter(
+            "d",
+            "m/s",
+            (0.0, 2.0),
+            0.0,
+            "smallest rim speed that moves a wheel",
+            0.15,
+            search=Search.GRID,
+            starts=(0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45),
+            step=0.02,
+        ),
+    )
+    needs = (Excitation.SMALL,)
+    confused_with = ("turn_droop",)
+
+    def change_commands(self, commands: Commands, around: Surroundings) -> Commands:
+        """See the formula above."""
+        least = self.values["d"] / around.vehicle.wheel_radius_m
+        left = np.where(np.abs(commands.left) < least, 0.0, commands.left)
+        right = np.where(np.abs(commands.right) < least, 0.0, commands.right)
+        return commands.change_wheels(left, right)
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """It is too small against what was asked for."""
+        return not self.values["d"] > _LEAST_SHARE * evidence.largest.speed
+
+    def _list_usual(self, largest: Largest) -> dict[str, float]:
+        (d,) = self.parameters
+        return {"d": d.typical * min(largest.speed, 1.0)}

@@ -1,0 +1,60 @@
+"""Drive lag: wheels approach the commanded speed like a first-order system.
+
+    tau * dOmega/dt = u - Omega, each wheel
+
+tau [s]: 0.55 to 0.64 on a Husky on tile, 1.0 in snow, 1.05 to 1.2 on a Warthog. Change commands often.
+
+Source: the powertrain model of Samson et al. 2024 and of DRIVE, Baril et al. 2024.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import STAMPS, DriveEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.filters import lag_signal
+
+if TYPE_CHECKING:
+    from pipeline.models.evidence import Evidence
+    from pipeline.runs.signals import Surroundings, Wheels
+
+
+class DriveLag(DriveEffect):
+    """Drive lag: wheels approach the commanded speed like a first-order system."""
+
+    id = "drive_lag"
+    rank = 20
+    parameters = (
+        Parameter(
+            "tau",
+            "s",
+            (0.0, 10.0),
+            0.0,
+            "time constant",
+            0.5,
+            search=Search.STARTS,
+            starts=(0.1, 0.3, 0.7, 1.4),
+            step=5e-3,
+            least=Least(0.015, STAMPS, sampled=True),
+            plausible=Plausible(0.0, 3.0, "wider than the 0.55 to 1.2 s of Husky and Warthog"),
+        ),
+    )
+    needs = (Excitation.CHANGES,)
+    confused_with = ("transport_delay", "turn_lag", "acceleration_limit")
+    equivalent_to = ("body_inertia",)
+    equivalent_when = "never turning, or only turning on the spot"
+    same_in_one_motion = ("turn_lag",)
+
+    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+        """See the formula above."""
+        tau, resets, step = self.values["tau"], around.wheels, around.step_s
+        return replace(
+            wheels,
+            left=lag_signal(wheels.left, tau, step, resets, resets.start[:, 0]),
+            right=lag_signal(wheels.right, tau, step, resets, resets.start[:, 1]),
+        )
+
+    def is_equivalent(self, evidence: Evidence) -> bool:
+        """Encoders tell a wheel from a body; without them only driving and turning at once does."""
+        return not (evidence.encoders or evidence.largest.moves_both_ways)

@@ -1,0 +1,58 @@
+"""Effective track: a skid-steered vehicle turns as if its wheels stood further apart.
+
+    w0 = w0 / k    (b_eff = k b)
+
+k is a plain number: 1 without skidding, about 1.9 on a Husky, 1.8 on a Warthog. Turn both ways.
+
+Source: Mandow et al., IROS 2007; Baril et al., CRV 2020.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import (
+    DATA_SHEET,
+    DIFFERENTIAL,
+    Excitation,
+    KinematicEffect,
+    Least,
+    Parameter,
+    Plausible,
+)
+from pipeline.models.effects.wheel_radius import WheelRadius
+
+if TYPE_CHECKING:
+    from pipeline.models.effect import Effect
+    from pipeline.runs.signals import Rolling, Surroundings
+
+
+class EffectiveTrack(KinematicEffect):
+    """Effective track: a skid-steered vehicle turns as if its wheels stood further apart."""
+
+    id = "effective_track"
+    rank = 20
+    kinds = DIFFERENTIAL
+    parameters = (
+        Parameter(
+            "k",
+            "1",
+            (0.2, 10.0),
+            1.0,
+            "effective over nominal track",
+            1.8,
+            least=Least(0.01, DATA_SHEET),
+            plausible=Plausible(0.7, 4.0, "wider than the 1.8 and 1.9 of Warthog and Husky"),
+        ),
+    )
+    needs = (Excitation.TURNING,)
+    confused_with = ("wheel_radius", "terrain_change")
+
+    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+        """See the formula above."""
+        del around
+        return rolling.scale(1.0, 1.0 / self.values["k"])
+
+    def scale_without(self, other: Effect) -> float:
+        """The yaw rate is that of the ratio k_radius / k_track: for nominal wheels the track is that wide."""
+        return 1.0 / other.values["k"] if isinstance(other, WheelRadius) else 1.0

@@ -1,0 +1,78 @@
+"""Heading skew: the reported heading is older than the reported position.
+
+    reported yaw(t) = yaw(t - d):  v_y += d * v0 * w0 at first order
+
+d [s], up to 0.1. It looks like lateral skid of c = -d. Where a gyro is the heading, it is the position that
+is reported d earlier than the heading.
+
+Source: two clocks in one localization; measured on the DRIVE recordings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models.effect import STAMPS, Excitation, Late, Least, Parameter, Plausible, ReportEffect
+from pipeline.models.evidence import LEAST_DELAY_S
+from pipeline.runs.signals import earlier_in_span
+
+if TYPE_CHECKING:
+    from pipeline.models.evidence import Evidence
+    from pipeline.runs.signals import Surroundings, Velocity
+
+
+class HeadingSkew(ReportEffect):
+    """Heading skew: the reported heading is older than the reported position."""
+
+    id = "heading_skew"
+    rank = 30
+    parameters = (
+        # A heading newer than its position is lateral skid to the first order, and skid is what vehicles do.
+        Parameter(
+            "d",
+            "s",
+            (-0.6, 0.6),
+            0.0,
+            "age of the heading against the position",
+            0.1,
+            step=1e-3,
+            least=Least(LEAST_DELAY_S, STAMPS),
+            plausible=Plausible(-0.3, 0.4, "wider than the 0.1 s of the DRIVE recordings"),
+            one_sign=True,
+        ),
+    )
+    needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
+    confused_with = ("lateral_skid", "body_inertia", "icr_offset")
+    late = Late.HEADING
+
+    def report(self, velocity: Velocity, around: Surroundings) -> Velocity:
+        """See the formula above."""
+        late = self.values["d"]
+        if late == 0.0:
+            return velocity
+        ends = np.cumsum(velocity.w) * around.step_s
+        middle = ends - 0.5 * velocity.w * around.step_s
+        # Between spans the cells jump in time; a delayed value must not come from the span before.
+        earlier = np.interp(around.times - late, around.times, middle)
+        reaches = earlier_in_span(around, late)
+        turned = np.where(reaches, middle - earlier, late * velocity.w)
+        rate = np.where(reaches, np.interp(around.times - late, around.times, velocity.w), velocity.w)
+        sine, cosine = np.sin(turned), np.cos(turned)
+        return replace(
+            velocity,
+            x=cosine * velocity.x - sine * velocity.y,
+            y=sine * velocity.x + cosine * velocity.y,
+            w=rate,
+        )
+
+    def report_gyro(self, velocity: Velocity, around: Surroundings) -> Velocity:
+        """The gyro's heading has no skew: nothing but the delay of the position is left."""
+        del around
+        return velocity
+
+    def can_show(self, evidence: Evidence) -> bool:
+        """It shows against the reported heading only."""
+        return not evidence.gyro

@@ -1,0 +1,48 @@
+"""Lateral ICR offset: turning drags the vehicle forward or backward, as with a load hung to one side.
+
+    v_x += y_icr * w
+
+w is the yaw rate of the model. y_icr [m], positive to the left. Spin on the spot both ways.
+
+Source: Mandow et al., IROS 2007, the lateral coordinates of the instantaneous centres of rotation.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import MOUNTING, Excitation, Least, LinearEffect, Parameter, Place, Plausible
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.models.effect import Column
+    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+
+
+class IcrLateral(LinearEffect):
+    """Lateral ICR offset: turning drags the vehicle forward or backward, as with a load hung to one side."""
+
+    id = "icr_lateral"
+    place = Place.CENTRE
+    parameters = (
+        Parameter(
+            "y_icr",
+            "m",
+            (-1.0, 1.0),
+            0.0,
+            "centre of rotation left of base_link",
+            0.08,
+            least=Least(0.004, MOUNTING),
+            plausible=Plausible(-0.5, 0.5, "further out it lies beside the wheels of a Warthog"),
+        ),
+    )
+    needs = (Excitation.TURNING,)
+    confused_with = ("wheel_asymmetry",)
+    equivalent_to = ("lever_arm",)
+    equivalent_when = "always: a pose of a point l_y = -y_icr to the left moves alike"
+
+    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+        """See the formula above."""
+        del rolling, around
+        return {"y_icr": (velocity.w, 0.0, 0.0)}

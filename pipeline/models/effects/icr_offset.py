@@ -1,0 +1,49 @@
+"""ICR offset: the vehicle turns about a point ahead of or behind its reference point.
+
+    v_y += -x_icr * w
+
+w is the yaw rate of the model. x_icr [m], -0.08 to 0.24, positive ahead; a load at the back moves it back.
+Spin on the spot and drive curves.
+
+Source: Mandow et al., IROS 2007, the longitudinal coordinate of the instantaneous centres of rotation.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import MOUNTING, Excitation, Least, LinearEffect, Parameter, Place, Plausible
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.models.effect import Column
+    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+
+
+class IcrOffset(LinearEffect):
+    """ICR offset: the vehicle turns about a point ahead of or behind its reference point."""
+
+    id = "icr_offset"
+    place = Place.CENTRE
+    parameters = (
+        Parameter(
+            "x_icr",
+            "m",
+            (-1.0, 1.0),
+            0.0,
+            "centre of rotation ahead of base_link",
+            0.12,
+            least=Least(0.004, MOUNTING),
+            plausible=Plausible(-0.6, 0.6, "wider than the -0.08 to 0.24 m that were seen"),
+        ),
+    )
+    needs = (Excitation.TURNING,)
+    confused_with = ("lateral_skid", "heading_skew")
+    equivalent_to = ("lever_arm",)
+    equivalent_when = "always: a pose of a point l_x = -x_icr ahead moves alike"
+
+    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+        """See the formula above."""
+        del rolling, around
+        return {"x_icr": (0.0, -velocity.w, 0.0)}

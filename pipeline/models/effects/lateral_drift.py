@@ -1,0 +1,35 @@
+"""Lateral drift: the vehicle moves sideways at a constant rate while its wheels turn.
+
+    v_y += c * turning
+
+turning is one while the wheels turn. c [m/s]. Drive forward and backward to tell it from a misaligned sensor.
+
+Source: constant term of the slip model of Seegmiller and Kelly, RSS 2014.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import Excitation, LinearEffect, Parameter
+from pipeline.runs.signals import find_turning
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.models.effect import Column
+    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+
+
+class LateralDrift(LinearEffect):
+    """Lateral drift: the vehicle moves sideways at a constant rate while its wheels turn."""
+
+    id = "lateral_drift"
+    parameters = (Parameter("c", "m/s", (-0.5, 0.5), 0.0, "speed to the left", 0.05),)
+    needs = (Excitation.BOTH_SIGNS,)
+    confused_with = ("yaw_misalignment", "slope_drift")
+
+    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+        """See the formula above."""
+        del velocity
+        return {"c": (0.0, find_turning(rolling.wheels, around), 0.0)}

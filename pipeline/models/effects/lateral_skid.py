@@ -1,0 +1,48 @@
+"""Lateral skid: in a turn the vehicle slides outward.
+
+    v_y += -c * v0 * w0
+
+c [s] grows with speed and falls with grip: 0.02 on tile, 0.15 on ice. Drive turns of both signs at several
+speeds, forward and backward, to tell it from a shifted centre of rotation.
+
+Source: Seegmiller and Kelly, RSS 2014, the centripetal term of the slip model.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import STAMPS, Excitation, Least, LinearEffect, Parameter, Plausible
+from pipeline.models.evidence import LEAST_DELAY_S
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.models.effect import Column
+    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+
+
+class LateralSkid(LinearEffect):
+    """Lateral skid: in a turn the vehicle slides outward."""
+
+    id = "lateral_skid"
+    parameters = (
+        Parameter(
+            "c",
+            "s",
+            (-0.5, 0.5),
+            0.0,
+            "outward slip per centripetal acceleration",
+            0.1,
+            least=Least(LEAST_DELAY_S, STAMPS),
+            plausible=Plausible(-0.02, 0.4, "wider than 0.02 on tile and 0.15 on ice"),
+            one_sign=True,
+        ),
+    )
+    needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
+    confused_with = ("icr_offset", "body_inertia", "heading_skew", "drive_lag")
+
+    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+        """See the formula above."""
+        del velocity, around
+        return {"c": (0.0, -rolling.v0 * rolling.w0, 0.0)}

@@ -1,0 +1,51 @@
+"""Slope drift: while it drives on a slope, the vehicle slides downhill.
+
+    v_x += k * sin(pitch) * turning,   v_y += -k * cos(pitch) * sin(roll) * turning
+
+pitch > 0 is nose down; turning is one while the wheels turn. k [m/s], 0.4 to 0.8. Drive a slope in several
+directions.
+
+Source: Seegmiller and Kelly, RSS 2014, the gravity term of the slip model.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models.effect import Excitation, LinearEffect, Parameter, Plausible
+from pipeline.runs.signals import find_turning
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.models.effect import Column
+    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+
+
+class SlopeDrift(LinearEffect):
+    """Slope drift: while it drives on a slope, the vehicle slides downhill."""
+
+    id = "slope_drift"
+    parameters = (
+        Parameter(
+            "k",
+            "m/s",
+            (-3.0, 3.0),
+            0.0,
+            "downhill speed on a vertical slope",
+            0.6,
+            plausible=Plausible(-0.1, 2.5, "wider than the 0.4 to 0.8 m/s that were seen"),
+            one_sign=True,
+        ),
+    )
+    needs = (Excitation.SLOPE,)
+    confused_with = ("lateral_drift",)
+
+    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+        """See the formula above."""
+        del velocity
+        turning = find_turning(rolling.wheels, around)
+        roll, pitch = around.attitude[:, 0], around.attitude[:, 1]
+        return {"k": (np.sin(pitch) * turning, -np.cos(pitch) * np.sin(roll) * turning, 0.0)}

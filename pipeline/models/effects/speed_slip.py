@@ -1,0 +1,47 @@
+"""Speed slip: the faster the wheels turn, the larger the share of their motion that is lost.
+
+    v_x += -k * v0 * abs(v0)
+
+k [s/m], about 0.08 on loose ground. Drive at several speeds, forward and backward.
+
+Source: longitudinal slip growing with traction; see Wong, Theory of Ground Vehicles, chapter 2.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models.effect import Excitation, LinearEffect, Parameter, Plausible
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.models.effect import Column
+    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+
+
+class SpeedSlip(LinearEffect):
+    """Speed slip: the faster the wheels turn, the larger the share of their motion that is lost."""
+
+    id = "speed_slip"
+    parameters = (
+        Parameter(
+            "k",
+            "s/m",
+            (-0.5, 0.5),
+            0.0,
+            "share of speed lost per speed",
+            0.08,
+            plausible=Plausible(-0.02, 0.4, "wider than the 0.08 of loose ground"),
+            one_sign=True,
+        ),
+    )
+    needs = (Excitation.SPEED_SPREAD,)
+    confused_with = ("wheel_radius", "turning_resistance")
+
+    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+        """See the formula above."""
+        del velocity, around
+        return {"k": (-rolling.v0 * np.abs(rolling.v0), 0.0, 0.0)}

@@ -1,0 +1,45 @@
+"""Steering gain: the wheels steer by a constant multiple of what is asked.
+
+    delta = g * delta
+
+g is a plain number, 0.85 for worn linkage. Steer to both sides at several angles.
+
+Source: kinematic bicycle with an uncalibrated steering; Becker et al. 2023.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter, Plausible
+
+if TYPE_CHECKING:
+    from pipeline.runs.signals import Surroundings, Wheels
+
+
+class SteeringGain(DriveEffect):
+    """Steering gain: the wheels steer by a constant multiple of what is asked."""
+
+    id = "steering_gain"
+    rank = 50
+    kinds = ACKERMANN
+    parameters = (
+        Parameter(
+            "g",
+            "1",
+            (0.05, 5.0),
+            1.0,
+            "steered over asked angle",
+            0.85,
+            least=Least(0.01, DATA_SHEET),
+            plausible=Plausible(0.5, 1.5, "wider than the 0.85 of a worn linkage"),
+        ),
+    )
+    needs = (Excitation.STEERING,)
+    confused_with = ("understeer",)
+
+    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+        """See the formula above."""
+        del around
+        return replace(wheels, steering=self.values["g"] * wheels.steering)

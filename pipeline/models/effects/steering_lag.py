@@ -1,0 +1,49 @@
+"""Steering lag: the steering angle approaches what is asked like a first-order system.
+
+    tau * ddelta/dt = u_delta - delta
+
+tau [s], about 0.4. Change the steering often.
+
+Source: actuator model of a kinematic bicycle; Becker et al. 2023.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import ACKERMANN, STAMPS, DriveEffect, Excitation, Least, Parameter, Search
+from pipeline.models.filters import lag_signal
+
+if TYPE_CHECKING:
+    from pipeline.runs.signals import Surroundings, Wheels
+
+
+class SteeringLag(DriveEffect):
+    """Steering lag: the steering angle approaches what is asked like a first-order system."""
+
+    id = "steering_lag"
+    rank = 60
+    kinds = ACKERMANN
+    parameters = (
+        Parameter(
+            "tau",
+            "s",
+            (0.0, 10.0),
+            0.0,
+            "time constant",
+            0.4,
+            search=Search.STARTS,
+            starts=(0.1, 0.3, 0.7, 1.4),
+            step=5e-3,
+            least=Least(0.015, STAMPS, sampled=True),
+        ),
+    )
+    needs = (Excitation.CHANGES, Excitation.STEERING)
+    confused_with = ("transport_delay",)
+
+    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+        """See the formula above."""
+        spans = around.spans
+        lagged = lag_signal(wheels.steering, self.values["tau"], around.step_s, spans, spans.start[:, 0])
+        return replace(wheels, steering=lagged)

@@ -1,0 +1,44 @@
+"""Steering offset: the wheels are off centre when straight ahead is asked.
+
+    delta = delta + o
+
+o [rad], about 0.04. Drive straight at several speeds.
+
+Source: kinematic bicycle with an uncalibrated steering; Becker et al. 2023.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter
+
+if TYPE_CHECKING:
+    from pipeline.runs.signals import Surroundings, Wheels
+
+
+class SteeringOffset(DriveEffect):
+    """Steering offset: the wheels are off centre when straight ahead is asked."""
+
+    id = "steering_offset"
+    rank = 70
+    kinds = ACKERMANN
+    parameters = (
+        Parameter(
+            "o",
+            "rad",
+            (-0.5, 0.5),
+            0.0,
+            "angle at which straight ahead is asked",
+            0.04,
+            least=Least(0.002, DATA_SHEET),
+        ),
+    )
+    needs = (Excitation.SPEED_SPREAD,)
+    confused_with = ("yaw_drift",)
+
+    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+        """See the formula above."""
+        del around
+        return replace(wheels, steering=wheels.steering + self.values["o"])

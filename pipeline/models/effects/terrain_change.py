@@ -1,0 +1,99 @@
+"""Terrain change: from a time or a place on, the ground takes another share of speed and turning.
+
+    v0 = k_v * v0,  w0 = k_w * w0    where t >= at_s, or where x > at_x when at_x is given
+
+k_v, k_w are plain numbers, off one by 8 to 30 %; at_s [s] since the run's start; at_x [m]. Both grounds
+need ten command steps with turning.
+
+Source: piecewise-constant slip; the deployments of Samson et al. 2024.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models.effect import (
+    DATA_SHEET,
+    NAN,
+    Excitation,
+    KinematicEffect,
+    Least,
+    Parameter,
+    Plausible,
+    Search,
+)
+
+if TYPE_CHECKING:
+    from pipeline.models.evidence import Evidence
+    from pipeline.runs.signals import Rolling, Surroundings
+
+_LEAST = Least(0.03, DATA_SHEET)
+_PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")
+# Nearer to the ends of a run it is a wheel radius and a track under another name.
+_EDGE = 0.15
+
+
+class TerrainChange(KinematicEffect):
+    """Terrain change: from a time or a place on, the ground takes another share of speed and turning."""
+
+    id = "terrain_change"
+    rank = 60
+    parameters = (
+        Parameter(
+            "k_v", "1", (0.05, 3.0), 1.0, "share of speed beyond", 0.85, least=_LEAST, plausible=_PLAUSIBLE
+        ),
+        Parameter(
+            "k_w", "1", (0.05, 3.0), 1.0, "share of turning beyond", 0.75, least=_LEAST, plausible=_PLAUSIBLE
+        ),
+        Parameter(
+            "at_s",
+            "s",
+            (0.0, 1e6),
+            NAN,
+            "time of the change",
+            150.0,
+            search=Search.GRID,
+            starts=(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
+            relative_to="duration",
+            step=1.0,
+        ),
+        Parameter(
+            "at_x",
+            "m",
+            (-1e6, 1e6),
+            NAN,
+            "place of the change along the map's x axis",
+            0.0,
+            starts=(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
+            relative_to="place",
+            instead_of="at_s",
+        ),
+    )
+    needs = (Excitation.LONG, Excitation.TURNING)
+    confused_with = ("time_drift", "wheel_radius", "effective_track")
+    contains = ("effective_track", "wheel_radius", "time_drift")
+    # A change point fits anything a little.
+    price = 0.05
+
+    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+        """See the formula above."""
+        at_x, at_s = self.values["at_x"], self.values["at_s"]
+        if math.isfinite(at_x):
+            beyond = around.place[:, 0] > at_x
+        else:
+            beyond = around.times >= (0.5 * around.duration_s if math.isnan(at_s) else at_s)
+        return rolling.scale(
+            np.where(beyond, self.values["k_v"], 1.0), np.where(beyond, self.values["k_w"], 1.0)
+        )
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """It does not lie within the run."""
+        at_s, at_x, largest = self.values["at_s"], self.values["at_x"], evidence.largest
+        if math.isfinite(at_s):
+            return not _EDGE <= at_s / largest.duration <= 1.0 - _EDGE
+        tenths = largest.places
+        low, high = 0.5 * (tenths[1] + tenths[2]), 0.5 * (tenths[-3] + tenths[-2])
+        return math.isfinite(at_x) and not low <= at_x <= high

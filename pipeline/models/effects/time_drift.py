@@ -1,0 +1,43 @@
+"""Time drift: speed and turning fade over a run, as with a falling battery or heating motors.
+
+    v0 = v0 * (1 - k * t/T),  w0 = w0 * (1 - k * t/T)
+
+T is the length of the run, t the time since its start. k is a plain number, about 10 % a run.
+
+Source: first-order drift of a gain; measured on long deployments.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import DATA_SHEET, Excitation, KinematicEffect, Least, Parameter, Plausible
+
+if TYPE_CHECKING:
+    from pipeline.runs.signals import Rolling, Surroundings
+
+
+class TimeDrift(KinematicEffect):
+    """Time drift: speed and turning fade over a run, as with a falling battery or heating motors."""
+
+    id = "time_drift"
+    rank = 50
+    parameters = (
+        Parameter(
+            "k",
+            "1",
+            (-0.9, 0.9),
+            0.0,
+            "share lost at the end of the run",
+            0.1,
+            least=Least(0.015, DATA_SHEET),
+            plausible=Plausible(-0.4, 0.4, "wider than the 10 % of long deployments"),
+        ),
+    )
+    needs = (Excitation.LONG,)
+    confused_with = ("terrain_change", "wheel_radius")
+
+    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+        """See the formula above."""
+        fade = 1.0 - self.values["k"] * around.times / around.duration_s
+        return rolling.scale(fade, fade)

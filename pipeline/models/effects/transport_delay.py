@@ -1,0 +1,56 @@
+"""Transport delay: the wheels do what was asked a moment ago.
+
+    Omega(t) = u(t - d)
+
+d [s], 0.05 to 0.4: network, controller period, drive. Change commands often; ramps alone show only the sum
+of delay and lag.
+
+Source: dead time of a first order plus dead time process; Astrom and Hagglund, Advanced PID Control.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import STAMPS, CommandEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.evidence import LEAST_DELAY_S
+
+if TYPE_CHECKING:
+    from pipeline.models.evidence import Evidence
+    from pipeline.runs.signals import Commands, Surroundings
+
+
+class TransportDelay(CommandEffect):
+    """Transport delay: the wheels do what was asked a moment ago."""
+
+    id = "transport_delay"
+    rank = 40
+    parameters = (
+        Parameter(
+            "d",
+            "s",
+            (0.0, 1.0),
+            0.0,
+            "age of the command that acts",
+            0.2,
+            search=Search.STARTS,
+            starts=(0.05, 0.15, 0.3, 0.5),
+            step=5e-3,
+            least=Least(LEAST_DELAY_S, STAMPS, sampled=True),
+            plausible=Plausible(0.0, 0.8, "wider than the 0.5 s after which a ros2_control drive stops"),
+        ),
+    )
+    needs = (Excitation.CHANGES,)
+    confused_with = ("drive_lag", "turn_lag", "body_inertia")
+    equivalent_to = ("clock_offset",)
+    equivalent_when = "the input is the command and there are neither encoders, gyro nor another clock"
+
+    def change_commands(self, commands: Commands, around: Surroundings) -> Commands:
+        """See the formula above."""
+        del around
+        return replace(commands, times=commands.times + self.values["d"])
+
+    def is_equivalent(self, evidence: Evidence) -> bool:
+        """Another clock tells it."""
+        return not (evidence.encoders or evidence.gyro)

@@ -1,0 +1,90 @@
+"""Turn droop: beyond a threshold the difference of the wheels falls short of its command.
+
+    D = Omega_r - Omega_l:  D = kept + gain * (D - kept),  kept = clip(D, -threshold, threshold)
+
+threshold [rad/s]; gain is a plain number. The Warthog reaches 84 to 100 % of a wheel difference of the same
+sign, 4 to 80 % after a change of sign. Turn slowly and quickly, on the spot and while driving.
+
+Source: measured on the DRIVE recordings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models.effect import (
+    DATA_SHEET,
+    DIFFERENTIAL,
+    NAN,
+    DriveEffect,
+    Excitation,
+    Least,
+    Parameter,
+    Plausible,
+    Search,
+)
+
+if TYPE_CHECKING:
+    from pipeline.models.evidence import Evidence, Largest
+    from pipeline.runs.signals import Surroundings, Wheels
+
+# Of the largest difference that was asked for: a lower threshold makes a wider track, a higher one nothing.
+_THRESHOLDS = (0.1, 0.99)
+# With no gain beyond the threshold it is a limit.
+_LEAST_RISE = 0.08
+_USUAL_THRESHOLD = 0.4
+
+
+class TurnDroop(DriveEffect):
+    """Turn droop: beyond a threshold the difference of the wheels falls short of its command."""
+
+    id = "turn_droop"
+    rank = 40
+    kinds = DIFFERENTIAL
+    parameters = (
+        Parameter(
+            "threshold",
+            "rad/s",
+            (0.0, 200.0),
+            NAN,
+            "wheel difference from which it falls short",
+            1.5,
+            search=Search.STARTS,
+            starts=(0.5, 1.5, 4.0, 10.0),
+            step=1e-2,
+        ),
+        Parameter(
+            "gain",
+            "1",
+            (0.0, 1.5),
+            1.0,
+            "share of the excess that is reached",
+            0.4,
+            least=Least(0.03, DATA_SHEET),
+            plausible=Plausible(0.0, 0.97, "with all of it reached nothing droops"),
+        ),
+    )
+    needs = (Excitation.LARGE, Excitation.TURNING)
+    confused_with = ("effective_track", "wheel_speed_limit", "body_turn_limit")
+    contains = ("effective_track",)
+
+    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+        """See the formula above."""
+        del around
+        gain = self.values["gain"]
+        threshold = float(np.nan_to_num(self.values["threshold"]))
+        difference = wheels.right - wheels.left
+        lost = (1.0 - gain) * (difference - np.clip(difference, -threshold, threshold))
+        return replace(wheels, left=wheels.left + 0.5 * lost, right=wheels.right - 0.5 * lost)
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """It is a wider track or a limit."""
+        low, high = _THRESHOLDS
+        bends = low < self.values["threshold"] / evidence.largest.difference < high
+        return not (bends and self.values["gain"] > _LEAST_RISE)
+
+    def _list_usual(self, largest: Largest) -> dict[str, float]:
+        return {**super()._list_usual(largest), "threshold": _USUAL_THRESHOLD * largest.difference}

@@ -1,0 +1,89 @@
+"""Turn lag: the difference of the wheels follows its command more slowly than their mean.
+
+    D = Omega_r - Omega_l,  M = (Omega_r + Omega_l)/2:
+    tau_mean * dM/dt = u_M - M,  tau_diff * dD/dt = u_D - D
+
+tau_mean, tau_diff [s]: friction on the ground brakes turning, so 0.4 and 1.1 to 1.6 s on a Warthog (0.55
+on ice), 0.1 and 0.35 s on a Husky. Change speed and turning separately.
+
+Source: measured on the DRIVE recordings; the powertrain model of DRIVE, Baril et al. 2024, split in two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import DIFFERENTIAL, DriveEffect, Excitation, Parameter, Plausible, Search
+from pipeline.models.effects.drive_lag import DriveLag
+from pipeline.models.filters import lag_signal
+
+if TYPE_CHECKING:
+    from pipeline.models.effect import Effect
+    from pipeline.models.evidence import Evidence
+    from pipeline.runs.signals import Surroundings, Wheels
+
+_PLAUSIBLE = Plausible(0.0, 3.0, "wider than the 0.1 to 1.6 s of Husky and Warthog")
+# Closer together, as a share of the slower one or in seconds, both time constants are one.
+_APART = 0.08
+_LEAST_APART_S = 0.02
+
+
+class TurnLag(DriveEffect):
+    """Turn lag: the difference of the wheels follows its command more slowly than their mean."""
+
+    id = "turn_lag"
+    rank = 30
+    kinds = DIFFERENTIAL
+    parameters = (
+        Parameter(
+            "tau_mean",
+            "s",
+            (0.0, 10.0),
+            0.0,
+            "time constant of the mean",
+            0.3,
+            search=Search.STARTS,
+            starts=(0.1, 0.4),
+            step=5e-3,
+            plausible=_PLAUSIBLE,
+        ),
+        Parameter(
+            "tau_diff",
+            "s",
+            (0.0, 10.0),
+            0.0,
+            "time constant of the difference",
+            1.0,
+            search=Search.STARTS,
+            starts=(0.3, 1.2),
+            step=5e-3,
+            plausible=_PLAUSIBLE,
+        ),
+    )
+    needs = (Excitation.CHANGES, Excitation.TURNING)
+    confused_with = ("drive_lag", "transport_delay", "turn_droop")
+    same_in_one_motion = ("drive_lag",)
+    contains = ("drive_lag",)
+
+    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+        """See the formula above."""
+        slow, fast = self.values["tau_diff"], self.values["tau_mean"]
+        if slow <= 0.0 and fast <= 0.0:
+            # Splitting into mean and difference and back would leave rounding behind.
+            return wheels
+        resets, step = around.wheels, around.step_s
+        left, right = resets.start[:, 0], resets.start[:, 1]
+        mean = lag_signal(0.5 * (wheels.left + wheels.right), fast, step, resets, 0.5 * (left + right))
+        difference = lag_signal(wheels.right - wheels.left, slow, step, resets, right - left)
+        return replace(wheels, left=mean - 0.5 * difference, right=mean + 0.5 * difference)
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """With equal time constants it is a drive lag."""
+        fast, slow = self.values["tau_mean"], self.values["tau_diff"]
+        least, larger = max(evidence.least_delay_s, _LEAST_APART_S), max(fast, slow)
+        return not (larger > least and abs(fast - slow) > max(_APART * larger, least))
+
+    def collapse(self) -> Effect | None:
+        """A drive lag of the mean time constant."""
+        return DriveLag(tau=0.5 * (self.values["tau_mean"] + self.values["tau_diff"]))

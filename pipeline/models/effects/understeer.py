@@ -1,0 +1,47 @@
+"""Understeer: the faster a car drives, the less it turns for the same steering.
+
+    w0 = v0 * tan(delta) / (l + K * v0^2)
+
+K [s^2/m], about 0.03. Take the same curve at several speeds.
+
+Source: Gillespie, Fundamentals of Vehicle Dynamics, steady-state cornering.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models.effect import ACKERMANN, Excitation, KinematicEffect, Parameter, Plausible
+
+if TYPE_CHECKING:
+    from pipeline.runs.signals import Rolling, Surroundings
+
+
+class Understeer(KinematicEffect):
+    """Understeer: the faster a car drives, the less it turns for the same steering."""
+
+    id = "understeer"
+    rank = 40
+    kinds = ACKERMANN
+    parameters = (
+        Parameter(
+            "K",
+            "s^2/m",
+            (-0.05, 1.0),
+            0.0,
+            "understeer gradient",
+            0.03,
+            plausible=Plausible(-0.02, 0.5, "wider than the 0.03 of a road car"),
+        ),
+    )
+    needs = (Excitation.SPEED_SPREAD, Excitation.STEERING)
+    confused_with = ("steering_gain",)
+
+    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+        """See the formula above."""
+        wheelbase = around.vehicle.wheelbase_m or 1.0
+        reach = np.maximum(1.0 + self.values["K"] / wheelbase * rolling.v0**2, 0.05)
+        return replace(rolling, w0=rolling.w0 / reach)

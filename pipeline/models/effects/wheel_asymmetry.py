@@ -1,0 +1,57 @@
+"""Wheel asymmetry: the wheels of one side are larger than those of the other.
+
+    left r * (1 - e/2), right r * (1 + e/2):  v0 += e*b*w0/4,  w0 += e*v0/b
+
+e is a plain number, 1 to 5 %; 8 % with one soft side. Drive straight forward and backward.
+
+Source: unequal wheel diameters; Borenstein and Feng, IEEE T-RA 1996 (UMBmark).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import (
+    DATA_SHEET,
+    DIFFERENTIAL,
+    Excitation,
+    KinematicEffect,
+    Least,
+    Parameter,
+    Plausible,
+)
+
+if TYPE_CHECKING:
+    from pipeline.runs.signals import Rolling, Surroundings
+
+
+class WheelAsymmetry(KinematicEffect):
+    """Wheel asymmetry: the wheels of one side are larger than those of the other."""
+
+    id = "wheel_asymmetry"
+    rank = 10
+    kinds = DIFFERENTIAL
+    parameters = (
+        Parameter(
+            "e",
+            "1",
+            (-0.5, 0.5),
+            0.0,
+            "right radius less left radius over their mean",
+            0.04,
+            least=Least(0.003, DATA_SHEET),
+            plausible=Plausible(-0.2, 0.2, "wider than the 8 % of one soft side"),
+        ),
+    )
+    needs = (Excitation.BOTH_SIGNS, Excitation.SPEED_SPREAD)
+    confused_with = ("yaw_drift", "lever_arm", "icr_lateral")
+
+    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+        """See the formula above."""
+        uneven, track = self.values["e"], around.track_m
+        return replace(
+            rolling,
+            v0=rolling.v0 + 0.25 * uneven * track * rolling.w0,
+            w0=rolling.w0 + uneven / track * rolling.v0,
+        )

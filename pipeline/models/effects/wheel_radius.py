@@ -1,0 +1,43 @@
+"""Wheel radius: all wheels are larger or smaller than nominal, or slip in proportion to their speed.
+
+    v0 = k * v0,  w0 = k * w0
+
+k is a plain number, off one by 2 to 25 %. Drive at several speeds, straight and turning.
+
+Source: Borenstein and Feng, IEEE T-RA 1996 (UMBmark), the common scale error.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import DATA_SHEET, Excitation, KinematicEffect, Least, Parameter, Plausible
+
+if TYPE_CHECKING:
+    from pipeline.runs.signals import Rolling, Surroundings
+
+
+class WheelRadius(KinematicEffect):
+    """Wheel radius: all wheels are larger or smaller than nominal, or slip in proportion to their speed."""
+
+    id = "wheel_radius"
+    rank = 30
+    parameters = (
+        Parameter(
+            "k",
+            "1",
+            (0.0, 5.0),
+            1.0,
+            "true over nominal radius",
+            0.92,
+            least=Least(0.004, DATA_SHEET),
+            plausible=Plausible(0.7, 1.3, "wider than the 2 to 25 % that were seen"),
+        ),
+    )
+    needs = (Excitation.SPEED_SPREAD,)
+    confused_with = ("speed_slip", "effective_track")
+
+    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+        """See the formula above."""
+        del around
+        return rolling.scale(self.values["k"], self.values["k"])

@@ -1,0 +1,55 @@
+"""Wheel speed limit: a wheel turns no faster than its motor can.
+
+    Omega = clip(Omega, -limit, limit), each wheel
+
+limit [rad/s], 12 to 12.8 on a Warthog. A limit that no command reaches is only bounded from below.
+
+Source: saturation of the drive; measured on the DRIVE recordings.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter, Search
+
+if TYPE_CHECKING:
+    from pipeline.models.evidence import Evidence
+    from pipeline.runs.signals import Commands, Surroundings
+
+
+class WheelSpeedLimit(CommandEffect):
+    """Wheel speed limit: a wheel turns no faster than its motor can."""
+
+    id = "wheel_speed_limit"
+    rank = 50
+    parameters = (
+        Parameter(
+            "limit",
+            "rad/s",
+            (0.05, 500.0),
+            INF,
+            "largest wheel speed",
+            4.5,
+            search=Search.STARTS,
+            starts=(0.3, 0.5, 0.7, 0.85, 0.95),
+            relative_to="wheel",
+            step=1e-2,
+        ),
+    )
+    needs = (Excitation.LARGE,)
+    confused_with = ("body_speed_limit", "body_turn_limit")
+
+    def change_commands(self, commands: Commands, around: Surroundings) -> Commands:
+        """See the formula above."""
+        del around
+        limit = self.values["limit"]
+        return commands.change_wheels(
+            np.clip(commands.left, -limit, limit), np.clip(commands.right, -limit, limit)
+        )
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """No command reaches it."""
+        return not evidence.largest.reaches(self.values["limit"], "wheel")

@@ -1,0 +1,36 @@
+"""Yaw drift: the vehicle turns at a constant rate while its wheels turn.
+
+    v_w += c * turning
+
+turning is one while the wheels turn. c [rad/s]. Drive straight forward and backward to tell it from uneven
+wheels.
+
+Source: constant term of the slip model of Seegmiller and Kelly, RSS 2014.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import Excitation, LinearEffect, Parameter
+from pipeline.runs.signals import find_turning
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.models.effect import Column
+    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+
+
+class YawDrift(LinearEffect):
+    """Yaw drift: the vehicle turns at a constant rate while its wheels turn."""
+
+    id = "yaw_drift"
+    parameters = (Parameter("c", "rad/s", (-0.5, 0.5), 0.0, "yaw rate to the left", 0.06),)
+    needs = (Excitation.BOTH_SIGNS,)
+    confused_with = ("wheel_asymmetry", "steering_offset")
+
+    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+        """See the formula above."""
+        del velocity
+        return {"c": (0.0, 0.0, find_turning(rolling.wheels, around))}

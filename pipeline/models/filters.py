@@ -1,0 +1,119 @@
+"""Filters of signals on cells: lag and rate limit, exact for inputs that are constant in a cell."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from pipeline.runs.signals import Floats, Integers, Resets, Signal
+
+_FORGOTTEN = 40.0
+"""Time constants after which a state is forgotten to the last bit."""
+
+
+def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start: Signal) -> Signal:
+    """First-order lag tau dy/dt = u - y of a real or complex signal.
+
+    Args:
+        signal: cell means of the input, shape (n,).
+        tau: time constant [s]; zero returns the input itself.
+        step_s: width of a cell [s].
+        resets: where the state begins anew.
+        start: the state there; the input's own value where it is NaN, shape (k,).
+
+    Returns:
+        Cell means of the output, shape (n,).
+    """
+    if tau <= 0.0:
+        return signal
+    from scipy.signal import lfilter  # noqa: PLC0415 - heavy
+
+    decay = float(np.exp(-step_s / tau))
+    end = lfilter([1.0 - decay], [1.0, -decay], signal)
+    before = np.concatenate((np.zeros(1, dtype=signal.dtype), end[:-1]))
+    # The filter ran through the resets: what it carried over is taken back, and the state put in its place.
+    # One reset after the other, in closed form: what is missing at each fades until the next.
+    fade = step_s / tau
+    known = np.where(np.isfinite(start), start, signal[resets.at])
+    if np.array_equal(resets.at, resets.first):
+        _add_fading(before, known - before[resets.at], resets.at, resets, fade)
+    else:
+        _add_fading(before, signal[resets.first] - before[resets.first], resets.first, resets, fade)
+        _add_fading(before, known - before[resets.at], resets.at, resets, fade)
+    lagged: Signal = signal + (before - signal) * (tau / step_s * (1.0 - decay))
+    return lagged
+
+
+def _add_fading(state: Signal, missing: Signal, at: Integers, resets: Resets, fade: float) -> None:
+    """Add what is missing at each reset to the state; it fades until the next reset comes."""
+    ends = np.append(resets.first[1:], state.size)
+    count = np.clip(ends - at, 0, int(_FORGOTTEN / fade) + 1)
+    since = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+    table = np.exp(-fade * np.arange(int(count.max(initial=1))))
+    state[np.repeat(at, count) + since] += np.repeat(missing, count) * table[since]
+
+
+def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, start: Floats) -> Floats:
+    """Let a signal follow its input no faster than ``limit`` per second.
+
+    Args:
+        signal: input on cells, shape (n,).
+        limit: largest rate [unit/s]; infinity returns the input itself.
+        step_s: width of a cell [s].
+        resets: where the state begins anew.
+        start: the state there; the input's own value where it is NaN, shape (k,).
+    """
+    if not np.isfinite(limit):
+        return signal
+    most = limit * step_s
+    starts = np.zeros(signal.size, dtype=bool)
+    starts[resets.first] = True
+    begins = np.flatnonzero(starts | np.concatenate(([True], np.diff(signal) != 0.0)))
+    count = np.diff(np.append(begins, signal.size))
+    gap = np.repeat(_find_gaps(signal, start, begins, most * count, resets), count)
+    inside = np.arange(signal.size) - np.repeat(begins, count) + 0.5
+    left = np.maximum(np.abs(gap) - most * inside, 0.0)
+    limited: Floats = signal - np.sign(gap) * left
+    return limited
+
+
+def _find_gaps(signal: Floats, start: Floats, begins: Integers, reach: Floats, resets: Resets) -> Floats:
+    """How far the limited signal is from its input where each plateau of the input begins.
+
+    Nearly always it has arrived before the plateau ends, so that the next one begins at the level of the one
+    before. Only from where it has not, until it has again, must plateaus be followed one by one.
+    """
+    level = signal[begins]
+    gap = np.diff(level, prepend=level[0])
+    fresh = np.searchsorted(begins, resets.first)
+    gap[fresh] = np.where(np.isfinite(start), level[fresh] - start, 0.0)
+    late = np.flatnonzero(np.abs(gap) > reach)
+    if not late.size:
+        return gap
+    levels, reaches = level.tolist(), reach.tolist()
+    ends = np.append(fresh, begins.size)
+    stops = ends[np.searchsorted(ends, late, side="right")]
+    changed: list[int] = []
+    values: list[float] = []
+    arrived = -1
+    for first, stop in zip(late.tolist(), stops.tolist(), strict=True):
+        if first <= arrived:
+            continue
+        value = levels[first] - float(gap[first])
+        arrived = first
+        for place in range(first, stop):
+            missing = levels[place] - value
+            most = reaches[place]
+            values.append(missing)
+            arrived = place
+            if missing > most:
+                value += most
+            elif missing < -most:
+                value -= most
+            else:
+                break
+        changed.extend(range(first, arrived + 1))
+    gap[changed] = values
+    return gap

@@ -1,0 +1,227 @@
+"""An effect that is a formula over named signals."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import keyword
+import math
+import unicodedata
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from pipeline.models.effect import AddedEffect, Excitation, Parameter
+from pipeline.models.formula.expression import Expression, parse_expression
+from pipeline.models.formula.units import parse_unit
+from pipeline.runs.errors import MotionError
+from pipeline.runs.signals import roll_ideally
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from numpy.typing import NDArray
+
+    from pipeline.models.formula.units import Unit
+    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+
+
+_BASE_UNITS = {
+    "v0": "m/s",
+    "w0": "rad/s",
+    "f_x": "m/s",
+    "f_w": "rad/s",
+    "roll": "rad",
+    "pitch": "rad",
+    "yaw": "rad",
+    "x": "m",
+    "y": "m",
+    "left": "rad/s",
+    "right": "rad/s",
+    "steering": "rad",
+}
+SIGNAL_UNITS: Mapping[str, str] = {
+    **_BASE_UNITS,
+    **{f"{name}_rate": f"{unit}/s" if "/" not in unit else f"{unit}^2" for name, unit in _BASE_UNITS.items()},
+    "t": "s",
+}
+"""Signals that a formula may use, and their units; ``<name>_rate`` is the time derivative."""
+
+_TAKEN = {"id", "note", "pi", "self", "name", "formulas", "parameters", "fixed", "where"}
+"""Words that mean something else in a model file or in the effect itself."""
+
+CHANNELS: Mapping[str, str] = {"v_x": "m/s", "v_y": "m/s", "v_w": "rad/s"}
+
+
+class FormulaEffect(AddedEffect):
+    """Adds formulas to the velocity, in parallel with the other ground effects.
+
+    Args:
+        name: id of the effect.
+        formulas: by channel (``v_x``, ``v_y``, ``v_w``).
+        parameters: the numbers in them.
+        fixed: names that a fit leaves alone.
+        where: file and line, for error messages.
+        values: of the parameters.
+
+    Raises:
+        MotionError: a formula that cannot be parsed, knows a name that does not exist, has another unit than
+            its channel, or does not vanish at the parameters' neutral values.
+    """
+
+    needs = (Excitation.DRIVING,)
+
+    def __init__(
+        self,
+        name: str,
+        formulas: Mapping[str, str],
+        parameters: tuple[Parameter, ...],
+        *,
+        fixed: Iterable[str] = (),
+        where: str = "",
+        **values: float,
+    ) -> None:
+        self.id = name
+        self.parameters = parameters
+        self.formulas = dict(formulas)
+        self._where = where or name
+        self._check_names()
+        self._expressions = {channel: self._parse(channel, text) for channel, text in self.formulas.items()}
+        self._check_parameters()
+        super().__init__(fixed=fixed, **values)
+        self._check_neutral()
+
+    @property
+    def expressions(self) -> Mapping[str, Expression]:
+        """The parsed formulas by channel."""
+        return self._expressions
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What the effect does, as a hashable value."""
+        return (*super().key, *self.formulas.items())
+
+    def describe(self) -> str:
+        """The effect's page."""
+        lines = [f"{self.id}: a formula of the model file.", ""]
+        lines += [f"    {channel} += {text}" for channel, text in self.formulas.items()]
+        return "\n".join(lines)
+
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Velocity:
+        """Add the formulas' values."""
+        del velocity
+        signals = _Signals(rolling, around)
+        added = {}
+        for channel, expression in self._expressions.items():
+            known: dict[str, NDArray[np.float64] | float] = {
+                name: self.values[name] if name in self.values else signals.read(name)
+                for name in expression.names
+            }
+            added[channel] = expression.evaluate(known)
+        return total.add(added.get("v_x"), added.get("v_y"), added.get("v_w"))
+
+    def _copy(self, values: Mapping[str, float], fixed: Iterable[str]) -> Self:
+        # The formulas are parsed already: another value changes nothing about them.
+        other = copy.copy(self)
+        other.values = self._complete(dict(values))
+        other.fixed = frozenset(fixed)
+        return other
+
+    def _parse(self, channel: str, text: str) -> Expression:
+        own = {p.name: parse_unit(p.unit, self._where) for p in self.parameters}
+        expression = parse_expression(text, {**_parse_signal_units(), **own}, self._where)
+        wanted = parse_unit(CHANNELS[channel], self._where)
+        if expression.unit != wanted:
+            raise MotionError(
+                "wrong_units",
+                f"{channel} = {text!r} is in {expression.unit}, not in {wanted}",
+                where=self._where,
+                hint="Mend the formula or the unit of a parameter.",
+            )
+        return expression
+
+    def _check_names(self) -> None:
+        for name in (p.name for p in self.parameters):
+            proper = name.isidentifier() and unicodedata.is_normalized("NFKC", name)
+            if proper and name not in {*SIGNAL_UNITS, *CHANNELS, *_TAKEN} and not keyword.iskeyword(name):
+                continue
+            what = "is taken" if proper else "is no name"
+            raise MotionError(
+                "name_taken",
+                f"the parameter {name[:80]!r} cannot be called so: the name {what}",
+                where=self._where,
+                hint="Choose another name, of letters, digits and _.",
+            )
+
+    def _check_parameters(self) -> None:
+        used = frozenset[str]().union(*(e.names for e in self._expressions.values()))
+        for parameter in self.parameters:
+            if parameter.name not in used:
+                raise MotionError(
+                    "unused_parameter",
+                    f"the parameter {parameter.name!r} stands in no formula",
+                    where=self._where,
+                    hint="Use it or drop it.",
+                )
+
+    def _check_neutral(self) -> None:
+        """The effect must change nothing at neutral values: the ladder compares with its absence."""
+        generator = np.random.default_rng(1)
+        signals = {name: generator.uniform(0.1, 1.0, 8) for name in SIGNAL_UNITS}
+        neutral = {p.name: p.neutral for p in self.parameters}
+        for channel, expression in self._expressions.items():
+            value = np.asarray(expression.evaluate({**signals, **neutral}))
+            if not np.allclose(value, 0.0, atol=1e-12):
+                raise MotionError(
+                    "not_neutral",
+                    f"{channel} = {expression.text!r} is not zero at the parameters' neutral values",
+                    where=self._where,
+                    hint="Give `neutral` to a parameter so that the formula vanishes there, or add a factor.",
+                )
+
+
+@functools.cache
+def _parse_signal_units() -> Mapping[str, Unit]:
+    return {name: parse_unit(unit, name) for name, unit in SIGNAL_UNITS.items()}
+
+
+class _Signals:
+    """Named signals of a run, made when they are asked for."""
+
+    def __init__(self, rolling: Rolling, around: Surroundings) -> None:
+        ideal = roll_ideally(rolling.wheels, around)
+        self._around = around
+        self._makers: Mapping[str, Callable[[], NDArray[np.float64]]] = {
+            "v0": lambda: rolling.v0,
+            "w0": lambda: rolling.w0,
+            "f_x": lambda: ideal.v0,
+            "f_w": lambda: ideal.w0,
+            "roll": lambda: around.attitude[:, 0],
+            "pitch": lambda: around.attitude[:, 1],
+            "yaw": lambda: around.attitude[:, 2],
+            "x": lambda: around.place[:, 0],
+            "y": lambda: around.place[:, 1],
+            "left": lambda: rolling.wheels.left,
+            "right": lambda: rolling.wheels.right,
+            "steering": lambda: rolling.wheels.steering,
+            "t": lambda: around.times,
+        }
+
+    def read(self, name: str) -> NDArray[np.float64]:
+        """A signal on the cells."""
+        if name in self._makers:
+            return self._makers[name]()
+        rate = np.gradient(self._makers[name.removesuffix("_rate")]()) / self._around.step_s
+        # Between spans there is no rate.
+        rate[self._around.spans.first] = 0.0
+        rate[np.maximum(self._around.spans.first - 1, 0)] = 0.0
+        return np.where(np.isfinite(rate), rate, 0.0)
+
+
+def make_parameter(name: str, unit: str, bounds: tuple[float, float], *, neutral: float = 0.0) -> Parameter:
+    """A parameter of a formula."""
+    low, high = bounds
+    wide = high - low if math.isfinite(high - low) else 1.0
+    return Parameter(
+        name, unit, bounds, neutral, "parameter of a formula", neutral + 0.1 * wide, step=1e-3 * wide
+    )

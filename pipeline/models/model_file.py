@@ -1,0 +1,434 @@
+"""The model file: TOML that people read, diff and commit; every error names its line."""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+import unicodedata
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from pipeline.core.toml import TomlError, parse_toml, require_finite, shorten
+from pipeline.models.catalogue import find_effect, run_effects
+from pipeline.models.formula.formula_effect import CHANNELS, FormulaEffect, make_parameter
+from pipeline.models.model import Model
+from pipeline.models.trust import hash_code, list_trusted, read_code
+from pipeline.runs.errors import MotionError
+from pipeline.vehicles import ConfigurationError, resolve_vehicle
+from pipeline.vehicles.configuration import VehicleSection
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from pipeline.models.catalogue import EffectClass
+    from pipeline.models.effect import Effect
+    from pipeline.vehicles import Vehicle
+
+FORMAT = 1
+_SECTIONS = ("format", "effects", "vehicle", "effect", "fit", "note")
+_NUMBER_KEYS = {"value", "low", "high", "unit", "bounds", "neutral", "fixed", "per_run"}
+_ID = re.compile(r"[^\W\d][\w-]{0,63}")
+
+Table = dict[str, object]
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """A model and what its file says beside it.
+
+    Attributes:
+        model: vehicle and effects with their values.
+        effect_files: files of the user's own effects, as written.
+        per_run: labels ``effect.name`` whose values belong to each run alone.
+        intervals: 95 % intervals of the last fit by label.
+        fit: what the last fit was: input, runs with hashes, delays, ladder; empty before one.
+        note: free text.
+        own: effects of the user's own Python, by id.
+        code: hashes of the Python that was run for them.
+        left_out: ids of effects that only Python which is not trusted can define.
+        warnings: what is left out and why, a line each.
+    """
+
+    model: Model
+    effect_files: tuple[str, ...] = ()
+    per_run: tuple[str, ...] = ()
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    fit: Mapping[str, object] = field(default_factory=dict)
+    note: str = ""
+    own: Mapping[str, EffectClass] = field(default_factory=dict, compare=False)
+    code: tuple[str, ...] = field(default=(), compare=False)
+    left_out: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def read_model(path: Path) -> ModelFile:
+    """Read a model file.
+
+    Python that it names is run only where its content has been trusted (`trust`); effects that only such code
+    defines are left out, and the file says so in its warnings.
+
+    Raises:
+        MotionError: the file is missing, not TOML, or says something that cannot be; with its line.
+    """
+    return parse_model(read_text(path), path)
+
+
+def read_text(path: Path) -> str:
+    """Text of a model file.
+
+    Raises:
+        MotionError: the file is missing or cannot be read.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise MotionError(
+            "model_not_found",
+            "there is no such model file",
+            where=str(path),
+            hint=f"Make one: slip model new {path.name} --vehicle husky_a200.",
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise MotionError(
+            "model_unreadable", f"cannot be read: {error}", where=str(path), hint="Check the file."
+        ) from None
+
+
+def parse_model(text: str, path: Path) -> ModelFile:
+    """Parse the text of a model file; see `read_model`.
+
+    Args:
+        text: TOML.
+        path: where it stands; files of effects are looked up beside it.
+    """
+    return _Reader(text, path).read()
+
+
+def list_code(path: Path) -> dict[str, str]:
+    """Python of the user's own that is meant by a file, names by hash; none of it is run.
+
+    Args:
+        path: a model file, or a Python file itself.
+
+    Raises:
+        MotionError: a file is missing or cannot be read.
+    """
+    if path.suffix == ".py":
+        return {hash_code(read_code(path.parent, path.name)): path.name}
+    return {hash_code(read_code(path.parent, name)): name for name in _Reader(read_text(path), path).files}
+
+
+class _Reader:
+    """One file: its text for line numbers, its tables, and what was found so far."""
+
+    def __init__(self, text: str, path: Path) -> None:
+        self.lines = text.splitlines()
+        self.path = path
+        try:
+            self.tree: Table = parse_toml(text)
+        except TomlError as error:
+            place = path if error.line is None else f"{path}:{error.line}"
+            raise MotionError(
+                "model_not_toml", error.what, where=str(place), hint="Mend that line."
+            ) from None
+        self.own: dict[str, EffectClass] = {}
+        self.code: list[str] = []
+        self.untrusted: list[str] = []
+        self.left_out: list[str] = []
+        self.per_run: list[str] = []
+        self.intervals: dict[str, tuple[float, float]] = {}
+
+    def read(self) -> ModelFile:
+        """The whole file."""
+        for key in self.tree:
+            if key not in _SECTIONS:
+                raise self._error(
+                    "unknown_key", f"unknown key {key!r}", f"Known are: {', '.join(_SECTIONS)}.", None, key
+                )
+        if self.tree.get("format", FORMAT) != FORMAT:
+            raise self._error(
+                "model_too_new",
+                f"format {self.tree['format']!r} is not known",
+                f"This version reads format {FORMAT}.",
+                None,
+                "format",
+            )
+        self._load_own()
+        vehicle = self._vehicle()
+        tables = self.tree.get("effect", [])
+        if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+            raise self._error(
+                "model_invalid", "effects are written as [[effect]]", "Double the brackets.", None, "effect"
+            )
+        effects: list[Effect] = []
+        for number, table in enumerate(tables):
+            effect = self._effect(number, table)
+            if effect is not None:
+                effects.append(effect)
+                self._check_composition(number, vehicle, effects)
+        fit = self.tree.get("fit", {})
+        return ModelFile(
+            model=Model(vehicle, tuple(effects)),
+            effect_files=self.files,
+            per_run=tuple(self.per_run),
+            intervals=self.intervals,
+            fit=fit if isinstance(fit, dict) else {},
+            note=str(self.tree.get("note", "")),
+            own=self.own,
+            code=tuple(self.code),
+            left_out=tuple(self.left_out),
+            warnings=self._warn(),
+        )
+
+    def _load_own(self) -> None:
+        trusted = list_trusted() if self.files else {}
+        for name in self.files:
+            try:
+                content = read_code(self.path.parent, name)
+                if hash_code(content) in trusted:
+                    self.own |= run_effects(content, self.path.parent / name)
+                    self.code.append(hash_code(content))
+                else:
+                    self.untrusted.append(name)
+            except MotionError as error:
+                where = f"{name!r}: {error.what}"
+                raise self._error(error.code, where, error.hint, None, "effects") from error
+
+    def _warn(self) -> tuple[str, ...]:
+        if not self.untrusted:
+            return ()
+        files = ", ".join(map(repr, self.untrusted))
+        missing = f"; left out: {', '.join(self.left_out)}" if self.left_out else ""
+        how = f"Read it, then trust it: slip model trust {shlex.quote(str(self.path))}"
+        return (f"{self.path}: Python that is not trusted is not run: {files}{missing}. {how}",)
+
+    def _vehicle(self) -> Vehicle:
+        table = self.tree.get("vehicle")
+        if not isinstance(table, dict):
+            raise self._error(
+                "vehicle_unknown",
+                "the model says no vehicle",
+                'Write [vehicle] and preset = "husky_a200", or kind and geometry.',
+                None,
+                "vehicle",
+            )
+        try:
+            require_finite({"vehicle": table})
+            section = msgspec.convert(table, VehicleSection)
+            return resolve_vehicle(section, recorded=None, where=str(self.path))
+        except (msgspec.ValidationError, TomlError) as error:
+            raise self._error(
+                "vehicle_invalid",
+                f"the vehicle is not valid: {error}",
+                "See README.md, Configuration, for the keys.",
+                ("vehicle", 0),
+                error.key.rpartition(".")[2] if isinstance(error, TomlError) else "",
+            ) from None
+        except ConfigurationError as error:
+            raise self._error(error.code, error.what, error.hint, ("vehicle", 0), "preset") from None
+
+    def _effect(self, number: int, table: Table) -> Effect | None:
+        at = ("effect", number)
+        name = table.get("id")
+        if not isinstance(name, str) or not name:
+            raise self._error(
+                "model_invalid",
+                "an effect needs an id",
+                "Write id = and one of those that `slip effects` lists.",
+                at,
+                "",
+            )
+        self._check_names(at, name, table)
+        formulas = {key: table[key] for key in CHANNELS if isinstance(table.get(key), str)}
+        numbers = {key: value for key, value in table.items() if key not in {"id", "note", *formulas}}
+        values, fixed = {}, []
+        for key, raw in numbers.items():
+            value, stays = self._number(at, name, key, raw, formula=bool(formulas))
+            if value is not None:
+                values[key] = value
+            if stays:
+                fixed.append(key)
+        if formulas:
+            texts = {channel: str(text) for channel, text in formulas.items()}
+            return self._formula(at, name, texts, numbers, values, fixed)
+        try:
+            effect = find_effect(name, self.own)
+        except MotionError as error:
+            if self.untrusted:
+                self.left_out.append(name)
+                return None
+            raise self._error(error.code, error.what, error.hint, at, "id") from error
+        for key, said in numbers.items():
+            self._check_parameter(at, effect(), key, said, values.get(key))
+        return self._make(effect, fixed, values)
+
+    def _check_names(self, at: tuple[str, int], name: str, table: Table) -> None:
+        if not _ID.fullmatch(name):
+            raise self._error(
+                "model_invalid",
+                f"{name[:80]!r} cannot be the id of an effect",
+                "Use letters, digits, _ and -, a letter first, at most 64.",
+                at,
+                "id",
+            )
+        for key in table:
+            if not (key.isidentifier() and unicodedata.is_normalized("NFKC", key)):
+                raise self._error(
+                    "model_invalid",
+                    f"{name}: {key[:80]!r} cannot be the name of a parameter",
+                    "Use letters, digits and _, a letter first.",
+                    at,
+                    key,
+                )
+
+    def _make(self, effect: EffectClass, fixed: list[str], values: dict[str, float]) -> Effect:
+        return effect().change(**values).fix(*fixed)
+
+    def _check_parameter(
+        self, at: tuple[str, int], effect: Effect, key: str, said: object, value: float | None
+    ) -> None:
+        """One parameter alone, so that an error names its own line."""
+        try:
+            declared = effect.parameter(key)
+            if value is not None:
+                effect.change(**{key: value})
+        except MotionError as error:
+            raise self._error(error.code, f"{effect.id}: {error.what}", error.hint, at, key) from error
+        if isinstance(said, dict) and said.get("unit", declared.unit) != declared.unit:
+            raise self._error(
+                "wrong_units",
+                f"{effect.id}.{key} is in {declared.unit}, not in {said['unit']}",
+                "Convert the value.",
+                at,
+                key,
+            )
+
+    def _formula(
+        self,
+        at: tuple[str, int],
+        name: str,
+        formulas: dict[str, str],
+        numbers: Table,
+        values: dict[str, float],
+        fixed: list[str],
+    ) -> Effect:
+        parameters = []
+        for key, raw in numbers.items():
+            table = raw if isinstance(raw, dict) else {}
+            bounds = table.get("bounds", [-math.inf, math.inf])
+            good = isinstance(bounds, list) and len(bounds) == 2 and all(_is_number(b) for b in bounds)  # noqa: PLR2004
+            if not good or not bounds[0] < bounds[1]:
+                raise self._error(
+                    "model_invalid",
+                    f"bounds of {key} must be two numbers",
+                    "Write bounds = [-1, 1].",
+                    at,
+                    key,
+                )
+            neutral = table.get("neutral", 0.0)
+            if not _is_number(neutral) or not math.isfinite(neutral):
+                raise self._error(
+                    "model_invalid",
+                    f"neutral of {key} is no finite number",
+                    "Write neutral = 1.0.",
+                    at,
+                    key,
+                )
+            unit = str(table.get("unit", "1"))
+            low, high = (float(bound) for bound in bounds)
+            parameters.append(make_parameter(key, unit, (low, high), neutral=float(neutral)))
+        lines = {key: self._place(at, key) for key in (*formulas, *numbers)}
+        try:
+            place = self._place(at, next(iter(formulas)))
+            effect = FormulaEffect(name, formulas, tuple(parameters), fixed=fixed, where=place)
+            return effect.change(**values)
+        except MotionError as error:
+            key = next(
+                (k for k in lines if f" {k} " in f" {error.where} {error.what} ".replace(".", " ")), ""
+            )
+            place = lines.get(key) or self._place(at, next(iter(formulas)))
+            raise MotionError(error.code, f"{name}: {error.what}", where=place, hint=error.hint) from error
+
+    def _number(
+        self, at: tuple[str, int], effect: str, key: str, raw: object, *, formula: bool
+    ) -> tuple[float | None, bool]:
+        """Value of a parameter and whether a fit leaves it alone."""
+        if _is_number(raw):
+            return float(raw), False  # type: ignore[arg-type]
+        if not isinstance(raw, dict) or set(raw) - _NUMBER_KEYS:
+            more = "" if formula else " (a formula is written v_x, v_y or v_w)"
+            raise self._error(
+                "model_invalid",
+                f"{effect}.{key} is no parameter{more}",
+                f"Write a number, or a table of {', '.join(sorted(_NUMBER_KEYS))}.",
+                at,
+                key,
+            )
+        label = f"{effect}.{key}"
+        if raw.get("per_run"):
+            self.per_run.append(label)
+        if _is_number(raw.get("low")) and _is_number(raw.get("high")):
+            self.intervals[label] = (float(raw["low"]), float(raw["high"]))
+        value = raw.get("value")
+        if value is not None and not _is_number(value):
+            raise self._error(
+                "model_invalid", f"the value of {label} is no number", "Write value = 1.5.", at, key
+            )
+        return (None if value is None else float(value)), bool(raw.get("fixed", False))
+
+    def _check_composition(self, number: int, vehicle: Vehicle, effects: list[Effect]) -> None:
+        try:
+            Model(vehicle, tuple(effects))
+        except MotionError as error:
+            raise self._error(error.code, error.what, error.hint, ("effect", number), "id") from error
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Files of Python that the model names."""
+        value = self.tree.get("effects", [])
+        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+            raise self._error(
+                "model_invalid",
+                "effects is a list of file names",
+                'Write effects = ["a.py"].',
+                None,
+                "effects",
+            )
+        return tuple(value)
+
+    def _error(self, code: str, what: str, hint: str, at: tuple[str, int] | None, key: str) -> MotionError:
+        return MotionError(code, shorten(what), where=self._place(at, key), hint=hint)
+
+    def _place(self, at: tuple[str, int] | None, key: str) -> str:
+        return f"{self.path}:{find_line(self.lines, at, key)}"
+
+
+def find_line(lines: list[str], at: tuple[str, int] | None, key: str) -> int:
+    """Line of a key, counted from one: in the ``at[1]``-th table ``at[0]``, or anywhere for None.
+
+    Where the key does not stand there, the line of the table's header; where there is none, the first line.
+    """
+    header, seen, inside = 1, -1, at is None
+    for number, line in enumerate(lines, start=1):
+        text = line.strip()
+        if text.startswith("["):
+            name = text.strip("[]").split("]")[0].strip()
+            if at is None:
+                if name == key or name.startswith(f"{key}."):
+                    return number
+                continue
+            if name == at[0]:
+                seen += 1
+            inside = name == at[0] and seen == at[1]
+            header = number if inside else header
+        elif inside and re.match(rf"\"?{re.escape(key)}\"?\s*=", text) and key:
+            return number
+    return header
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -1,0 +1,172 @@
+"""Writing a model file: plain TOML with units, values and intervals, one line a parameter."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import msgspec
+import tomlkit
+
+from pipeline.models.formula.formula_effect import FormulaEffect
+from pipeline.models.model_file import FORMAT
+from pipeline.runs.errors import MotionError
+from pipeline.store.files import replace_file
+from pipeline.vehicles import find_preset
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pipeline.models.effect import Effect, Parameter
+    from pipeline.models.model_file import ModelFile
+    from pipeline.vehicles import Vehicle
+
+_GEOMETRY = (
+    "wheel_radius_m",
+    "track_width_m",
+    "wheelbase_m",
+    "base_to_rear_axle_m",
+    "mass_kg",
+    "max_speed_mps",
+    "max_yaw_rate_radps",
+    "max_steering_rad",
+    "controller_track_multiplier",
+)
+_DIGITS = 6
+
+
+def write_model(file: ModelFile, path: Path) -> None:
+    """Write a model file in one moment: a reader sees the old one or the new one.
+
+    Raises:
+        MotionError: ``model_unwritable``; ``model_incomplete``, see `format_model`.
+    """
+    text = format_model(file)
+    try:
+        replace_file(path, text.encode())
+    except OSError as error:
+        raise MotionError(
+            "model_unwritable",
+            f"cannot be written: {error.strerror}",
+            where=str(path),
+            hint="Check the folder and its permissions.",
+        ) from None
+
+
+def format_model(file: ModelFile) -> str:
+    """The text of a model file.
+
+    Raises:
+        MotionError: ``model_incomplete``, effects were left out when it was read and would be lost.
+    """
+    if file.left_out:
+        raise MotionError(
+            "model_incomplete",
+            f"{', '.join(file.left_out)} would be lost: {', '.join(file.effect_files)} is not trusted",
+            where=", ".join(file.left_out),
+            hint="Read it and trust it (slip model trust), or take its effects out of the file by hand.",
+        )
+    lines = [
+        "# A motion model: a vehicle, and the physical effects by which it differs from the ideal one.",
+        "# `slip effects ID` explains an effect; `slip model show` this file.",
+        f"format = {FORMAT}",
+    ]
+    if file.note:
+        lines.append(f"note = {_value(file.note)}")
+    if file.effect_files:
+        lines.append(f"effects = [{', '.join(_value(name) for name in file.effect_files)}]")
+    lines += ["", *_format_vehicle(file.model.vehicle)]
+    for effect in file.model:
+        lines += ["", "[[effect]]", f"id = {_value(effect.id)}"]
+        if isinstance(effect, FormulaEffect):
+            lines += [f"{channel} = {_value(text)}" for channel, text in effect.formulas.items()]
+        lines += [_format_parameter(file, effect, parameter) for parameter in effect.parameters]
+    if file.fit:
+        lines += ["", "# What the values were fitted on.", *_format_table("fit", file.fit)]
+    return "\n".join(lines) + "\n"
+
+
+def _format_vehicle(vehicle: Vehicle) -> list[str]:
+    preset = find_preset(vehicle.id)
+    lines = ["[vehicle]"]
+    values = msgspec.structs.asdict(vehicle)
+    if preset is not None:
+        lines.append(f"preset = {_value(preset.id)}")
+        known = msgspec.structs.asdict(preset)
+        return lines + [f"{key} = {_exactly(values[key])}" for key in _GEOMETRY if values[key] != known[key]]
+    lines += [f"name = {_value(vehicle.name)}", f"kind = {_value(vehicle.kind)}"]
+    return lines + [f"{key} = {_exactly(values[key])}" for key in _GEOMETRY if values[key] is not None]
+
+
+def _format_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> str:
+    label, value = f"{effect.id}.{parameter.name}", effect.values[parameter.name]
+    parts = [] if math.isnan(value) else [f"value = {_round_within(value, parameter)}"]
+    if label in file.intervals:
+        low, high = file.intervals[label]
+        parts += [f"low = {_value(low)}", f"high = {_value(high)}"]
+    parts.append(f"unit = {_value(parameter.unit)}")
+    if isinstance(effect, FormulaEffect):
+        parts.append(f"bounds = [{', '.join(map(_exactly, parameter.bounds))}]")
+        if parameter.neutral != 0.0:
+            parts.append(f"neutral = {_exactly(parameter.neutral)}")
+    if parameter.name in effect.fixed:
+        parts.append("fixed = true")
+    if label in file.per_run or effect.id in file.per_run:
+        parts.append("per_run = true")
+    return f"{_key(parameter.name)} = {{ {', '.join(parts)} }}"
+
+
+def _format_table(name: str, table: Mapping[str, object]) -> list[str]:
+    """A table with its plain keys first, then lists of tables as [[name.key]]."""
+    lines = [f"[{name}]"]
+    for key, value in table.items():
+        if not _is_tables(value):
+            lines.append(f"{_key(key)} = {_value(value)}")
+    for key, value in table.items():
+        if _is_tables(value) and isinstance(value, Sequence):
+            for row in value:
+                lines += [
+                    "",
+                    f"[[{name}.{_key(key)}]]",
+                    *(f"{_key(k)} = {_value(v)}" for k, v in row.items()),
+                ]
+    return lines
+
+
+def _is_tables(value: object) -> bool:
+    return (
+        isinstance(value, Sequence)
+        and not isinstance(value, str)
+        and bool(value)
+        and all(isinstance(item, Mapping) for item in value)
+    )
+
+
+def _value(value: object) -> str:
+    """A value in TOML; lists and tables stand in one line."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return "[" + ", ".join(_value(item) for item in value) + "]"
+    if isinstance(value, float):
+        value = _round(value)
+    return str(tomlkit.item(value).as_string())
+
+
+def _key(name: str) -> str:
+    return str(tomlkit.key(name).as_string())
+
+
+def _exactly(value: float) -> str:
+    return str(tomlkit.item(float(value)).as_string())
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.{_DIGITS}g}")
+
+
+def _round_within(value: float, parameter: Parameter) -> str:
+    """A fitted value with the digits that mean something, unless that moves it out of its bounds."""
+    low, high = parameter.bounds
+    return _exactly(_round(value) if low <= _round(value) <= high and value != parameter.neutral else value)

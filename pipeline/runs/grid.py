@@ -1,0 +1,166 @@
+"""The fine grid of a run: spans without holes, cut into cells, and the inputs on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.runs.signals import Commands, Signal, Wheels
+
+if TYPE_CHECKING:
+    from pipeline.runs.recording import DriveSeries, MotionRun
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_SHORTEST_HOLE = 0.3
+_SHORTEST_SPAN = 0.5
+_BEFORE = 1.0
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Cells of all spans, one after the other.
+
+    Attributes:
+        step_s: width of a cell.
+        times: middles [s], shape (n,).
+        span: number of the span, shape (n,).
+        first: first cell of each span, shape (k,).
+        starts: start of each span [s], shape (k,).
+        ends: end of each span's last cell [s], shape (k,).
+    """
+
+    step_s: float
+    times: Floats
+    span: Integers
+    first: Integers
+    starts: Floats
+    ends: Floats
+
+    def find_span(self, at: Floats) -> Integers:
+        """Number of the span that holds each time, -1 in a hole."""
+        span = np.searchsorted(self.starts, at, side="right") - 1
+        inside = (span >= 0) & (at <= self.ends[np.maximum(span, 0)])
+        return np.where(inside, span, -1)
+
+    def sum_up(self, rate: Signal) -> Signal:
+        """Integral of a rate at every cell edge: index 0 is the first edge of all, holes count nothing."""
+        summed: Signal = np.empty(rate.size + 1, dtype=rate.dtype)
+        summed[0] = 0.0
+        np.cumsum(rate, out=summed[1:])
+        summed *= self.step_s
+        return summed
+
+    def locate_edges(self, at: Floats) -> Floats:
+        """Place of times among the cell edges as a fractional index into `sum_up`'s result."""
+        span = np.clip(np.searchsorted(self.starts, at, side="right") - 1, 0, self.starts.size - 1)
+        inside = np.clip(at, self.starts[span], self.ends[span]) - self.starts[span]
+        return self.first[span] + inside / self.step_s
+
+
+def make_cells(run: MotionRun, rate_hz: float) -> Cells:
+    """Cut a run at the holes of its recording and lay cells over what remains.
+
+    Args:
+        run: the run.
+        rate_hz: cells per second.
+    """
+    stamps = run.streams
+    period = np.diff(stamps)
+    hole = max(_SHORTEST_HOLE, 3.0 * float(np.median(period)))
+    edges = np.flatnonzero(period > hole)
+    starts = np.concatenate((stamps[:1], stamps[edges + 1]))
+    ends = np.concatenate((stamps[edges], stamps[-1:]))
+    long = ends - starts >= _SHORTEST_SPAN
+    starts, ends = starts[long], ends[long]
+    step = 1.0 / rate_hz
+    counts = np.ceil((ends - starts) / step - 1e-6).astype(np.int64)
+    first = np.concatenate(([0], np.cumsum(counts)[:-1]))
+    span = np.repeat(np.arange(starts.size), counts)
+    times = starts[span] + (np.arange(span.size) - first[span] + 0.5) * step
+    return Cells(step, times, span, first, starts, starts + counts * step)
+
+
+class MeasuredDrive:
+    """Measured wheels as a function of time, held towards the middle of holes.
+
+    Args:
+        series: wheel speeds [rad/s] and steering [rad] at their stamps.
+    """
+
+    def __init__(self, series: DriveSeries) -> None:
+        times = series.times
+        period = np.diff(times)
+        hole = np.flatnonzero(period > max(_SHORTEST_HOLE, 3.0 * float(np.median(period))))
+        middle = 0.5 * (times[hole] + times[hole + 1])
+        places = np.concatenate((hole + 1, hole + 1))
+        self._knots = np.insert(times, places, np.concatenate((middle - 1e-6, middle + 1e-6)))
+
+        def fill(values: Floats) -> Floats:
+            return np.insert(values, places, np.concatenate((values[hole], values[hole + 1])))
+
+        self._left, self._right = fill(series.left), fill(series.right)
+        self._steering = fill(series.steering) if series.steering.any() else None
+
+    def interpolate(self, at: Floats, delay_s: float) -> Wheels:
+        """Wheels at times [s] of shape (n,), their stamps being late by ``delay_s``."""
+        late = at + delay_s
+        return Wheels(
+            np.interp(late, self._knots, self._left),
+            np.interp(late, self._knots, self._right),
+            np.zeros(late.size) if self._steering is None else np.interp(late, self._knots, self._steering),
+        )
+
+
+def begin_spans(series: DriveSeries, cells: Cells, measured: Floats) -> Commands:
+    """Commands with a first value for every span: what the wheels did there, or the span's first command.
+
+    Args:
+        series: held commands.
+        cells: the grid.
+        measured: wheel speeds at each span's start, NaN where unknown, shape (k, 2).
+    """
+    following = np.minimum(np.searchsorted(series.times, cells.starts - 1e-6), series.times.size - 1)
+    # At a hole nobody knows what was asked meanwhile; at the start of the recording nothing was.
+    ends_before = np.concatenate(([-np.inf], cells.ends[:-1]))
+    stamp = np.maximum(ends_before + 1e-3, cells.starts - _BEFORE)
+    values = []
+    for column, source in ((0, series.left), (1, series.right), (None, series.steering)):
+        first = source[following]
+        if column is not None:
+            first = np.where(np.isfinite(measured[:, column]), measured[:, column], first)
+        values.append(first)
+    inside = cells.find_span(series.times) >= 0
+    times = np.concatenate((stamp, series.times[inside]))
+    order = np.argsort(times, kind="stable")
+    columns = [
+        np.concatenate((begin, source[inside]))[order]
+        for begin, source in zip(values, (series.left, series.right, series.steering), strict=True)
+    ]
+    return Commands(times[order], *columns)
+
+
+def hold_on_cells(commands: Commands, cells: Cells) -> Wheels:
+    """Cell means of held commands, exact wherever a stamp falls inside a cell."""
+    times = commands.times
+    edges = np.concatenate((cells.times - 0.5 * cells.step_s, cells.ends))
+    last_of_span = np.append(cells.first[1:], cells.times.size) - 1
+    index = np.clip(np.searchsorted(times, edges, side="right") - 1, 0, times.size - 1)
+    into = edges - times[index]
+    until = np.arange(cells.times.size) + 1
+    until[last_of_span] = cells.times.size + np.arange(cells.first.size)
+
+    def average(values: Floats) -> Floats:
+        area = np.concatenate(([0.0], np.cumsum(values[:-1] * np.diff(times))))
+        at = area[index] + values[index] * into
+        means: Floats = (at[until] - at[: cells.times.size]) / cells.step_s
+        # Differences of a growing integral leave rounding; where nothing changed the value is known exactly.
+        steady = index[until] == index[: cells.times.size]
+        return np.where(steady, values[index[: cells.times.size]], means)
+
+    steering = average(commands.steering) if commands.steering.any() else np.zeros(cells.times.size)
+    return Wheels(average(commands.left), average(commands.right), steering)

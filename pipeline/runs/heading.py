@@ -1,0 +1,241 @@
+"""The heading that models are judged with: of the gyro where there is a good one, else of the poses.
+
+A gyro is a better heading and a better clock than a localization, once its sign, scale and bias are known and
+it is brought into the map's frame by the slow part of its difference from the reported heading.
+"""
+
+from __future__ import annotations
+
+import enum
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core import timegrid
+from pipeline.runs.recording import GyroFit
+
+if TYPE_CHECKING:
+    from pipeline.runs.grid import Cells
+    from pipeline.runs.recording import MotionRun, Track
+
+Floats = NDArray[np.float64]
+
+_WINDOW_S = 0.5
+_LARGEST_DELAY = 0.7
+_DELAY_STEP = 0.01
+_FEWEST = 40
+_REFINEMENTS = 4
+_REWEIGHTED = 3
+_UNIT_S = 10.0
+_LARGEST_STEP_S = 0.05
+_LEAST_TURNING = 0.02
+_GOOD = 0.35
+_ALIGN_S = 3.0
+_HOLE_S = 0.5
+_SILENT_S = 0.25
+_LEAST_COVERED = 0.95
+
+
+class HeadingSource(enum.Enum):
+    """Whose heading is used: the gyro's where it agrees with the poses, or always the poses'."""
+
+    AUTO = "auto"
+    POSE = "pose"
+
+
+@dataclass(frozen=True)
+class Heading:
+    """Heading on the cells and at the poses.
+
+    Attributes:
+        gyro: how the gyro was used; None where the poses' own heading is.
+        edges: gyro heading at the cell edges [rad], shape (n + 1,); empty without a gyro.
+        offset: what is added to the gyro's heading to stand in the map, at every pose [rad]; or the reported
+            heading itself without a gyro, shape (m,).
+    """
+
+    gyro: GyroFit | None
+    edges: Floats
+    offset: Floats
+
+
+def choose_heading(run: MotionRun, cells: Cells, source: HeadingSource) -> Heading:
+    """The gyro's heading where it agrees with the poses, else the poses' own."""
+    track = run.track
+    fit = run.gyro_fit if source is HeadingSource.AUTO else None
+    if fit is None or run.gyro is None:
+        return Heading(None, np.zeros(0), track.heading)
+    times, rate = run.gyro
+    on_cells = fit.signed_scale * np.interp(cells.times, times, rate) + fit.bias
+    edges = cells.sum_up(on_cells)
+    seen = np.interp(cells.locate_edges(track.times - fit.yaw_delay_s), np.arange(edges.size), edges)
+    difference = track.heading - seen
+    good = ~mark_barred(run, track.times)
+    offset = align_heading(track, difference, good, cells.find_span(track.times))
+    return Heading(fit, edges, offset)
+
+
+def align_heading(
+    track: Track, difference: Floats, good: NDArray[np.bool_], span: NDArray[np.int64] | None = None
+) -> Floats:
+    """Slow part of the difference between two headings, within segments and spans [rad], shape (n,).
+
+    Args:
+        track: the poses.
+        difference: of the reported heading from the other one, shape (n,).
+        good: poses that count, shape (n,); where a piece has none all of its poses do.
+        span: number of the span of each pose; by default holes in the stamps end a span.
+    """
+    if span is None:
+        span = np.concatenate(([0], np.cumsum(np.diff(track.times) > _HOLE_S)))
+    offset = np.empty(track.times.size)
+    for begin, end in _find_pieces(track.segment, span):
+        rows = slice(begin, end)
+        counts = good[rows] if good[rows].any() else np.ones(end - begin, dtype=bool)
+        offset[rows] = _smooth(track.times[rows], difference[rows], counts)
+    return offset
+
+
+def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out is a reason
+    """Compare turning over half a second; None where there is no gyro, little turning, or no agreement."""
+    if run.gyro is None:
+        return None
+    times, rate = run.gyro
+    if times.size < _FEWEST or _measure_cover(times, run.track.times) < _LEAST_COVERED:
+        return None
+    first, second = _pair_up(run.track, run)
+    if first.size < _FEWEST:
+        return None
+    start, end = run.track.times[first], run.track.times[second]
+    turned = run.track.heading[second] - run.track.heading[first]
+    angle = timegrid.integrate_rate(times, rate)
+    spread = float(np.median(np.abs(turned)) + np.std(turned))
+    if spread < _LEAST_TURNING:
+        return None
+    inside = (start - _LARGEST_DELAY > times[0]) & (end + _LARGEST_DELAY < times[-1])
+    start, end, turned = start[inside], end[inside], turned[inside]
+    if start.size < _FEWEST:
+        return None
+
+    def judge(delay: float) -> tuple[float, float, float]:
+        gyro = np.interp(end - delay, times, angle) - np.interp(start - delay, times, angle)
+        return _fit_robustly(gyro, end - start, turned)
+
+    coarse = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 1e-9, 5 * _DELAY_STEP)
+    best = float(coarse[np.argmin([judge(float(d))[2] for d in coarse])])
+    scale, bias, loss = judge(best)
+    residual = loss / float(np.sqrt(np.mean(np.minimum(np.abs(turned), 3.0 * spread) ** 2)))
+    if residual > _GOOD or not 0.5 < abs(scale) < 2.0:  # noqa: PLR2004 - no gyro is that wrong
+        return None
+    refined = _refine((times, angle), (start, end), turned, (scale, bias, best))
+    # The poses' own errors are no reason to distrust the sensor's scale by a fraction of a percent.
+    return GyroFit(*refined, residual)
+
+
+def _refine(
+    gyro: tuple[Floats, Floats],
+    span: tuple[Floats, Floats],
+    turned: Floats,
+    values: tuple[float, float, float],
+) -> tuple[float, float, float, float]:
+    """Scale, bias and delay by robust Gauss-Newton steps; and the delay's standard error.
+
+    Args:
+        gyro: times [s] and integrated rate [rad], each of shape (m,).
+        span: start and end of every window [s], each of shape (n,).
+        turned: change of the reported heading over every window [rad], shape (n,).
+        values: scale, bias [rad/s] and delay [s] to start from.
+    """
+    (times, angle), (start, end) = gyro, span
+    scale, bias, delay = values
+
+    def turn(late: float) -> Floats:
+        change: Floats = np.interp(end - late, times, angle) - np.interp(start - late, times, angle)
+        return change
+
+    error = np.inf
+    unit = np.unique((start // _UNIT_S).astype(np.int64), return_inverse=True)[1]
+    for _ in range(_REFINEMENTS):
+        # The turning rate is the slope over the delay.
+        slope = scale * (turn(delay + _DELAY_STEP) - turn(delay - _DELAY_STEP)) / (2.0 * _DELAY_STEP)
+        design = np.column_stack((turn(delay), end - start, slope))
+        target = turned - design[:, :2] @ np.array([scale, bias])
+        weight, step = np.ones(target.size), np.zeros(3)
+        for _ in range(_REWEIGHTED):
+            rows = design * weight[:, None]
+            step = np.linalg.lstsq(rows.T @ design, rows.T @ target, rcond=None)[0]
+            rest = np.abs(target - design @ step)
+            spread = 1.4826 * float(np.median(rest)) + 1e-9
+            weight = np.minimum(1.0, 3.0 * spread / np.maximum(rest, 1e-12))
+        scale, bias = scale + float(step[0]), bias + float(step[1])
+        delay += float(np.clip(step[2], -_LARGEST_STEP_S, _LARGEST_STEP_S))
+        bread = np.linalg.pinv((design * weight[:, None]).T @ design)
+        pulls = np.zeros((int(unit.max()) + 1, 3))
+        np.add.at(pulls, unit, design * ((target - design @ step) * weight)[:, None])
+        error = float(np.sqrt(max((bread @ (pulls.T @ pulls) @ bread)[2, 2], 0.0)))
+    return scale, bias, delay, error
+
+
+def _measure_cover(times: Floats, at: Floats) -> float:
+    """Share of some moments beside which the gyro spoke: one that fell silent half-way is no heading."""
+    next_one = np.minimum(np.searchsorted(times, at), times.size - 1)
+    nearest = np.minimum(np.abs(times[next_one] - at), np.abs(times[np.maximum(next_one - 1, 0)] - at))
+    return float(np.mean(nearest < _SILENT_S))
+
+
+def _pair_up(track: Track, run: MotionRun) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Poses half a second apart in one segment, outside bad stretches."""
+    second = np.searchsorted(track.times, track.times + _WINDOW_S - 0.02)
+    first = np.arange(track.times.size)
+    kept = second < track.times.size
+    first, second = first[kept], second[kept].astype(np.int64)
+    kept = (track.segment[first] == track.segment[second]) & (track.times[second] - track.times[first] < 0.8)  # noqa: PLR2004
+    kept &= ~has_barred(run.barred, track.times[first], track.times[second])
+    return first[kept], second[kept]
+
+
+def has_barred(barred: Floats, start: Floats, end: Floats) -> NDArray[np.bool_]:
+    """Whether a barred sample lies in each closed interval."""
+    inside: NDArray[np.bool_] = np.searchsorted(barred, end + 1e-9) > np.searchsorted(barred, start - 1e-9)
+    return inside
+
+
+def mark_barred(run: MotionRun, times: Floats) -> NDArray[np.bool_]:
+    """Whether a barred sample lies beside each time."""
+    return has_barred(run.barred, times - 0.05, times + 0.05)
+
+
+def _fit_robustly(gyro: Floats, span: Floats, turned: Floats) -> tuple[float, float, float]:
+    """Scale, bias and robust spread of turned = scale * gyro + bias * span."""
+    keep = np.ones(gyro.size, dtype=bool)
+    scale = bias = spread = 0.0
+    for _ in range(4):
+        design = np.column_stack((gyro[keep], span[keep]))
+        (scale, bias), *_ = np.linalg.lstsq(design, turned[keep], rcond=None)
+        rest = np.abs(turned - scale * gyro - bias * span)
+        spread = 1.4826 * float(np.median(rest))
+        keep = rest <= max(3.0 * spread, 1e-9)
+    return float(scale), float(bias), spread
+
+
+def _find_pieces(segment: NDArray[np.int64], span: NDArray[np.int64]) -> list[tuple[int, int]]:
+    edges = np.flatnonzero((np.diff(segment) != 0) | (np.diff(span) != 0)) + 1
+    bounds = [0, *edges.tolist(), segment.size]
+    return list(itertools.pairwise(bounds))
+
+
+def _smooth(times: Floats, values: Floats, good: NDArray[np.bool_]) -> Floats:
+    """Running mean over six seconds of the good values."""
+    known = times[good]
+    total = np.concatenate(([0.0], np.cumsum(values[good])))
+    low = np.searchsorted(known, times - _ALIGN_S)
+    high = np.searchsorted(known, times + _ALIGN_S, side="right")
+    empty = high <= low
+    mean = (total[high] - total[low]) / np.maximum(high - low, 1)
+    if empty.any():
+        mean[empty] = np.interp(times[empty], known, values[good])
+    smooth: Floats = mean
+    return smooth

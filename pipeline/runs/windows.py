@@ -1,0 +1,206 @@
+"""What is compared: displacements over half a second, and two seconds of prediction from a measured pose.
+
+Poses are gathered into nodes; windows join nodes of one segment. Nothing crosses a hole, a jump, a bad
+stretch or the end of an interval with live commands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.runs.heading import has_barred
+
+if TYPE_CHECKING:
+    from pipeline.runs.grid import Cells
+    from pipeline.runs.recording import MotionRun, Track
+    from pipeline.runs.signals import Signal
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+
+WINDOW_S = 0.5
+HORIZON_S = 2.0
+NODE_S = 0.25
+_GATHER_S = 0.066
+_DENSE_S = 0.08
+_LEAD_S = 0.5
+_LEAST_LEAD_S = 0.02
+_SHORTEST_BLOCK_S = 5.0
+_LONGEST_BLOCK_S = 12.0
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Groups of poses whose mean is one measurement.
+
+    Attributes:
+        poses: indices into the track of all members, shape (m,).
+        first: place in `poses` where each group begins, shape (n,).
+        count: members of each group, shape (n,).
+        times: mean stamp of each group [s], shape (n,).
+        piece: number of the stretch without segment end or hole, shape (n,).
+    """
+
+    poses: Integers
+    first: Integers
+    count: Integers
+    times: Floats
+    piece: Integers
+
+    def average(self, values: Signal) -> Signal:
+        """Mean over each group of values at `poses`."""
+        sums: Signal = np.add.reduceat(values, self.first)
+        return sums / self.count
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Pairs of nodes about half a second apart.
+
+    Attributes:
+        start, end: node indices, shape (n,).
+        span_s: time between them [s], shape (n,).
+        block: number of the block (command step) of each, shape (n,).
+        times: start and end [s], shape (n, 2).
+    """
+
+    start: Integers
+    end: Integers
+    span_s: Floats
+    block: Integers
+    times: Floats
+
+
+@dataclass(frozen=True)
+class Horizons:
+    """Predictions of up to two seconds: one row a node reached.
+
+    Attributes:
+        origin: node predicted from, shape (n,).
+        node: node reached, shape (n,).
+        number: which prediction a row belongs to, shape (n,).
+        block: block of the prediction's start, shape (n,).
+        times: start of the prediction and its end, shape (n, 2).
+    """
+
+    origin: Integers
+    node: Integers
+    number: Integers
+    block: Integers
+    times: Floats
+
+
+def gather_nodes(track: Track, cells: Cells) -> Nodes:
+    """Gather poses: means over 0.13 s every quarter of a second, or single poses where they are rare."""
+    span = cells.find_span(track.times)
+    cut = (np.diff(track.segment) != 0) | (np.diff(span) != 0)
+    piece = np.concatenate(([0], np.cumsum(cut)))
+    period = np.diff(track.times)[~cut]
+    usable = (span >= 0) & track.active
+    if period.size == 0 or float(np.median(period)) > _DENSE_S:
+        poses = np.flatnonzero(usable)
+        each = np.ones(poses.size, dtype=np.int64)
+        return Nodes(poses, np.arange(poses.size), each, track.times[poses], piece[poses])
+    begin = track.times[np.searchsorted(piece, np.arange(int(piece[-1]) + 1))]
+    since = track.times - begin[piece] - _GATHER_S
+    raster = np.round(since / NODE_S)
+    member = usable & (np.abs(since - raster * NODE_S) <= _GATHER_S) & (raster >= 0)
+    poses = np.flatnonzero(member)
+    if poses.size == 0:
+        return Nodes(poses, poses, poses, track.times[poses], poses)
+    label = piece[poses] * 1_000_000 + raster[poses].astype(np.int64)
+    first = np.flatnonzero(np.concatenate(([True], np.diff(label) != 0)))
+    count = np.diff(np.append(first, poses.size))
+    times = np.add.reduceat(track.times[poses], first) / count
+    return Nodes(poses, first, count, times, piece[poses][first])
+
+
+def number_blocks(run: MotionRun, cells: Cells) -> Floats:
+    """Starts of blocks [s]: command steps, short ones joined, long ones divided; and spans."""
+    hard = cells.starts
+    soft = run.step_starts
+    starts: list[float] = []
+    for begin, end in zip(hard.tolist(), cells.ends.tolist(), strict=True):
+        inside = soft[(soft > begin) & (soft < end)]
+        kept = [begin]
+        for step in inside.tolist():
+            if step - kept[-1] >= _SHORTEST_BLOCK_S and end - step >= _SHORTEST_BLOCK_S:
+                kept.append(step)
+        for left, right in zip(kept, [*kept[1:], end], strict=True):
+            parts = (
+                max(int((right - left) // (_LONGEST_BLOCK_S / 2.0)), 1)
+                if right - left > _LONGEST_BLOCK_S
+                else 1
+            )
+            starts += [left + (right - left) * k / parts for k in range(parts)]
+    return np.array(starts)
+
+
+def find_lead(run: MotionRun, delay_s: float) -> float:
+    """How long after its start a span is not compared [s].
+
+    Where encoders say what the wheels did when the recording began, only the delay of the poses must pass:
+    they report what happened before. Without them the state of the drive must settle first.
+    """
+    return _LEAD_S if run.wheels is None else max(delay_s, 0.0) + _LEAST_LEAD_S
+
+
+def join_windows(run: MotionRun, cells: Cells, nodes: Nodes, lead_s: float) -> Windows:
+    """All windows of half a second, a quarter of a second apart where poses are dense."""
+    start = np.arange(nodes.times.size)
+    at = np.searchsorted(nodes.times, nodes.times + WINDOW_S)
+    before = np.clip(at - 1, 0, nodes.times.size - 1)
+    after = np.clip(at, 0, nodes.times.size - 1)
+    nearer = np.abs(nodes.times[after] - nodes.times - WINDOW_S) < np.abs(
+        nodes.times[before] - nodes.times - WINDOW_S
+    )
+    end = np.where(nearer, after, before)
+    length = nodes.times[end] - nodes.times
+    kept = (length > 0.6 * WINDOW_S) & (length < 1.5 * WINDOW_S)
+    kept &= _is_clean(run, cells, nodes, (start, end), lead_s)
+    start, end = start[kept], end[kept]
+    times = np.column_stack((nodes.times[start], nodes.times[end]))
+    blocks = number_blocks(run, cells)
+    block = np.searchsorted(blocks, times.mean(axis=1), side="right") - 1
+    return Windows(start, end, times[:, 1] - times[:, 0], block, times)
+
+
+def join_horizons(run: MotionRun, cells: Cells, nodes: Nodes, lead_s: float) -> Horizons:
+    """Predictions of two seconds, one after the other."""
+    reach = nodes.times + HORIZON_S
+    last = np.searchsorted(nodes.times, reach + 0.13, side="right") - 1
+    origin = np.arange(nodes.times.size)
+    whole = (nodes.piece[last] == nodes.piece) & (nodes.times[last] > reach - 0.3)
+    whole &= _is_clean(run, cells, nodes, (origin, last), lead_s)
+    chosen, next_start = [], -np.inf
+    for index in np.flatnonzero(whole).tolist():
+        if nodes.times[index] >= next_start - 1e-6:
+            chosen.append(index)
+            next_start = nodes.times[last[index]]
+    picked = np.array(chosen, dtype=np.int64)
+    counts = (last[picked] - picked) if picked.size else np.zeros(0, dtype=np.int64)
+    number = np.repeat(np.arange(picked.size), counts)
+    origins = picked[number]
+    offset = np.arange(number.size) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+    node = origins + offset
+    blocks = number_blocks(run, cells)
+    times = np.column_stack((nodes.times[origins], nodes.times[last[origins]]))
+    block = np.searchsorted(blocks, times.mean(axis=1), side="right") - 1
+    return Horizons(origins, node, number, block, times)
+
+
+def _is_clean(
+    run: MotionRun, cells: Cells, nodes: Nodes, ends: tuple[Integers, Integers], lead_s: float
+) -> Flags:
+    """Whether a stretch stays in one piece, clear of what is barred and of its span's first moments."""
+    start, end = ends
+    begin, stop = nodes.times[start], nodes.times[end]
+    clean = (nodes.piece[start] == nodes.piece[end]) & ~has_barred(run.barred, begin, stop)
+    span = np.clip(cells.find_span(begin), 0, cells.starts.size - 1)
+    late_enough: Flags = clean & (begin - cells.starts[span] >= lead_s)
+    return late_enough

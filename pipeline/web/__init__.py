@@ -1,0 +1,13 @@
+"""The workbench: a local page where one sees where a model fails, adds an effect, and watches the error fall.
+
+State lives in files beside the results, so the page can be reloaded at any time; what is drawn are the
+figures of the report. The server listens on the loopback only unless asked, lets in only who has its token,
+and refuses what another page sends. Logs are worked on in a process of its own, with limits.
+"""
+
+from pipeline.web.app import build_app
+from pipeline.web.errors import WorkbenchError
+from pipeline.web.limits import Limits
+from pipeline.web.server import is_loopback, serve
+
+__all__ = ["Limits", "WorkbenchError", "build_app", "is_loopback", "serve"]

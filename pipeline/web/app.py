@@ -1,0 +1,207 @@
+"""The web side: what each address answers."""
+
+from __future__ import annotations
+
+from contextlib import asynccontextmanager
+from importlib.resources import files
+from typing import TYPE_CHECKING
+from urllib.parse import quote
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.routing import Route
+
+from pipeline.analysis.analyze import REPORT
+from pipeline.report.bundle import load_bundle
+from pipeline.vehicles import list_presets
+from pipeline.web.answers import answer, make_handlers
+from pipeline.web.errors import WorkbenchError
+from pipeline.web.guard import LOOPBACK, Guard
+from pipeline.web.hall import Hall
+from pipeline.web.limits import Limits
+from pipeline.web.places import Places
+from pipeline.web.requests import read_ask
+from pipeline.web.runs import find_run, list_runs
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable
+    from pathlib import Path
+
+    from starlette.requests import Request
+    from starlette.types import ASGIApp
+
+    from pipeline.batch.work import Report, Task
+
+    Answer = Callable[[Request], Awaitable[Response]]
+
+_LONGEST_LENGTH = 18
+"""Digits of the size of a log, before it is taken for a number."""
+
+_PAGES = {
+    "/": ("pipeline.web", "page.html", "text/html"),
+    "/page.css": ("pipeline.web", "page.css", "text/css"),
+    "/page.js": ("pipeline.web", "page.js", "text/javascript"),
+    "/pane.js": ("pipeline.web", "pane.js", "text/javascript"),
+    "/parts.js": ("pipeline.web", "parts.js", "text/javascript"),
+    "/marks.js": ("pipeline.report", "marks.js", "text/javascript"),
+    "/plots.js": ("pipeline.report", "plots.js", "text/javascript"),
+}
+# The report's own policy stands inside it: it may run what it brought, and reach nothing.
+_REPORT_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox allow-scripts"
+)
+
+
+class Web:
+    """What each address answers.
+
+    Args:
+        hall: what is asked.
+    """
+
+    def __init__(self, hall: Hall) -> None:
+        self._hall = hall
+
+    def routes(self) -> list[Route]:
+        """All addresses."""
+        return [
+            *(Route(path, _serve_own(*where)) for path, where in _PAGES.items()),
+            Route("/vega.js", self.bundle),
+            Route("/model.toml", self.download),
+            Route("/report", self.report),
+            Route("/api/runs", self.runs),
+            Route("/api/jobs", self.jobs),
+            Route("/api/desk", self.desk, methods=["POST"]),
+            Route("/api/figures", self.figures, methods=["POST"]),
+            Route("/api/rows", self.rows, methods=["POST"]),
+            Route("/api/save", self.save, methods=["POST"]),
+            Route("/api/upload", self.upload, methods=["POST"]),
+            Route("/api/diagnose", self.diagnose, methods=["POST"]),
+            Route("/api/retry", self.retry, methods=["POST"]),
+            Route("/api/dismiss", self.dismiss, methods=["POST"]),
+        ]
+
+    async def runs(self, _: Request) -> Response:
+        """Runs, jobs and known vehicles."""
+        hall = self._hall
+        listed = await run_in_threadpool(list_runs, hall.store)
+        presets = [{"id": preset.id, "name": preset.name} for preset in list_presets()]
+        more = {"jobs": hall.jobs.show(), "vehicles": presets, "results": str(hall.results)}
+        return answer({**listed, **more})
+
+    async def jobs(self, _: Request) -> Response:
+        """Logs on their way to runs."""
+        return answer({"jobs": self._hall.jobs.show()})
+
+    async def desk(self, request: Request) -> Response:
+        """A change to a desk, and what it looks like then."""
+        return answer(await run_in_threadpool(self._hall.answer, await read_ask(request)))
+
+    async def figures(self, request: Request) -> Response:
+        """All figures of a desk."""
+        return answer(await run_in_threadpool(self._hall.draw, await read_ask(request)))
+
+    async def rows(self, request: Request) -> Response:
+        """Rows of the figures of a desk."""
+        return answer(await run_in_threadpool(self._hall.redraw, await read_ask(request)))
+
+    async def save(self, request: Request) -> Response:
+        """Write the model file of a desk."""
+        ask = await read_ask(request)
+        path = await run_in_threadpool(self._hall.save_model, ask.run, ask.slot)
+        return answer({"path": str(path)})
+
+    async def download(self, request: Request) -> Response:
+        """The model file of a desk."""
+        run, slot = request.query_params.get("run", ""), request.query_params.get("slot", "a")
+        text = await run_in_threadpool(self._hall.format_model, run, slot)
+        name = quote(f"{run.rpartition('/')[2]}.toml", safe="")
+        disposition = f"attachment; filename*=UTF-8''{name}"
+        return PlainTextResponse(text, headers={"content-disposition": disposition})
+
+    async def report(self, request: Request) -> Response:
+        """The stored report of a run, shut off from this page."""
+        run = request.query_params.get("run", "")
+        manifest = await run_in_threadpool(find_run, self._hall.store, run)
+        path = manifest.path(REPORT)
+        if not path.is_file():
+            raise WorkbenchError("no_report", "its report is gone", where=run, hint="Analyze the log again.")
+        headers = {"content-security-policy": _REPORT_POLICY}
+        return FileResponse(path, media_type="text/html", headers=headers)
+
+    async def bundle(self, _: Request) -> Response:
+        """The JavaScript that draws."""
+        script = await run_in_threadpool(load_bundle)
+        # It changes only with the installed version: a reload must not fetch megabytes again.
+        headers = {"cache-control": "private, max-age=3600"}
+        return Response(script, media_type="text/javascript", headers=headers)
+
+    async def upload(self, request: Request) -> Response:
+        """Take a log in, and begin to analyze it."""
+        length = request.headers.get("content-length", "")
+        if not (length.isascii() and length.isdecimal() and len(length) <= _LONGEST_LENGTH):
+            raise WorkbenchError("no_length", "the size of the log is not known", hint="Drop it again.")
+        name = request.query_params.get("name", "")
+        job = await self._hall.jobs.take(name, int(length), request.stream())
+        return answer({"job": job.show()})
+
+    async def diagnose(self, request: Request) -> Response:
+        """Begin to name what is missing from the model of a run."""
+        ask = await read_ask(request)
+        manifest = await run_in_threadpool(find_run, self._hall.store, ask.run)
+        return answer({"job": self._hall.jobs.diagnose(manifest).show()})
+
+    async def retry(self, request: Request) -> Response:
+        """Analyze a log again, now that its vehicle is known."""
+        query = request.query_params
+        job = self._hall.jobs.retry(query.get("id", ""), query.get("vehicle", ""))
+        return answer({"job": job.show()})
+
+    async def dismiss(self, request: Request) -> Response:
+        """Forget a job that has ended."""
+        self._hall.jobs.dismiss(request.query_params.get("id", ""))
+        return answer({"jobs": self._hall.jobs.show()})
+
+
+def build_app(
+    results: Path,
+    *,
+    token: str,
+    hosts: tuple[str, ...] = LOOPBACK,
+    limits: Limits | None = None,
+    diagnosis: bool = True,
+    work: Callable[[Task], Report] | None = None,
+) -> ASGIApp:
+    """The workbench as an ASGI application.
+
+    Args:
+        results: the results folder; need not exist yet.
+        token: what whoever asks must know.
+        hosts: names under which it may be addressed, without a port.
+        limits: what logs and the work on them may cost.
+        diagnosis: whether a dropped log is diagnosed too.
+        work: what the worker process does with a task; importable by its name there.
+    """
+    places = Places(results)
+    hall = Hall(results, limits or Limits(), diagnosis=diagnosis, places=places, work=work)
+
+    @asynccontextmanager
+    async def live(_: Starlette) -> AsyncIterator[None]:
+        try:
+            yield
+        finally:
+            await run_in_threadpool(hall.jobs.close)
+
+    app = Starlette(routes=Web(hall).routes(), exception_handlers=make_handlers(places), lifespan=live)
+    return Guard(app, token, hosts)
+
+
+def _serve_own(package: str, name: str, kind: str) -> Answer:
+    content = files(package).joinpath(name).read_text(encoding="utf-8")
+
+    async def serve(_: Request) -> Response:
+        return Response(content, media_type=kind)
+
+    return serve

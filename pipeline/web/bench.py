@@ -1,0 +1,181 @@
+"""Runs made ready for fitting, kept in memory: the expensive part of every answer."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import polars as pl
+
+from pipeline.identification import Input, Problem, State, choose_input, fit_model, hold_out
+from pipeline.identification.describe import errors_as_json
+from pipeline.identification.floor import estimate_floor
+from pipeline.identification.intervals import estimate_intervals
+from pipeline.identification.scoring import score
+from pipeline.models import Timing
+from pipeline.report.motion_run import load_motion_run, load_vehicle
+from pipeline.report.motion_view import MotionStage
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.identification import Errors, Fitted
+    from pipeline.models import Model
+    from pipeline.report.motion_view import MotionView
+    from pipeline.runs import MotionRun
+    from pipeline.store import Manifest
+    from pipeline.vehicles import Vehicle
+
+_MOST_RUNS = 6
+_MOST_FITS = 60
+_COARSE_RATE_HZ = 50.0
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A fitted model with its held-out errors, the floor that it shows, and the intervals of its numbers."""
+
+    fitted: Fitted
+    errors: Errors
+    floor: Errors
+    intervals: Mapping[str, tuple[float, float]]
+
+
+@dataclass
+class Stand:
+    """One run and input, ready; one thread at a time.
+
+    Attributes:
+        manifest: the run's results.
+        vehicle: what it was analyzed with.
+        run: as arrays.
+        problem: ready for fits.
+        stage: ready to be shown.
+        lock: held while one of these is used.
+    """
+
+    manifest: Manifest
+    vehicle: Vehicle
+    run: MotionRun
+    problem: Problem
+    stage: MotionStage
+    lock: threading.RLock = field(default_factory=threading.RLock)
+    _fits: OrderedDict[object, Judged] = field(default_factory=OrderedDict)
+    _coarse: Problem | None = None
+
+    def judge(self, model: Model) -> Judged:
+        """Fit a model and score it on data that the fit has not seen; remembered.
+
+        Effects at neutral values are searched, the others start from the values they have.
+        """
+        key = model.effects
+        with self.lock:
+            if key not in self._fits:
+                fitted = fit_model(self.problem, model)
+                held_out = hold_out(self.problem, fitted)
+                floor = estimate_floor(self.problem, held_out)
+                items = estimate_intervals(self.problem, fitted).items if model.effects else ()
+                found = {i.free.label: (i.low, i.high) for i in items if i.free.effect and i.free.run is None}
+                self._fits[key] = Judged(fitted, held_out.pooled, floor, found)
+                while len(self._fits) > _MOST_FITS:
+                    self._fits.popitem(last=False)
+            self._fits.move_to_end(key)
+            return self._fits[key]
+
+    def judge_quickly(self, model: Model) -> Errors:
+        """Held-out errors of a fitted model, without floor and intervals."""
+        with self.lock:
+            return hold_out(self.problem, fit_model(self.problem, model)).pooled
+
+    def score(self, model: Model, timing: Sequence[float]) -> Errors:
+        """Errors of a model as it stands, nothing fitted."""
+        with self.lock:
+            return score(self.problem, self.state(model, timing), self.stage.ideal.weights).pooled
+
+    def state(self, model: Model, timing: Sequence[float]) -> State:
+        """A model with the recording's delays."""
+        pose, wheel = timing
+        return State(model, {}, (Timing(pose, wheel),))
+
+    def view(
+        self,
+        model: Model,
+        timing: Sequence[float],
+        ladder: Sequence[Mapping[str, object]],
+        floor: Mapping[str, object] | None,
+    ) -> MotionView:
+        """Rows to draw of a model as it stands."""
+        with self.lock:
+            return self.stage.view(self.state(model, timing), ladder, floor)
+
+    def coarse_problem(self) -> Problem:
+        """The run on a coarser grid, for trying many effects beside the work in front."""
+        with self.lock:
+            if self._coarse is None:
+                self._coarse = Problem([self.run], self.vehicle, self.problem.source, rate_hz=_COARSE_RATE_HZ)
+            return self._coarse
+
+
+class Bench:
+    """The runs that were opened last."""
+
+    def __init__(self) -> None:
+        self._stands: OrderedDict[tuple[str, str, str], Stand] = OrderedDict()
+        self._runs: OrderedDict[tuple[str, str], tuple[Vehicle, MotionRun]] = OrderedDict()
+        self._lock = threading.Lock()
+        self._making: dict[tuple[str, str, str], threading.Lock] = {}
+
+    def load(self, manifest: Manifest) -> tuple[Vehicle, MotionRun]:
+        """The run as arrays; remembered."""
+        key = (manifest.run, manifest.key)
+        with self._lock:
+            if key in self._runs:
+                return self._runs[key]
+        vehicle = load_vehicle(manifest)
+        loaded = (vehicle, load_motion_run(manifest, vehicle))
+        with self._lock:
+            self._runs[key] = loaded
+            while len(self._runs) > _MOST_RUNS:
+                self._runs.popitem(last=False)
+        return loaded
+
+    def list_inputs(self, manifest: Manifest) -> list[str]:
+        """What models of a run can be fed with, the usual one first."""
+        _, run = self.load(manifest)
+        found = [Input.COMMAND] if run.commands is not None else []
+        found += [Input.MEASURED] if run.wheels is not None else []
+        return [source.value for source in found]
+
+    def stand(self, manifest: Manifest, source: str | None) -> Stand:
+        """A run ready for an input; made where it is not there yet.
+
+        Raises:
+            MotionError: the run has too little that can be compared.
+        """
+        vehicle, run = self.load(manifest)
+        chosen = choose_input([run], source).source
+        key = (manifest.run, manifest.key, chosen.value)
+        with self._lock:
+            making = self._making.setdefault(key, threading.Lock())
+        with making:
+            with self._lock:
+                if key in self._stands:
+                    self._stands.move_to_end(key)
+                    return self._stands[key]
+            problem = Problem([run], vehicle, chosen)
+            places = None
+            if "velocities" in manifest.tables:
+                places = manifest.read("velocities").select(pl.col("t", "x", "y")).sort("t")
+            stand = Stand(manifest, vehicle, run, problem, MotionStage(problem, places))
+            with self._lock:
+                self._stands[key] = stand
+                while len(self._stands) > _MOST_RUNS:
+                    self._stands.popitem(last=False)
+            return stand
+
+
+def rung_as_json(effects: Sequence[str], errors: Errors) -> dict[str, object]:
+    """A rung of the ladder as the JSON of `slip diagnose` has it."""
+    return {"effects": list(effects), **errors_as_json(errors)}

@@ -1,0 +1,176 @@
+"""What lies on a desk: a model of a run in the making and every step back to the ideal one, in one file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from pipeline.models import Model
+from pipeline.models.model_file import ModelFile, parse_model
+from pipeline.models.model_text import format_model
+from pipeline.store.files import make_folder, replace_file
+from pipeline.store.names import encode_run
+from pipeline.web.errors import WorkbenchError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path, PurePosixPath
+
+    from pipeline.vehicles import Vehicle
+
+SLOTS = ("a", "b")
+FOLDER = "workbench"
+
+_MOST_STEPS = 200
+
+
+class Step(msgspec.Struct, frozen=True, kw_only=True):
+    """A model on the desk and what is known of it.
+
+    Attributes:
+        said: what was done, in a few words.
+        model: text of its model file.
+        order: ids of its effects in the order in which they were added.
+        off: ids of effects that are switched off.
+        timing: delays of the recording: of the poses and of the wheels [s].
+        ladder: rungs from the ideal model up, as JSON.
+        without: error over 2 s [m] when an effect alone is dropped, by id.
+        by_hand: whether values were set by hand since the last fit.
+    """
+
+    said: str
+    model: str
+    order: list[str] = []
+    off: list[str] = []
+    timing: tuple[float, float] = (0.0, 0.0)
+    ladder: list[dict[str, object]] = []
+    without: dict[str, float] = {}
+    by_hand: bool = False
+
+
+class Desk(msgspec.Struct, frozen=True, kw_only=True):
+    """All steps of a model in the making.
+
+    Attributes:
+        run: the run it is fitted to.
+        key: generation of the run's results that the errors belong to.
+        input: what the model is fed with.
+        floor: the lowest noise floor seen, as JSON; empty before the first fit.
+        steps: oldest first.
+        at: which step counts: those after it can be redone.
+    """
+
+    run: str
+    key: str
+    input: str
+    floor: dict[str, object] = {}
+    steps: list[Step] = []
+    at: int = -1
+
+    @property
+    def step(self) -> Step:
+        """The step that counts.
+
+        Raises:
+            WorkbenchError: ``empty_desk``.
+        """
+        if not 0 <= self.at < len(self.steps):
+            raise WorkbenchError(
+                "empty_desk", "nothing has been fitted here yet", where=self.run, hint="Open the run again."
+            )
+        return self.steps[self.at]
+
+    def push(self, step: Step) -> Desk:
+        """The desk after another step; what had been undone is forgotten."""
+        steps = [*self.steps[: self.at + 1], step][-_MOST_STEPS:]
+        return msgspec.structs.replace(self, steps=steps, at=len(steps) - 1)
+
+    def drop(self, which: int) -> Desk:
+        """The desk without one of its steps; before it where that one counted."""
+        steps = [step for number, step in enumerate(self.steps) if number != which]
+        return msgspec.structs.replace(self, steps=steps, at=max(self.at - (which <= self.at), 0))
+
+    def move(self, by: int) -> Desk:
+        """The desk some steps back (negative) or forward, as far as there are any."""
+        return msgspec.structs.replace(self, at=min(max(self.at + by, 0), len(self.steps) - 1))
+
+
+@dataclass(frozen=True)
+class DeskFile:
+    """Where a desk is kept.
+
+    Attributes:
+        results: the results folder.
+        run: name of the run.
+        slot: `a`, or `b` for the one beside it.
+    """
+
+    results: Path
+    run: str
+    slot: str = field(default="a")
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        if self.slot not in SLOTS:
+            raise WorkbenchError(
+                "no_such_slot", f"there is no desk {self.slot!r}", hint=f"Use one of {', '.join(SLOTS)}."
+            )
+        return self.results / FOLDER / "desks" / self.slot / _with_suffix(encode_run(self.run), ".json")
+
+    @property
+    def model_path(self) -> Path:
+        """Where the model is saved."""
+        suffix = ".toml" if self.slot == "a" else f".{self.slot}.toml"
+        return self.results / FOLDER / "models" / _with_suffix(encode_run(self.run), suffix)
+
+    def read(self) -> Desk | None:
+        """The desk; None when there is none that can be read."""
+        try:
+            return msgspec.json.decode(self.path.read_bytes(), type=Desk)
+        except (OSError, ValueError, msgspec.DecodeError, RecursionError):
+            return None
+
+    def write(self, desk: Desk) -> None:
+        """Keep the desk.
+
+        Raises:
+            WorkbenchError: ``desk_not_written``.
+        """
+        try:
+            make_folder(self.path.parent)
+            replace_file(self.path, json.dumps(msgspec.to_builtins(desk), allow_nan=False).encode())
+        except OSError as error:
+            raise WorkbenchError(
+                "desk_not_written",
+                f"the state cannot be kept: {error.strerror}",
+                where=str(self.path),
+                hint="Free some space, or choose a results folder that can be written.",
+            ) from error
+
+    def parse(self, text: str) -> ModelFile:
+        """The model of a step."""
+        return parse_model(text, self.model_path)
+
+
+def format_step(model: Model, intervals: Mapping[str, tuple[float, float]]) -> str:
+    """The model text of a step."""
+    return format_model(ModelFile(model, intervals=intervals))
+
+
+def begin_desk(run: str, key: str, source: str, vehicle: Vehicle) -> Desk:
+    """A desk with the ideal model on it, not fitted yet."""
+    step = Step(said="ideal model", model=format_step(Model(vehicle), {}))
+    return Desk(run=run, key=key, input=source, steps=[step], at=0)
+
+
+def switch_off(model: Model, off: list[str]) -> Model:
+    """The model without the effects that are switched off."""
+    return replace(model, effects=tuple(effect for effect in model if effect.id not in off))
+
+
+def _with_suffix(path: PurePosixPath, suffix: str) -> PurePosixPath:
+    return path.with_name(f"{path.name}{suffix}")

@@ -1,0 +1,48 @@
+"""What a diagnosis says of a run: kept with its results, or beside them where it was asked for here."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+from pipeline.analysis.diagnosis import DIAGNOSIS, read_recording
+from pipeline.analysis.options import INPUTS
+from pipeline.store.files import make_folder, replace_file
+from pipeline.store.names import encode_run
+from pipeline.web.desk import FOLDER
+from pipeline.web.runs import read_json
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from pipeline.store import Manifest
+
+
+def read_diagnosis(results: Path, manifest: Manifest) -> Mapping[str, object] | None:
+    """What is known of a run's missing effects; None where nobody has asked yet."""
+    if DIAGNOSIS in manifest.files:
+        return read_json(manifest.path(DIAGNOSIS)) or None
+    kept = read_json(_path_of(results, manifest))
+    found = kept.get("diagnosis") if kept.get("key") == manifest.key else None
+    return found if isinstance(found, dict) else None
+
+
+def write_diagnosis(results: Path, manifest: Manifest) -> None:
+    """Diagnose a stored run and keep what comes of it beside the results; it works for many seconds.
+
+    Raises:
+        SlipError: nothing can be said of the run.
+    """
+    from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy, and only for the worker process
+
+    vehicle, recording = read_recording(manifest)
+    (found,) = diagnose_runs([recording], vehicle, inputs=INPUTS).to_json()
+    path = _path_of(results, manifest)
+    make_folder(path.parent)
+    replace_file(path, json.dumps({"key": manifest.key, "diagnosis": found}).encode())
+
+
+def _path_of(results: Path, manifest: Manifest) -> Path:
+    place = encode_run(manifest.run)
+    return results / FOLDER / "diagnoses" / place.with_name(f"{place.name}.json")

@@ -1,0 +1,252 @@
+"""Dropped logs on their way to runs, and diagnoses: in the background, with progress."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.analysis.options import STAGES, Options
+from pipeline.analysis.subject import name_run
+from pipeline.core.errors import SlipError
+from pipeline.store import LogSighting, Store, see_log
+from pipeline.web.errors import WorkbenchError
+from pipeline.web.uploads import Upload, Uploads, clean_name
+from pipeline.web.workers import ANALYZE, DIAGNOSE, Errand, Workers
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from pipeline.batch.work import Report, Task
+    from pipeline.store import Manifest
+    from pipeline.web.limits import Limits
+    from pipeline.web.places import Places
+
+WORDS = {
+    "upload": "taking the log in",
+    "read": "reading the log",
+    "extract": "extracting commands and poses",
+    "align": "putting clocks and scales right",
+    "velocity": "differentiating poses",
+    "slip": "computing slip",
+    "aggregate": "aggregating",
+    "diagnosis": "naming what is missing",
+    "report": "drawing the report",
+}
+
+_STEPS = ("upload", "read", *STAGES, "diagnosis", "report")
+_MOST_JOBS = 50
+_LONGEST_NAME = 200
+_FOLDER = Path("/dropped")
+"""A run is called after its log's folder and name; this one need not exist."""
+
+
+@dataclass
+class Job:
+    """One log on its way to a run.
+
+    Attributes:
+        id: for the page.
+        name: of the file, as dropped.
+        total: bytes that were announced.
+        received: bytes that have come.
+        stage: what is being done.
+        began: when the stage began [s, monotonic].
+        run: the run it became; empty until then.
+        error: what went wrong, as JSON; None while nothing did.
+        done: whether it has ended.
+        lossy: whether the log had losses.
+        upload: the log, as long as it is there: until it is analyzed, or while its vehicle is asked for.
+        sha256: of the log.
+    """
+
+    id: str
+    name: str
+    total: int = 0
+    received: int = 0
+    stage: str = "upload"
+    began: float = field(default_factory=time.monotonic)
+    run: str = ""
+    error: dict[str, str] | None = None
+    done: bool = False
+    lossy: bool = False
+    upload: Upload | None = None
+    sha256: str = ""
+
+    def tell(self, stage: str) -> None:
+        """Go on to a stage."""
+        self.stage, self.began = stage, time.monotonic()
+
+    def show(self) -> dict[str, object]:
+        """As JSON."""
+        return {
+            "id": self.id,
+            "name": self.name,
+            "stage": self.stage,
+            "words": WORDS.get(self.stage, self.stage),
+            "step": _STEPS.index(self.stage) if self.stage in _STEPS else 0,
+            "steps": len(_STEPS),
+            "seconds": round(time.monotonic() - self.began, 1),
+            "received": self.received,
+            "total": self.total,
+            "run": self.run,
+            "error": self.error,
+            "done": self.done,
+            "lossy": self.lossy,
+        }
+
+
+class Jobs:
+    """All logs that were dropped and all diagnoses that were asked for since the server started.
+
+    Args:
+        results: the results folder.
+        limits: what logs and the work on them may cost.
+        diagnosis: whether a dropped log is diagnosed too.
+        work: what is done in the worker process; importable by its name there.
+    """
+
+    def __init__(
+        self,
+        results: Path,
+        limits: Limits,
+        *,
+        diagnosis: bool,
+        places: Places,
+        work: Callable[[Task], Report] | None = None,
+    ) -> None:
+        self._results = results.resolve()
+        self._diagnosis = diagnosis
+        self._places = places
+        self._jobs: dict[str, Job] = {}
+        self._uploads = Uploads(results, limits)
+        self._workers = Workers(limits, work)
+
+    def show(self) -> list[dict[str, object]]:
+        """All jobs as JSON, the newest first."""
+        return [job.show() for job in reversed(tuple(self._jobs.values()))]
+
+    def dismiss(self, name: str) -> None:
+        """Forget a job that has ended."""
+        job = self._jobs.get(name)
+        if job is not None and job.done:
+            self._forget(job)
+
+    def close(self) -> None:
+        """End what is being done, and delete the logs."""
+        self._workers.close()
+        self._uploads.close()
+
+    async def take(self, name: str, total: int, chunks: AsyncIterator[bytes]) -> Job:
+        """Take a log in, piece by piece, and begin to analyze it.
+
+        Args:
+            name: of the file, as the browser says it.
+            total: bytes that were announced.
+            chunks: the content.
+
+        Raises:
+            WorkbenchError: too large or too many, no room on the disk, or the connection broke.
+        """
+        job = Job(secrets.token_hex(4), name[:_LONGEST_NAME], total)
+
+        def begin() -> None:
+            self._add(job)
+
+        def tell(received: int) -> None:
+            job.received = received
+
+        try:
+            job.upload, job.sha256 = await self._uploads.take(job.name, total, chunks, begin, tell)
+        except BaseException:
+            self._jobs.pop(job.id, None)
+            raise
+        self._start(job, job.upload, None)
+        return job
+
+    def retry(self, name: str, vehicle: str) -> Job:
+        """Analyze again, now that the vehicle is known.
+
+        Raises:
+            WorkbenchError: ``no_such_job``.
+        """
+        job = self._jobs.get(name)
+        if job is None or not job.done or job.upload is None:
+            raise WorkbenchError("no_such_job", "that log is not waiting", hint="Drop it again.")
+        self._start(job, job.upload, vehicle)
+        return job
+
+    def diagnose(self, manifest: Manifest) -> Job:
+        """Name what is missing from the model of a stored run, in the background.
+
+        Raises:
+            WorkbenchError: ``busy``, that is being done already.
+        """
+        name = f"diagnosis of {manifest.run}"
+        if any(job.name == name and not job.done for job in tuple(self._jobs.values())):
+            raise WorkbenchError(
+                "busy", "that is being done already", where=manifest.run, hint="Wait for it."
+            )
+        job = Job(secrets.token_hex(4), name)
+        job.tell("diagnosis")
+        self._add(job)
+        self._begin(job, partial(self._make_diagnosis, manifest))
+        return job
+
+    def _add(self, job: Job) -> None:
+        self._jobs[job.id] = job
+        for old in tuple(self._jobs.values()):
+            if len(self._jobs) > _MOST_JOBS and old.done:
+                self._forget(old)
+
+    def _forget(self, job: Job) -> None:
+        self._jobs.pop(job.id, None)
+        if job.upload is not None:
+            self._uploads.remove(job.upload)
+
+    def _start(self, job: Job, upload: Upload, vehicle: str | None) -> None:
+        job.error, job.done = None, False
+        job.tell("read")
+        self._begin(job, partial(self._make_analysis, upload, job.sha256, vehicle))
+
+    def _begin(self, job: Job, prepare: Callable[[], Errand]) -> None:
+        threading.Thread(target=self._do, args=(job, prepare), daemon=True).start()
+
+    def _do(self, job: Job, prepare: Callable[[], Errand]) -> None:
+        try:
+            entry = self._workers.run(prepare(), job.tell)
+            job.run, job.lossy = entry.run, entry.state == "lossy"
+        except SlipError as error:
+            code, upload = error.code, job.upload
+            message = str(error) if upload is None else str(error).replace(str(upload.path), job.name)
+            job.error = {"code": code, "message": self._places.hide(message), "hint": error.hint}
+        except Exception as error:  # noqa: BLE001 - whoever waits for the job must hear that it has ended
+            message = self._places.hide(f"{type(error).__name__}: {error}")
+            job.error = {"code": "failed", "message": message, "hint": "Try it in a terminal."}
+        finally:
+            # A log whose vehicle is asked for is needed once more.
+            waits = job.error is not None and "vehicle" in job.error["code"]
+            if job.upload is not None and not waits:
+                self._uploads.remove(job.upload)
+                job.upload = None
+            job.done = True
+
+    def _make_analysis(self, upload: Upload, sha256: str, vehicle: str | None) -> Errand:
+        store = Store(self._results)
+        options = Options(
+            out=self._results,
+            run=name_run(_FOLDER / clean_name(upload.name), sha256, store),
+            overrides={"vehicle": {"preset": vehicle}} if vehicle else {},
+            diagnosis=self._diagnosis,
+        )
+        log = see_log(upload.path)
+        return Errand(path=upload.path, log=log, basis=ANALYZE, options=options, notes=upload.notes)
+
+    def _make_diagnosis(self, manifest: Manifest) -> Errand:
+        options = Options(out=self._results, run=manifest.run)
+        log = LogSighting(path=manifest.run, size=0, mtime_ns=0, inode=0, seen_ns=0)
+        return Errand(path=manifest.folder, log=log, basis=DIAGNOSE, options=options, notes=None)

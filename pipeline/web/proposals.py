@@ -1,0 +1,163 @@
+"""What to add next: each effect of the catalogue tried on top of the model."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.core.errors import SlipError
+from pipeline.identification import fit_model, hold_out
+from pipeline.identification.ladder import compare_losses
+from pipeline.models import list_effects
+from pipeline.runs import MotionError
+from pipeline.web.cards import describe_shortly
+from pipeline.web.errors import evaluating
+
+if TYPE_CHECKING:
+    from pipeline.identification import HeldOut, Problem
+    from pipeline.models import Model
+    from pipeline.web.bench import Stand
+
+_WORTH = 0.99
+_SURE = 2.5
+_EACH_NUMBER = 1.02
+_MOST_KEPT = 40
+_CLIP = 6.0
+
+
+@dataclass
+class Trial:
+    """Every effect tried on top of one model.
+
+    Attributes:
+        owner: who asked for it.
+        total: how many there are to try.
+        tried: how many were.
+        found: what each would do, as JSON.
+        stopped: whether somebody wants it to end.
+    """
+
+    owner: str
+    total: int
+    tried: int = 0
+    found: list[dict[str, object]] = field(default_factory=list)
+    stopped: bool = False
+
+    @property
+    def is_broken(self) -> bool:
+        """Whether it was stopped before its end."""
+        return self.stopped and self.tried < self.total
+
+    def show(self) -> dict[str, object]:
+        """As JSON: those that help first."""
+        ranked = sorted(self.found, key=lambda entry: (not entry["helps"], entry["rank"]))
+        return {"total": self.total, "tried": self.tried, "found": ranked}
+
+
+class Trials:
+    """Trials that run or ran, by run, input and model; one thread each, the older ones of a run stopped."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[object, ...], Trial] = {}
+        self._lock = threading.Lock()
+
+    def find(self, stand: Stand, model: Model) -> Trial | None:
+        """The trial of a model, if there is one that was not stopped before its end."""
+        with self._lock:
+            trial = self._known.get(_key(stand, model))
+        return None if trial is None or trial.is_broken else trial
+
+    def begin(self, stand: Stand, model: Model, owner: str) -> Trial:
+        """Try every effect on top of a model, in the background; what its owner had begun before ends.
+
+        Args:
+            stand: the run.
+            model: as it stands.
+            owner: who asks: one trial each.
+        """
+        key = _key(stand, model)
+        with self._lock:
+            known = self._known.get(key)
+            if known is not None and not known.is_broken:
+                return known
+            for trial in self._known.values():
+                trial.stopped = trial.stopped or trial.owner == owner
+            while len(self._known) >= _MOST_KEPT:
+                self._known.pop(next(iter(self._known)))
+            kinds = [
+                effect
+                for effect in list_effects()
+                if stand.vehicle.kind in effect.kinds and effect.id not in model
+            ]
+            trial = Trial(owner, len(kinds))
+            self._known[key] = trial
+        names = [effect.id for effect in kinds]
+        threading.Thread(target=_try_all, args=(stand, model, names, trial), daemon=True).start()
+        return trial
+
+
+def _key(stand: Stand, model: Model) -> tuple[object, ...]:
+    manifest = stand.manifest
+    return (manifest.run, manifest.key, stand.problem.source.value, model.effects)
+
+
+def _try_all(stand: Stand, model: Model, names: list[str], trial: Trial) -> None:
+    try:
+        with evaluating(stand.manifest.run):
+            _try_each(stand, model, names, trial)
+    except SlipError:
+        # On top of a model that cannot be fitted nothing can be tried.
+        trial.tried = trial.total
+
+
+def _try_each(stand: Stand, model: Model, names: list[str], trial: Trial) -> None:
+    problem = stand.coarse_problem()
+    base: HeldOut = hold_out(problem, fit_model(problem, model))
+    kinds = {effect.id: effect for effect in list_effects()}
+    for name in names:
+        if trial.stopped:
+            return
+        added = model + kinds[name]()
+        if len(problem.active_effects(added)) > len(problem.active_effects(model)):
+            try:
+                held_out = hold_out(problem, fit_model(problem, added))
+            except (MotionError, ArithmeticError, ValueError):
+                # What cannot be fitted to this run is no proposal.
+                held_out = base
+            ratio = compare_losses(held_out, base)
+            trial.found.append(
+                {
+                    "id": name,
+                    "about": describe_shortly(kinds[name]),
+                    "ratio": ratio,
+                    # Of two that do the same, the one with fewer numbers.
+                    "rank": ratio * _EACH_NUMBER ** len(kinds[name].parameters),
+                    "helps": ratio < _WORTH
+                    and _reaches_further(base, held_out)
+                    and _is_sure(problem, base, held_out),
+                    "from": {"t": base.pooled.t_mrmse_m, "r": base.pooled.r_mrmse_rad},
+                    "to": {"t": held_out.pooled.t_mrmse_m, "r": held_out.pooled.r_mrmse_rad},
+                }
+            )
+        trial.tried += 1
+
+
+def _reaches_further(base: HeldOut, new: HeldOut) -> bool:
+    """Whether a planner would feel it: predictions over two seconds get better in position or heading."""
+    before, after = base.pooled, new.pooled
+    return after.t_mrmse_m < before.t_mrmse_m or after.r_mrmse_rad < before.r_mrmse_rad
+
+
+def _is_sure(problem: Problem, base: HeldOut, new: HeldOut) -> bool:
+    """Whether the loss falls in most blocks, not by luck in a few: t over blocks of command steps."""
+    known = np.isfinite(base.residuals).all(axis=1) & np.isfinite(new.residuals).all(axis=1)
+    sizes = [base.weights.normalise(side.residuals, problem)[known] for side in (base, new)]
+    before, after = (np.minimum(size**2, _CLIP**2).mean(axis=1) for size in sizes)
+    block = problem.block_of[known]
+    count = np.bincount(block)
+    gain = np.bincount(block, before - after)[count > 0] / count[count > 0]
+    error = float(gain.std(ddof=1)) / np.sqrt(gain.size) if gain.size > 1 else np.inf
+    return bool(gain.mean() > _SURE * error)

@@ -1,0 +1,98 @@
+"""Starting the server."""
+
+from __future__ import annotations
+
+import os
+import socket
+from typing import TYPE_CHECKING
+
+from pipeline.report.bundle import warm_bundle
+from pipeline.web.app import build_app
+from pipeline.web.errors import WorkbenchError
+from pipeline.web.guard import LOOPBACK, make_token
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from pipeline.web.limits import Limits
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address can be reached from this machine only."""
+    return host in LOOPBACK or host == "::1"
+
+
+def serve(
+    results: Path,
+    *,
+    host: str,
+    port: int,
+    tell: Callable[[str, str], None],
+    limits: Limits,
+    diagnosis: bool = True,
+) -> None:
+    """Serve the workbench until it is interrupted.
+
+    Args:
+        results: the results folder.
+        host: address to listen on; anything but the loopback opens it to the network.
+        port: 0 takes any that is free.
+        tell: told the address and the token once it listens.
+        limits: what logs and work on them may cost.
+        diagnosis: whether a dropped log is diagnosed too.
+
+    Raises:
+        WorkbenchError: ``port_taken``, nothing can listen there.
+    """
+    import uvicorn  # noqa: PLC0415 - heavy
+
+    # Processes that are started from here take no code from the folder they are started in.
+    os.environ["PYTHONSAFEPATH"] = "1"
+    listener = _listen(host, port)
+    hosts = LOOPBACK if is_loopback(host) else (*LOOPBACK, host.lower(), *_own_names(host))
+    token = make_token()
+    app = build_app(results, token=token, hosts=hosts, limits=limits, diagnosis=diagnosis)
+    warm_bundle()
+    shown = f"[{host}]" if ":" in host else host
+    tell(f"http://{shown}:{listener.getsockname()[1]}/", token)
+    configuration = uvicorn.Config(
+        app,
+        ws="none",
+        log_level="warning",
+        server_header=False,
+        access_log=False,
+        timeout_graceful_shutdown=2,
+    )
+    uvicorn.Server(configuration).run(sockets=[listener])
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+        # Whoever reads the address may ask at once; the answer comes when the server is ready.
+        listener.listen()
+    except OSError as error:
+        listener.close()
+        raise WorkbenchError(
+            "port_taken",
+            f"nothing can listen there: {error.strerror}",
+            where=f"{host}:{port}",
+            hint="Give another --port, or 0 for any that is free.",
+        ) from error
+    return listener
+
+
+def _own_names(host: str) -> tuple[str, ...]:
+    """Names of this machine, where it listens on all addresses."""
+    if host not in {"0.0.0.0", "::"}:  # noqa: S104 - compared, not bound
+        return ()
+    name = socket.gethostname().lower()
+    try:
+        addresses = {str(info[4][0]) for info in socket.getaddrinfo(name, None)}
+    except OSError:
+        addresses = set()
+    return (name, f"{name}.local", *(f"[{each}]" if ":" in each else each for each in sorted(addresses)))

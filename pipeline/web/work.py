@@ -1,0 +1,210 @@
+"""What one does at a desk: add, drop, switch, set, fit, undo. Each takes a desk and gives the next one."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from pipeline.identification.describe import errors_as_json
+from pipeline.models import find_effect
+from pipeline.web.bench import rung_as_json
+from pipeline.web.cards import show_desk
+from pipeline.web.desk import Desk, Step, begin_desk, format_step, switch_off
+from pipeline.web.errors import WorkbenchError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.identification import Errors
+    from pipeline.models import Effect, Model
+    from pipeline.web.bench import Judged, Stand
+    from pipeline.web.desk import DeskFile
+
+    Rungs = Mapping[tuple[str, ...], dict[str, object]]
+
+
+def open_desk(file: DeskFile, stand: Stand) -> Desk:
+    """The desk of a run as it was left; begun anew where there is none or the results have changed.
+
+    Steps that cannot be opened any more are left out.
+    """
+    desk = file.read()
+    source = stand.problem.source.value
+    if desk is not None and (desk.key != stand.manifest.key or desk.input != source):
+        desk = None
+    desk = desk.move(0) if desk is not None else None
+    while desk is not None and desk.steps and not _can_open(file, desk):
+        desk = desk.drop(desk.at)
+    if desk is None or not desk.steps:
+        desk = begin_desk(stand.manifest.run, stand.manifest.key, source, stand.vehicle)
+        fitted = _fit_anew(
+            stand, desk, _model_of(file, desk), desk.step.order, desk.step.said, off=desk.step.off, known={}
+        )
+        desk = msgspec.structs.replace(fitted, steps=[fitted.step], at=0)
+        file.write(desk)
+    return desk
+
+
+def move(file: DeskFile, desk: Desk, by: int) -> Desk:
+    """The desk a step back (-1) or forward (1); steps that cannot be opened any more are left out."""
+    while True:
+        moved = desk.move(by)
+        if moved.at == desk.at or _can_open(file, moved):
+            return moved
+        desk = desk.drop(moved.at)
+
+
+def _can_open(file: DeskFile, desk: Desk) -> bool:
+    try:
+        show_desk(desk, file.parse(desk.step.model))
+    except Exception:  # noqa: BLE001 - whatever a file holds that was written elsewhere
+        return False
+    return True
+
+
+def add_effect(file: DeskFile, stand: Stand, desk: Desk, effect: Effect | str) -> Desk:
+    """Put an effect on top of the model and fit all of it."""
+    made = find_effect(effect)() if isinstance(effect, str) else effect
+    model = _model_of(file, desk) + made
+    order, known = [*desk.step.order, made.id], _known_rungs(desk.step)
+    return _fit_anew(stand, desk, model, order, f"+ {made.id}", off=desk.step.off, known=known)
+
+
+def drop_effect(file: DeskFile, stand: Stand, desk: Desk, name: str) -> Desk:
+    """Take an effect away and fit the rest."""
+    model = _model_of(file, desk) - name
+    order = [each for each in desk.step.order if each != name]
+    off = [each for each in desk.step.off if each != name]
+    return _fit_anew(stand, desk, model, order, f"\u2212 {name}", off=off, known=_known_rungs(desk.step))
+
+
+def fit_desk(file: DeskFile, stand: Stand, desk: Desk) -> Desk:
+    """Fit all values that are not locked, from where they are."""
+    model = _model_of(file, desk)
+    return _fit_anew(stand, desk, model, desk.step.order, "fit", off=desk.step.off, known={})
+
+
+def switch_effect(file: DeskFile, stand: Stand, desk: Desk, name: str) -> Desk:
+    """Switch an effect off, or on again, without a fit: what it carries alone shows at once."""
+    model = _model_of(file, desk)
+    model.effect(name)
+    off = desk.step.off
+    off = [each for each in off if each != name] if name in off else [*off, name]
+    said = f"{name} {'off' if name in off else 'on'}"
+    return desk.push(_score_by_hand(stand, desk.step, model, said, off))
+
+
+def set_value(file: DeskFile, stand: Stand, desk: Desk, name: str, values: Mapping[str, float]) -> Desk:
+    """Set values of an effect by hand, without a fit."""
+    model = _model_of(file, desk).change(name, **values)
+    told = ", ".join(f"{key} = {value:.4g}" for key, value in values.items())
+    step = _score_by_hand(stand, desk.step, model, f"{name}: {told}", desk.step.off)
+    return desk.push(step)
+
+
+def lock_value(file: DeskFile, desk: Desk, name: str, parameter: str) -> Desk:
+    """Lock a value against fits, or unlock it."""
+    parsed = file.parse(desk.step.model)
+    effect = parsed.model.effect(name)
+    changed = effect.loosen(parameter) if parameter in effect.fixed else effect.fix(parameter)
+    model = parsed.model.swap(changed)
+    said = f"{name}.{parameter} {'locked' if parameter in changed.fixed else 'unlocked'}"
+    step = msgspec.structs.replace(desk.step, said=said, model=format_step(model, parsed.intervals))
+    return desk.push(step)
+
+
+def _model_of(file: DeskFile, desk: Desk) -> Model:
+    return file.parse(desk.step.model).model
+
+
+def _score_by_hand(stand: Stand, step: Step, model: Model, said: str, off: list[str]) -> Step:
+    errors = stand.score(switch_off(model, off), step.timing)
+    _require_numbers(errors, stand.manifest.run)
+    shown = [name for name in step.order if name not in off]
+    ladder = [rung for rung in step.ladder if set(_effects_of(rung)) < set(shown)]
+    ladder.append(rung_as_json(shown, errors))
+    return msgspec.structs.replace(
+        step, said=said, model=format_step(model, {}), off=off, ladder=ladder, by_hand=True
+    )
+
+
+def _effects_of(rung: Mapping[str, object]) -> list[str]:
+    found = rung.get("effects")
+    return [str(name) for name in found] if isinstance(found, list) else []
+
+
+def _fit_anew(
+    stand: Stand, desk: Desk, model: Model, order: list[str], said: str, *, off: list[str], known: Rungs
+) -> Desk:
+    """Fit a model; its ladder goes up in the order in which effects were added.
+
+    Args:
+        stand: the run.
+        desk: whose step it follows.
+        model: with the effects that are switched off.
+        order: of its effects.
+        said: what was done.
+        off: effects that are switched off.
+        known: rungs that need not be fitted again.
+    """
+    whole = stand.judge(switch_off(model, off))
+    _require_numbers(whole.errors, desk.run)
+    fitted = whole.fitted.model
+    shown = [name for name in order if name in fitted]
+    ladder = []
+    for count in range(len(shown)):
+        rung = known.get(tuple(shown[:count]))
+        if rung is None:
+            rung = rung_as_json(shown[:count], stand.judge_quickly(fitted.keep(shown[:count])))
+        ladder.append(rung)
+    ladder.append(rung_as_json(shown, whole.errors))
+    timing = whole.fitted.state.timing[0]
+    delays = (timing.pose_delay_s, timing.wheel_delay_s)
+    step = Step(
+        said=said,
+        model=format_step(model.swap(*fitted.effects), whole.intervals),
+        order=order,
+        off=off,
+        timing=delays,
+        ladder=ladder,
+        without={name: stand.score(fitted - name, delays).t_mrmse_m for name in shown},
+    )
+    return msgspec.structs.replace(desk, floor=_lower_floor(desk, whole)).push(step)
+
+
+def _require_numbers(errors: Errors, run: str) -> None:
+    if not (math.isfinite(errors.t_mrmse_m) and math.isfinite(errors.r_mrmse_rad)):
+        raise WorkbenchError(
+            "not_finite",
+            "with that the model predicts no finite motion on this run",
+            where=run,
+            hint="The model is as it was; take other values or another formula.",
+        )
+
+
+def _known_rungs(step: Step) -> Rungs:
+    """The rungs of a step that were fitted, by their effects; the last one was not after a change by hand."""
+    rungs = step.ladder[:-1] if step.by_hand else step.ladder
+    return {tuple(_effects_of(rung)): rung for rung in rungs}
+
+
+def learn_floor(desk: Desk, diagnosis: Mapping[str, object] | None) -> Desk:
+    """The desk with the floor that a diagnosis found for the same input, where it is lower."""
+    found = diagnosis.get("noise_floor") if diagnosis and diagnosis.get("input") == desk.input else None
+    lower = found if isinstance(found, dict) and isinstance(found.get("t_mrmse_m"), float) else None
+    if lower is None or not _is_below(lower, desk.floor):
+        return desk
+    return msgspec.structs.replace(desk, floor=lower)
+
+
+def _lower_floor(desk: Desk, judged: Judged) -> dict[str, object]:
+    """The floor can only sink: the better the model, the sharper it is."""
+    found = errors_as_json(judged.floor)
+    return found if _is_below(found, desk.floor) else desk.floor
+
+
+def _is_below(found: Mapping[str, object], known: Mapping[str, object]) -> bool:
+    new, old = found.get("t_mrmse_m"), known.get("t_mrmse_m")
+    return isinstance(new, float) and (not isinstance(old, float) or new < old)

@@ -1,0 +1,105 @@
+"""What a diagnosis finds in logs is what `slip trend` follows over their dates."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.options import Options
+from pipeline.analysis.trend import follow_trend
+from pipeline.cli import main
+from pipeline.simulate import simulate_case
+from pipeline.store import Store
+
+QUANTITY = "effective_track.k (command)"
+
+
+def drive(folder: Path, tracks: list[float], *, duration_s: float = 40.0) -> Path:
+    """Results of one log a day, each with its own effective track."""
+    for number, track in enumerate(tracks):
+        log = folder / "yard" / f"2026-05-{number + 1:02d}.mcap"
+        effects = {"effective_track": {"k": track}}
+        simulate_case("ideal_husky", effects, out=log, seed=number, duration_s=duration_s)
+        analyze_log(log, Options(out=folder / "results", report=False, diagnosis=True))
+    return folder / "results"
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return drive(tmp_path_factory.mktemp("three"), [1.4, 1.5, 1.9])
+
+
+def test_the_table_of_parameters_is_the_diagnosis(three: Path) -> None:
+    for manifest in Store(three).manifests():
+        told = json.loads(manifest.path("diagnosis.json").read_text(encoding="utf-8"))
+        expected = [
+            (told["input"], effect["id"], name, *(number[key] for key in ("value", "low", "high", "unit")))
+            for effect in told["effects"]
+            for name, number in effect["parameters"].items()
+        ]
+        table = manifest.read("parameters")
+        columns = ["input", "effect", "parameter", "value", "low", "high", "unit"]
+        assert table.select(pl.col(columns)).rows() == expected
+        assert ("command", "effective_track", "k") in [row[:3] for row in expected]
+        assert not table["at_bound"].any()
+
+
+def test_a_track_that_changed_raises_the_alert(three: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    codes = {}
+    for limit in ("2.0", "1.7"):
+        with pytest.raises(SystemExit) as ended:
+            main(["trend", str(three), "--by", "vehicle", "--limit", f"effective_track.k={limit}", "--json"])
+        codes[limit] = ended.value.code
+    found = json.loads(capsys.readouterr().out.split("\n}\n")[1] + "\n}")
+
+    assert codes == {"2.0": 0, "1.7": 4}
+    (alert,) = found["alerts"]
+    assert alert["quantity"] == QUANTITY
+    assert "yard/2026-05-03, above the limit of 1.7" in alert["text"]
+    (series,) = [one for one in found["series"] if one["quantity"] == QUANTITY]
+    assert [point["day"] for point in series["points"]] == ["2026-05-01", "2026-05-02", "2026-05-03"]
+    for point, track in zip(series["points"], [1.4, 1.5, 1.9], strict=True):
+        assert math.isclose(point["value"], track, rel_tol=0.03)
+
+
+def test_runs_that_do_not_name_an_effect_are_said(tmp_path: Path) -> None:
+    results = drive(tmp_path, [1.6, 1.0])
+    found = follow_trend(Store(results), ("vehicle",), threshold=0.1, limits={})
+
+    assert any(f"{QUANTITY} in 1 of 2 runs" in note for note in found.notes)
+
+
+def test_results_of_a_diagnosis_without_the_table_are_made_again(tmp_path: Path) -> None:
+    """As an older version left them: the key of its diagnosis was another one."""
+    results = drive(tmp_path, [1.6])
+    store, (manifest,) = Store(results), Store(results).manifests()
+    with store.open_generation(manifest.run, "older") as generation:
+        for table in manifest.tables:
+            if table != "parameters":
+                generation.reuse_table(table)
+        for file in manifest.files:
+            generation.reuse_file(file)
+        details = json.loads(json.dumps(dict(manifest.details)))
+        details["stages"]["diagnosis"]["key"] = "0123456789abcdef"
+        generation.commit(details)
+
+    again = analyze_log(
+        tmp_path / "yard" / "2026-05-01.mcap", Options(out=results, report=False, diagnosis=True)
+    )
+    assert again.computed == ("diagnosis",)
+    assert "parameters" in again.manifest.tables
+
+
+@pytest.mark.long
+def test_a_level_that_moved_is_found_in_analyzed_logs(tmp_path: Path) -> None:
+    results = drive(tmp_path, [1.5, 1.52, 1.49, 1.51, 1.5, 1.8, 1.79, 1.81, 1.8, 1.82])
+    found = follow_trend(Store(results), ("vehicle",), threshold=0.1, limits={})
+
+    (alert,) = [alert for alert in found.alerts if alert.quantity == QUANTITY]
+    assert alert.text.startswith(f"{QUANTITY} of husky_a200 moved from 1.5")
+    assert "since 2026-05-06 (5 runs before, 5 since" in alert.text

@@ -1,0 +1,239 @@
+"""`slip compare` over results: what is said about good and bad input."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from comparison_store import Run, write_run
+
+from pipeline.analysis.compare import Answer, Question, compare_results
+from pipeline.analysis.compare_files import describe_answer, write_answer
+from pipeline.analysis.errors import JobError
+from pipeline.cli.app import main
+from pipeline.fleet import ComparisonError, Group, Samples, compare_groups
+from pipeline.store import Store
+from schemas.contract import list_contracts
+from schemas.slip import Slip
+
+TERRAINS = {"asphalt": 0.5, "gravel": 1.0, "ice": 2.0}
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "results")
+
+
+def fill(store: Store, terrains: dict[str, float], *, runs: int) -> None:
+    for terrain, median in terrains.items():
+        for i in range(runs):
+            name = f"{terrain}_{i}"
+            factor = 1.0 + 0.03 * i
+            write_run(
+                store,
+                Run(name=name, dataset=f"warthog_{terrain}", terrain=terrain, median=median * factor),
+            )
+
+
+def ask(store: Store, **asked: object) -> Answer:
+    return compare_results(store, Question(**asked))  # type: ignore[arg-type]
+
+
+def pick(answer: Answer, a: str, b: str) -> dict[str, object]:
+    found = answer.comparisons.filter(pl.col("a") == a, pl.col("b") == b)
+    return found.row(0, named=True)
+
+
+def test_four_runs_a_side_tell_terrains_apart(store: Store) -> None:
+    fill(store, TERRAINS, runs=4)
+    answer = ask(store)
+    pair = pick(answer, "warthog_asphalt", "warthog_ice")
+    assert pair["unit_of_analysis"] == "runs"
+    assert pair["p"] == pytest.approx(2 / 70)
+    assert pair["p_adjusted"] == pytest.approx(2 / 70)
+    assert pair["smallest_p"] == pytest.approx(2 / 70)
+    assert "exact permutation of whole runs, max-T over 3 pairs" in str(pair["method"])
+    assert pair["cliffs_delta"] == 1.0
+    assert pair["size"] == "large"
+    assert float(str(pair["low"])) < float(str(pair["shift"])) < float(str(pair["high"]))
+    rows = answer.datasets.filter(pl.col("input") == "command")
+    assert rows["runs"].to_list() == [4, 4, 4]
+    assert rows["interval"].to_list() == ["over runs"] * 3
+    for row in rows.iter_rows(named=True):
+        assert row["low"] < row["median_modulus"] < row["high"]
+        assert f"{row['terrain']}_0/k0" in row["keys"]
+
+
+def test_three_runs_a_side_are_told_what_would_do(store: Store) -> None:
+    fill(store, {"asphalt": 0.5, "ice": 2.0}, runs=3)
+    answer = ask(store)
+    pair = pick(answer, "warthog_asphalt", "warthog_ice")
+    assert pair["smallest_p"] == pytest.approx(0.1)
+    assert pair["note"] == "cannot be significant with 3 runs a side; 4 a side would do"
+    assert any("cannot be significant with 3 runs a side" in note for note in answer.notes)
+
+
+def test_one_run_a_side_is_labelled_run_against_run(store: Store) -> None:
+    fill(store, {"asphalt": 0.5, "ice": 2.0}, runs=1)
+    answer = ask(store)
+    pair = pick(answer, "warthog_asphalt", "warthog_ice")
+    assert pair["unit_of_analysis"] == "blocks"
+    assert "this run against that run, not the terrain" in str(pair["note"])
+    assert answer.datasets.filter(pl.col("input") == "command")["interval"].to_list() == ["this run only"] * 2
+
+
+def test_equal_runs_are_not_told_apart_where_plain_samples_are(store: Store) -> None:
+    for i in range(6):
+        write_run(store, Run(name=f"r{i}", dataset=f"d{i}", terrain=f"t{i}", seconds=120.0), seed=3)
+    answer = ask(store)
+    assert answer.comparisons["p_adjusted"].min() > 0.05  # type: ignore[operator]
+    assert (answer.comparisons["p_uncorrected"] < 0.05).sum() >= 5
+    assert any("not valid" in note for note in answer.notes)
+
+
+def test_grave_findings_copies_and_other_scales_are_left_out_and_said(store: Store) -> None:
+    fill(store, {"asphalt": 0.5, "ice": 2.0}, runs=4)
+    write_run(store, Run(name="air", findings=[("not_moving", "error", 0.01)]))
+    write_run(store, Run(name="copy", sha256="ice_0", dataset="warthog_ice", terrain="ice"))
+    write_run(store, Run(name="scaled", length=0.5, dataset="warthog_ice", terrain="ice"))
+    write_run(store, Run(name="somewhere", terrain="unknown", dataset="warthog_unknown"))
+    answer = ask(store)
+    told = "\n".join(answer.notes)
+    assert "left out, finding not_moving: air" in told
+    assert "same recording" in told
+    assert "left out, its length scale" in told
+    assert "not pooled: somewhere" in told
+    command = answer.datasets.filter(pl.col("input") == "command")
+    assert command["runs"].to_list() == [4, 4]
+
+
+def test_tables_of_another_contract_are_left_out_and_said(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Slip, "VERSION", 999)
+    list_contracts.cache_clear()
+    write_run(store, Run(name="future", dataset="warthog_ice", terrain="ice"))
+    monkeypatch.undo()
+    list_contracts.cache_clear()
+    fill(store, {"asphalt": 0.5, "gravel": 1.0}, runs=2)
+    answer = ask(store)
+    assert any("contract version 999" in note for note in answer.notes)
+    assert answer.datasets["dataset"].unique().sort().to_list() == ["warthog_asphalt", "warthog_gravel"]
+
+
+def test_a_side_that_does_not_vary_is_said_and_compared(store: Store) -> None:
+    write_run(store, Run(name="flat", dataset="flat", terrain="a", still=True))
+    write_run(store, Run(name="live", dataset="live", terrain="b"))
+    pair = pick(ask(store), "flat", "live")
+    assert "a side does not vary at all" in str(pair["note"])
+
+
+def test_a_damaged_run_costs_itself_only(store: Store) -> None:
+    fill(store, {"asphalt": 0.5, "ice": 2.0}, runs=2)
+    manifest = write_run(store, Run(name="broken"))
+    (manifest.folder.parent / "manifest.json").write_text("{")
+    answer = ask(store)
+    assert any("left out" in note and "broken" in note for note in answer.notes)
+    assert answer.comparisons.height == 1
+
+
+def test_a_command_that_is_scaled_wrongly_is_said(store: Store) -> None:
+    fill(store, {"asphalt": 0.5}, runs=1)
+    write_run(
+        store, Run(name="snow", dataset="snow", terrain="s", findings=[("command_scale", "warning", 1.8)])
+    )
+    assert any("scaled wrongly" in note and "snow" in note for note in ask(store).notes)
+    assert not any("scaled wrongly" in note for note in ask(store, input="measured").notes)
+
+
+def test_groups_may_be_any_labels(store: Store) -> None:
+    fill(store, TERRAINS, runs=2)
+    assert ask(store, by=("vehicle",)).datasets["dataset"].unique().to_list() == ["warthog"]
+    assert ask(store, by=("vehicle", "terrain")).comparisons["a"][0] == "warthog / asphalt"
+    assert ask(store, by=("run",)).comparisons.height == 15
+    with pytest.raises(ComparisonError, match="cannot be grouped by colour"):
+        ask(store, by=("colour",))
+
+
+def test_nothing_to_compare_is_one_clear_line(store: Store) -> None:
+    with pytest.raises(JobError, match="no run whose numbers can be compared"):
+        ask(store)
+
+
+def test_measures_of_difficulty_have_their_definition(store: Store) -> None:
+    write_run(store, Run(name="one", still=True, median=1.0, seconds=120.0))
+    (row,) = ask(store).datasets.filter(pl.col("input") == "command").iter_rows(named=True)
+    assert row["slip_energy"] == pytest.approx(0.5 * 470.0)
+    assert row["transitory_slip"] == pytest.approx(0.0, abs=1e-9)
+    assert row["unpredictability"] < 1.0
+    assert 1.0 / 2.3 < row["relative_slip"] < 1.0 / 0.5
+    assert row["height_rate"] is None
+
+
+def test_files_and_json_keep_their_promises(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    fill(store, TERRAINS, runs=2)
+    answer = ask(store)
+    written = write_answer(store, answer, "svg")
+    page = written["comparison.html"].read_text(encoding="utf-8")
+    assert "http://" not in page.split("<script>")[0]
+    assert "The honest figure" in page
+    assert "warthog_ice" in page
+    assert written["run_medians_by_dataset.svg"].stat().st_size > 1000
+    table = pl.read_parquet(store.root / "comparisons.parquet")
+    assert table["keys"].str.contains("ice_0/k0").any()
+    assert (store.root / "datasets.tex").read_text().startswith("\\begin{tabular}")
+    promised = describe_answer(answer)
+    assert {"datasets", "pairs", "notes"} <= set(promised)
+    pair = promised["pairs"][0]  # type: ignore[index]
+    assert {
+        "a", "b", "shift", "low", "high", "cliffs_delta", "p", "p_adjusted", "smallest_p", "method",
+        "unit_of_analysis", "p_uncorrected",
+    } <= set(pair)  # fmt: skip
+    with pytest.raises(SystemExit) as ended:
+        main(["compare", str(store.root), "--json"])
+    assert ended.value.code == 0
+    spoken = json.loads(capsys.readouterr().out)
+    assert {
+        "dataset", "vehicle", "terrain", "runs", "samples", "median_modulus", "low", "high",
+        "median_window_norm",
+    } <= set(spoken["datasets"][0])  # fmt: skip
+
+
+def test_the_same_question_gets_the_same_bytes(store: Store) -> None:
+    fill(store, TERRAINS, runs=2)
+    first = {name: path.read_bytes() for name, path in write_answer(store, ask(store)).items()}
+    second = {name: path.read_bytes() for name, path in write_answer(store, ask(store)).items()}
+    assert first == second
+
+
+def test_more_groups_than_closed_testing_takes_are_corrected_after_holm(store: Store) -> None:
+    fill(store, {f"terrain{i}": 1.0 for i in range(9)}, runs=2)
+    (row, *_) = ask(store).comparisons.iter_rows(named=True)
+    assert "Holm over 36 pairs" in row["method"]
+    assert row["note"] == "cannot be significant with 2 runs a side; 7 a side would do"
+
+
+def test_many_single_runs_say_that_they_are_too_many() -> None:
+    rng = np.random.default_rng(1)
+    ticks = np.arange(1200)
+    groups = [
+        Group(f"r{i}", (Samples(rng.uniform(0.5, 1.5, 1200), ticks, np.zeros_like(ticks), 40.0),))
+        for i in range(21)
+    ]
+    pairs = compare_groups(groups)
+    assert len(pairs) == 210
+    assert all("cannot be significant among 210 pairs" in pair.note for pair in pairs)
+
+
+def test_runs_without_wheels_have_no_published_number_and_that_is_said(store: Store) -> None:
+    for terrain in ("ice", "sand"):
+        manifest = write_run(store, Run(name=terrain, dataset=f"d_{terrain}", terrain=terrain))
+        path = manifest.path("slip")
+        pl.read_parquet(path).filter(pl.col("input") == "command").write_parquet(path)
+    answer = ask(store, as_published=True)
+    assert any("ice, sand not compared: no published norm" in note for note in answer.notes)
+    assert answer.comparisons.is_empty()
+    assert "comparison.html" in write_answer(store, answer)

@@ -1,0 +1,126 @@
+"""What is known of an effect stands in its own file, and nowhere else."""
+
+from __future__ import annotations
+
+import ast
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.identification.describe import describe_effect
+from pipeline.models import Effect, list_effects
+from pipeline.models.catalogue import find_late_effect
+from pipeline.models.effect import Late
+from pipeline.models.evidence import Evidence, Largest
+
+EFFECTS = list_effects()
+BY_ID = {effect.id: effect for effect in EFFECTS}
+SOURCES = Path(__file__).parents[2] / "pipeline"
+OWN = SOURCES / "models" / "effects"
+WRITERS = {SOURCES / "models" / "export.py", SOURCES / "models" / "python_text.py"}
+GENERIC = sorted(
+    path
+    for path in SOURCES.rglob("*.py")
+    if OWN not in path.parents and SOURCES / "simulate" not in path.parents and path not in WRITERS
+)
+ASKED = Largest(1.5, 1.2, 9.0, 8.0, 300.0, np.linspace(-5.0, 20.0, 11))
+
+
+def list_mentions(path: Path) -> list[str]:
+    """Effects that a file's logic knows: by their ids as text, or by importing their files."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in BY_ID:
+            found.append(f"line {node.lineno}: {node.value!r}")
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+        module = f"{node.module}." if isinstance(node, ast.ImportFrom) and node.module else ""
+        found += [
+            f"line {node.lineno}: imports {module}{name}"
+            for name in names
+            if f"{module}{name}".startswith("pipeline.models.effects.")
+        ]
+    return found
+
+
+def test_no_generic_file_knows_an_effect() -> None:
+    knowing = {str(path.relative_to(SOURCES)): list_mentions(path) for path in GENERIC}
+    assert {path: lines for path, lines in knowing.items() if lines} == {}
+
+
+def test_an_effect_that_a_file_knows_is_seen(tmp_path: Path) -> None:
+    file = tmp_path / "knows.py"
+    file.write_text(
+        '"""A lag, as in drive_lag."""\n'
+        "from pipeline.models.effects.turn_lag import TurnLag\n"
+        "SLOW = {'drive_lag', TurnLag.id}\n",
+        encoding="utf-8",
+    )
+    assert list_mentions(file) == [
+        "line 2: imports pipeline.models.effects.turn_lag.TurnLag",
+        "line 3: 'drive_lag'",
+    ]
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=list(BY_ID))
+def test_sizes_have_reasons_and_fit_each_other(effect: type[Effect]) -> None:
+    page = describe_effect(effect)
+    for parameter in effect.parameters:
+        low, high = parameter.bounds
+        if parameter.least is not None:
+            assert 0.0 < parameter.least.size < abs(parameter.typical - parameter.neutral)
+            assert parameter.least.reason in page
+        if parameter.plausible is not None:
+            assert low <= parameter.plausible.low < parameter.plausible.high <= high
+            assert parameter.plausible.low <= parameter.typical <= parameter.plausible.high
+            assert parameter.plausible.source in page
+        if parameter.one_sign:
+            assert parameter.typical > parameter.neutral
+        if parameter.instead_of:
+            assert math.isnan(effect().parameter(parameter.instead_of).neutral)
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=list(BY_ID))
+def test_relations_hold_on_both_sides(effect: type[Effect]) -> None:
+    assert set(effect.contains) <= BY_ID.keys() - {effect.id}
+    assert all(effect.id in BY_ID[name].same_in_one_motion for name in effect.same_in_one_motion)
+    assert all(effect.id in BY_ID[name].equivalent_to for name in effect.equivalent_to)
+    for part in effect.parts:
+        assert part.name in {p.name for p in effect.parameters}
+        assert part.parameter in {p.name for p in BY_ID[part.effect].parameters}
+    simpler = effect().collapse()
+    assert simpler is None or simpler.id in effect.contains
+    assert all(other.id in BY_ID for other in effect().list_softer(ASKED))
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=list(BY_ID))
+def test_a_usual_size_is_that_effect_and_no_other(effect: type[Effect]) -> None:
+    usual = effect().make_usual(ASKED)
+    assert not usual.is_neutral
+    assert not usual.is_degenerate(Evidence(ASKED, encoders=True, gyro=True))
+
+
+@pytest.mark.parametrize("late", Late, ids=[late.name for late in Late])
+def test_every_delay_that_sensors_know_is_one_effect(late: Late) -> None:
+    (effect,) = [effect for effect in EFFECTS if effect.late is late]
+    assert find_late_effect(late) is effect
+    assert effect.of_delay(0.1).delay == 0.1
+    assert effect.of_delay(1e3).delay == effect.parameters[0].bounds[1]
+
+
+def test_parts_that_are_found_together_make_the_whole() -> None:
+    whole = next(effect for effect in EFFECTS if effect.parts)
+    values = {part.effect: (part.parameter, 0.1 * number) for number, part in enumerate(whole.parts, start=1)}
+    joined = whole.join({name: BY_ID[name](**dict([value])) for name, value in values.items()})
+    assert joined.searched_as == values.keys()
+    assert list(joined.values.values()) == [-0.1, -0.2]
+
+
+def test_of_two_places_of_a_change_only_the_one_that_is_given_counts() -> None:
+    change = next(effect for effect in EFFECTS if any(p.instead_of for p in effect.parameters))
+    instead = next(p for p in change.parameters if p.instead_of)
+    for given, idle in ((instead.name, instead.instead_of), (instead.instead_of, instead.name)):
+        effect = change(**{given: 10.0})
+        assert effect.is_used(effect.parameter(given))
+        assert not effect.is_used(effect.parameter(idle))

@@ -1,0 +1,283 @@
+"""What is exported computes what the model computes, and no name in a model becomes code or structure."""
+
+from __future__ import annotations
+
+import builtins
+import json
+import math
+import random
+import symtable
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from motion_runs import QUIET, simulate, vehicle_of
+
+from pipeline.identification import Input
+from pipeline.identification.comparison import Comparison
+from pipeline.models import Model, ModelFile, Place, Timing, find_effect, list_effects
+from pipeline.models.export import export_json, export_python, export_ros2_control
+from pipeline.models.formula import FormulaEffect
+from pipeline.models.formula.formula_effect import make_parameter
+from pipeline.models.model_file import parse_model
+from pipeline.models.model_text import format_model
+from pipeline.runs import MotionError
+from pipeline.simulate import VEHICLES, Disturbance, Program
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.runs import MotionRun
+
+HUSKY = vehicle_of("husky_a200")
+HERE = Path("model.toml")
+STEP_S = 0.005
+FREE = st.floats(-3.0, 3.0, allow_subnormal=False)
+LEAVES = [
+    "a",
+    "b",
+    "roll",
+    "pitch",
+    "yaw",
+    "pi",
+    "(v0 / u)",
+    "(w0 * s)",
+    "(t / s)",
+    "(left * s)",
+    "(x / (u * s))",
+    "-a",
+]
+NAMES = st.one_of(
+    st.text(max_size=30),
+    st.sampled_from(
+        [
+            '"""',
+            "'''",
+            "\\",
+            "a\nimport os",
+            "{radius}",
+            "{name}",
+            "# no",
+            ": [",
+            "\u2028\x85\x00",
+            "%s",
+            '\\"""\n"""',
+        ]
+    ),
+)
+
+
+def numbers() -> st.SearchStrategy[str]:
+    return st.one_of(
+        st.integers(0, 10**30).map(str),
+        st.floats(0.0, 1e6).map(repr),
+        st.sampled_from(["1e-300", "2.5E3", ".5", "3."]),
+    )
+
+
+def combine(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
+    power = st.sampled_from(["0", "1", "2", "3", "0.5", "-1", "-2", "1.5"])
+    one = st.sampled_from(
+        ["sin", "cos", "tan", "asin", "acos", "atan", "tanh", "exp", "log", "abs", "sqrt", "sign"]
+    )
+    two = st.sampled_from(["min", "max", "hypot", "atan2"])
+    return st.one_of(
+        st.tuples(inner, st.sampled_from(["+", "-", "*", "/", " - -"]), inner).map("".join),
+        st.tuples(inner, st.sampled_from(["+", "-", "*", "/"]), inner).map(
+            lambda parts: f"({' '.join(parts)})"
+        ),
+        st.tuples(inner, st.sampled_from(["**", "^", " ** "]), power).map("".join),
+        st.tuples(st.sampled_from(["-", "+", "- -"]), inner).map("".join),
+        st.tuples(one, inner).map(lambda parts: f"{parts[0]}({parts[1]})"),
+        st.tuples(two, inner, inner).map(lambda parts: f"{parts[0]}({parts[1]},\n{parts[2]})"),
+    )
+
+
+FORMULAS = st.recursive(st.one_of(st.sampled_from(LEAVES), numbers()), combine, max_leaves=12)
+
+
+def run_exported(
+    source: str, commands: list[tuple[float, ...]], until_s: float, **more: object
+) -> np.ndarray:
+    space: dict[str, object] = {}
+    exec(compile(source, "exported", "exec"), space)  # noqa: S102 - that is what it is for
+    return np.array(space["predict"](commands, until_s, **more))  # type: ignore[operator]
+
+
+def list_free_names(source: str) -> set[str]:
+    """Names of the module that nothing in it defines."""
+    module = symtable.symtable(source, "exported", "exec")
+    known = {name.get_name() for name in module.get_symbols() if name.is_assigned() or name.is_imported()}
+    known |= {child.get_name() for child in module.get_children()} | set(dir(builtins))
+    used = {
+        name.get_name() for child in module.get_children() for name in child.get_symbols() if name.is_global()
+    }
+    return used - known
+
+
+@settings(max_examples=150)
+@given(
+    text=FORMULAS,
+    state=st.tuples(FREE, FREE, FREE, FREE, FREE, FREE, FREE),
+    values=st.tuples(FREE, FREE, FREE, st.floats(0.1, 3.0), st.floats(0.1, 3.0)),
+    channel=st.sampled_from(["v_x", "v_y"]),
+)
+def test_an_exported_formula_gives_what_the_model_gives(
+    text: str, state: tuple[float, ...], values: tuple[float, ...], channel: str
+) -> None:
+    parameters = (
+        make_parameter("k", "1", (-9.0, 9.0)),
+        *(make_parameter(name, "1", (-9.0, 9.0), neutral=0.7) for name in "ab"),
+        make_parameter("u", "m/s", (-9.0, 9.0), neutral=0.7),
+        make_parameter("s", "s", (-9.0, 9.0), neutral=0.7),
+    )
+    whole = f"k * u * ({text}) + 0 * k * (a + b) * u * s / s"
+    try:
+        effect = FormulaEffect("f", {channel: whole}, parameters).change(
+            **dict(zip("kabus", values, strict=True))
+        )
+    except MotionError as error:
+        assume(error.code not in {"bad_formula", "not_finite"})
+        raise
+    left, right, x, y, yaw, roll, pitch = state
+    radius, track = HUSKY.wheel_radius_m, HUSKY.track_width_m or math.nan
+    signals = {"left": left, "right": right, "x": x, "y": y, "yaw": yaw, "roll": roll, "pitch": pitch}
+    signals |= {"v0": radius * (left + right) / 2.0, "w0": radius * (right - left) / track, "t": STEP_S / 2.0}
+    expression = effect.expressions[channel]
+    try:
+        added = float(expression.evaluate({**signals, **effect.values}))
+    except MotionError:
+        return
+    source = export_python(ModelFile(Model(HUSKY, (effect,))))
+    assert list_free_names(source) == set()
+    rows = run_exported(source, [(-1.0, left, right)], STEP_S, pose=(x, y, yaw), roll=roll, pitch=pitch)
+    expected = added + (signals["v0"] if channel == "v_x" else 0.0)
+    assert rows[0, 4 if channel == "v_x" else 5] == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+
+def test_a_power_of_a_negative_number_keeps_its_sign() -> None:
+    effect = FormulaEffect("f", {"v_x": "k**2 * v0"}, (make_parameter("k", "1", (-1.0, 1.0)),), k=-0.5)
+    rows = run_exported(export_python(ModelFile(Model(HUSKY, (effect,)))), [(-1.0, 1.0, 1.0)], STEP_S)
+    assert rows[0, 4] == pytest.approx(1.25 * HUSKY.wheel_radius_m)
+
+
+@pytest.fixture(scope="module")
+def runs() -> Mapping[str, MotionRun]:
+    quiet = {"duration_s": 8.0, "encoders": None, "pose": QUIET, "disturbance": Disturbance()}
+    car = {"vehicle": VEHICLES["car"], "program": Program(speed_scale=0.5)}
+    return {"differential": simulate({}, **quiet), "ackermann": simulate({}, **quiet, **car)}  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", [e.id for e in list_effects() if e.place is not Place.LOCALIZATION])
+def test_every_effect_moves_alike_at_any_of_its_values(name: str, runs: Mapping[str, MotionRun]) -> None:
+    rng = random.Random(name)  # noqa: S311 - no secret
+    kind = find_effect(name)
+    for vehicle, run in runs.items():
+        if vehicle not in kind.kinds:
+            continue
+        assert run.commands is not None
+        model = Model(vehicle_of("husky_a200" if vehicle == "differential" else "ackermann_car"))
+        comparison = Comparison(run, model.vehicle, Input.COMMAND)
+        series = run.commands
+        columns = [series.times, series.left, series.right, series.steering]
+        rows = list(zip(*(column.tolist() for column in columns), strict=True))
+        for _ in range(3):
+            values = {
+                p.name: p.neutral
+                if math.isnan(p.neutral) and p.name == "at_x"
+                else rng.uniform(
+                    *sorted((max(p.bounds[0], -2 * abs(p.typical)), min(p.bounds[1], 2 * abs(p.typical))))
+                )
+                for p in kind().parameters
+            }
+            effect = kind(**values)
+            expected = comparison.predict_velocity([effect], Timing())
+            fine = run_exported(
+                export_python(ModelFile(model + effect)), rows, run.duration_s, step_s=STEP_S / 5
+            )
+            # The model's cells hold means; so do these.
+            got = fine[: len(fine) // 5 * 5].reshape(-1, 5, 7).mean(axis=1)
+            times = comparison.cells.times[comparison.cells.times < run.duration_s - 0.1]
+            for column, channel in ((4, "x"), (5, "y"), (6, "w")):
+                seen = np.interp(times, got[:, 0] - STEP_S / 10.0, got[:, column])
+                wanted = getattr(expected, channel)[: times.size]
+                typical = float(np.sqrt(np.mean(wanted**2)))
+                apart = float(np.sqrt(np.mean((seen - wanted) ** 2)))
+                assert apart < 0.02 * max(typical, 0.1), (values, channel, apart, typical)
+
+
+@settings(max_examples=80)
+@given(name=NAMES, note=NAMES, unit=st.sampled_from(["1", "m/m", "rad"]), value=st.floats(-9.0, 9.0))
+def test_no_name_becomes_code_or_structure(name: str, note: str, unit: str, value: float) -> None:
+    vehicle = vehicle_of("husky_a200")
+    vehicle = type(vehicle)(
+        **{f: getattr(vehicle, f) for f in vehicle.__struct_fields__} | {"name": name, "id": "n"}
+    )
+    effect = FormulaEffect("hart-é", {"v_x": "k * v0"}, (make_parameter("k", unit, (-9.0, 9.0)),), k=value)
+    file = ModelFile(
+        Model(vehicle, (effect, find_effect("effective_track")(k=1.5))), note=note, fit={name: [note]}
+    )
+    source = export_python(file)
+    plain = export_python(ModelFile(Model(vehicle_of("husky_a200"), file.model.effects)))
+    assert [line for line in source.splitlines() if not line.startswith("VEHICLE = ")] == [
+        line for line in plain.splitlines() if not line.startswith("VEHICLE = ")
+    ]
+    space: dict[str, object] = {}
+    exec(compile(source, "exported", "exec"), space)  # noqa: S102 - that is what it is for
+    assert space["VEHICLE"] == name
+    assert list(yaml.safe_load(export_ros2_control(file))) == ["diff_drive_controller"]
+    assert json.loads(export_json(file))["fit"] == {name: [note]}
+
+
+TREES = st.recursive(
+    st.one_of(
+        st.text(max_size=8),
+        st.booleans(),
+        st.integers(-(2**63), 2**63 - 1),
+        st.floats(allow_nan=False).map(lambda value: float(f"{value:.6g}")).filter(math.isfinite),
+        st.datetimes(),
+        st.dates(),
+    ),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=6), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=80)
+@given(
+    note=st.text(max_size=20),
+    fit=st.dictionaries(st.text(max_size=6), TREES, min_size=1, max_size=4),
+    name=st.sampled_from(["k", "kappa", "τ", "k_2", "_k"]),
+    bounds=st.tuples(st.floats(-1e9, 0.0), st.floats(0.0, 1e9)).filter(lambda pair: pair[0] < pair[1]),
+    share=st.floats(0.0, 1.0),
+    neutral=st.floats(0.0, 1.0),
+)
+def test_a_model_file_says_again_what_it_was_told(
+    note: str, fit: dict[str, object], name: str, bounds: tuple[float, float], share: float, neutral: float
+) -> None:
+    neutral = bounds[0] + neutral * (bounds[1] - bounds[0])
+    value = min(max(bounds[0] + share * (bounds[1] - bounds[0]), bounds[0]), bounds[1])
+    assume(bounds[0] <= neutral <= bounds[1])
+    parameter = make_parameter(name, "1", bounds, neutral=neutral)
+    effect = FormulaEffect("f", {"v_x": f"({name} - {neutral!r}) * v0"}, (parameter,))
+    effect = effect.change(**{name: value})
+    file = ModelFile(Model(HUSKY, (effect,)), note=note, fit=fit)
+    text = format_model(file)
+    again = parse_model(text, HERE)
+    assert again.note == note
+    assert again.fit == fit
+    read = again.model.effect("f")
+    assert isinstance(read, FormulaEffect)
+    assert read.formulas == effect.formulas
+    assert read.parameter(name).bounds == bounds
+    assert read.parameter(name).neutral == neutral
+    assert read.values[name] == pytest.approx(value, rel=1e-5)
+    assert format_model(again) == text
+    assert tomllib.loads(text)["format"] == 1

@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.models.filters import lag_signal, limit_rate
+from pipeline.runs.grid import Cells, hold_on_cells
+from pipeline.runs.signals import Commands, Resets
+
+STEP = 0.005
+
+
+def resets_at(first: list[int], size: int, start: list[float]) -> Resets:
+    begins = np.array(first)
+    number = np.searchsorted(begins, np.arange(size), side="right") - 1
+    return Resets(number, begins, begins, np.array(start)[:, None])
+
+
+def test_a_lag_of_a_step_is_the_exponential_of_the_textbook() -> None:
+    size, tau = 400, 0.3
+    lagged = lag_signal(np.ones(size), tau, STEP, resets_at([0], size, [0.0]), np.array([0.0]))
+    edges = np.arange(size + 1) * STEP
+    # Cell means of 1 - exp(-t/tau), exactly.
+    area = edges + tau * np.exp(-edges / tau)
+    assert np.allclose(lagged, np.diff(area) / STEP, atol=1e-12)
+
+
+def test_a_lag_without_time_constant_is_its_input_itself() -> None:
+    signal = np.linspace(0.0, 1.0, 9)
+    assert lag_signal(signal, 0.0, STEP, resets_at([0], 9, [5.0]), np.array([5.0])) is signal
+
+
+def test_a_state_begins_anew_at_a_reset_and_carries_nothing_over() -> None:
+    size, tau = 300, 0.5
+    signal = np.concatenate((np.full(150, 4.0), np.zeros(150)))
+    whole = lag_signal(signal, tau, STEP, resets_at([0, 150], size, [0.0, 1.0]), np.array([0.0, 1.0]))
+    second = lag_signal(signal[150:], tau, STEP, resets_at([0], 150, [1.0]), np.array([1.0]))
+    assert np.allclose(whole[150:], second, atol=1e-12)
+
+
+def test_an_unknown_state_is_the_input_s_own_value() -> None:
+    signal = np.concatenate((np.full(100, 3.0), np.full(100, -2.0)))
+    unknown = np.array([np.nan, np.nan])
+    lagged = lag_signal(signal, 0.4, STEP, resets_at([0, 100], 200, [np.nan, np.nan]), unknown)
+    assert np.allclose(lagged, signal, atol=1e-12)
+
+
+@given(st.lists(st.floats(-5.0, 5.0), min_size=2, max_size=12), st.floats(0.5, 50.0), st.floats(-5.0, 5.0))
+@settings(max_examples=50, deadline=None)
+def test_a_rate_limit_agrees_with_stepping_through_it(
+    levels: list[float], limit: float, start: float
+) -> None:
+    cells = 20
+    signal = np.repeat(levels, cells)
+    limited = limit_rate(signal, limit, STEP, resets_at([0], signal.size, [start]), np.array([start]))
+    fine, value, expected = 50, start, []
+    for target in signal:
+        inside = []
+        for _ in range(fine):
+            most = limit * STEP / fine
+            value += float(np.clip(target - value, -most, most))
+            inside.append(value)
+        expected.append(np.mean(inside))
+    assert np.allclose(limited, expected, atol=limit * STEP)
+
+
+@given(
+    st.lists(st.floats(0.001, 0.09), min_size=1, max_size=40),
+    st.integers(0, 2**31),
+)
+@settings(max_examples=50, deadline=None)
+def test_held_commands_keep_their_area_wherever_their_stamps_fall(gaps: list[float], seed: int) -> None:
+    times = np.concatenate(([-1.0], np.cumsum(gaps)))
+    values = np.random.default_rng(seed).uniform(-3.0, 3.0, times.size)
+    size = int(np.ceil((times[-1] + 0.1) / STEP))
+    cells = Cells(
+        STEP,
+        (np.arange(size) + 0.5) * STEP,
+        np.zeros(size, dtype=np.int64),
+        np.array([0]),
+        np.array([0.0]),
+        np.array([size * STEP]),
+    )
+    wheels = hold_on_cells(Commands(times, values, values, np.zeros(times.size)), cells)
+    inside = np.clip(np.append(times, size * STEP), 0.0, None)
+    assert wheels.left.sum() * STEP == pytest.approx(float(np.sum(values * np.diff(inside))), abs=1e-9)
+    assert wheels.left.min() >= values.min() - 1e-9
+    assert wheels.left.max() <= values.max() + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_rate_limit_follows_its_input_step_by_step(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    size, step = 600, 0.01
+    signal = np.repeat(rng.normal(size=size) * rng.integers(0, 2, size), rng.integers(1, 25, size))[:size]
+    first = np.unique(np.concatenate(([0], rng.integers(1, size, 3))))
+    start = np.where(rng.random(first.size) < 0.5, np.nan, rng.normal(size=first.size))
+    limit = float(10.0 ** rng.uniform(-0.5, 2.0))
+    found = limit_rate(
+        signal, limit, step, Resets(np.zeros(size, dtype=np.int64), first, first, start[:, None]), start
+    )
+
+    begins = dict(zip(first.tolist(), start.tolist(), strict=True))
+    value = signal[0]
+    for cell in range(size):
+        if cell in begins:
+            value = begins[cell] if np.isfinite(begins[cell]) else signal[cell]
+        # Half a cell on, the mean of a cell in which the signal moves evenly.
+        half = value + np.clip(signal[cell] - value, -limit * step / 2.0, limit * step / 2.0)
+        value += np.clip(signal[cell] - value, -limit * step, limit * step)
+        assert found[cell] == pytest.approx(half, abs=1e-9)

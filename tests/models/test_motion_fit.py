@@ -1,0 +1,289 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from motion_runs import WANDERING, simulate, vehicle_of
+
+from pipeline.identification import (
+    Input,
+    Problem,
+    climb,
+    estimate_floor,
+    estimate_intervals,
+    fit_model,
+    hold_out,
+    predict,
+    predict_at,
+    score,
+)
+from pipeline.identification.floor import hold_below
+from pipeline.identification.persistence import split_residuals
+from pipeline.identification.scoring import GAP_S, assign_folds, list_training, measure_by_terrain
+from pipeline.models import Model, Timing, find_effect
+from pipeline.runs import HeadingSource, MotionError
+from pipeline.simulate import Disturbance, Imu, PoseSensor
+
+HUSKY = vehicle_of("husky_a200")
+SKID = {"effective_track": 1.8, "turn_lag": {"tau_mean": 0.1, "tau_diff": 0.4}, "icr_offset": 0.12}
+
+
+def model_of(*names: str) -> Model:
+    return Model(HUSKY, tuple(find_effect(name)() for name in names))
+
+
+def test_several_effects_come_back_together() -> None:
+    truth = {**SKID, "transport_delay": 0.15, "turning_resistance": 0.2}
+    run = simulate(truth, duration_s=200.0)
+    problem = Problem([run], HUSKY, Input.COMMAND)
+    fitted = fit_model(problem, model_of(*truth))
+    estimates = estimate_intervals(problem, fitted)
+    expected = {
+        "effective_track.k": 1.8,
+        "turn_lag.tau_mean": 0.1,
+        "turn_lag.tau_diff": 0.4,
+        "icr_offset.x_icr": 0.12,
+        "transport_delay.d": 0.15,
+        "turning_resistance.k": 0.2,
+    }
+    for label, value in expected.items():
+        item = estimates.find(label)
+        assert abs(item.value - value) < 2.0 * 0.5 * (item.high - item.low), label
+    assert np.all(np.abs(np.diag(estimates.correlation) - 1.0) < 1e-9)
+
+
+def test_measured_wheels_leave_the_drivetrain_out() -> None:
+    run = simulate(SKID)
+    problem = Problem([run], HUSKY, Input.MEASURED)
+    labels = [free.label for free in problem.list_free(model_of(*SKID))]
+    assert labels == ["effective_track.k", "icr_offset.x_icr", "timing.wheel_delay_s"]
+
+
+def test_fixed_parameters_stay_and_others_fit_round_them() -> None:
+    run = simulate(SKID)
+    problem = Problem([run], HUSKY, Input.MEASURED)
+    model = model_of("icr_offset") + find_effect("effective_track")(k=1.5).fix("k")
+    fitted = fit_model(problem, model)
+    assert fitted.model.effect("effective_track").values["k"] == 1.5
+    assert fitted.model.effect("icr_offset").values["x_icr"] == pytest.approx(0.12, abs=0.03)
+
+
+def test_runs_share_a_parameter_or_have_their_own() -> None:
+    runs = [simulate({"effective_track": k, "icr_offset": 0.1}, seed=i) for i, k in enumerate((1.5, 1.9))]
+    problem = Problem(runs, HUSKY, Input.MEASURED)
+    fitted = fit_model(problem, model_of("effective_track", "icr_offset"), per_run=["effective_track.k"])
+    estimates = estimate_intervals(problem, fitted)
+    own = [item for item in estimates.items if item.free.label == "effective_track.k"]
+    assert [item.free.run for item in own] == [0, 1]
+    assert [item.value for item in own] == pytest.approx([1.5, 1.9], abs=0.03)
+    assert estimates.find("icr_offset.x_icr").value == pytest.approx(0.1, abs=0.01)
+    held_out = hold_out(problem, fitted)
+    assert len(held_out.by_run) == 2
+    assert held_out.pooled.windows == sum(errors.windows for errors in held_out.by_run)
+    by_terrain = measure_by_terrain(problem, held_out)
+    assert by_terrain == {"simulated": held_out.pooled}
+
+
+def test_nothing_crosses_a_jump_of_the_pose() -> None:
+    jumpy = replace(PoseSensor(noise_m=0.002, noise_rad=0.001), jumps=4, jump_m=2.0, jump_rad=0.5)
+    run = simulate(SKID, pose=jumpy)
+    problem = Problem([run], HUSKY, Input.MEASURED)
+    assert np.unique(run.track.segment).size == 5
+    fitted = fit_model(problem, model_of("effective_track", "icr_offset"))
+    assert np.abs(fitted.residuals).max() < 0.15
+    assert fitted.model.effect("effective_track").values["k"] == pytest.approx(1.8, abs=0.02)
+
+
+def test_a_gyro_of_the_wrong_sign_and_a_late_pose_are_found_and_named() -> None:
+    run = simulate({"effective_track": 1.7, "clock_offset": 0.12}, imu=Imu(sign=-1, bias_radps=0.01))
+    problem = Problem([run], HUSKY, Input.MEASURED)
+    gyro = problem.comparisons[0].heading.gyro
+    assert gyro is not None
+    assert gyro.signed_scale == pytest.approx(-1.0, abs=0.02)
+    assert gyro.bias == pytest.approx(-0.01, abs=0.002)
+    assert gyro.yaw_delay_s == pytest.approx(0.12, abs=0.01)
+
+
+def test_without_a_gyro_the_poses_own_heading_serves() -> None:
+    run = simulate({"effective_track": 1.7, "heading_skew": 0.1}, imu=None)
+    problem = Problem([run], HUSKY, Input.COMMAND)
+    assert not problem.comparisons[0].has_gyro
+    fitted = fit_model(problem, model_of("effective_track", "heading_skew"))
+    assert fitted.model.effect("heading_skew").values["d"] == pytest.approx(0.1, abs=0.01)
+    with_gyro = simulate({"effective_track": 1.7})
+    assert not Problem([with_gyro], HUSKY, Input.COMMAND, heading=HeadingSource.POSE).comparisons[0].has_gyro
+
+
+def test_an_effect_that_leaves_no_trace_says_so() -> None:
+    run = simulate({})
+    problem = Problem([run], HUSKY, Input.COMMAND)
+    fitted = fit_model(problem, model_of("slope_drift"))
+    item = estimate_intervals(problem, fitted).find("slope_drift.k")
+    assert not item.observable or item.high - item.low > 1.0
+
+
+def test_a_run_without_encoders_cannot_be_fed_with_them() -> None:
+    run = simulate({}, encoders=None)
+    with pytest.raises(MotionError) as caught:
+        Problem([run], HUSKY, Input.MEASURED)
+    assert caught.value.code == "no_measured"
+
+
+def test_a_run_that_is_too_short_says_how_much_is_needed() -> None:
+    run = simulate({}, duration_s=4.0)
+    with pytest.raises(MotionError, match="are needed"):
+        Problem([run], HUSKY, Input.COMMAND)
+
+
+def test_training_windows_keep_their_distance_from_tested_ones() -> None:
+    run = simulate(SKID)
+    problem = Problem([run], HUSKY, Input.MEASURED)
+    fold = assign_folds(problem)
+    seen = np.zeros(problem.run_of.size, dtype=int)
+    for number in range(int(fold.max()) + 1):
+        tested = fold[problem.block_of] == number
+        training = list_training(problem, tested)
+        seen += tested
+        assert training.any()
+        assert not (training & tested).any()
+        for start, end in problem.times[tested]:
+            near = (problem.times[:, 1] > start - GAP_S) & (problem.times[:, 0] < end + GAP_S)
+            assert not (near & training).any()
+    assert (seen == 1).all()
+
+
+def test_a_useless_effect_does_not_lower_the_error_on_unseen_data_and_is_left_out() -> None:
+    run = simulate(SKID, duration_s=150.0)
+    problem = Problem([run], HUSKY, Input.MEASURED)
+    ladder = climb(problem, model_of("effective_track", "icr_offset", "lateral_drift"))
+    assert ladder.rungs[0].effects == ()
+    assert set(ladder.rungs[2].effects) == {"effective_track", "icr_offset"}
+    losses = [rung.errors.t_mrmse_m for rung in ladder.rungs[:3]]
+    assert losses == sorted(losses, reverse=True)
+    shares = ladder.explained_shares()
+    assert shares[0] == 0.0
+    assert shares[2] is not None
+    assert shares[2] > 0.8
+
+
+@pytest.mark.parametrize("source", list(Input))
+def test_the_floor_is_the_true_model_s_error_under_slow_localization_noise(source: Input) -> None:
+    truth = {"effective_track": 1.8, "drive_lag": 0.3, "icr_offset": 0.1}
+    run = simulate(truth, duration_s=200.0, pose=WANDERING, disturbance=Disturbance())
+    problem = Problem([run], HUSKY, source)
+    fitted = fit_model(problem, model_of(*truth))
+    floor = estimate_floor(problem, hold_out(problem, fitted))
+    true_model = Model(
+        HUSKY,
+        (
+            find_effect("effective_track")(k=1.8),
+            find_effect("drive_lag")(tau=0.3),
+            find_effect("icr_offset")(x_icr=0.1),
+        ),
+    )
+    true = score(problem, problem.start_state(true_model), fitted.weights).pooled
+    assert np.allclose(floor.ratios(true), 1.0, atol=0.15)
+
+
+def test_the_floor_is_one_number_whatever_model_it_is_taken_from() -> None:
+    truth = {"effective_track": 1.8, "drive_lag": 0.3, "icr_offset": 0.1}
+    run = simulate(truth, duration_s=200.0, pose=WANDERING, disturbance=Disturbance(0.03, 0.05))
+    problem = Problem([run], HUSKY, Input.MEASURED)
+    rungs = climb(problem, model_of("effective_track", "icr_offset")).rungs
+    floors = [estimate_floor(problem, rung.held_out) for rung in rungs]
+    for floor in floors[:-1]:
+        assert np.allclose(floor.ratios(floors[-1])[:3], 1.0, atol=0.15)
+        held = hold_below(floor, rungs[-1].errors)
+        assert np.all(np.array(held.ratios(rungs[-1].errors)) <= 1.0)
+        assert np.all(np.array(held.ratios(floor)) <= 1.0)
+
+
+def test_the_noise_of_poses_is_measured_whatever_the_model_lacks() -> None:
+    sparse = PoseSensor(rate_hz=4.0, noise_m=0.03, noise_rad=0.002)
+    run = simulate({"effective_track": 1.8, "icr_offset": 0.1}, duration_s=300.0, pose=sparse)
+    problem = Problem([run], HUSKY, Input.MEASURED)
+    for rung in climb(problem, model_of("effective_track", "icr_offset")).rungs:
+        x, y, _ = split_residuals(problem.comparisons, rung.held_out.residuals)
+        assert x.pose_noise == pytest.approx(0.03, rel=0.15)
+        assert y.pose_noise == pytest.approx(0.03, rel=0.25)
+
+
+def test_motion_that_lasts_is_no_noise_though_nothing_recorded_tells_of_it() -> None:
+    truth = {"effective_track": 1.8}
+    floors = []
+    for unseen in (Disturbance(), Disturbance(0.1, 0.1, correlation_s=4.0)):
+        run = simulate(truth, duration_s=300.0, pose=WANDERING, disturbance=unseen)
+        problem = Problem([run], HUSKY, Input.MEASURED)
+        held_out = hold_out(problem, fit_model(problem, model_of(*truth)))
+        floors.append((estimate_floor(problem, held_out), held_out.pooled))
+    (quiet, _), (pushed, error) = floors
+    assert np.all(np.array(error.ratios(quiet)) > 3.0)
+    x, y, _, position, _ = pushed.ratios(quiet)
+    assert np.allclose((x, y, position), 1.0, atol=0.3)
+    # A gyro's noise is so small that beside such motion only its bound can be given.
+    assert np.all(np.array(pushed.ratios(error)) < 0.3)
+
+
+def test_predictions_begin_at_measured_poses_and_follow_the_true_motion() -> None:
+    run = simulate({"effective_track": 1.8, "drive_lag": 0.3}, duration_s=60.0, disturbance=Disturbance())
+    model = Model(HUSKY, (find_effect("effective_track")(k=1.8), find_effect("drive_lag")(tau=0.3)))
+    made = predict(model, run, Input.COMMAND, timing=Timing())
+    assert made.poses.shape == (made.start_times.size, made.horizon_times.size, 3)
+    assert made.velocity.shape == (made.times.size, 3)
+    ends = made.start_times + made.horizon_times[-1]
+    seen = np.interp(ends, run.track.times, run.track.place[:, 0])
+    assert np.sqrt(np.mean((made.poses[:, -1, 0] - seen) ** 2)) < 0.02
+    ideal = predict(model.ideal, run, Input.COMMAND, timing=Timing())
+    turned = np.abs(ideal.poses[:, -1, 2] - made.poses[:, -1, 2])
+    assert turned.max() > 0.3
+
+
+def test_slip_against_the_true_model_is_noise_where_slip_against_the_ideal_is_not() -> None:
+    run = simulate({"effective_track": 1.8, "drive_lag": 0.3}, duration_s=60.0, disturbance=Disturbance())
+    true = Model(HUSKY, (find_effect("effective_track")(k=1.8), find_effect("drive_lag")(tau=0.3)))
+    at = 0.5 * (run.track.times[2:] + run.track.times[:-2])
+    turned = (run.track.heading[2:] - run.track.heading[:-2]) / (run.track.times[2:] - run.track.times[:-2])
+    slips = [
+        np.nanstd(predict_at(model, run, Input.COMMAND, at, timing=Timing())[:, 2] - turned)
+        for model in (true, true.ideal)
+    ]
+    assert slips[0] < 0.03
+    assert slips[1] > 0.1
+    outside = predict_at(true, run, Input.COMMAND, np.array([-5.0, 1e6]), timing=Timing())
+    assert np.isnan(outside).all()
+
+
+@pytest.mark.long
+def test_nine_of_ten_intervals_hold_the_truth() -> None:
+    sets = (
+        {**SKID, "transport_delay": 0.15, "turning_resistance": 0.2},
+        {"effective_track": 1.6, "body_inertia": 0.4, "acceleration_limit": 4.0, "wheel_asymmetry": 0.03},
+        {
+            "wheel_radius": 0.93,
+            "deadband": 0.12,
+            "body_turn_limit": 0.7,
+            "drive_lag": 0.4,
+            "lateral_skid": 0.08,
+        },
+        {
+            "lever_arm": {"l_x": 0.2, "l_y": 0.08},
+            "yaw_misalignment": 0.05,
+            "speed_slip": 0.08,
+            "yaw_drift": 0.05,
+        },
+    )
+    held = total = 0
+    for truth in sets:
+        for seed in range(10):
+            run = simulate(truth, seed=100 + seed, duration_s=200.0)
+            problem = Problem([run], HUSKY, Input.COMMAND)
+            estimates = estimate_intervals(problem, fit_model(problem, model_of(*truth)))
+            for name, value in truth.items():
+                effect = find_effect(name)
+                numbers = value if isinstance(value, dict) else {effect.parameters[0].name: value}
+                for parameter, expected in numbers.items():
+                    item = estimates.find(f"{name}.{parameter}")
+                    held += item.low <= expected <= item.high
+                    total += 1
+    assert held / total >= 0.9

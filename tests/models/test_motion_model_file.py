@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from motion_runs import vehicle_of
+
+from pipeline.models import Model, ModelFile, find_effect, list_effects, read_model, write_model
+from pipeline.models.model_file import list_code, parse_model
+from pipeline.models.model_text import format_model
+from pipeline.models.trust import trust
+from pipeline.runs import MotionError
+
+HEAD = '[vehicle]\npreset = "husky_a200"\n\n'
+HERE = Path("model.toml")
+
+OWN_EFFECT = '''
+"""Tilt: an effect of a user's own."""
+from pipeline.models import LinearEffect, Parameter
+
+
+class Tilt(LinearEffect):
+    """Adds speed to the left."""
+
+    id = "tilt"
+    parameters = (Parameter("k", "1", (-1.0, 1.0), 0.0, "share", 0.1),)
+
+    def columns(self, rolling, velocity, around):
+        return {"k": (0.0, rolling.v0, 0.0)}
+'''
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "says"),
+    [
+        (HEAD + '[[effect]]\nid = "effective_track"\nk = 25.0\n', 6, "outside of 0.2 to 10"),
+        (HEAD + '[[effect]]\nid = "effective_track"\nq = 2.0\n', 6, "no parameter 'q'"),
+        (HEAD + '[[effect]]\nid = "effective_track"\nk = "wide"\n', 6, "no parameter"),
+        (
+            HEAD + '[[effect]]\nid = "effective_track"\nk = { value = 1.5, unit = "m" }\n',
+            6,
+            "is in 1, not in m",
+        ),
+        (HEAD + '[[effect]]\nid = "effective_track"\nk = { value = "a" }\n', 6, "no number"),
+        (HEAD + '[[effect]]\nid = "effective_truck"\n', 5, "no effect is called"),
+        (HEAD + '[[effect]]\nid = "understeer"\n', 5, "ackermann vehicles only"),
+        (HEAD + '[[effect]]\nid = "lateral_skid"\n[[effect]]\nid = "lateral_skid"\n', 7, "twice"),
+        (HEAD + '[[effect]]\nid = "w"\nv_y = "k * sin(yawn)"\nk = { unit = "m/s" }\n', 6, "'yawn'"),
+        (HEAD + '[[effect]]\nid = "w"\nv_y = "k * sin(yaw)"\nk = { unit = "m" }\n', 6, "not in m/s"),
+        (HEAD + '[[effect]]\nid = "w"\nv_y = "k * v0"\nk = { unit = "furlong" }\n', 6, "not a unit"),
+        (HEAD + '[[effect]]\nid = "w"\nv_y = "k * v0"\nk = { unit = "1", bounds = [2, 1] }\n', 7, "bounds"),
+        (HEAD + '[[effect]]\nid = "w"\nv_y = "k * v0"\nk = { value = 3, bounds = [-1, 1] }\n', 7, "outside"),
+        (HEAD + "[[effect]]\nk = 1.0\n", 4, "needs an id"),
+        (HEAD + "[effect]\n", 4, "[[effect]]"),
+        (HEAD + "[[effect]\n", 4, "not a valid TOML"),
+        ('format = 7\n[vehicle]\npreset = "husky_a200"\n', 1, "format 7"),
+        ("colour = 1\n" + HEAD, 1, "unknown key"),
+        ('[vehicle]\npreset = "nope"\n', 2, "no vehicle preset"),
+        ("[vehicle]\nwheel_radius_m = -1\n", 1, "not valid"),
+        ("format = 1\n", 1, "no vehicle"),
+        ('effects = ["nowhere.py"]\n' + HEAD, 1, "no such file of effects"),
+    ],
+)
+def test_a_malformed_file_is_one_clear_line_that_names_its_line(text: str, line: int, says: str) -> None:
+    with pytest.raises(MotionError) as caught:
+        parse_model(text, HERE)
+    assert caught.value.where == f"model.toml:{line}"
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_every_effect_survives_a_round_trip() -> None:
+    for kind, preset in (("differential", "husky_a200"), ("ackermann", "ackermann_car")):
+        effects = [
+            effect(**{p.name: p.typical for p in effect.parameters})
+            for effect in list_effects()
+            if kind in effect.kinds
+        ]
+        effects[0] = effects[0].fix(*effects[0].values)
+        model = Model(vehicle_of(preset), tuple(effects))
+        label = f"{effects[1].id}.{effects[1].parameters[0].name}"
+        file = ModelFile(
+            model, per_run=(label,), intervals={label: (0.25, 0.75)}, note='a "note"\nwith lines'
+        )
+        again = parse_model(format_model(file), HERE)
+        assert again == file
+        assert format_model(again) == format_model(file)
+
+
+def test_what_was_fitted_stands_in_the_file(tmp_path: Path) -> None:
+    fit = {
+        "input": "measured",
+        "runs": [{"run": "a/b", "sha256": "ab" * 32}],
+        "ladder": [{"effects": [], "velocity_rms": [0.1, 0.2, 0.3]}],
+    }
+    path = tmp_path / "m.toml"
+    write_model(ModelFile(Model(vehicle_of("warthog")), fit=fit), path)
+    assert read_model(path).fit == fit
+    assert [item.name for item in tmp_path.iterdir()] == ["m.toml"]
+
+
+def test_a_vehicle_without_preset_keeps_its_geometry() -> None:
+    text = '[vehicle]\nname = "crab"\nkind = "differential"\nwheel_radius_m = 0.2\ntrack_width_m = 0.7\n'
+    file = parse_model(text, HERE)
+    assert parse_model(format_model(file), HERE).model.vehicle == file.model.vehicle
+
+
+def test_formulas_are_read_and_written() -> None:
+    text = HEAD + '[[effect]]\nid = "wind"\nv_y = "k * sin(yaw)"\nk = { unit = "m/s", bounds = [-1, 1] }\n'
+    file = parse_model(text, HERE)
+    wind = file.model.effect("wind")
+    assert wind.parameter("k").bounds == (-1.0, 1.0)
+    assert parse_model(format_model(file), HERE).model.effect("wind") == wind
+
+
+def test_effects_of_one_s_own_come_from_a_file_beside_the_model(tmp_path: Path) -> None:
+    (tmp_path / "my_effects.py").write_text(OWN_EFFECT, encoding="utf-8")
+    path = tmp_path / "m.toml"
+    path.write_text(
+        'effects = ["my_effects.py"]\n' + HEAD + '[[effect]]\nid = "tilt"\nk = 0.2\n', encoding="utf-8"
+    )
+    trust(list_code(path))
+    file = read_model(path)
+    assert file.model.effect("tilt").values == {"k": 0.2}
+    assert file.warnings == ()
+    write_model(file, path)
+    assert read_model(path).model.ids == ("tilt",)
+
+
+@pytest.mark.parametrize(("text", "says"), [("1 / 0", "ZeroDivisionError"), ("x = 1", "no effect")])
+def test_a_file_of_effects_that_does_not_work_is_named(tmp_path: Path, text: str, says: str) -> None:
+    (tmp_path / "own.py").write_text(text, encoding="utf-8")
+    path = tmp_path / "m.toml"
+    path.write_text('effects = ["own.py"]\n' + HEAD, encoding="utf-8")
+    trust(list_code(path))
+    with pytest.raises(MotionError, match=says) as caught:
+        read_model(path)
+    assert caught.value.where == f"{path}:1"
+
+
+def test_models_compose_in_the_order_of_a_command_s_way() -> None:
+    ideal = Model(vehicle_of("husky_a200"))
+    lever, track, lag = (find_effect(name)() for name in ("lever_arm", "effective_track", "drive_lag"))
+    model = ideal + lever + track + lag
+    assert model.ids == ("drive_lag", "effective_track", "lever_arm")
+    assert (model - "effective_track").ids == ("drive_lag", "lever_arm")
+    with pytest.raises(MotionError, match="twice"):
+        _ = model + track
+    with pytest.raises(MotionError, match="no effect 'speed_slip'"):
+        _ = model - "speed_slip"
+    with pytest.raises(MotionError, match="outside"):
+        model.change("effective_track", k=50.0)

@@ -1,0 +1,128 @@
+"""Poses stand at the moments they belong to, faults of a localization are left out, encoders may be late."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+import pytest
+from motion_runs import QUIET, align, make_scenario, tables_of, vehicle_of
+
+from pipeline.identification.comparison import Comparison, Input
+from pipeline.identification.encoders import measure_wheel_delay
+from pipeline.runs import MotionRun, load_run
+from pipeline.simulate import Imu, simulate_run
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+HUSKY = vehicle_of("husky_a200")
+SKID = {"effective_track": 1.8, "turn_lag": {"tau_mean": 0.1, "tau_diff": 0.4}, "icr_offset": 0.12}
+
+
+@pytest.fixture(scope="module")
+def tables() -> Mapping[str, pl.DataFrame]:
+    return tables_of(simulate_run(make_scenario(SKID, duration_s=240.0, pose=QUIET, imu=Imu())), HUSKY)
+
+
+def load(tables: Mapping[str, pl.DataFrame], **changed: pl.DataFrame) -> MotionRun:
+    recorded = {name: tables[name] for name in ("poses", "commands", "wheels", "imu")}
+    recorded["poses"] = recorded["poses"].drop("latency", "outlier")
+    slip = {name: frame for name, frame in changed.items() if name == "slip"}
+    return load_run({**align({**recorded, **changed}, HUSKY), **slip}, HUSKY, name="changed")
+
+
+def draw_ages(count: int, spread: float) -> np.ndarray:
+    """Ages that last for some poses, as of a localization that is now quick and now slow."""
+    random = np.random.default_rng(5)
+    ages = np.zeros(count)
+    for index in range(1, count):
+        ages[index] = 0.7 * ages[index - 1] + random.normal(0.0, spread * np.sqrt(1.0 - 0.49))
+    return ages
+
+
+def test_good_stamps_and_good_poses_stay_as_they_are(tables: Mapping[str, pl.DataFrame]) -> None:
+    run = load(tables)
+    assert run.alignment.latency_spread_s == 0.0
+    assert run.alignment.outlier_s == 0.0
+    assert np.array_equal(run.track.times, np.sort(tables["poses"]["t"].to_numpy()))
+
+
+def test_poses_at_a_hundred_a_second_do_not_push_each_other_on() -> None:
+    pose = replace(QUIET, rate_hz=102.0)
+    made = simulate_run(make_scenario(SKID, duration_s=120.0, pose=pose, imu=Imu()))
+    stamps = np.sort(made.poses.stamp_s)
+    run = load(tables_of(made, HUSKY))
+    assert run.alignment.latency_spread_s == 0.0
+    assert np.array_equal(run.track.times, stamps)
+
+
+def test_nothing_is_scored_before_the_first_command(tables: Mapping[str, pl.DataFrame]) -> None:
+    late = float(tables["commands"]["t"][0]) + 20.0
+    after = pl.col("t") >= late
+    slip = pl.DataFrame(
+        {"t": np.arange(late, 240.0, 0.05)},
+    ).with_columns(input=pl.lit("command"), step=pl.lit(0), suspect=pl.lit(value=False))
+    run = load(tables, commands=tables["commands"].filter(after), slip=slip)
+    assert Comparison(run, HUSKY, Input.COMMAND).windows.times.min() > late - 1e-6
+
+
+def test_the_gyro_tells_how_old_each_pose_is(tables: Mapping[str, pl.DataFrame]) -> None:
+    poses = tables["poses"]
+    true = poses["t"].to_numpy()
+    stamps = true + draw_ages(true.size, 0.06)
+    stamps = np.maximum.accumulate(stamps - 0.01 * np.arange(true.size)) + 0.01 * np.arange(true.size)
+    run = load(tables, poses=poses.with_columns(pl.Series("t", stamps)))
+    assert run.alignment.latency_spread_s == pytest.approx(0.06, rel=0.35)
+    turning = np.abs(np.gradient(run.track.heading, true)) > 0.3
+    before, after = (stamps - true)[turning], (run.track.times - true)[turning]
+    assert np.std(after) < 0.4 * np.std(before)
+    everywhere = run.track.times - true
+    assert np.std(everywhere) < np.std(stamps - true)
+
+
+def test_a_localization_that_jumps_away_and_back_is_not_compared(tables: Mapping[str, pl.DataFrame]) -> None:
+    poses = tables["poses"]
+    times = poses["t"].to_numpy()
+    away = (times > 100.0) & (times < 102.0)
+    moved = poses.with_columns(pl.Series("x", poses["x"].to_numpy() + 1.5 * away))
+    run = load(tables, poses=moved)
+    more = np.setdiff1d(run.barred, load(tables).barred)
+    assert np.abs(more - 101.0).max() < 1.8
+    for edge in (100.0, 102.0):
+        assert np.abs(more - edge).min() < 0.1
+
+
+def test_faults_are_never_more_than_a_twentieth(tables: Mapping[str, pl.DataFrame]) -> None:
+    poses = tables["poses"]
+    times = poses["t"].to_numpy()
+    often = np.where(times % 4.0 < 1.0, 1.5, 0.0)
+    run = load(tables, poses=poses.with_columns(pl.Series("y", poses["y"].to_numpy() + often)))
+    assert run.alignment.outlier_s <= 0.05 * run.duration_s + 0.5
+    assert run.barred.size > load(tables).barred.size
+
+
+def test_a_pose_that_is_only_waited_for_is_no_rest(tables: Mapping[str, pl.DataFrame]) -> None:
+    poses = tables["poses"]
+    wheels = tables["wheels"]
+    times = poses["t"].to_numpy()
+    rim = np.interp(times, wheels["t"].to_numpy(), np.abs(wheels["left"].to_numpy()))
+    start = int(np.flatnonzero((rim > 2.0) & (times > 60.0))[0])
+    stuck = np.arange(times.size)
+    stuck[start : start + 17] = start
+    held = np.zeros(times.size, dtype=bool)
+    held[start + 1 : start + 17] = True
+    assert 0.6 < times[start + 16] - times[start] < 1.5
+    frozen = poses.select(pl.all().gather(stuck)).with_columns(t=poses["t"], held=pl.Series(held))
+    run = load(tables, poses=frozen)
+    assert run.track.times.size == times.size - 16
+
+
+@pytest.mark.parametrize("late", [0.0, 0.12, 0.25])
+def test_the_delay_of_the_encoders_is_measured_against_the_gyro(
+    late: float, tables: Mapping[str, pl.DataFrame]
+) -> None:
+    wheels = tables["wheels"].with_columns(pl.col("t") + late)
+    assert measure_wheel_delay(load(tables, wheels=wheels), HUSKY) == pytest.approx(late, abs=0.02)

@@ -1,0 +1,129 @@
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from motion_runs import QUIET, simulate, vehicle_of
+
+from pipeline.identification import Input, Problem, carry_over, fit_model
+from pipeline.identification.comparison import Comparison
+from pipeline.models import Model, ModelFile, Timing, find_effect
+from pipeline.models.export import export_json, export_python, export_ros2_control
+from pipeline.models.formula import FormulaEffect
+from pipeline.models.formula.formula_effect import make_parameter
+from pipeline.runs import MotionError
+from pipeline.simulate import VEHICLES, Disturbance, Program
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+HUSKY = vehicle_of("husky_a200")
+TILE = {"effective_track": 1.8, "icr_offset": 0.12}
+
+
+def test_a_model_carries_over_to_the_same_ground_and_warns_on_ice() -> None:
+    first, second = (simulate(TILE, seed=seed) for seed in (1, 2))
+    ice = simulate({"effective_track": 1.4, "body_inertia": 0.9}, seed=3)
+    problem = Problem([first], HUSKY, Input.MEASURED)
+    fitted = fit_model(problem, Model(HUSKY, tuple(find_effect(name)() for name in (*TILE, "body_inertia"))))
+    same, other = carry_over(fitted.model, [second, ice], Input.MEASURED, fitted_on=["tile"])
+    assert 0.95 < same.ratio <= 1.1
+    assert same.warning == ""
+    assert other.ratio > 1.3
+    assert "fitted on tile" in other.warning
+    assert same.carried.pooled.t_mrmse_m < same.ideal.pooled.t_mrmse_m
+
+
+def run_exported(
+    model: Model, commands: list[tuple[float, ...]], until_s: float, **more: float
+) -> np.ndarray:
+    space: dict[str, object] = {}
+    exec(compile(export_python(ModelFile(model)), "exported", "exec"), space)  # noqa: S102 - that is what it is for
+    rows = space["predict"](commands, until_s, **more)  # type: ignore[operator]
+    return np.array(rows)
+
+
+def typical_model(kind: str) -> Model:
+    from pipeline.models import Place, list_effects  # noqa: PLC0415 - only here
+
+    values: Mapping[str, Mapping[str, float]] = {
+        "body_speed_limit": {"limit": 0.9},
+        "body_turn_limit": {"limit": 0.9},
+        "deadband": {"d": 0.05},
+        "wheel_speed_limit": {"limit": 6.0},
+        "terrain_change": {"k_v": 0.9, "k_w": 0.8, "at_s": 20.0},
+    }
+    effects = [
+        effect(**values.get(effect.id, {p.name: p.typical for p in effect.parameters}))
+        for effect in list_effects()
+        if kind in effect.kinds and effect.place is not Place.LOCALIZATION
+    ]
+    return Model(vehicle_of("husky_a200" if kind == "differential" else "ackermann_car"), tuple(effects))
+
+
+@pytest.mark.parametrize("kind", ["differential", "ackermann"])
+def test_the_exported_function_moves_like_the_model_with_every_effect(kind: str) -> None:
+    model = typical_model(kind)
+    more = {} if kind == "differential" else {"vehicle": VEHICLES["car"], "program": Program(speed_scale=0.5)}
+    run = simulate({}, duration_s=40.0, encoders=None, pose=QUIET, disturbance=Disturbance(), **more)
+    assert run.commands is not None
+    comparison = Comparison(run, model.vehicle, Input.COMMAND)
+    expected = comparison.predict_velocity(model.effects, Timing())
+    series = run.commands
+    columns = [series.times, series.left, series.right, series.steering]
+    rows = list(zip(*(column.tolist() for column in columns), strict=True))
+    got = run_exported(model, rows, run.duration_s)
+    times = comparison.cells.times
+    for column, channel, size in ((4, "x", 0.02), (5, "y", 0.02), (6, "w", 0.02)):
+        seen = np.interp(times, got[:, 0] - 0.0025, got[:, column])
+        typical = float(np.sqrt(np.mean(getattr(expected, channel) ** 2)))
+        assert np.sqrt(np.mean((seen - getattr(expected, channel)) ** 2)) < size * max(typical, 0.1), channel
+
+
+def test_formulas_are_exported_and_other_python_is_refused() -> None:
+    wind = FormulaEffect("wind", {"v_y": "k * sin(yaw)"}, (make_parameter("k", "m/s", (-1.0, 1.0)),), k=0.2)
+    rows = run_exported(Model(HUSKY, (wind,)), [(0.0, 2.0, 2.0)], 1.0, pose=(0.0, 0.0, math.pi / 2))  # type: ignore[arg-type]
+    assert rows[-1, 5] == pytest.approx(0.2)
+    rate = FormulaEffect("rate", {"v_y": "k * v0_rate"}, (make_parameter("k", "s", (-1.0, 1.0)),))
+    with pytest.raises(MotionError, match="rate of a signal"):
+        export_python(ModelFile(Model(HUSKY, (rate,))))
+
+
+def test_controllers_get_the_parameters_they_have_and_are_told_of_the_rest() -> None:
+    effects = (
+        find_effect("effective_track")(k=1.9),
+        find_effect("wheel_radius")(k=0.95),
+        find_effect("wheel_asymmetry")(e=0.04),
+        find_effect("body_turn_limit")(limit=1.0),
+        find_effect("lateral_skid")(c=0.1),
+    )
+    text = export_ros2_control(ModelFile(Model(HUSKY, effects)))
+    assert "wheel_separation_multiplier: 1.9" in text
+    assert "left_wheel_radius_multiplier: 0.931" in text
+    assert "right_wheel_radius_multiplier: 0.969" in text
+    assert "angular.z.max_velocity: 1" in text
+    assert "lateral_skid" in text.splitlines()[1]
+
+
+def test_controllers_get_doubles_where_they_declare_doubles() -> None:
+    """ROS 2 refuses `1` for a parameter declared as a double."""
+    limits = (find_effect("body_speed_limit")(limit=2.0), find_effect("body_turn_limit")(limit=1.0))
+    text = export_ros2_control(ModelFile(Model(HUSKY, (find_effect("effective_track")(k=2.0), *limits))))
+    values = [line.split(": ")[1] for line in text.splitlines() if ": " in line and not line.startswith("#")]
+    numbers = [number for value in values for number in value.strip("[]").split(", ")]
+    assert len(numbers) == 15
+    assert all("." in number for number in numbers)
+
+
+def test_json_holds_no_number_that_json_does_not_know() -> None:
+    file = ModelFile(Model(HUSKY, (find_effect("body_speed_limit")(), find_effect("turn_droop")())))
+    content = json.loads(export_json(file))
+    assert content["effects"][0]["parameters"]["limit"] == {
+        "value": None,
+        "low": None,
+        "high": None,
+        "unit": "m/s",
+    }

@@ -1,0 +1,249 @@
+"""Python that a model file names is not run before its very content has been trusted."""
+
+from __future__ import annotations
+
+import json
+import os
+import py_compile
+import shutil
+from typing import TYPE_CHECKING
+
+import pytest
+
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.options import Options
+from pipeline.cli import main
+from pipeline.models import read_model, write_model
+from pipeline.models.model_file import list_code, parse_model
+from pipeline.models.model_text import format_model
+from pipeline.models.trust import distrust, list_trusted, trust
+from pipeline.runs import MotionError
+from pipeline.simulate import simulate_case
+from pipeline.web.cards import show_desk
+from pipeline.web.desk import Desk, DeskFile, Step
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+MODEL = """effects = ["own.py"]
+[vehicle]
+preset = "husky_a200"
+[[effect]]
+id = "effective_track"
+k = 1.5
+[[effect]]
+id = "tilt"
+k = 0.2
+"""
+OWN = """
+import pathlib
+pathlib.Path({mark!r}).write_text("ran")
+from pipeline.models import LinearEffect, Parameter
+
+class Tilt(LinearEffect):
+    "Adds speed to the left."
+    id = "tilt"
+    parameters = (Parameter("k", "1", (-1.0, 1.0), 0.0, "share", 0.1),)
+
+    def columns(self, rolling, velocity, around):
+        return {{"k": (0.0, rolling.v0, 0.0)}}
+"""
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    folder = tmp_path / "somebody's"
+    folder.mkdir()
+    (folder / "own.py").write_text(OWN.format(mark=str(tmp_path / "mark")), encoding="utf-8")
+    path = folder / "m.toml"
+    path.write_text(MODEL, encoding="utf-8")
+    return path
+
+
+def has_run(model: Path) -> bool:
+    return (model.parents[1] / "mark").exists()
+
+
+@pytest.fixture
+def slip(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Runs a verb; its exit code, what it prints, and what it says."""
+
+    def run(*words: object) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as ended:
+            main([str(word) for word in words])
+        return int(str(ended.value.code)), *capsys.readouterr()
+
+    return run
+
+
+def test_untrusted_python_does_not_run_and_what_it_defines_is_left_out_and_named(model: Path) -> None:
+    file = read_model(model)
+    assert not has_run(model)
+    assert file.model.ids == ("effective_track",)
+    assert file.left_out == ("tilt",)
+    (warning,) = file.warnings
+    assert "'own.py'" in warning
+    assert "tilt" in warning
+    assert "slip model trust" in warning
+    assert "\n" not in warning
+
+
+def test_what_was_left_out_is_never_lost_from_the_file(model: Path) -> None:
+    file = read_model(model)
+    before = model.read_bytes()
+    with pytest.raises(MotionError, match="tilt would be lost"):
+        write_model(file, model)
+    assert model.read_bytes() == before
+    assert [path.name for path in sorted(model.parent.iterdir())] == ["m.toml", "own.py"]
+
+
+def test_trust_is_in_the_content_wherever_it_lies_and_ends_when_it_changes(
+    model: Path, tmp_path: Path
+) -> None:
+    trust(list_code(model))
+    assert not has_run(model)
+    assert read_model(model).model.ids == ("effective_track", "tilt")
+    assert has_run(model)
+    elsewhere = tmp_path / "elsewhere"
+    shutil.copytree(model.parent, elsewhere)
+    assert read_model(elsewhere / "m.toml").warnings == ()
+    with (elsewhere / "own.py").open("a", encoding="utf-8") as file:
+        file.write("# one more line\n")
+    assert read_model(elsewhere / "m.toml").left_out == ("tilt",)
+    distrust(set(list_code(model)))
+    assert read_model(model).left_out == ("tilt",)
+
+
+def test_the_bytes_that_were_judged_are_the_bytes_that_run(
+    model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file swapped after it was read, or something else compiled beside it, does not run."""
+    trust(list_code(model))
+    own = model.parent / "own.py"
+    good, other = own.read_text(encoding="utf-8"), model.parents[1] / "other"
+    evil = f"import pathlib; pathlib.Path({str(other)!r}).write_text('ran')\n".ljust(len(good), "#")
+    own.write_text(evil, encoding="utf-8")
+    py_compile.compile(str(own), doraise=True)
+    stamp = own.stat()
+    own.write_text(good, encoding="utf-8")
+    os.utime(own, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+
+    from pipeline.models import model_file  # noqa: PLC0415 - patched
+
+    def swap(content: bytes) -> str:
+        own.write_text(evil, encoding="utf-8")
+        return original(content)
+
+    original = model_file.hash_code
+    monkeypatch.setattr(model_file, "hash_code", swap)
+    assert "tilt" in read_model(model).model.ids
+    assert not other.exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["/etc/evil.py", "../evil.py", "a/../../evil.py", "..", "", "a\\..\\b.py", "a\0b.py"]
+)
+def test_python_lies_beside_the_model_file(model: Path, name: str) -> None:
+    text = MODEL.replace('"own.py"', json.dumps(name))
+    with pytest.raises(MotionError, match="must lie beside") as caught:
+        parse_model(text, model)
+    assert caught.value.where == f"{model}:1"
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda path: path.symlink_to("/dev/zero")])
+def test_what_is_no_plain_file_is_refused_at_once(model: Path, make: Callable[[Path], None]) -> None:
+    (model.parent / "own.py").unlink()
+    make(model.parent / "own.py")
+    with pytest.raises(MotionError, match=r"own\.py"):
+        read_model(model)
+
+
+def test_the_list_is_the_user_s_alone(model: Path, own_configuration: Path) -> None:
+    trust(list_code(model))
+    path = own_configuration / "slip" / "trusted_code"
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert path.parent.stat().st_mode & 0o777 == 0o700
+    path.chmod(0o666)
+    with pytest.raises(MotionError, match="yours alone"):
+        read_model(model)
+    assert not has_run(model)
+
+
+def test_a_relative_configuration_folder_counts_for_nothing(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    trust(list_code(model))
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("XDG_CONFIG_HOME", ".")
+    monkeypatch.chdir(tmp_path)
+    assert list_trusted() == {}
+
+
+def test_names_in_the_list_cannot_add_a_line() -> None:
+    trust({"a" * 64: "x\n" + "b" * 64 + "  y"})
+    assert set(list_trusted()) == {"a" * 64}
+
+
+def test_every_verb_says_what_it_leaves_out(model: Path, slip: Callable[..., tuple[int, str, str]]) -> None:
+    code, printed, said = slip("model", "show", model, "--json")
+    assert code == 0
+    assert "own.py" in said
+    assert "tilt" in json.loads(printed)["warnings"][0]
+    code, _, said = slip("model", "fit", model, "--on", "nowhere.mcap")
+    assert code == 1
+    assert "tilt would be lost" in said
+    assert "own.py" in slip("model", "export", model, "--to", "python")[2]
+    assert not has_run(model)
+
+
+def test_trust_is_said_once_listed_and_taken_back(
+    model: Path, slip: Callable[..., tuple[int, str, str]]
+) -> None:
+    (code,) = list_code(model)
+    assert code in slip("model", "trust", model)[1]
+    assert not has_run(model)
+    assert code in slip("model", "trusted")[1]
+    assert "tilt" in slip("model", "show", model)[1]
+    assert code in slip("model", "untrust", code[:12])[1]
+    assert "no Python is trusted" in slip("model", "trusted")[1]
+    assert "tilt" in slip("model", "show", model, "--trust-code")[1]
+    assert code in slip("model", "trusted")[1]
+
+
+def test_a_model_out_of_a_results_folder_runs_nothing_in_the_workbench_and_says_so(model: Path) -> None:
+    file = DeskFile(model.parent, "run")
+    file.model_path.parent.mkdir(parents=True)
+    shutil.copy(model.parent / "own.py", file.model_path.parent)
+    ladder: list[dict[str, object]] = [{"t_mrmse_m": 0.1, "r_mrmse_rad": 0.1}]
+    step = Step(said="opened", model=MODEL, order=["effective_track", "tilt"], ladder=ladder)
+    desk = Desk(run="run", key="k", input="command", steps=[step], at=0)
+    shown = show_desk(desk, file.parse(step.model))
+    assert not has_run(model)
+    assert "left out: tilt" in str(shown["warnings"])
+    assert [card["id"] for card in shown["effects"]] == ["effective_track"]  # type: ignore[attr-defined]
+
+
+@pytest.mark.long
+def test_an_analysis_says_what_it_leaves_out_and_is_made_again_when_it_is_trusted(
+    model: Path, tmp_path: Path
+) -> None:
+    log = simulate_case("husky_tile", out=tmp_path / "run.mcap", duration_s=12.0)
+    options = Options(out=tmp_path / "results", model=model)
+    before = analyze_log(log, options)
+    (finding,) = [row for row in before.summary["findings"] if row["id"] == "model_code_left_out"]
+    assert "tilt" in finding["text"]
+    assert not has_run(model)
+    assert not analyze_log(log, options).computed
+    trust(list_code(model))
+    after = analyze_log(log, options)
+    assert after.computed
+    assert "model_code_left_out" not in {row["id"] for row in after.summary["findings"]}
+
+
+def test_own_effects_can_be_written_again(model: Path) -> None:
+    trust(list_code(model))
+    file = read_model(model)
+    assert parse_model(format_model(file), model).model.ids == ("effective_track", "tilt")

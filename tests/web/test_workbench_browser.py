@@ -1,0 +1,344 @@
+"""The workbench in a real browser, as a person uses it: look, add, see the error fall, undo, drop, reload."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+import pytest
+from workbench_server import RUN, TOKEN, Workbench
+
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.options import Options
+from pipeline.analysis.peers import find_peers
+from pipeline.cli.verb_serve import _open_browser
+from pipeline.logs import LogWriter
+from pipeline.models import model_file
+from pipeline.simulate import simulate_case
+from pipeline.store import Store
+
+if TYPE_CHECKING:
+    from chrome import Chrome
+
+PHONE, LAPTOP = 390, 1280
+START = 1_700_000_000_000_000_000
+EVIL = "<img src=x onerror=\"window.pwned='yes'\"><script>window.pwned='yes'</script>"
+SHOWN = "document.querySelector('.pane')?.dataset.drawn"
+ERROR = "Number(document.querySelector('.number.r .value').textContent)"
+
+
+def look_for_trouble(chrome: Chrome) -> None:
+    assert chrome.errors == []
+    asked = [address for address in chrome.requests if "//" in address and not address.startswith("file:")]
+    assert {address.split("/")[2].split(":")[0] for address in asked} == {"127.0.0.1"}
+
+
+def test_a_person_adds_the_hidden_effect_undoes_drops_a_log_and_reloads(
+    chrome: Chrome, workbench: Workbench, pictures: Path, tmp_path: Path
+) -> None:
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    before = cast("float", chrome.run(ERROR))
+    chrome.picture(pictures / "workbench_opened.png")
+
+    chrome.click(".proposals li[data-effect=effective_track] .add")
+    chrome.wait("document.querySelector('.card[data-effect=effective_track]')")
+    chrome.wait(f"{ERROR} < {0.1 * before}")
+    chrome.wait("document.querySelectorAll('[data-figure=ladder] .mark-rect path').length === 2")
+    assert "%" in str(chrome.run("document.querySelector('.number.r .fall').textContent"))
+    chrome.picture(pictures / "workbench_added.png", whole=True)
+
+    # The slider, by keyboard: the value goes with it at once, the number a moment later.
+    chrome.run("document.querySelector('.slider input').focus()")
+    for _ in range(40):
+        chrome.press("ArrowRight", 39)
+    chrome.wait(f"{ERROR} > {0.1 * before}")
+    chrome.wait("document.querySelector('.ideal-said').textContent.includes('by hand')")
+
+    chrome.wait("!document.querySelector('.pane').classList.contains('busy')")
+    for _ in range(40):
+        if chrome.run("document.querySelector('.undo').disabled"):
+            break
+        chrome.click(".undo")
+        chrome.wait("!document.querySelector('.pane').classList.contains('busy')")
+    chrome.wait(f"Math.abs({ERROR} - {before}) < 1e-6")
+    assert chrome.run("document.querySelectorAll('.card').length") == 0
+
+    chrome.click(".redo")
+    chrome.wait("document.querySelector('.card')")
+    chrome.run("location.reload()")
+    chrome.wait(f"document.querySelector('.card') && {SHOWN}")
+    assert str(chrome.run("location.hash")).endswith("hidden")
+
+    other = simulate_case("husky_tile", out=tmp_path / "other.mcap", duration_s=40.0)
+    chrome.drop(other, "#drop")
+    chrome.wait("[...document.querySelectorAll('.run')].length === 2")
+    chrome.wait("(document.querySelector('.title h2')?.textContent ?? 'field/hidden') !== 'field/hidden'")
+    chrome.wait(SHOWN)
+    look_for_trouble(chrome)
+
+
+def test_without_the_token_the_page_is_a_sentence_and_with_it_stays_open(
+    chrome: Chrome, workbench: Workbench, pictures: Path
+) -> None:
+    chrome.size(PHONE, 600)
+    chrome.open(f"{workbench.origin}/")
+    chrome.wait("document.readyState === 'complete' && document.body?.innerText")
+    assert "slip serve" in str(chrome.run("document.body.innerText"))
+    assert chrome.run("document.scripts.length") == 0
+    chrome.picture(pictures / "workbench_refused.png")
+    chrome.errors.clear()
+
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    # The token is in neither the address nor the reach of a script.
+    assert str(chrome.run("location.href")).startswith(f"{workbench.origin}/#")
+    assert TOKEN not in str(chrome.run("document.cookie + document.documentElement.outerHTML"))
+    chrome.run("location.reload()")
+    chrome.wait(f"document.readyState === 'complete' && {SHOWN}")
+    look_for_trouble(chrome)
+
+
+def test_a_link_in_a_file_opens_the_page_as_well(
+    chrome: Chrome, workbench: Workbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    _open_browser(workbench.address)
+    # Others can read the words of a command: the browser is given a file that only this user can read.
+    (file,) = tmp_path.glob("slip-*.html")
+    assert opened == [file.as_uri()]
+    assert file.stat().st_mode & 0o077 == 0
+    chrome.open(opened[0])
+    chrome.wait(SHOWN)
+    chrome.call("Page.reload")
+    chrome.wait(f"document.readyState === 'complete' && {SHOWN}")
+    look_for_trouble(chrome)
+
+
+def test_what_the_loader_of_models_warns_of_is_shown(
+    chrome: Chrome, workbench: Workbench, monkeypatch: pytest.MonkeyPatch, pictures: Path
+) -> None:
+    told = f"evil.py was not run {EVIL}"
+    monkeypatch.setattr(model_file._Reader, "_warn", lambda _reader: (told,))
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    assert chrome.run("document.querySelector('.model .warning').textContent") == told
+    chrome.picture(pictures / "workbench_warning.png")
+    look_for_trouble(chrome)
+
+
+def test_two_models_of_a_run_stand_side_by_side(chrome: Chrome, workbench: Workbench, pictures: Path) -> None:
+    workbench.desk(RUN, "add", effect="effective_track")
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    chrome.click("#compare")
+    chrome.wait("document.querySelector('[data-slot=b]')?.dataset.drawn")
+    numbers = "[...document.querySelectorAll('.number.r .value')].map((node) => Number(node.textContent))"
+    first, second = cast("list[float]", chrome.run(numbers))
+    assert first < 0.2 * second
+    assert cast("int", chrome.run("document.documentElement.scrollWidth - innerWidth")) <= 0
+    chrome.picture(pictures / "workbench_compare.png", whole=True)
+    look_for_trouble(chrome)
+
+
+def count_marks(figure: str, pane: str = "a") -> str:
+    """How many marked spans or points a figure shows."""
+    kinds = "path[stroke='#00b3d6'], path[fill='#00b3d6']"
+    plot = f"[data-slot={pane}] [data-figure={figure}]"
+    return f"document.querySelector('{plot}').querySelectorAll(\"{kinds}\").length"
+
+
+def test_a_stretch_that_is_brushed_shows_on_the_map_and_in_command_space(
+    chrome: Chrome, workbench: Workbench, pictures: Path
+) -> None:
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    chrome.wait(
+        "document.querySelectorAll('.plot.drawn').length === document.querySelectorAll('.plot').length"
+    )
+    before = {name: chrome.run(count_marks(name)) for name in ("trajectory", "command_space", "reach")}
+    chrome.drag("[data-figure=reach] svg", (0.3, 0.5), (0.5, 0.5))
+    chrome.wait("!document.querySelector('.marked').hidden")
+    assert "highest slip" in str(chrome.run("document.querySelector('.marked').textContent"))
+    for name, count in before.items():
+        chrome.wait(f"{count_marks(name)} > {count}")
+    chrome.picture(pictures / "workbench_brushed.png", whole=True)
+    # The mark outlives a change of the model.
+    chrome.click(".proposals .add")
+    chrome.wait(
+        "document.querySelector('.card') && !document.querySelector('.pane').classList.contains('busy')"
+    )
+    chrome.wait(f"{count_marks('trajectory')} > {before['trajectory']}")
+
+    # A box on the map marks the times the vehicle was there; beside it the same run follows.
+    chrome.click("#compare")
+    chrome.wait("document.querySelector('[data-slot=b]')?.dataset.drawn")
+    chrome.drag("[data-slot=a] [data-figure=trajectory] svg", (0.3, 0.3), (0.8, 0.8))
+    chrome.wait(f"{count_marks('reach', 'b')} > {before['reach']}")
+    chrome.press("Escape", 27)
+    chrome.wait("[...document.querySelectorAll('.marked')].every((bar) => bar.hidden)")
+    chrome.wait(f"{count_marks('trajectory')} === {before['trajectory']}")
+
+    # And by numbers.
+    chrome.run("document.querySelector('.mark-from').value = '10'")
+    chrome.run("document.querySelector('.mark-to').value = '20'")
+    chrome.click(".mark-set")
+    chrome.wait("document.querySelector('.marked').textContent.includes('20.0 s: 10.0 s, highest slip')")
+    look_for_trouble(chrome)
+
+
+def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, workbench: Workbench) -> None:
+    manifest = Store(workbench.results).manifest(RUN)
+    assert manifest is not None
+    effects = [{"id": "drive_lag", "gain": 0.1}, {"id": "effective_track", "gain": 9.0}]
+    path = workbench.results / "workbench" / "diagnoses" / f"{RUN}.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps({"key": manifest.key, "diagnosis": {"effects": effects}}))
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    named = "[...document.querySelectorAll('.named li')].map((entry) => entry.dataset.effect)"
+    assert chrome.run(named) == ["effective_track", "drive_lag"]
+    chrome.click(".add-all")
+    chrome.wait("document.querySelectorAll('.card').length === 2")
+    chrome.wait("document.querySelectorAll('[data-figure=ladder] .mark-rect path').length === 3")
+    look_for_trouble(chrome)
+
+
+def test_a_run_stands_beside_those_that_its_report_does(chrome: Chrome, workbench: Workbench) -> None:
+    store = Store(workbench.results)
+    manifest = store.manifest(RUN)
+    assert manifest is not None
+    own = json.loads(manifest.path("summary.json").read_text()) | {"terrain": "ice", "dataset": "husky_ice"}
+    manifest.path("summary.json").write_text(json.dumps(own))
+    doubtful = [{"id": "not_moving", "severity": "error", "text": "it does not move"}]
+    others: list[dict[str, object]] = [
+        {"median_modulus": 0.0, "log": {"sha256": "low"}},
+        {"median_modulus": 9.0, "log": {"sha256": "high"}},
+        {"median_modulus": 9.0, "log": {"sha256": "high"}},
+        {"median_modulus": 0.0, "log": own["log"]},
+        {"median_modulus": 0.0, "log": {"sha256": "still"}, "findings": doubtful},
+        {"median_modulus": 0.0, "log": {"sha256": "scaled"}, "length_scale_m": 0.5},
+        {"median_modulus": 0.0, "log": {"sha256": "grass"}, "dataset": "husky_grass"},
+    ]
+    for number, other in enumerate(others):
+        summary = {**own, "findings": [], "run": f"field/other_{number}", **other}
+        with store.open_generation(f"field/other_{number}", "0" * 16) as generation:
+            generation.write_text("summary.json", json.dumps(summary))
+            generation.commit({"dataset": summary["dataset"], "log": summary["log"]})
+    assert len(find_peers(store, own)[own["leading_input"]]) == 2
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait("document.querySelector('.lead')?.textContent.includes('cannot be fitted')")
+    chrome.errors.clear()
+    chrome.run(f"location.hash = 'a={RUN}'")
+    chrome.run("location.reload()")
+    chrome.wait(f"document.querySelector('.title h2')?.textContent === '{RUN}' && {SHOWN}")
+    facts = str(chrome.run("document.querySelector('.facts').textContent"))
+    assert "vs 2 runs of husky_ice: more slip than 1" in facts
+    look_for_trouble(chrome)
+
+
+@pytest.mark.parametrize(("width", "dark"), [(PHONE, False), (LAPTOP, True)], ids=["phone", "laptop-dark"])
+def test_nothing_is_cut_or_overlaps(
+    chrome: Chrome, workbench: Workbench, pictures: Path, width: int, *, dark: bool
+) -> None:
+    workbench.desk(RUN, "add", effect="effective_track")
+    chrome.size(width, 844, dark=dark)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    chrome.picture(pictures / f"workbench_{width}{'_dark' if dark else ''}.png", whole=True)
+    assert cast("int", chrome.run("document.documentElement.scrollWidth - innerWidth")) <= 0
+    cut = """[...document.querySelectorAll('.plot svg')].flatMap((svg) => {
+      const box = svg.getBoundingClientRect();
+      return [...svg.querySelectorAll('text')].filter((text) => {
+        const word = text.getBoundingClientRect();
+        return word.width && (word.left < box.left - 1 || word.right > box.right + 1);
+      }).map((text) => text.textContent);
+    })"""
+    assert chrome.run(cut) == []
+    overlapping = """(() => {
+      const parts = [...document.querySelectorAll('.hero > *, .model > *, .figures > *, #side > *')]
+        .map((node) => [node.className || node.id, node.getBoundingClientRect()])
+        .filter(([, box]) => box.width && box.height);
+      const found = [];
+      for (const [i, [one, a]] of parts.entries()) for (const [other, b] of parts.slice(i + 1))
+        if (a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1)
+          found.push([one, other]);
+      return found;
+    })()"""
+    assert chrome.run(overlapping) == []
+    assert chrome.run("document.querySelector('.numbers').getBoundingClientRect().bottom < innerHeight")
+    look_for_trouble(chrome)
+
+
+def test_markup_in_a_log_is_shown_as_text(chrome: Chrome, tmp_path: Path, pictures: Path) -> None:
+    folder = tmp_path / "<b onclick=alert(1)>field"
+    folder.mkdir()
+    log = folder / "<img src=x onerror=window.pwned=1>.mcap"
+    rng = np.random.default_rng(4)
+    stamps = START + np.arange(1600, dtype=np.int64) * 50_000_000
+    speed = np.repeat(rng.uniform(0.2, 0.9, 20), 80)
+    turn = np.repeat(rng.uniform(-0.8, 0.8, 20), 80)
+    yaw = np.cumsum(0.6 * turn) * 0.05
+    pose = {
+        "header.frame_id": EVIL,
+        "pose.pose.position.x": np.cumsum(speed * np.cos(yaw)) * 0.05,
+        "pose.pose.position.y": np.cumsum(speed * np.sin(yaw)) * 0.05,
+        "pose.pose.orientation.z": np.sin(0.5 * yaw),
+        "pose.pose.orientation.w": np.cos(0.5 * yaw),
+    }
+    with LogWriter(log) as writer:
+        writer.metadata("deployment", {"vehicle": "husky_a200", "terrain": EVIL})
+        command = {"linear.x": speed, "angular.z": turn}
+        writer.write_columns(f"/{EVIL}/cmd_vel", "geometry_msgs/msg/Twist", stamps, command)
+        writer.write_columns(f"/{EVIL}/icp_odom", "nav_msgs/msg/Odometry", stamps, pose, header_time=stamps)
+    results = tmp_path / "results"
+    outcome = analyze_log(log, Options(out=results))
+    assert EVIL in str(outcome.summary["terrain"])
+    server = Workbench(results)
+    try:
+        chrome.size(LAPTOP, 900)
+        chrome.open(server.address)
+        chrome.wait(SHOWN)
+        chrome.picture(pictures / "workbench_markup.png")
+        assert EVIL in str(chrome.run("document.querySelector('.facts').textContent"))
+        assert "<img src=x" in str(chrome.run("document.querySelector('.title h2').textContent"))
+        assert chrome.run("document.querySelectorAll('img, b[onclick]').length") == 0
+        assert chrome.run("window.pwned ?? null") is None
+        look_for_trouble(chrome)
+        report = Path(str(outcome.summary["report"]))
+        chrome.open(report.as_uri())
+        chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
+        chrome.picture(pictures / "report_markup.png", whole=True)
+        assert EVIL in str(chrome.run("document.body.textContent"))
+        assert chrome.run("document.querySelectorAll('img').length") == 0
+        assert chrome.run("window.pwned ?? null") is None
+        assert chrome.errors == []
+    finally:
+        server.close()
+
+
+def test_an_empty_folder_asks_for_a_log(chrome: Chrome, tmp_path: Path, pictures: Path) -> None:
+    server = Workbench(tmp_path / "nothing yet")
+    try:
+        chrome.size(PHONE, 844)
+        chrome.open(server.address)
+        chrome.wait("document.querySelector('.blank')")
+        chrome.picture(pictures / "workbench_empty.png")
+        assert chrome.run("document.querySelector('#drop').getBoundingClientRect().height > 80")
+        look_for_trouble(chrome)
+    finally:
+        server.close()
+    assert not (tmp_path / "nothing yet").exists()

@@ -1,0 +1,194 @@
+"""Who may ask the server what, and what its answers allow a browser to do."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import secrets
+import socket
+from typing import TYPE_CHECKING
+
+import pytest
+from workbench_server import LIMITS, RUN, TOKEN
+
+from pipeline.web import WorkbenchError, serve
+from pipeline.web.guard import Guard, make_token, strip_port
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from workbench_server import Workbench
+
+
+EVERYTHING = (
+    ("GET", "/"), ("GET", "/page.js"), ("GET", "/vega.js"), ("GET", "/api/runs"), ("GET", "/api/jobs"),
+    ("GET", f"/report?run={RUN}"), ("GET", f"/model.toml?run={RUN}"), ("GET", "/nowhere"), ("HEAD", "/"),
+    ("POST", "/api/desk"), ("POST", "/api/upload?name=x.mcap"), ("POST", "/api/diagnose"), ("PUT", "/"),
+)  # fmt: skip
+STRANGERS: tuple[dict[str, str], ...] = (
+    {},
+    {"Cookie": "slip-1=x; slip=y"},
+    {"Authorization": "Bearer"},
+    {"Authorization": f"Bearer {TOKEN[:-1]}"},
+    {"Authorization": f"Basic {TOKEN}"},
+    {"Authorization": "Bearer \xe9\xff"},
+)
+
+
+@pytest.mark.parametrize(("method", "path"), EVERYTHING)
+def test_whoever_has_no_token_gets_nothing_but_a_sentence(
+    workbench: Workbench, method: str, path: str
+) -> None:
+    for headers in (*STRANGERS, {"Cookie": f"slip-{workbench.port}=guess"}):
+        status, answered, body = workbench.request(method, path, b"", headers=headers, known=False)
+        assert status == 403
+        assert method == "HEAD" or b"`slip serve` printed" in body
+        assert RUN.encode() not in body
+        assert answered["set-cookie"] is None
+    assert not (workbench.results / "workbench").exists()
+
+
+def test_a_wrong_token_in_the_address_is_refused(workbench: Workbench) -> None:
+    for token in ("", "guess", TOKEN[:-1], TOKEN + "x", "%E9", "%ff"):
+        status, headers, _ = workbench.request("GET", f"/?token={token}", known=False)
+        assert status == 403
+        assert headers["set-cookie"] is None
+    # It is asked for where the page is opened, and nowhere else: it must not end up in logs and links.
+    assert workbench.request("GET", f"/api/runs?token={TOKEN}", known=False)[0] == 403
+
+
+def test_the_printed_address_gives_a_cookie_that_only_the_browser_sees(workbench: Workbench) -> None:
+    path = workbench.address.removeprefix(workbench.origin)
+    status, headers, body = workbench.request("GET", path, known=False)
+    assert status == 200
+    assert TOKEN.encode() not in body
+    kept, *flags = [part.strip().lower() for part in headers["set-cookie"].split(";")]
+    assert {"httponly", "samesite=strict", "path=/"} <= set(flags)
+    assert not any(flag.startswith(("domain", "expires", "max-age")) for flag in flags)
+    for foreign, page in (("/", 200), ("/api/runs", 200)):
+        assert workbench.request("GET", foreign, headers={"Cookie": kept}, known=False)[0] == page
+
+
+def test_a_script_sends_the_token_as_a_header(workbench: Workbench) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", workbench.port)
+    bearer = {"Authorization": f"Bearer {TOKEN}"}
+    connection.request("POST", "/api/desk", json.dumps({"run": RUN}).encode(), headers=bearer)
+    assert connection.getresponse().status == 200
+    connection.close()
+    # Whatever it knows, another origin is another origin.
+    for foreign in ({"Origin": "https://evil.example"}, {"Sec-Fetch-Site": "cross-site"}):
+        assert workbench.request("GET", "/api/runs", headers={**bearer, **foreign}, known=False)[0] == 403
+
+
+def test_tokens_are_compared_in_constant_time_and_made_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared = []
+
+    def compare(one: bytes, two: bytes) -> bool:
+        compared.append((one, two))
+        return False
+
+    monkeypatch.setattr(secrets, "compare_digest", compare)
+    asked = {"type": "http", "path": "/", "method": "GET", "query_string": b"token=guess", "server": ("", 80)}
+    headers = [(b"host", b"localhost"), (b"cookie", b"slip-80=crumb"), (b"authorization", b"Bearer word")]
+    answer = Guard(lambda *_: None, TOKEN)._answer({**asked, "headers": headers})  # type: ignore[arg-type, return-value]
+    assert answer is not None
+    assert {given for given, _ in compared} == {b"guess", b"crumb", b"word"}
+    assert {make_token() for _ in range(20)}.__len__() == 20
+    assert len(make_token()) >= 43
+
+
+def test_answers_carry_a_strict_policy(workbench: Workbench) -> None:
+    for path in ("/", "/page.js", "/api/runs", "/nowhere"):
+        _, headers, _ = workbench.request("GET", path)
+        policy = headers["content-security-policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy
+        assert "frame-ancestors 'none'" in policy
+        assert headers["x-content-type-options"] == "nosniff"
+        assert headers["access-control-allow-origin"] is None
+
+
+def test_a_report_is_shut_off_from_the_page_that_links_to_it(workbench: Workbench) -> None:
+    status, headers, body = workbench.request("GET", f"/report?run={RUN}")
+    assert status == 200
+    assert b"<html" in body[:200]
+    policy = headers.get_all("content-security-policy")
+    assert policy is not None
+    assert len(policy) == 1
+    assert "sandbox allow-scripts" in policy[0]
+    assert "frame-ancestors 'none'" in policy[0]
+    assert "allow-same-origin" not in policy[0]
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "127.0.0.1.evil.example", "[::2]:80", "", "localhost.evil:1"]
+)
+def test_a_name_that_points_here_from_elsewhere_is_refused(workbench: Workbench, host: str) -> None:
+    for path in ("/", "/api/runs"):
+        status, _, body = workbench.request("GET", path, headers={"Host": host})
+        assert status in {400, 403}
+        assert b"runs" not in body
+
+
+@pytest.mark.parametrize("host", ["localhost", "127.0.0.1", "[::1]", "LOCALHOST"])
+def test_the_loopback_by_any_of_its_names_is_let_in(workbench: Workbench, host: str) -> None:
+    status, _, _ = workbench.request("GET", "/api/runs", headers={"Host": f"{host}:{workbench.port}"})
+    assert status == 200
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "https://evil.example",
+        "null",
+        "http://[",
+        "",
+        "http://localhost:1",
+        "http://127.0.0.1",
+        "http://127.0.0.1:99999",
+    ],
+)
+def test_another_origin_is_refused(workbench: Workbench, origin: str) -> None:
+    body = json.dumps({"run": RUN, "action": "add", "effect": "drive_lag"}).encode()
+    status, _, _ = workbench.request("POST", "/api/desk", body, headers={"Origin": origin})
+    assert status == 403
+    status, _, _ = workbench.request("GET", "/api/runs", headers={"Origin": origin})
+    assert status == 403
+    assert not (workbench.results / "workbench").exists()
+
+
+def test_a_change_without_an_origin_is_refused(workbench: Workbench) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", workbench.port)
+    cookie = {"Cookie": f"slip-{workbench.port}={TOKEN}"}
+    connection.request("POST", "/api/desk", b"{}", headers=cookie)
+    assert connection.getresponse().status == 403
+    connection.close()
+
+
+def test_another_site_may_link_here_and_load_nothing(workbench: Workbench) -> None:
+    foreign = {"Sec-Fetch-Site": "cross-site"}
+    status, _, _ = workbench.request("GET", "/", headers={**foreign, "Sec-Fetch-Mode": "navigate"})
+    assert status == 200
+    for path, mode in (("/page.js", "no-cors"), ("/api/runs", "no-cors"), (f"/report?run={RUN}", "navigate")):
+        status, _, _ = workbench.request("GET", path, headers={**foreign, "Sec-Fetch-Mode": mode})
+        assert status == 403
+
+
+def test_a_body_that_is_too_long_is_not_read_to_its_end(workbench: Workbench) -> None:
+    assert workbench.refuse("/api/desk", run=RUN, formula="x" * 200_000)["code"] == "bad_request"
+
+
+def test_ports_are_stripped_from_hosts() -> None:
+    assert strip_port("LocalHost:80") == "localhost"
+    assert strip_port("[::1]:8321") == "[::1]"
+    assert strip_port("127.0.0.1") == "127.0.0.1"
+
+
+def test_a_taken_port_is_named(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(WorkbenchError, match="--port") as caught:
+            serve(tmp_path, host="127.0.0.1", port=port, tell=lambda *_: None, limits=LIMITS)
+    assert caught.value.code == "port_taken"

@@ -1,0 +1,68 @@
+"""A megabyte of whatever somebody wrote takes a moment to refuse: no pattern looks at it twice."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from pipeline.core.errors import SlipError
+from pipeline.logs import fields, idl, index, schema
+from pipeline.models.formula.units import parse_unit
+from pipeline.stages.extract import drive
+from pipeline.vehicles import complaints, topics
+from pipeline.web.formulas import make_formula
+from pipeline.web.uploads import clean_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+LENGTH = 1_000_000
+LONGEST_S = 3.0
+PIECES = (
+    "/* ", "\n", " \n", '"', '\\"', "\\'", "//", "<", "[", " ", "1", "=", "===\n", "a", "_", "- \n", "m*",
+    "`$", "value '", "left_", "#", "_1", "IDL:", ",", "0 .. ",
+)  # fmt: skip
+READERS: dict[str, tuple[str, Callable[[str], object]]] = {
+    "idl": ('"', lambda text: idl.parse_idl("a/B", text)),
+    "msg": ("a", lambda text: schema.parse_msg("a/B", text)),
+    "metadata.yaml": ("relative_file_paths:\n", index._listed_files),
+    "file name": ("_", lambda text: index._split_number(Path(text))),
+    "indexed field": ("[", fields._INDEXED.match),
+    "unit": ("m", lambda text: parse_unit(text, "")),
+    "configuration": ("[", complaints._read_header),
+    "complaint": ("at `$", lambda text: complaints._find(complaints._PLACE, text)),
+    "topic": ("/", topics._LOCALIZED.search),
+    "joint": ("_", drive._LEFT.search),
+    "parameters": ("c [1] ", lambda text: make_formula("own", "v_w", "c * w0", text)),
+    "formula": ("c * ", lambda text: make_formula("own", "v_w", text, "c [1] 0 .. 1")),
+    "upload": ("", clean_name),
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_megabyte_is_read_or_refused_in_a_moment(reader: str) -> None:
+    start, read = READERS[reader]
+    for piece in PIECES:
+        text = f"{start}{piece * (LENGTH // len(piece))}!"
+        started = time.process_time()
+        with contextlib.suppress(SlipError, schema.SchemaError):
+            read(text)
+        assert time.process_time() - started < LONGEST_S, piece
+
+
+def test_a_definition_with_comments_and_quotes_is_still_read() -> None:
+    text = """
+    // a wheel of 5" and a robot's arm
+    # a line of the old kind
+    module a { module msg {
+      /* until "here */
+      @verbatim (language="comment", text="it's // no comment /* at all")
+      struct B { double x; sequence<string> s; /* y */ long y[3]; };
+    }; };
+    """
+    members = idl.parse_idl("a/msg/B", text).members
+    assert [member.name for member in members] == ["x", "s", "y"]
