@@ -290,7 +290,8 @@ def test_a_summary_that_was_damaged_is_one_clear_error_and_made_anew_with_force(
     path = analyze(log, out).manifest.path("summary.json")
     whole = path.read_bytes()
     assert b'"reason"' in whole
-    for damaged in (whole[:-9], b"[]", b"[" * 5000, b"\xff" + whole[1:], whole.replace(b'"reason"', b'"reas0n"')):
+    misspelt = whole.replace(b'"reason"', b'"reas0n"')
+    for damaged in (whole[:-9], b"[]", b"[" * 5000, b"\xff" + whole[1:], misspelt):
         path.write_bytes(damaged)
         with pytest.raises(SlipError, match="not what was written") as caught:
             analyze(log, out)
