@@ -88,7 +88,7 @@ class Work:
     def _is_body_commanded(self) -> bool:
         """Whether the command is a body command, which the controller turns into wheel speeds."""
         source = self.subject.sources.command
-        return source is not None and source.form in {DriveForm.BODY, DriveForm.BODY_SIGNALS}
+        return source is not None and source.form is DriveForm.BODY
 
     def run_stages(self) -> None:
         """Run every stage up to the last one asked for, reusing what has not changed."""

@@ -10,6 +10,7 @@ from pipeline.vehicles.loading import list_configuration_files, load_configurati
 from pipeline.vehicles.presets import Vehicle, find_preset, list_presets, resolve_vehicle
 from pipeline.vehicles.sources import DriveForm, DriveSource, PoseSource, Signal, Sources, TopicSource
 from pipeline.vehicles.topics import DEFAULT_INTERVAL, choose_sources
+from pipeline.vehicles.units import convert_unit
 
 __all__ = [
     "DEFAULT_INTERVAL",
@@ -24,6 +25,7 @@ __all__ = [
     "TopicSource",
     "Vehicle",
     "choose_sources",
+    "convert_unit",
     "find_preset",
     "list_configuration_files",
     "list_presets",

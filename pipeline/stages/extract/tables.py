@@ -20,11 +20,11 @@ from pipeline.stages.extract.absurd import remove_absurd
 from pipeline.stages.extract.clocks import Recorded, TopicClock, align_clocks
 from pipeline.stages.extract.drive import (
     Drive,
-    is_single_topic,
-    read_body,
+    differentiate_angle,
+    is_angle,
     read_joints,
-    read_sides,
-    read_steering,
+    read_pair,
+    read_signal,
 )
 from pipeline.stages.extract.intervals import Span, find_spans_given, find_spans_of_state, is_inside
 from pipeline.stages.extract.transforms import chain_poses, describe_chain, is_transforms, to_base_link
@@ -100,8 +100,9 @@ class _Extraction:
         self.configuration = configuration
         self.vehicle = vehicle
         self.where = where
+        self._orders: dict[str, NDArray[np.int64]] = {}
         self.columns = {
-            topic: found
+            topic: reading.with_stamps(found)
             for topic in dict.fromkeys(columns.topic for columns in topics)
             if (found := self._join_channels(topic)) is not None
         }
@@ -184,7 +185,9 @@ class _Extraction:
         columns, clock = self.columns.get(topic), self.clocks.get(topic)
         if columns is None or clock is None:
             return None
-        return columns, clock, self._order(clock)
+        if topic not in self._orders:
+            self._orders[topic] = self._order(clock)
+        return columns, clock, self._orders[topic]
 
     def _order(self, clock: TopicClock) -> NDArray[np.int64]:
         """Usable messages in the order of their stamps; disorder is noted."""
@@ -306,17 +309,14 @@ class _Extraction:
     ) -> pl.DataFrame:
         if source is None:
             return pl.DataFrame()
-        found = self._ordered(source.signals[0].topic)
-        if found is None:
-            raise self._nothing("command" if held else "wheels", source.signals[0].topic)
-        columns, clock, order = found
-        if is_single_topic(source.form):
-            drive = self._read_single(source, section, columns, self._seconds(clock.stamp))
+        if source.form is DriveForm.JOINTS:
+            columns, clock, order = self._require(source.signals[0].topic, held=held)
+            drive = read_joints(columns, self._seconds(clock.stamp), section, self.vehicle)
             drive = _take(drive, order)
             stamp, log_time = clock.stamp[order], columns.log_time[order]
         else:
-            stamp, log_time, pair = self._read_pair(source, held=held)
-            drive = self._read_pair_as_drive(source, section, pair)
+            stamp, log_time, (first, second) = self._read_pair(source, section, held=held)
+            drive = read_pair(source.form, first, second, section, self.vehicle, measured=not held)
         self.findings += drive.findings
         times = self._seconds(stamp)
         empty = np.full(times.size, np.nan)
@@ -344,27 +344,22 @@ class _Extraction:
             self.findings.append(Finding("no_measured_wheels", "info", text, where=str(source)))
             return pl.DataFrame()
 
-    def _read_single(
-        self, source: DriveSource, section: DriveSection, columns: TopicColumns, times: Floats
-    ) -> Drive:
-        if source.form is DriveForm.JOINTS:
-            return read_joints(columns, times, section, self.vehicle)
-        types = {columns.topic: columns.type_name}
-        first, second = (
-            reading.numbers(columns, signal.field) for signal in reading.drive_fields(source, types)
-        )
-        reader = read_body if source.form is DriveForm.BODY else read_steering
-        return reader(first, second, section, self.vehicle)
+    def _require(self, topic: str, *, held: bool) -> tuple[TopicColumns, TopicClock, NDArray[np.int64]]:
+        found = self._ordered(topic)
+        if found is None:
+            raise self._nothing("command" if held else "wheels", topic)
+        return found
 
-    def _read_pair(self, source: DriveSource, *, held: bool) -> tuple[Stamps, Stamps, tuple[Floats, Floats]]:
+    def _read_pair(
+        self, source: DriveSource, section: DriveSection, *, held: bool
+    ) -> tuple[Stamps, Stamps, tuple[Floats, Floats]]:
         """Two signals at common times: held commands at the stamps of either, measurements at the first's."""
         series = []
-        for signal in source.signals:
-            found = self._ordered(signal.topic)
-            if found is None:
-                raise self._nothing("command" if held else "wheels", signal.topic)
-            columns, clock, order = found
-            values = reading.numbers(columns, signal.field)[order]
+        for number, signal in enumerate(source.signals):
+            columns, clock, order = self._require(signal.topic, held=held)
+            values = read_signal(columns, source, number, section, self.vehicle)[order]
+            if is_angle(source, section):
+                values = differentiate_angle(self._seconds(clock.stamp[order]), values)
             series.append((clock.stamp[order], columns.log_time[order], values))
         (first, log_first, a), (second, log_second, b) = series
         if np.array_equal(first, second):
@@ -378,16 +373,6 @@ class _Extraction:
         union, log_time = union[known], log_time[known]
         at = [np.searchsorted(stamps, union, side="right") - 1 for stamps in (first, second)]
         return union, log_time, (a[at[0]], b[at[1]])
-
-    def _read_pair_as_drive(
-        self, source: DriveSource, section: DriveSection, pair: tuple[Floats, Floats]
-    ) -> Drive:
-        readers = {
-            DriveForm.SIDES: read_sides,
-            DriveForm.BODY_SIGNALS: read_body,
-            DriveForm.STEERING_SIGNALS: read_steering,
-        }
-        return readers[source.form](pair[0], pair[1], section, self.vehicle)
 
     def _imu(self, spans: Sequence[Span] | None) -> pl.DataFrame:
         source = self.sources.imu

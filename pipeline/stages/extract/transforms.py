@@ -11,7 +11,8 @@ from pipeline.stages.errors import StageError
 from pipeline.stages.extract.localization import move_to_base, normalize_quaternions
 from pipeline.stages.extract.reading import PoseArrays
 from pipeline.stages.finding import Finding
-from pipeline.vehicles.topics import TRANSFORM_TYPES, plain_type
+from pipeline.vehicles.message_types import plain_type
+from pipeline.vehicles.topics import TRANSFORM_TYPES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
