@@ -196,7 +196,7 @@ class Work:
             "losses": [describe_loss(loss, data.index.start_ns) for loss in data.losses],
             "unchecked": data.unchecked or None,
         }
-        return StageOutcome((*made.findings, *found, *notes), context)
+        return StageOutcome((*subject.choice.findings, *made.findings, *found, *notes), context)
 
     def _align(self) -> StageOutcome:
         previous = self.generation.previous

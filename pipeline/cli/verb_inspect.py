@@ -77,6 +77,11 @@ def _as_json(seen: Inspection) -> dict[str, object]:
             else {"topic": str(source), "reason": source.reason}
             for role in _ROLES
         },
+        **(
+            seen.choice.to_json({topic.topic: topic.type_name for topic in seen.topics})
+            if seen.choice
+            else {}
+        ),
         "problem": seen.problem or None,
     }
 

@@ -28,6 +28,8 @@ LOCALIZED = re.compile(
     r"icp|slam|lidar|laser|map|locali|loam|gnss|gps|rtk|ground_truth|truth|mocap|vicon|optitrack|amcl|vio|lio"
     r"|kiss|/pf/|particle|qualisys"
 )
+FILTERED = re.compile(r"(?<!un)filter|ekf|ukf|fused|merged|combined")
+_OF_WHEELS = re.compile(r"wheel|unfiltered|controller|raw")
 _RECEIVED = re.compile(r"controller|mux/cmd|cmd_vel_out|platform/cmd|drive/cmd|base/cmd|vehicle/")
 _UPSTREAM = re.compile(
     r"joy|teleop|nav|web|key|interactive|marker|plan|raw|key_vel|smoothed|manual|autonomous|safe|unsmoothed"
@@ -91,7 +93,8 @@ class Topics:
                 role = "wheels" if MEASURED.search(name) else "command"
             if (role == "command") != commanded:
                 continue
-            if role == "odometry" and (LOCALIZED.search(name) or not DEAD_RECKONED.search(name)):
+            made_of_more = LOCALIZED.search(name) or FILTERED.search(name)
+            if role == "odometry" and (made_of_more or not DEAD_RECKONED.search(name)):
                 continue
             signals = (Signal(topic, drive.first, drive.unit), Signal(topic, drive.second, drive.unit))
             if drive.form == "steering" and drive.unit:
@@ -101,7 +104,7 @@ class Topics:
 
     def _rank_single(self, name: str, form: str, role: str, unit: str) -> tuple[float, str]:
         if role == "odometry":
-            return 1.0, "the body motion that an odometry measured by the wheels"
+            return 1.0 + 0.1 * bool(_OF_WHEELS.search(name)), "the body motion of an odometry of the wheels"
         if form != "body":
             what = "speed and steering angle" if form == "steering" else "left and right wheels"
             return 2.9 if unit == "ticks" else 3.0 + 0.1 * bool(_EXECUTED.search(name)), what

@@ -111,13 +111,16 @@ def _plain(name: str) -> str:
     return name.strip().lower().replace("-", "_").replace(" ", "_")
 
 
-def resolve_vehicle(section: VehicleSection, *, recorded: str | None, where: str) -> Vehicle:
+def resolve_vehicle(
+    section: VehicleSection, *, recorded: str | None, where: str, told: Vehicle | None = None
+) -> Vehicle:
     """The vehicle of a run.
 
     Args:
         section: what the configuration and the command line say.
         recorded: vehicle named in the log's `deployment` record, used when the configuration names none.
         where: the log, for the error message.
+        told: vehicle that the rest of the log tells, used when neither names a preset.
 
     Raises:
         ConfigurationError: no vehicle is named, the name is unknown, or a value is missing.
@@ -130,6 +133,8 @@ def resolve_vehicle(section: VehicleSection, *, recorded: str | None, where: str
         raise ConfigurationError(
             "vehicle_unknown", f"no vehicle preset is called {named!r}", where=where, hint=_how_to_choose()
         )
+    if base is None and not {"wheel_radius_m", "kind"} & set(values):
+        base = told
     if base is None:
         if "wheel_radius_m" not in values:
             said = (

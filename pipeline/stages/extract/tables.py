@@ -62,12 +62,14 @@ class Extracted:
         findings: what was noticed.
         start_ns: stamp at which t is zero.
         clocks: by topic: which time was used and how late messages were recorded [s].
+        frames: the frame the poses are given in, and the one they place; empty where it is not said.
     """
 
     tables: Mapping[str, pl.DataFrame]
     findings: tuple[Finding, ...]
     start_ns: int
     clocks: Mapping[str, Mapping[str, str | float]]
+    frames: tuple[str, str] = ("", "")
 
 
 def extract_tables(
@@ -100,6 +102,7 @@ class _Extraction:
         self.configuration = configuration
         self.vehicle = vehicle
         self.where = where
+        self.frames = ("", "")
         self._orders: dict[str, NDArray[np.int64]] = {}
         self.columns = {
             topic: reading.with_stamps(found)
@@ -124,7 +127,7 @@ class _Extraction:
             clock.topic: {"clock": clock.clock, "latency_s": round(clock.latency_s, 6)}
             for clock in self.clocks.values()
         }
-        return Extracted(tables, tuple(self.findings), self.start_ns, clocks)
+        return Extracted(tables, tuple(self.findings), self.start_ns, clocks, self.frames)
 
     def _join_channels(self, topic: str) -> TopicColumns | None:
         """All channels of a topic as one series; where they cannot be one, the one with most messages."""
@@ -274,6 +277,7 @@ class _Extraction:
             recorded, log_times = reading.read_pose_topic(columns), columns.log_time
         if clock is None or not clock.usable.any():
             raise self._nothing("pose", topic)
+        self.frames = (recorded.parent, recorded.child)
         order = self._order(clock)
         stamp, log_time = clock.stamp[order], log_times[order]
         breaks = np.zeros(order.size, dtype=bool)
