@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from pipeline.store import JSON
     from pipeline.vehicles import Configuration, Description, Recognized, Sources, VehicleSource
 
+UNKNOWN_VEHICLE = "unknown"
 _STAND_IN_RADIUS_M = 0.1
 _STAND_IN_TRACK_M = 0.5
 _STEERED = ("ackermann_msgs/", "autoware_control_msgs/", "hunter_msgs/")
@@ -134,18 +135,8 @@ def choose(
     )
     if rivals or fits:
         chosen = _compare(chosen, index, configuration, rivals, sha256)
-    if problem is not None:
-        if not fits:
-            # What a log lacks altogether is said before what is not known of its vehicle.
-            return (
-                chosen if sources.pose is None or not (sources.wheels or sources.command) else _fail(problem)
-            )
-        chosen = _fit_vehicle(chosen, configuration, problem, where)
-    return chosen
-
-
-def _fail(problem: ConfigurationError) -> Choice:
-    raise problem
+    # What a log lacks altogether is said before what is not known of its vehicle.
+    return chosen if problem is None or not fits else _fit_vehicle(chosen, configuration, problem, where)
 
 
 def _find_description(index: LogIndex) -> Description | None:
@@ -189,7 +180,7 @@ def _stand_in(index: LogIndex, configuration: Configuration) -> Vehicle:
     steered = any(name.startswith(_STEERED) for name in types)
     kind = configuration.vehicle.kind or ("ackermann" if steered else "differential")
     return Vehicle(
-        id="unknown",
+        id=UNKNOWN_VEHICLE,
         name="unknown vehicle",
         kind=kind,
         wheel_radius_m=1.0,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.analysis.choice import Choice, choose
+from pipeline.analysis.choice import UNKNOWN_VEHICLE, Choice, choose
 from pipeline.core.errors import SlipError
 from pipeline.logs import ChannelInfo, LogIndex, Loss, Wanted, open_log, read_topics
 from pipeline.vehicles import (
@@ -67,7 +67,8 @@ class Inspection:
     @property
     def vehicle(self) -> Vehicle | None:
         """The vehicle; None where it is not known."""
-        return self.choice.vehicle if self.choice is not None and not self.problem else None
+        known = self.choice is not None and not self.problem and self.choice.vehicle.id != UNKNOWN_VEHICLE
+        return self.choice.vehicle if known and self.choice is not None else None
 
     @property
     def sources(self) -> Sources | None:

@@ -110,6 +110,9 @@ def _describe_topics(summary: Summary) -> list[str]:
         source = _part(topics, role)
         if source:
             lines.append(_row("" if lines else "topics", f"{role:<9}{source['topic']}    {source['reason']}"))
+    others = _part(_part(summary, "choices"), "pose").get("others")
+    rejected = others if isinstance(others, list) else []
+    lines.extend(_row("", f"{'not':<9}{other['reason']}") for other in rejected)
     return lines
 
 

@@ -18,7 +18,7 @@ from pipeline.simulate.messages import (
     wheel_sheets,
 )
 from pipeline.simulate.published import publish
-from pipeline.simulate.stamps import stamp_times
+from pipeline.simulate.stamps import stamp_headers, stamp_times
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -61,7 +61,7 @@ def write_log(run: SimulatedRun, path: Path) -> None:
     )
     with LogWriter(path) as writer:
         for sheet in cut_gaps(run, sheets):
-            header = None if sheet.header_s is None else stamp_times(scenario.clock, sheet.header_s)
+            header = None if sheet.header_s is None else stamp_headers(scenario.clock, sheet.header_s)
             fields = sheet.fields
             if header is not None and sheet.stamp != "header":
                 fields, header = fields | _write_stamp(sheet.stamp, header, scenario.clock.start_ns), None

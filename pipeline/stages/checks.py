@@ -16,6 +16,7 @@ from pipeline.models.effect import Late
 from pipeline.stages.delays import estimate_delay
 from pipeline.stages.finding import Finding
 from pipeline.stages.samples import Samples, gather_samples
+from pipeline.stages.scale import check_scale
 from pipeline.stages.trust import check_live_commands
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         return stuck
     checks: tuple[Callable[[Samples, Vehicle], list[Finding]], ...] = (
         check_live_commands,
+        check_scale,
         check_limits,
         check_delays,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import TYPE_CHECKING
 
@@ -115,3 +115,16 @@ class Sources:
     interval: TopicSource | None
     notes: tuple[str, ...] = ()
     others: Mapping[str, tuple[DriveSource | PoseSource | TopicSource, ...]] = field(default_factory=dict)
+
+    def separated(self) -> Sources:
+        """The same, but with measured wheels from another topic than the pose."""
+        pose = None if self.pose is None else self.pose.topic
+        ranked = [
+            one for one in (self.wheels, *self.others.get("wheels", ())) if isinstance(one, DriveSource)
+        ]
+        free = [one for one in ranked if {signal.topic for signal in one.signals} != {pose}]
+        chosen = free[0] if free else None
+        if chosen == self.wheels or (self.wheels is not None and self.wheels.reason == "configured"):
+            return self
+        rest = tuple(one for one in ranked if one is not chosen)
+        return replace(self, wheels=chosen, others={**self.others, "wheels": rest})

@@ -49,7 +49,7 @@ def choose_sources(
     """
     chooser = _Chooser([channel for channel in channels if channel.message_count != 0], vehicle, where)
     chooser.settle_robot(configuration)
-    return Sources(
+    sources = Sources(
         command=chooser.choose_drive(configuration.command, commanded=True),
         wheels=chooser.choose_drive(configuration.wheels, commanded=False),
         pose=chooser.choose_pose(configuration.pose.topic, configuration.pose.frames),
@@ -58,6 +58,7 @@ def choose_sources(
         notes=tuple(chooser.notes),
         others=chooser.others,
     )
+    return sources.separated()
 
 
 class _Chooser:

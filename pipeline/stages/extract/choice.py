@@ -19,7 +19,7 @@ from pipeline.core import rigid, timegrid
 from pipeline.core.errors import SlipError
 from pipeline.stages.extract.tables import extract_tables
 from pipeline.stages.trust import measure_rest
-from pipeline.vehicles import DriveSource, PoseSource
+from pipeline.vehicles import PoseSource
 from pipeline.vehicles.candidates import DEAD_RECKONED, FILTERED, LOCALIZED
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def _rate(
     vehicle: Vehicle,
     where: str,
 ) -> PoseRating:
-    alone = replace(sources, pose=pose, command=None, imu=None, interval=None)
+    alone = replace(sources, pose=pose, imu=None, interval=None)
     try:
         made = extract_tables(data, alone, configuration, vehicle, where=where)
     except SlipError as error:
@@ -129,7 +129,7 @@ def _rate(
     time = poses["t"].to_numpy()
     position = np.stack([poses[axis].to_numpy() for axis in "xy"], axis=1)
     yaw = np.unwrap(_yaw_of(np.stack([poses[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))
-    length = max(data.index.duration_s, 1e-9)
+    length = max(_span_of(table) for table in made.tables.values())
     period = float(np.median(np.diff(time)))
     rate = 1.0 / period if period > 0.0 else 0.0
     coverage = min(float(np.minimum(np.diff(time), 2.0 * period).sum()) / length, 1.0)
@@ -163,6 +163,10 @@ def _rate(
         score=score,
         reason=", ".join(reasons),
     )
+
+
+def _span_of(table: pl.DataFrame) -> float:
+    return float(np.ptp(table["t"].to_numpy())) if table.height else 0.0
 
 
 def _score_frame(name: str, parent: str) -> tuple[float, list[str]]:
@@ -302,10 +306,8 @@ def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:
     chosen = replace(best.source, reason=best.reason)
     notes = [note for note in sources.notes if not note.startswith("pose:")]
     notes += [f"pose: {best.describe()}", *(f"pose, not taken: {other.describe()}" for other in ratings[1:])]
-    wheels, others = sources.wheels, dict(sources.others)
-    others["pose"] = tuple(replace(one.source, reason=one.refused or one.reason) for one in ratings[1:])
-    if wheels is not None and {signal.topic for signal in wheels.signals} == {chosen.topic}:
-        spare = [one for one in others.get("wheels", ()) if isinstance(one, DriveSource)]
-        wheels = spare[0] if spare else None
-        others["wheels"] = tuple(spare[1:])
-    return replace(sources, pose=chosen, wheels=wheels, notes=tuple(notes), others=others)
+    others = {
+        **sources.others,
+        "pose": tuple(replace(one.source, reason=one.describe()) for one in ratings[1:]),
+    }
+    return replace(sources, pose=chosen, notes=tuple(notes), others=others).separated()

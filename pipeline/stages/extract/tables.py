@@ -27,7 +27,13 @@ from pipeline.stages.extract.drive import (
     read_signal,
 )
 from pipeline.stages.extract.intervals import Span, find_spans_given, find_spans_of_state, is_inside
-from pipeline.stages.extract.transforms import chain_poses, describe_chain, is_transforms, to_base_link
+from pipeline.stages.extract.transforms import (
+    chain_poses,
+    describe_chain,
+    describe_frame,
+    is_transforms,
+    to_base_link,
+)
 from pipeline.stages.finding import Finding
 from pipeline.vehicles import (
     DEFAULT_INTERVAL,
@@ -278,6 +284,8 @@ class _Extraction:
         if clock is None or not clock.usable.any():
             raise self._nothing("pose", topic)
         self.frames = (recorded.parent, recorded.child)
+        if self.chain is None:
+            self.findings += describe_frame(topic, recorded.parent)
         order = self._order(clock)
         stamp, log_time = clock.stamp[order], log_times[order]
         breaks = np.zeros(order.size, dtype=bool)
