@@ -19,6 +19,7 @@ from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.extract.choice import PoseRating, fit_geometry, rate_poses, replace_pose
 from pipeline.stages.finding import Finding
 from pipeline.vehicles import (
+    CONFIGURED,
     ConfigurationError,
     DriveForm,
     DriveSource,
@@ -32,6 +33,7 @@ from pipeline.vehicles import (
     recognize_vehicle,
     resolve_vehicle,
 )
+from pipeline.vehicles.candidates import LOCALIZED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -128,15 +130,23 @@ def choose(
         Finding("vehicle_choice", "info", note, where="vehicle") for note in (told.notes if told else ())
     ]
     findings += _check_contradiction(told, vehicle, source)
+    if sources.command is None and sources.wheels is not None:
+        text = "the log holds no command: it is analyzed on the measured wheels"
+        findings.append(Finding("no_command", "info", text, where="command"))
     chosen = Choice(vehicle, source, sources, findings=tuple(findings))
     rivals = [one for one in sources.others.get("pose", ()) if isinstance(one, PoseSource)]
     fits = (
         problem is not None and sources.pose is not None and (sources.wheels or sources.command) is not None
     )
-    if rivals or fits:
+    if rivals or fits or _may_be_odometry(sources.pose):
         chosen = _compare(chosen, index, configuration, rivals, sha256)
     # What a log lacks altogether is said before what is not known of its vehicle.
     return chosen if problem is None or not fits else _fit_vehicle(chosen, configuration, problem, where)
+
+
+def _may_be_odometry(pose: PoseSource | None) -> bool:
+    """Whether only its content can tell a pose from an odometry of the wheels."""
+    return pose is not None and pose.reason != CONFIGURED and not LOCALIZED.search(pose.topic.lower())
 
 
 def _find_description(index: LogIndex) -> Description | None:
@@ -223,7 +233,15 @@ def _compare(
     types = {channel.topic: channel.type_name for channel in index.channels}
     data = read_topics(index, list_wanted(chosen.sources, types, rivals), sha256=sha256)
     ratings = rate_poses(data, chosen.sources, configuration, chosen.vehicle, where=str(index.path))
-    return replace(chosen, sources=replace_pose(chosen.sources, ratings), ratings=ratings, data=data)
+    findings = chosen.findings
+    if ratings and ratings[0].from_wheels:
+        text = (
+            f"the position of {ratings[0].source} is computed from the wheels, and the log has no other "
+            "pose: the way ahead cannot slip against itself; only what turning shows is the heading's"
+        )
+        findings += (Finding("pose_is_odometry", "error", text, where=str(ratings[0].source)),)
+    sources = replace_pose(chosen.sources, ratings)
+    return replace(chosen, sources=sources, ratings=ratings, findings=findings, data=data)
 
 
 def _fit_vehicle(

@@ -75,7 +75,10 @@ def describe_subject(path: Path, options: Options) -> Subject:
 
 
 def _require_sources(sources: Sources, index: LogIndex, options: Options) -> None:
-    there = ", ".join(sorted({f"{channel.topic} ({channel.type_name})" for channel in index.channels}))
+    topics = {channel.topic: f"{channel.topic} ({channel.type_name})" for channel in index.channels}
+    empty = {channel.topic for channel in index.channels if channel.message_count == 0}
+    there = ", ".join(text for topic, text in sorted(topics.items()) if topic not in empty)
+    there += f". Without any message: {', '.join(sorted(empty))}" if empty else ""
     if sources.pose is None:
         raise JobError(
             "no_pose",

@@ -39,17 +39,20 @@ _SURE = 5.0
 
 
 def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
-    """All checks; where the vehicle does not move, only the ones that say so."""
-    stuck = check_dead_wheels(samples, vehicle) + check_motion(samples, vehicle)
+    """All checks; where the vehicle does not move, only the ones that say so.
+
+    Wheels on a wrong scale may look as if nothing moved: the scale is judged first.
+    """
+    scaled = check_scale(samples, vehicle)
+    stuck = check_dead_wheels(samples, vehicle) + ([] if scaled else check_motion(samples, vehicle))
     if stuck:
         return stuck
     checks: tuple[Callable[[Samples, Vehicle], list[Finding]], ...] = (
         check_live_commands,
-        check_scale,
         check_limits,
         check_delays,
     )
-    return [finding for check in checks for finding in check(samples, vehicle)]
+    return scaled + [finding for check in checks for finding in check(samples, vehicle)]
 
 
 def check_dead_wheels(samples: Samples, _vehicle: Vehicle) -> list[Finding]:

@@ -16,11 +16,20 @@ from pipeline.vehicles.recognition import (
     list_contradictions,
     recognize_vehicle,
 )
-from pipeline.vehicles.sources import DriveForm, DriveSource, PoseSource, Signal, Sources, TopicSource
+from pipeline.vehicles.sources import (
+    CONFIGURED,
+    DriveForm,
+    DriveSource,
+    PoseSource,
+    Signal,
+    Sources,
+    TopicSource,
+)
 from pipeline.vehicles.topics import DEFAULT_INTERVAL, choose_sources
 from pipeline.vehicles.units import convert_unit
 
 __all__ = [
+    "CONFIGURED",
     "DEFAULT_INTERVAL",
     "Configuration",
     "ConfigurationError",

@@ -107,7 +107,7 @@ class Topics:
             return 1.0 + 0.1 * bool(_OF_WHEELS.search(name)), "the body motion of an odometry of the wheels"
         if form != "body":
             what = "speed and steering angle" if form == "steering" else "left and right wheels"
-            return 2.9 if unit == "ticks" else 3.0 + 0.1 * bool(_EXECUTED.search(name)), what
+            return 2.9 if unit == "ticks" else 3.2 + 0.1 * bool(_EXECUTED.search(name)), what
         if role == "wheels":
             return 2.0, "the body motion that the base measured by its wheels"
         return self._rank_body(name)

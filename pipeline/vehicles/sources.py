@@ -13,6 +13,10 @@ if TYPE_CHECKING:
 _INNER_INDEX = re.compile(r"\[(\d+)\]\.([\w.]+)$")
 
 
+CONFIGURED = "configured"
+"""Reason of a choice that the user made."""
+
+
 class DriveForm(Enum):
     """What a drive source's signals are."""
 
@@ -124,7 +128,7 @@ class Sources:
         ]
         free = [one for one in ranked if {signal.topic for signal in one.signals} != {pose}]
         chosen = free[0] if free else None
-        if chosen == self.wheels or (self.wheels is not None and self.wheels.reason == "configured"):
+        if chosen == self.wheels or (self.wheels is not None and self.wheels.reason == CONFIGURED):
             return self
         rest = tuple(one for one in ranked if one is not chosen)
         return replace(self, wheels=chosen, others={**self.others, "wheels": rest})

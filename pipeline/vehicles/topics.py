@@ -14,7 +14,15 @@ from pipeline.vehicles.candidates import DEAD_RECKONED, LOCALIZED, Topics
 from pipeline.vehicles.errors import ConfigurationError
 from pipeline.vehicles.message_types import find_type, list_types, plain_type
 from pipeline.vehicles.robots import choose_robot, find_robots
-from pipeline.vehicles.sources import DriveForm, DriveSource, PoseSource, Signal, Sources, TopicSource
+from pipeline.vehicles.sources import (
+    CONFIGURED,
+    DriveForm,
+    DriveSource,
+    PoseSource,
+    Signal,
+    Sources,
+    TopicSource,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -159,7 +167,7 @@ class _Chooser:
         return self._best(topics.list_drives(commanded=commanded, steered=steered), usual, role)
 
     def _configured_drive(self, section: DriveSection, role: str) -> DriveSource | None:
-        reason = "configured"
+        reason = CONFIGURED
         if section.left_topic and section.right_topic:
             sides = (section.left_topic, section.right_topic)
             return DriveSource(
@@ -199,11 +207,11 @@ class _Chooser:
                     where=self.where,
                     hint="Configure pose.topic.",
                 )
-            return PoseSource(transforms, "configured", from_transforms=True, frames=(frames[0], frames[1]))
+            return PoseSource(transforms, CONFIGURED, from_transforms=True, frames=(frames[0], frames[1]))
         if topic:
             name = self.require(topic, "pose").topic
             if self.types[name] in TRANSFORM_TYPES:
-                return PoseSource(name, "configured", from_transforms=True)
+                return PoseSource(name, CONFIGURED, from_transforms=True)
             if find_type(self.types[name]).pose is None:
                 raise ConfigurationError(
                     "type_not_usable",
@@ -211,7 +219,7 @@ class _Chooser:
                     where=self.where,
                     hint=f"Use one of: {', '.join(list_types('pose'))}; or pose.frames.",
                 )
-            return PoseSource(name, "configured")
+            return PoseSource(name, CONFIGURED)
         candidates = [
             ranked for name in self.with_part("pose") if (ranked := self._rank_pose(name)) is not None
         ]
@@ -243,7 +251,7 @@ class _Chooser:
             name = self.require(topic, "imu").topic
             if find_type(self.types[name]).imu is None:
                 raise self._unusable(name, "imu", " or ".join(list_types("imu")))
-            return TopicSource(name, "configured")
+            return TopicSource(name, CONFIGURED)
         candidates = [(1.0, TopicSource(name, "an IMU by its type")) for name in self.with_part("imu")]
         return self._best(candidates, self.vehicle.topics.imu, "imu")
 
@@ -259,7 +267,7 @@ class _Chooser:
                 hint="Give one state topic; it may have several [[interval]] with different `equals`.",
             )
         if configured:
-            return TopicSource(self._require_type(configured[0], "interval", STRING_TYPE), "configured")
+            return TopicSource(self._require_type(configured[0], "interval", STRING_TYPE), CONFIGURED)
         topic, value = DEFAULT_INTERVAL
         if sections or configuration.use_intervals == "all" or self.types.get(topic) != STRING_TYPE:
             return None

@@ -119,7 +119,7 @@ def _follow_simulated_time(
         return recorded, []
     log, stamp = knots
     rate = float(np.median(np.diff(stamp) / np.diff(log)))
-    if abs(rate - 1.0) < _OTHER_RATE:
+    if abs(rate - 1.0) < _OTHER_RATE or abs(rate - 1.0) * (log[-1] - log[0]) < _JUMP_NS:
         return recorded, []
 
     def follow(times: Stamps) -> Stamps:
