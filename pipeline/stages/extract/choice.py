@@ -308,6 +308,6 @@ def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:
     notes += [f"pose: {best.describe()}", *(f"pose, not taken: {other.describe()}" for other in ratings[1:])]
     others = {
         **sources.others,
-        "pose": tuple(replace(one.source, reason=one.describe()) for one in ratings[1:]),
+        "pose": tuple(replace(one.source, reason=one.refused or one.reason) for one in ratings[1:]),
     }
     return replace(sources, pose=chosen, notes=tuple(notes), others=others).separated()
