@@ -10,13 +10,14 @@ import pytest
 from stage_logs import FIELD, PLAIN, TakeThrough
 
 from pipeline.analysis.choice import Choice, choose
-from pipeline.logs import LogWriter, TopicColumns, open_log
+from pipeline.logs import LogWriter, TopicColumns, open_log, read_topics
 from pipeline.simulate import Clock, Encoders, PoseSensor, Recording, Scenario, simulate_run, write_log
 from pipeline.simulate.cases import make_scenario
+from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.extract.clocks import Recorded, align_clocks
 from pipeline.stages.extract.drive import unwrap_counter
 from pipeline.stages.extract.reading import read_pose_topic
-from pipeline.vehicles import load_configuration
+from pipeline.vehicles import Configuration, load_configuration
 
 SECOND = 10**9
 COUNT = 600
@@ -179,3 +180,18 @@ def test_wheels_of_another_scale_than_the_motion_are_told(
 def test_wheels_in_turns_a_minute_are_recognized(drive: TakeThrough) -> None:
     taken = drive(replace(PLAIN, encoders=Encoders(gain=60.0 / (2.0 * np.pi))), {})
     assert "rpm" in taken.finding("unit_wrong").text
+
+
+def test_a_command_to_move_sideways_is_said_to_have_no_model(tmp_path: Path, stamps: np.ndarray) -> None:
+    with LogWriter(tmp_path / "run.mcap") as log:
+        write_wheels_and(log, np.arange(COUNT) * 0.025, np.zeros(COUNT), stamps)
+        command = {"linear.x": 0.5, "linear.y": np.where(np.arange(COUNT) > 300, 0.3, 0.0)}
+        log.write_columns("/cmd_vel", "geometry_msgs/msg/Twist", stamps, command)
+    index = open_log(tmp_path / "run.mcap")
+    chosen = choose(index, Configuration(), {})
+    types = {channel.topic: channel.type_name for channel in index.channels}
+    data = read_topics(index, list_wanted(chosen.sources, types))
+    made = extract_tables(data, chosen.sources, Configuration(), chosen.vehicle, where="run.mcap")
+    (finding,) = [found for found in made.findings if found.id == "sideways_command"]
+    assert "mecanum" in finding.text
+    assert finding.value == pytest.approx(0.5, abs=0.02)

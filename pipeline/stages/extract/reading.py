@@ -16,7 +16,7 @@ from pipeline.vehicles.message_types import find_type, plain_type
 from pipeline.vehicles.topics import TRANSFORM_TYPES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +39,18 @@ def drive_fields(source: DriveSource, types: dict[str, str]) -> list[Signal]:
         names = () if joints is None else (joints.names, joints.velocity, joints.position)
         return [Signal(topic, name) for name in names]
     fields = [Signal(signal.topic, path) for signal in source.signals for path in signal.fields()]
-    return fields + [Signal(signal.topic, signal.per_turn) for signal in source.signals if signal.per_turn]
+    fields += [Signal(signal.topic, signal.per_turn) for signal in source.signals if signal.per_turn]
+    sideways = sideways_field(source, types)
+    return fields if sideways is None else [*fields, sideways]
+
+
+def sideways_field(source: DriveSource, types: Mapping[str, str]) -> Signal | None:
+    """Where a body command of a known type asks for sideways motion."""
+    topic = source.signals[0].topic
+    drive = find_type(types[topic]).drive
+    if source.form is not DriveForm.BODY or not source.name or drive is None or not drive.sideways:
+        return None
+    return Signal(topic, drive.sideways)
 
 
 def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:

@@ -56,6 +56,9 @@ Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
+_SIDEWAYS_MPS = 0.02
+_SIDEWAYS_SHARE = 0.01
+"""A hundredth of the commands is no slip of a joystick."""
 _DEFAULT_SECTION = IntervalSection(topic=DEFAULT_INTERVAL[0], equals=DEFAULT_INTERVAL[1])
 
 
@@ -329,6 +332,7 @@ class _Extraction:
         else:
             stamp, log_time, (first, second) = self._read_pair(source, section, held=held)
             drive = read_pair(source.form, first, second, section, self.vehicle, measured=not held)
+            self.findings += self._check_sideways(source)
         self.findings += drive.findings
         times = self._seconds(stamp)
         empty = np.full(times.size, np.nan)
@@ -361,6 +365,23 @@ class _Extraction:
         if found is None:
             raise self._nothing("command" if held else "wheels", topic)
         return found
+
+    def _check_sideways(self, source: DriveSource) -> list[Finding]:
+        """Commands that no vehicle of this kind can follow: it moves along its wheels alone."""
+        topic = source.signals[0].topic
+        columns = self.columns[topic]
+        signal = reading.sideways_field(source, {topic: columns.type_name})
+        if signal is None:
+            return []
+        share = float(np.mean(np.abs(reading.numbers(columns, signal.field)) > _SIDEWAYS_MPS))
+        if share < _SIDEWAYS_SHARE:
+            return []
+        text = (
+            f"{share:.0%} of the commands of {topic} ask for sideways motion, which {self.vehicle.name} "
+            f"({self.vehicle.kind}) cannot do: mecanum and other omnidirectional drives have no model here, "
+            "and that motion is left out"
+        )
+        return [Finding("sideways_command", "error", text, where=topic, value=share)]
 
     def _read_pair(
         self, source: DriveSource, section: DriveSection, *, held: bool

@@ -27,13 +27,14 @@ Convention = Literal["flu", "ned_frd"]
 
 
 class DriveFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Two fields of one message that speak of the drive."""
+    """Two fields of one message that speak of the drive; ``sideways`` is the body command's third."""
 
     form: Form
     role: Role
     first: str
     second: str
     unit: str = ""
+    sideways: str = ""
 
 
 class NumberField(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
