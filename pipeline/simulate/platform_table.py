@@ -5,6 +5,8 @@ Sources of names, types and geometry: the platforms' own repositories, named bes
 
 from __future__ import annotations
 
+import math
+
 from pipeline.simulate.errors import unknown_name
 from pipeline.simulate.platforms import (
     Fields,
@@ -22,6 +24,8 @@ from pipeline.simulate.published import Published, Q, Source
 from pipeline.simulate.vehicles import Vehicle
 
 _TICKS = 508.8
+_RPM = 60.0 / (2.0 * math.pi)
+_RIGHT_FIRST = ("right", "left", "left", "right")
 _SIDES = ("left", "right")
 _FOUR = ("front_left", "front_right", "rear_left", "rear_right")
 _CAR = ("rear_left", "rear_right", "steer_front_left", "steer_front_right")
@@ -189,7 +193,11 @@ PLATFORMS: dict[str, Platform] = {
                 "/scout_status",
                 "scout_msgs/msg/ScoutStatus",
                 "wheels",
-                {"linear_velocity": Q("speed"), "angular_velocity": Q("yaw_rate")},
+                {
+                    "linear_velocity": Q("speed"),
+                    "angular_velocity": Q("yaw_rate"),
+                    "actuator_states[].rpm": tuple(Q(side, _RPM, whole=True) for side in _RIGHT_FIRST),
+                },
             ),
             odometry("/odom", "odometry", "odom", "base_link"),
             odometry("/Odometry", "localization", "camera_init", "body"),

@@ -147,7 +147,7 @@ class Topics:
                         Signal(topic, pair.first.field, pair.first.unit),
                         Signal(other, pair.second.field, pair.second.unit),
                     )
-                    yield 3.1, DriveSource(_FORMS[pair.form], signals, "a pair of topics by their names")
+                    yield 3.3, DriveSource(_FORMS[pair.form], signals, "a pair of topics by their names")
 
     def pairs_of_sides(self) -> list[tuple[str, str]]:
         """Topics of one number whose names differ in left and right."""

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from platforms import give_geometry, hidden_effects, try_platform
 
+from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.choice import Choice, choose
+from pipeline.analysis.errors import JobError
+from pipeline.analysis.options import Options
+from pipeline.analysis.subject import describe_subject
 from pipeline.logs import open_log
 from pipeline.simulate import PLATFORMS, simulate_case
 from pipeline.vehicles import load_configuration
@@ -132,3 +137,26 @@ def test_an_odometry_of_the_wheels_is_never_preferred_and_says_what_it_is(tmp_pa
     assert not verdicts["/tf"].from_wheels
     assert "too slow" in verdicts["/amcl_pose"].reason
     assert [note for note in chosen.sources.notes if note.startswith("pose, not taken: /odom")]
+
+
+def test_a_field_of_one_of_several_structures_can_be_a_side(tmp_path: Path) -> None:
+    record("scout_2", tmp_path)
+    paths = {
+        side: f"/scout_status.actuator_states[{number}].rpm" for side, number in (("left", 1), ("right", 0))
+    }
+    text = f'[wheels]\nleft_topic = "{paths["left"]}"\nright_topic = "{paths["right"]}"\nunit = "rpm"\n'
+    (tmp_path / "run.toml").write_text(text, encoding="utf-8")
+    options = Options(out=tmp_path / "out", report=False, through="extract")
+    wheels = analyze_log(tmp_path / "run.mcap", options).manifest.read("wheels")
+    poses = analyze_log(tmp_path / "run.mcap", options).manifest.read("poses")
+    assert wheels["left"].abs().max() > 1.0
+    turned = (0.16459 * 0.5 * (wheels["left"] + wheels["right"])).to_numpy()
+    driven = np.diff(poses["x"].to_numpy()) ** 2 + np.diff(poses["y"].to_numpy()) ** 2
+    assert np.abs(turned).sum() / 20.0 == pytest.approx(np.sqrt(driven).sum(), rel=0.2)
+
+
+def test_a_robot_without_a_pose_is_refused_before_its_vehicle_is_asked_for(foreign_logs: Path) -> None:
+    with pytest.raises(JobError) as caught:
+        describe_subject(foreign_logs / "abitobot.mcap", Options())
+    assert caught.value.code == "no_pose"
+    assert "/joint_states" in str(caught.value)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 from stage_logs import FIELD, PLAIN, TakeThrough
 
 from pipeline.analysis.choice import Choice, choose
@@ -15,9 +16,9 @@ from pipeline.simulate import Clock, Encoders, PoseSensor, Recording, Scenario, 
 from pipeline.simulate.cases import make_scenario
 from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.extract.clocks import Recorded, align_clocks
-from pipeline.stages.extract.drive import unwrap_counter
+from pipeline.stages.extract.drive import read_pair, unwrap_counter
 from pipeline.stages.extract.reading import read_pose_topic
-from pipeline.vehicles import Configuration, load_configuration
+from pipeline.vehicles import Configuration, DriveForm, DriveSection, find_preset, load_configuration
 
 SECOND = 10**9
 COUNT = 600
@@ -195,3 +196,16 @@ def test_a_command_to_move_sideways_is_said_to_have_no_model(tmp_path: Path, sta
     (finding,) = [found for found in made.findings if found.id == "sideways_command"]
     assert "mecanum" in finding.text
     assert finding.value == pytest.approx(0.5, abs=0.02)
+
+
+def test_an_odometry_of_a_controller_is_read_with_the_controllers_track() -> None:
+    # The controller's odometry divides by its own track; the base's own status by the nominal one.
+    husky = find_preset("husky_a200")
+    assert husky is not None
+    vehicle = structs.replace(husky, controller_track_multiplier=1.5)
+    half = 0.5 * 1.0 * vehicle.track_width_m / vehicle.wheel_radius_m  # type: ignore[operator]
+    for nominal, factor in ((True, 1.0), (False, 1.5)):
+        still, turning = np.zeros(3), np.ones(3)
+        drive = read_pair(DriveForm.BODY, still, turning, DriveSection(), vehicle, nominal=nominal)
+        assert drive.right == pytest.approx(half * factor)
+        assert drive.left == pytest.approx(-half * factor)

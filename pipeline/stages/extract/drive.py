@@ -234,7 +234,7 @@ def unwrap_counter(count: Floats) -> Floats:
 
 
 def read_pair(
-    form: DriveForm, first: Floats, second: Floats, section: DriveSection, vehicle: Vehicle, *, measured: bool
+    form: DriveForm, first: Floats, second: Floats, section: DriveSection, vehicle: Vehicle, *, nominal: bool
 ) -> Drive:
     """Two signals at common times as what the drive is told.
 
@@ -244,8 +244,8 @@ def read_pair(
         second: speeds of the right wheels [rad/s], yaw rate [rad/s] or steering angle [rad].
         section: sign.
         vehicle: its kind and geometry.
-        measured: whether a body motion was measured by the wheels: publishers then use the nominal track
-            width, whatever the controller multiplies it by.
+        nominal: whether a body motion is meant with the nominal track width, whatever the controller
+            multiplies it by.
 
     Raises:
         StageError: the vehicle is of a kind that is told something else.
@@ -254,7 +254,7 @@ def read_pair(
         return read_sides(first * section.sign, second * section.sign, vehicle)
     if form is DriveForm.STEERING:
         return read_steering(first * section.sign, second, vehicle)
-    if measured:
+    if nominal:
         vehicle = structs.replace(vehicle, controller_track_multiplier=1.0)
     return read_body(first * section.sign, second, vehicle)
 

@@ -44,6 +44,12 @@ def drive_fields(source: DriveSource, types: dict[str, str]) -> list[Signal]:
     return fields if sideways is None else [*fields, sideways]
 
 
+def is_of_base(source: DriveSource, types: Mapping[str, str]) -> bool:
+    """Whether the base measured a body motion; an odometry is made by the controller, with its own track."""
+    drive = find_type(types[source.signals[0].topic]).drive
+    return drive is None or drive.role != "odometry"
+
+
 def sideways_field(source: DriveSource, types: Mapping[str, str]) -> Signal | None:
     """Where a body command of a known type asks for sideways motion."""
     topic = source.signals[0].topic

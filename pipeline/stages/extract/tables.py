@@ -13,6 +13,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from pipeline.core.errors import SlipError
 from pipeline.logs import join_channels
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract import localization, reading
@@ -331,7 +332,9 @@ class _Extraction:
             stamp, log_time = clock.stamp[order], columns.log_time[order]
         else:
             stamp, log_time, (first, second) = self._read_pair(source, section, held=held)
-            drive = read_pair(source.form, first, second, section, self.vehicle, measured=not held)
+            topic = source.signals[0].topic
+            nominal = not held and reading.is_of_base(source, {topic: self.columns[topic].type_name})
+            drive = read_pair(source.form, first, second, section, self.vehicle, nominal=nominal)
             self.findings += self._check_sideways(source)
         self.findings += drive.findings
         times = self._seconds(stamp)
@@ -353,7 +356,7 @@ class _Extraction:
         section = self.configuration.wheels
         try:
             return self._drive_table(source, section, spans, held=False)
-        except StageError as error:
+        except SlipError as error:
             if source is None or section != DriveSection():
                 raise
             text = f"{source} was taken for measured wheels by its type, but {error.what}: left out"
