@@ -11,12 +11,12 @@ from msgspec import structs
 from stage_logs import FIELD, PLAIN, TakeThrough
 
 from pipeline.analysis.choice import Choice, choose
-from pipeline.logs import LogWriter, TopicColumns, open_log, read_topics
+from pipeline.logs import LogWriter, Ragged, RaggedStrings, TopicColumns, open_log, read_topics
 from pipeline.simulate import Clock, Encoders, PoseSensor, Recording, Scenario, simulate_run, write_log
 from pipeline.simulate.cases import make_scenario
 from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.extract.clocks import Recorded, align_clocks
-from pipeline.stages.extract.drive import read_pair, unwrap_counter
+from pipeline.stages.extract.drive import read_joints, read_pair, unwrap_counter
 from pipeline.stages.extract.reading import read_pose_topic
 from pipeline.vehicles import Configuration, DriveForm, DriveSection, find_preset, load_configuration
 
@@ -209,3 +209,29 @@ def test_an_odometry_of_a_controller_is_read_with_the_controllers_track() -> Non
         drive = read_pair(DriveForm.BODY, still, turning, DriveSection(), vehicle, nominal=nominal)
         assert drive.right == pytest.approx(half * factor)
         assert drive.left == pytest.approx(-half * factor)
+
+
+@pytest.mark.parametrize(
+    ("unit", "gain"), [("rpm", 60.0 / (2.0 * np.pi)), ("deg/s", 180.0 / np.pi), (None, 1.0)]
+)
+def test_velocities_in_another_unit_than_their_positions_are_converted(unit: str | None, gain: float) -> None:
+    husky = find_preset("husky_a200")
+    assert husky is not None
+    count = 400
+    times = np.arange(count) / 20.0
+    speed = 3.0 + np.sin(times)
+    angle = 3.0 * times - np.cos(times)
+    names = RaggedStrings(np.tile([0, 1], count), ("left_wheel", "right_wheel"), np.arange(count + 1) * 2)
+    fields = {
+        "name": names,
+        "velocity": Ragged(np.repeat(speed * gain, 2), names.offsets),
+        "position": Ragged(np.repeat(angle, 2), names.offsets),
+    }
+    stamps = (times * SECOND).astype(np.int64)
+    columns = TopicColumns(
+        "/joint_states", 0, "sensor_msgs/msg/JointState", stamps, stamps, stamps, fields, ()
+    )
+    drive = read_joints(columns, times, DriveSection(), husky)
+    assert drive.left == pytest.approx(speed)
+    assert [finding.id for finding in drive.findings] == (["unit_wrong"] if unit else [])
+    assert all(str(unit) in finding.text for finding in drive.findings)

@@ -20,6 +20,8 @@ from pipeline.vehicles.presets import OwnUnit
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.vehicles.configuration import Unit
+
 Floats = NDArray[np.float64]
 
 _LEFT = re.compile(r"left|(^|[_/])(l|lf|fl|rl|bl|ml|lb)([_/\d]|$)")
@@ -30,6 +32,11 @@ _USUAL_UNITS = {
     DriveForm.BODY: ("m/s", "rad/s"),
     DriveForm.STEERING: ("m/s", "rad"),
 }
+_UNIT_GAINS: dict[Unit, float] = {"rpm": 60.0 / (2.0 * np.pi), "deg/s": 180.0 / np.pi}
+_UNIT_NEAR = 0.1
+_LIVE = 0.2
+_STILL_RADPS = 0.05
+_FEWEST_LIVE = 50
 _COUNTERS = (2.0**16, 2.0**32)
 """After so many ticks counters of encoders begin again."""
 
@@ -94,6 +101,16 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
         if not _is_known(position, joint):
             raise _no_wheels(columns.topic, joints)
         velocity[joint] = differentiate_angle(times, position[joint])
+    if section.unit is None:
+        both = [joint for joint in (*left, *right) if joint not in missing and _is_known(position, joint)]
+        unit = _recognize_unit(times, [(velocity[joint], position[joint]) for joint in both])
+        if unit:
+            section = structs.replace(section, unit=unit)
+            text = (
+                f"the velocities of {columns.topic} are what its positions turn, in {unit}: they were "
+                'converted ([wheels] unit = "rad/s" in run.toml where the positions are wrong)'
+            )
+            found.append(Finding("unit_wrong", "warning", text, where=columns.topic))
     if vehicle.kinematics.has_inputs("steering"):
         steering = _mean_steering(position, section.steering_joint, columns.topic)
         wheels = [velocity[joint] for joint in (*left, *right)]
@@ -108,6 +125,29 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
         for side in (left, right)
     ]
     return Drive(left=sides[0], right=sides[1], findings=tuple(found))
+
+
+def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> Unit | None:
+    """Unit of velocities that are not what the positions beside them turn in rad/s; None where they are.
+
+    Only a gain that is a unit's, and the same throughout, tells one.
+    """
+    gains = []
+    for velocity, position in joints:
+        turned = differentiate_angle(times, position)
+        live = np.isfinite(turned) & np.isfinite(velocity)
+        live &= np.abs(turned) > _LIVE * float(np.max(np.abs(turned[live]), initial=_STILL_RADPS / _LIVE))
+        if live.sum() < _FEWEST_LIVE:
+            return None
+        ratio = velocity[live] / turned[live]
+        gain = float(np.median(ratio))
+        if float(np.median(np.abs(ratio - gain))) > _UNIT_NEAR * abs(gain):
+            return None
+        gains.append(gain)
+    for unit, gain in _UNIT_GAINS.items():
+        if gains and all(abs(one / gain - 1.0) < _UNIT_NEAR for one in gains):
+            return unit
+    return None
 
 
 def _mean_steering(position: Mapping[str, Floats], configured: str | None, topic: str) -> Floats:
