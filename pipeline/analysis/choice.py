@@ -249,11 +249,14 @@ def _fit_vehicle(
 ) -> Choice:
     """The vehicle that nothing tells, as wheels and pose show it."""
     sources, vehicle, data = chosen.sources, chosen.vehicle, chosen.data
-    drive = sources.wheels or sources.command
-    if drive is None or data is None:
+    drives = [drive for drive in (sources.wheels, sources.command) if drive is not None]
+    # Body motion is the same whatever the wheels are.
+    drive = next((one for one in drives if one.form is not DriveForm.BODY), None)
+    if not drives or data is None:
         raise problem
-    if drive.form is DriveForm.BODY:
+    if drive is None:
         values: dict[str, float] = {"wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": _STAND_IN_TRACK_M}
+        name = "fitted_body"
         text = (
             "no vehicle is named and none is needed: the drive is told and measured as body motion, whose "
             "slip does not depend on wheel radius and track width"
@@ -264,18 +267,21 @@ def _fit_vehicle(
         fitted = fit_geometry(made.tables["wheels"], made.tables["poses"], vehicle.kind)
         if fitted is None:
             raise problem
-        values, text = fitted, _describe_fit(fitted)
-    known = {"name": "fitted vehicle", "id": "fitted", "track_width_m": None, "wheelbase_m": None, **values}
+        values, (name, text) = fitted, _describe_fit(fitted)
+    section = msgspec.structs.asdict(configuration.vehicle)
+    given = {key: value for key, value in section.items() if value is not None and key != "preset"}
+    known = {"name": "fitted vehicle", "id": name, "track_width_m": None, "wheelbase_m": None, **values}
     if vehicle.kind == "ackermann":
         known = {**known, "wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": None}
-    vehicle = msgspec.structs.replace(vehicle, **known)
+    vehicle = msgspec.structs.replace(vehicle, **{**known, **given})
     findings = (*chosen.findings, Finding("vehicle_fitted", "warning", text, where="vehicle"))
     return replace(chosen, vehicle=vehicle, vehicle_source="fitted", findings=findings)
 
 
-def _describe_fit(fitted: Mapping[str, float]) -> str:
+def _describe_fit(fitted: Mapping[str, float]) -> tuple[str, str]:
+    """A name, the same for the same geometry, and what is said of it."""
     if "wheelbase_m" in fitted:
-        return (
+        return f"fitted_{1e3 * fitted['wheelbase_m']:.0f}", (
             "the log does not say which vehicle it is of: a wheelbase of "
             f"{fitted['wheelbase_m']:.3g} m was fitted; vehicle.wheelbase_m in run.toml gives the true one"
         )
@@ -286,7 +292,8 @@ def _describe_fit(fitted: Mapping[str, float]) -> str:
         if alike
         else "--wheel-radius and --track-width give others"
     )
-    return (
+    name = alike.id if alike else f"{1e3 * radius:.0f}_{1e3 * track:.0f}"
+    return f"fitted_{name}", (
         f"the log does not say which vehicle it is of: a wheel radius of {radius:.3g} m and an effective "
         f"track of {track:.3g} m were fitted, so that neither can be missing from the model ({guess})"
     )
