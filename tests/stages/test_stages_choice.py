@@ -235,3 +235,21 @@ def test_velocities_in_another_unit_than_their_positions_are_converted(unit: str
     assert drive.left == pytest.approx(speed)
     assert [finding.id for finding in drive.findings] == (["unit_wrong"] if unit else [])
     assert all(str(unit) in finding.text for finding in drive.findings)
+
+
+def test_a_pose_whose_heading_does_not_follow_the_gyro_loses(tmp_path: Path, stamps: np.ndarray) -> None:
+    turn = np.sin(np.arange(COUNT) / 40.0)
+    with LogWriter(tmp_path / "run.mcap") as log:
+        write_wheels_and(log, np.arange(COUNT) * 0.02, np.cos(np.arange(COUNT) / 25.0), stamps)
+        good = {
+            "pose.position.x": np.arange(COUNT) * 0.02,
+            "pose.orientation.z": np.sin(turn / 2),
+            "pose.orientation.w": np.cos(turn / 2),
+            "header.frame_id": "map",
+        }
+        log.write_columns("/other", "geometry_msgs/msg/PoseStamped", stamps, good, header_time=stamps)
+        rate = {"angular_velocity.z": np.gradient(turn, 0.05)}
+        log.write_columns("/imu", "sensor_msgs/msg/Imu", stamps, rate, header_time=stamps)
+    chosen = look(tmp_path / "run.mcap")
+    assert str(chosen.sources.pose) == "/other"
+    assert "not the gyro's" in chosen.ratings[1].reason

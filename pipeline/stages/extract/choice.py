@@ -41,6 +41,8 @@ _FROM_WHEELS: Final = 0.02
 4 mm is as much of half a metre."""
 _SIDEWAYS_MPS: Final = 2e-3
 """Sideways speed below which a pose may be the wheels': a localization has more noise."""
+_ASTRAY: Final = 0.3
+"""Share of its turning that a pose may have beside the gyro: its noise, and a tilted gyro's loss."""
 _SLOW_HZ: Final = 4.0
 """Fewer new poses a second leave too few for a velocity over 0.75 s."""
 _SPARSE: Final = 0.5
@@ -116,7 +118,7 @@ def _rate(
     vehicle: Vehicle,
     where: str,
 ) -> PoseRating:
-    alone = replace(sources, pose=pose, imu=None, interval=None)
+    alone = replace(sources, pose=pose, interval=None)
     try:
         made = extract_tables(data, alone, configuration, vehicle, where=where)
     except SlipError as error:
@@ -148,6 +150,10 @@ def _rate(
         reasons = ["it is computed from the wheels"]
     elif share is not None:
         reasons.append(f"{share:.1%} of its way is not the wheels'")
+    astray = _compare_with_gyro(time, yaw, made.tables["imu"])
+    if astray is not None and astray > _ASTRAY:
+        score -= 1.5
+        reasons.append(f"{astray:.0%} of its turning is not the gyro's")
     if rate < _SLOW_HZ:
         score -= 5.0
         reasons.append("too slow for velocities")
@@ -236,6 +242,22 @@ def _compare_with_wheels(
 
 def _yaw_of(quaternion: Floats) -> Floats:
     return rigid.euler_from_quaternions(quaternion)[2]
+
+
+def _compare_with_gyro(time: Floats, yaw: Floats, imu: pl.DataFrame) -> float | None:
+    """Share of a pose's turning that the gyro does not account for, whatever its sign, scale and mounting."""
+    if imu.height < _FEWEST:
+        return None
+    clock = imu["t"].to_numpy()
+    inside = (time >= clock[0]) & (time <= clock[-1])
+    time, yaw = time[inside], yaw[inside]
+    if time.size < _FEWEST:
+        return None
+    span = max(round(_SPAN_S / max(float(np.median(np.diff(time))), 1e-3)), 1)
+    ends = np.arange(0, time.size, span)
+    rate = np.nan_to_num(imu["rate_z"].to_numpy())
+    turned = np.diff(np.interp(time[ends], clock, timegrid.integrate_rate(clock, rate)))
+    return measure_rest(np.diff(yaw[ends]), turned, np.diff(time[ends]))
 
 
 def _split_chords(position: Floats, yaw: Floats) -> tuple[Floats, Floats]:
