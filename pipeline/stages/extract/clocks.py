@@ -34,6 +34,7 @@ _FREQUENT = 4
 _DENSE = 1.6
 _KNOT_NS = 2_000_000_000
 _FEWEST_KNOTS = 5
+_ROUGH_KNOTS = 200
 _OTHER_RATE = 5e-3
 """No two real clocks differ by so much; simulated time does."""
 
@@ -114,13 +115,14 @@ def _follow_simulated_time(
     if not stamped:
         return recorded, []
     leading = max(stamped, key=lambda times: times.log_time.size)
-    knots = _find_knots(leading)
-    if knots is None:
+    rough = _find_knots(leading, most=_ROUGH_KNOTS)
+    if rough is None:
         return recorded, []
-    log, stamp = knots
+    log, stamp = rough
     rate = float(np.median(np.diff(stamp) / np.diff(log)))
     if abs(rate - 1.0) < _OTHER_RATE or abs(rate - 1.0) * (log[-1] - log[0]) < _JUMP_NS:
         return recorded, []
+    log, stamp = _find_knots(leading) or rough
 
     def follow(times: Stamps) -> Stamps:
         # Beyond the first and the last knot the clock runs on as it did there.
@@ -142,18 +144,26 @@ def _follow_simulated_time(
     return mapped, [Finding("simulated_time", "info", text, where=leading.topic, value=rate)]
 
 
-def _find_knots(times: Recorded) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Medians of log time and stamp [ns] in bins of log time; None where there are too few to tell a rate."""
-    header = times.header_time
-    if header is None or times.log_time.size < _FEWEST_KNOTS:
+def _find_knots(
+    times: Recorded, *, most: int | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Medians of log time and stamp [ns] in bins of log time; None where there are too few to tell a rate.
+
+    Args:
+        times: of a topic with stamps.
+        most: how many bins there may be.
+    """
+    header, log = times.header_time, times.log_time
+    if header is None or log.size < _FEWEST_KNOTS:
         return None
-    bins = (times.log_time - times.log_time[0]) // _KNOT_NS
-    places = np.unique(bins)
-    if places.size < _FEWEST_KNOTS:
+    width = max(_KNOT_NS, int(log[-1] - log[0]) // most if most else 0)
+    edges = np.searchsorted(log, np.arange(int(log[0]), int(log[-1]) + width, width))
+    spans = [slice(a, b) for a, b in itertools.pairwise(np.unique(np.append(edges, log.size)).tolist())]
+    if len(spans) < _FEWEST_KNOTS:
         return None
-    log = np.array([np.median(times.log_time[bins == place]) for place in places])
-    stamp = np.array([np.median(header[bins == place]) for place in places])
-    return (log, stamp) if (np.diff(stamp) >= 0.0).all() else None
+    middle = np.array([[np.median(log[span]), np.median(header[span])] for span in spans])
+    rises = (np.diff(middle, axis=0) >= [1.0, 0.0]).all()
+    return (middle[:, 0], middle[:, 1]) if rises else None
 
 
 def _read_clock(times: Recorded) -> TopicClock:
