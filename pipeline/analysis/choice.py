@@ -34,6 +34,7 @@ from pipeline.vehicles import (
     resolve_vehicle,
 )
 from pipeline.vehicles.candidates import LOCALIZED
+from pipeline.vehicles.topics import list_topics
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -116,7 +117,14 @@ def choose(
         LogError: the log cannot be read.
     """
     where = str(index.path)
-    told = recognize_vehicle(index.channels, index.metadata, _find_description(index))
+    named = [
+        configuration.pose.topic,
+        *list_topics(configuration.command),
+        *list_topics(configuration.wheels),
+    ]
+    told = recognize_vehicle(
+        index.channels, index.metadata, _find_description(index), [topic for topic in named if topic]
+    )
     problem: ConfigurationError | None = None
     try:
         vehicle, source = _name_vehicle(index, configuration, overrides, told)

@@ -47,6 +47,7 @@ def recognize_vehicle(
     channels: Iterable[ChannelInfo],
     metadata: Mapping[str, Mapping[str, str]],
     description: Description | None,
+    configured: Iterable[str] = (),
 ) -> Recognized | None:
     """The vehicle that a log tells; None where it tells none.
 
@@ -54,13 +55,16 @@ def recognize_vehicle(
         channels: what the log holds.
         metadata: its records.
         description: its robot description.
+        configured: topics that the configuration names; of several robots theirs is meant.
     """
     held = [channel for channel in channels if channel.message_count != 0]
+    named = {part for topic in configured for part in topic.split("/")[1:-1]}
     spaces = {part for channel in held for part in channel.topic.split("/")[1:-1]}
     hosts = {text for record in metadata.values() for key, text in record.items() if "host" in key.lower()}
     packages = {channel.type_name.split("/")[0] for channel in held}
     told: tuple[tuple[VehicleSource, set[str]], ...] = (
         ("robot_description", {description.name} if description is not None else set()),
+        ("namespace", named),
         ("namespace", spaces | hosts),
         ("message_types", packages),
     )
@@ -72,14 +76,14 @@ def recognize_vehicle(
 
 
 def _find_platform(words: Iterable[str]) -> Vehicle | None:
-    """The platform that words name; the longest word wins."""
-    found: list[tuple[int, Vehicle]] = []
+    """The platform that words name; None where they name several."""
+    found: dict[str, Vehicle] = {}
     for preset in list_presets():
         for word in preset.recognized_by:
             pattern = re.compile(rf"(^|[^a-z0-9]){re.escape(word)}([^a-z]|$)")
             if any(pattern.search(text.lower()) for text in words):
-                found.append((len(word), preset))
-    return max(found, key=lambda one: one[0])[1] if found else None
+                found[preset.id] = preset
+    return next(iter(found.values())) if len(found) == 1 else None
 
 
 def _compare(preset: Vehicle, source: VehicleSource, description: Description | None) -> Recognized:

@@ -94,7 +94,7 @@ class _Chooser:
         poses = {topic for topic in self.with_part("pose") if self._rank_pose(topic) is not None}
         poses |= {topic for topic in self.of_type(*TRANSFORM_TYPES) if "static" not in topic}
         robots = find_robots(drives, poses)
-        named = (*_list_topics(configuration.command), *_list_topics(configuration.wheels))
+        named = (*list_topics(configuration.command), *list_topics(configuration.wheels))
         named = tuple(filter(None, (*named, configuration.pose.topic, configuration.imu.topic)))
         self._robot = choose_robot(robots, configured=named, drives=drives, poses=poses, where=self.where)
         if self._robot is not None:
@@ -292,7 +292,7 @@ class _Chooser:
         return ranked[0][1]
 
 
-def _list_topics(section: DriveSection) -> Iterable[str]:
+def list_topics(section: DriveSection) -> Iterable[str]:
     """Topics that the configuration of a drive names."""
     pairs = (section.left_topic, section.right_topic, section.speed_topic, section.steering_topic)
     return filter(None, (section.topic, *pairs, section.yaw_rate_topic))

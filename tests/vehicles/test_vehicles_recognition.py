@@ -138,3 +138,15 @@ def test_another_vehicle_than_the_logs_is_contradicted() -> None:
     assert jackal is not None
     assert [text for text in list_contradictions(husky, jackal) if "wheel_radius_m" in text]
     assert list_contradictions(husky, husky) == []
+
+
+def test_of_several_platforms_in_a_log_the_configured_topic_tells_which_is_meant() -> None:
+    topics = ("/husky/odom", "/husky/cmd_vel", "/warthog/odom", "/warthog/cmd_vel")
+    channels = [
+        ChannelInfo(i, topic, "nav_msgs/msg/Odometry", "ros2msg", "cdr", 5, {})
+        for i, topic in enumerate(topics)
+    ]
+    assert recognize_vehicle(channels, {}, None) is None
+    meant = recognize_vehicle(channels, {}, None, ["/warthog/odom"])
+    assert meant is not None
+    assert meant.vehicle.id == "warthog"
