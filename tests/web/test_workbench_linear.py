@@ -12,8 +12,8 @@ import pytest
 from pipeline.core.errors import SlipError
 from pipeline.logs import fields, idl, index, schema
 from pipeline.models.formula.units import parse_unit
-from pipeline.stages.extract import drive
-from pipeline.vehicles import complaints, topics
+from pipeline.stages.extract import choice, drive
+from pipeline.vehicles import Signal, candidates, complaints, read_description
 from pipeline.web.formulas import make_formula
 from pipeline.web.uploads import clean_name
 
@@ -35,7 +35,10 @@ READERS: dict[str, tuple[str, Callable[[str], object]]] = {
     "unit": ("m", lambda text: parse_unit(text, "")),
     "configuration": ("[", complaints._read_header),
     "complaint": ("at `$", lambda text: complaints._find(complaints._PLACE, text)),
-    "topic": ("/", topics._LOCALIZED.search),
+    "topic": ("/", candidates.LOCALIZED.search),
+    "pose frame": ("/", choice._FIXED_FRAME.search),
+    "field path": ("[1].", lambda text: Signal.parse(f"/topic.{text}").fields()),
+    "robot description": ("<robot>", read_description),
     "joint": ("_", drive._LEFT.search),
     "parameters": ("c [1] ", lambda text: make_formula("own", "v_w", "c * w0", text)),
     "formula": ("c * ", lambda text: make_formula("own", "v_w", text, "c [1] 0 .. 1")),

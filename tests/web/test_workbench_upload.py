@@ -32,12 +32,13 @@ def empty(tmp_path: Path) -> Iterator[Workbench]:
 
 
 def write_plain(path: Path) -> None:
-    """A log that does not say its vehicle."""
+    """A log that does not say its vehicle, and on its straight way does not show a track width."""
     stamps = START + np.arange(600, dtype=np.int64) * 50_000_000
     along = 0.02 * np.arange(600)
     pose = {"pose.pose.position.x": along, "pose.pose.orientation.w": np.ones(600)}
     with LogWriter(path) as log:
-        log.write_columns("/cmd_vel", "geometry_msgs/msg/Twist", stamps, {"linear.x": np.full(600, 0.4)})
+        for side in ("left", "right"):
+            log.write_columns(f"/{side}_drive/velocity", "std_msgs/msg/Float64", stamps, {"data": 4.0})
         log.write_columns("/odom", "nav_msgs/msg/Odometry", stamps, pose, header_time=stamps)
 
 
