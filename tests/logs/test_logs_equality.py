@@ -99,7 +99,9 @@ def values_of(
             if member.count is not None:
                 if counts is not None:
                     continue
-                inner = np.array(draw(st.lists(st.integers(0, 3), min_size=rows, max_size=rows)))
+                several = member.count == SEQUENCE
+                drawn = draw(st.lists(st.integers(0, 3), min_size=rows, max_size=rows)) if several else None
+                inner = np.full(rows, member.count) if drawn is None else np.array(drawn)
             below = f"{path}{'[]' if member.count is not None else ''}."
             found |= values_of(member.element, rows, draw, below, inner)
             continue
