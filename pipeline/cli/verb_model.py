@@ -342,7 +342,7 @@ def _as_json(
         "timing": [
             {
                 "run": comparison.run.name,
-                "pose_delay_s": timing.pose_delay_s,
+                "pose_delay_s": comparison.run.alignment.heading_delay_s,
                 "wheel_delay_s": timing.wheel_delay_s,
                 "latency_spread_s": comparison.run.alignment.latency_spread_s,
                 "outlier_s": comparison.run.alignment.outlier_s,

@@ -1,4 +1,4 @@
-"""Where models compete: a problem, its metric and folds, and the effects that may be named."""
+"""Where models compete: a part of the way, its weights and folds, and the effects that may be named."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.diagnosis.judge import LEAST_GAIN, Verdict, compare, hold_out, make_folds
-from pipeline.diagnosis.metric import Metric, make_metric, measure_spread, saturate
+from pipeline.diagnosis.judge import LEAST_GAIN, Verdict, compare
 from pipeline.diagnosis.plausibility import is_nameable
-from pipeline.diagnosis.polish import Fitted, polish
-from pipeline.diagnosis.screen import propose
+from pipeline.identification.fit import PartFit, fit_part
+from pipeline.identification.folds import hold_out_part, make_folds
+from pipeline.identification.proposals import propose
+from pipeline.identification.weights import Weights, make_weights, measure_spread
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from pipeline.diagnosis.judge import Fold
-    from pipeline.diagnosis.problem import Problem
-    from pipeline.diagnosis.screen import Candidate, Proposal, Trial
-    from pipeline.diagnosis.state import State
+    from pipeline.identification.folds import Fold
+    from pipeline.identification.parts import Part
+    from pipeline.identification.proposals import Candidate, Proposal, Trial
+    from pipeline.identification.state import State
     from pipeline.models.evidence import Evidence, Largest
 
 Floats = NDArray[np.float64]
@@ -37,53 +38,51 @@ class Contender:
     """A fitted model with its held-out residuals.
 
     Attributes:
-        fitted: the model.
+        fit: the model.
         held: residuals under parameters fitted elsewhere, shape (n, 3).
         score: held-out loss, a little more for every number.
     """
 
-    fitted: Fitted
+    fit: PartFit
     held: Floats
     score: float
 
     @property
     def state(self) -> State:
         """The model's state."""
-        return self.fitted.state
+        return self.fit.state
 
     @property
     def ids(self) -> tuple[str, ...]:
         """Ids of its effects."""
-        return self.fitted.state.ids
+        return self.fit.state.ids
 
 
 @dataclass
 class Arena:
-    """A problem with what is needed to judge models of it.
+    """A part of the way with what is needed to judge models of it.
 
     Attributes:
-        problem: what is explained.
+        part: of the way that is explained.
         candidates: effects that may be named.
         evidence: what the runs can show.
-        noise: spread that a saturated fit leaves, shape (n, 3).
         kept: effects that are never dropped: those of the model to start from.
-        metric: cost of residuals at the current model.
+        weights: cost of residuals at the current model.
         work: how many times candidates were looked through.
         least_share: share of the asked motion (rms) that an effect must account for.
     """
 
-    problem: Problem
+    part: Part
     candidates: tuple[Candidate, ...]
     evidence: Evidence
-    noise: Floats
     folds: tuple[Fold, ...]
-    metric: Metric
+    weights: Weights
     kept: frozenset[str] = frozenset()
     least_share: float = 0.0
     _dropped: dict[tuple[str, ...], Contender] = field(default_factory=dict)
     _suggested: dict[tuple[object, ...], list[Contender]] = field(default_factory=dict)
     _proposed: dict[tuple[object, ...], list[Proposal]] = field(default_factory=dict)
-    _tried: dict[tuple[object, ...], Fitted] = field(default_factory=dict)
+    _tried: dict[tuple[object, ...], PartFit] = field(default_factory=dict)
     _finished: dict[tuple[object, ...], Contender] = field(default_factory=dict)
     work: int = 0
     _columns: dict[str, list[Trial]] = field(default_factory=dict)
@@ -91,7 +90,7 @@ class Arena:
     def widen(self, candidates: tuple[Candidate, ...]) -> Arena:
         """The same arena with other candidates; nothing that was tried here counts there."""
         return Arena(
-            self.problem, candidates, self.evidence, self.noise, self.folds, self.metric,
+            self.part, candidates, self.evidence, self.folds, self.weights,
             kept=self.kept, least_share=self.least_share,
         )  # fmt: skip
 
@@ -102,7 +101,7 @@ class Arena:
 
     def enter(self, state: State) -> Contender:
         """Fit a state and hold it out."""
-        return self._present(polish(self.problem, self.metric, state))
+        return self._present(fit_part(self.part, self.weights, state))
 
     def drop(self, current: Contender, names: Iterable[str]) -> Contender:
         """A model without some of its effects, fitted anew."""
@@ -111,17 +110,17 @@ class Arena:
             self._dropped[state.ids] = self.enter(state)
         return self._dropped[state.ids]
 
-    def _present(self, fitted: Fitted) -> Contender:
-        held = hold_out(fitted, self.metric, self.folds)
+    def _present(self, fit: PartFit) -> Contender:
+        held = hold_out_part(fit, self.folds)
         price = 1.0 + sum(
             effect.price + _PRICE_OF_A_NUMBER * sum(np.isfinite(value) for value in effect.values.values())
-            for effect in fitted.state.effects
+            for effect in fit.state.effects
         )
-        return Contender(fitted, held, self.metric.loss(held) * price)
+        return Contender(fit, held, self.weights.loss(held) * price)
 
     def judge(self, before: Contender, after: Contender) -> Verdict:
         """How much better ``after`` is."""
-        return compare(self.problem, self.metric, before.held, after.held)
+        return compare(self.part, self.weights, before.held, after.held)
 
     def prefers(self, before: Contender, after: Contender, least_gain: float = LEAST_GAIN) -> bool:
         """Whether ``after`` is better beyond doubt, and by enough to matter."""
@@ -131,13 +130,13 @@ class Arena:
         """Whether enough of the motion is explained: encoders are so exact that all else is certain."""
         if self.least_share == 0.0:
             return True
-        asked = (self.problem.find_ideal()[:, 0, :] ** 2).mean(axis=0)
+        asked = (self.part.find_ideal()[:, 0, :] ** 2).mean(axis=0)
         fall = (before.held**2 - after.held**2).mean(axis=0)[[0, 2]]
         return bool((fall > self.least_share**2 * asked).any())
 
     def adapt(self, contender: Contender) -> Contender:
-        """Take the metric from a model's own residuals, and fit it anew."""
-        self.metric = make_metric(contender.fitted.residual, self.noise, self.problem)
+        """Take the weights from a model's own residuals, and fit it anew."""
+        self.weights = make_weights(contender.fit.residual, self.part)
         self._dropped.clear()
         self._suggested.clear()
         self._proposed.clear()
@@ -155,10 +154,9 @@ class Arena:
         proposals = self._propose(base, barred)[:count]
         # A few steps tell which of them are worth fitting to the end.
         tried = [self._try(base.ids, proposal.state) for proposal in proposals]
-        best = min((fitted.loss for fitted in tried), default=0.0)
+        best = min((fit.loss for fit in tried), default=0.0)
         entered = [
-            self._finish(base.ids, fitted) if fitted.loss < _WORTH * best else self._present(fitted)
-            for fitted in tried
+            self._finish(base.ids, fit) if fit.loss < _WORTH * best else self._present(fit) for fit in tried
         ]
         entered = [self._simplify(contender) for contender in entered]
         ranked = sorted((c for c in entered if self.is_sound(c)), key=lambda c: c.score)
@@ -170,21 +168,19 @@ class Arena:
         key = (base.ids, barred)
         if key not in self._proposed:
             candidates = [c for c in self.candidates if c.id not in barred]
-            self._proposed[key] = propose(
-                self.problem, self.metric, base.fitted, candidates, self.largest, self._columns
-            )
+            self._proposed[key] = propose(self.part, base.fit, candidates, self.largest, self._columns)
         return self._proposed[key]
 
-    def _try(self, base: tuple[str, ...], state: State) -> Fitted:
+    def _try(self, base: tuple[str, ...], state: State) -> PartFit:
         key = (base, state.ids)
         if key not in self._tried:
-            self._tried[key] = polish(self.problem, self.metric, state, _FIRST_STEPS)
+            self._tried[key] = fit_part(self.part, self.weights, state, _FIRST_STEPS)
         return self._tried[key]
 
-    def _finish(self, base: tuple[str, ...], fitted: Fitted) -> Contender:
-        key = (base, fitted.state.ids)
+    def _finish(self, base: tuple[str, ...], fit: PartFit) -> Contender:
+        key = (base, fit.state.ids)
         if key not in self._finished:
-            self._finished[key] = self.enter(fitted.state)
+            self._finished[key] = self.enter(fit.state)
         return self._finished[key]
 
     def _simplify(self, contender: Contender) -> Contender:
@@ -199,8 +195,8 @@ class Arena:
 
     def has_room(self, contender: Contender) -> bool:
         """Whether a model leaves more than a saturated fit does in any channel."""
-        own = measure_spread(contender.fitted.residual, self.problem)[:, self.problem.channels]
-        return bool((own > _FLOOR * self.noise[:, self.problem.channels]).any())
+        own = measure_spread(contender.fit.residual, self.part)[:, self.part.channels]
+        return bool((own > _FLOOR * self.part.noise[:, self.part.channels]).any())
 
     def is_sound(self, contender: Contender) -> bool:
         """Whether every effect is large enough to be named, and no degenerate form of another."""
@@ -210,13 +206,9 @@ class Arena:
 
 
 def open_arena(
-    problem: Problem, start: State, candidates: tuple[Candidate, ...], evidence: Evidence
+    part: Part, start: State, candidates: tuple[Candidate, ...], evidence: Evidence
 ) -> tuple[Arena, Contender]:
-    """The arena of a problem, and the model to start from, fitted."""
-    residual = problem.find_residuals(start)
-    noise = saturate(problem, residual)
-    metric = make_metric(residual, noise, problem)
-    arena = Arena(
-        problem, candidates, evidence, noise, make_folds(problem), metric, kept=frozenset(start.ids)
-    )
+    """The arena of a part of the way, and the model to start from, fitted."""
+    weights = make_weights(part.find_residuals(start), part)
+    arena = Arena(part, candidates, evidence, make_folds(part), weights, kept=frozenset(start.ids))
     return arena, arena.adapt(arena.enter(start))

@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.diagnosis import leftover
 from pipeline.diagnosis.diagnosis import Named, RunDiagnosis
 from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.naming_rules import join_classes, list_equivalents
-from pipeline.diagnosis.own_way import list_values, measure_values, read_gyro_clock, rescale_values
 from pipeline.diagnosis.plausibility import find_implausible
-from pipeline.diagnosis.rating import rate_effects
 from pipeline.diagnosis.unexplained import find_places
+from pipeline.diagnosis.values import list_values, read_clock
 from pipeline.diagnosis.where import map_errors, pick_regions
 from pipeline.identification import Input
 from pipeline.identification.describe import errors_as_json, ladder_as_json
-from pipeline.identification.judgement import note_fit
+from pipeline.identification.judgement import judge_model, note_fit
 from pipeline.identification.ladder import compare_losses
-from pipeline.models import ModelFile, find_effect
+from pipeline.identification.parts import BodyPart
+from pipeline.models import Model, ModelFile, find_effect
 from pipeline.models.effect import Late, find_late
 from pipeline.runs import MotionError
 from pipeline.runs.windows import WINDOW_S
@@ -34,10 +36,13 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.diagnosis import Json
     from pipeline.diagnosis.ground import Ground
     from pipeline.diagnosis.naming_rules import Clocks
-    from pipeline.diagnosis.problem import Problem
     from pipeline.diagnosis.subject import Recording
     from pipeline.identification.judgement import Judgement
-    from pipeline.models import Effect, Timing
+    from pipeline.identification.parts import Part
+    from pipeline.identification.state import State
+    from pipeline.models import Effect
+
+Floats = NDArray[np.float64]
 
 _DRAWS = 400
 _WORTH = 0.01
@@ -65,33 +70,27 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
     open_ids = {item.candidates[0] for item in undecided}
     found = _gather(ways, clocks)
     known = frozenset().union(*(way.search.arena.kept for way in ways))
-    timing = body.search.final.state.timing
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
     inputs = tuple(dict.fromkeys((source, Input(body.search.way))))
-    judgements = _rate_ways(ground, inputs, [*found, *terms], timing)
+    judgements = _judge_ways(ground, inputs, [*found, *terms], open_ids)
     idle = [e for e in _find_idle(found, ways, judgements.get(source.value)) if e.id not in known]
     if idle:
         found = [effect for effect in found if effect not in idle]
         # From measured wheels the drivetrain's effects were not in it.
-        judgements |= _rate_ways(ground, [source], [*found, *terms], timing)
+        judgements |= _judge_ways(ground, [source], [*found, *terms], open_ids)
     judgement = judgements.get(source.value)
     unexplained = leftover.describe(ways)
     described = tuple(
-        _describe(effect, ground, ways, judgements, open_ids)
+        _describe(effect, ground, ways, judgement)
         for effect in _order(found, judgement)
         if not effect.searched_as & open_ids and effect.id not in known
     )
     named = tuple(effect for effect in described if _doubt(effect) is None)
     named = leftover.mark_tentative(_mark_idle(named, judgements), ways, unexplained)
-    problem: Problem = body.search.arena.problem
-    start = body.search.start
-    comparisons = ground.compare(source)
-    residual = start.fitted.residual
-    if source.value != body.search.way:
-        problem = ground.pose_body(source)
-        residual = problem.find_residuals(start.state)
-    places = np.concatenate([find_places(comparison) for comparison in comparisons])
-    regions = map_errors(problem, residual, places)
+    part, start = ground.problem.whole, body.search.start
+    residual = part.find_residuals(start.state)
+    places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
+    regions = map_errors(part, residual, places)
     hidden = {name for item in undecided for name in item.candidates} | {effect.id for effect in found}
     hidden |= set().union(*(effect.searched_as for effect in found))
     unobservable = {u.id: u for way in ways for u in way.unobservable if u.id not in hidden}
@@ -110,10 +109,9 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
         noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
         explained_share=math.nan if last is None else last,
         regions=tuple(regions),
-        where=tuple(pick_regions(regions, residual, body.search.arena.noise[: residual.shape[0]])),
+        where=tuple(pick_regions(regions, residual, part.noise)),
         timing={"runs": cast("Json", list(clocks.timing))},
         by_way=_describe_ways(ways, source, judgements.get("measured")),
-        consistency=_compare_ways(named, judgement) if len(ways) > 1 else {},
         disturbance=leftover.describe_disturbance(body, unexplained),
         proposal=None if judgement is None else note_fit(ModelFile(judgement.fitted.model), judgement),
     )
@@ -148,7 +146,7 @@ def _note_brevity(ground: Ground, common: RunDiagnosis) -> list[Mapping[str, Jso
     least, words = _LEAST_DRIVING_S[common.input]
     driven = sum(
         float(np.minimum(np.diff(comparison.windows.times[:, 0], append=np.inf), WINDOW_S).sum())
-        for comparison in ground.compare(Input(common.input))
+        for comparison in ground.problem.comparisons
     )
     if driven >= least:
         return []
@@ -177,38 +175,47 @@ def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
     return sorted(joined, key=lambda effect: (effect.place, effect.rank, effect.id))
 
 
-def _rate_ways(
-    ground: Ground, inputs: Sequence[Input], effects: Sequence[Effect], timing: Sequence[Timing]
+def _judge_ways(
+    ground: Ground, inputs: Sequence[Input], effects: Sequence[Effect], open_ids: set[str]
 ) -> dict[str, Judgement]:
-    """The model judged from each input to the body."""
+    """The model of these effects judged from each input to the body.
+
+    What was put right when the recordings were aligned is no part of it, nor is what is one explanation of
+    several for the numbers of others: they are told as if it were not there.
+    """
+    kept = [
+        effect
+        for effect in effects
+        if not _was_aligned(effect, ground)
+        and not (effect.id in open_ids and any(other.scale_without(effect) != 1.0 for other in effects))
+    ]
     found = {}
     for source in inputs:
-        try:
-            found[source.value] = rate_effects(ground, source, effects, timing)
-        except MotionError:
-            continue
+        problem = ground.problem if source is ground.problem.source else ground.problem.behind_wheels
+        with contextlib.suppress(MotionError):
+            found[source.value] = judge_model(problem, Model(ground.vehicle, tuple(kept)))
     return found
+
+
+def _was_aligned(effect: Effect, ground: Ground) -> bool:
+    """Whether an effect says what the gyro had put right before any model was fitted."""
+    return effect.late is Late.POSES and ground.has_gyro
 
 
 def _describe(
     effect: Effect,
     ground: Ground,
     ways: Sequence[Explored],
-    judgements: Mapping[str, Judgement],
-    open_ids: set[str],
+    judgement: Judgement | None,
 ) -> Named:
     way = _way_of(effect, ways)
     gain, selected = _measure_gain(effect, way)
-    judgement = judgements.get(way.search.way)
-    if effect.late is Late.POSES and ground.has_gyro:
-        values = read_gyro_clock(effect, [delay for delay in ground.yaw_delays if delay is not None])
+    if _was_aligned(effect, ground):
+        values = read_clock(effect, ground.runs)
     elif judgement is not None and effect.id in judgement.fitted.model:
         values = list_values(judgement.fitted.model.effect(effect.id), judgement.estimates)
-        # What is one explanation of several is left out of the numbers of the others.
-        for other in judgement.fitted.model.keep(open_ids):
-            values = rescale_values(values, effect.scale_without(other))
     else:
-        values = measure_values(effect, way.search)
+        values = list_values(effect, None)
     return Named(
         id=effect.id,
         parameters=values,
@@ -285,20 +292,21 @@ def _measure_gain(effect: Effect, way: Explored) -> tuple[float, float]:
     clock = find_late(final.state.effects, Late.POSES)
     if effect.late in _CLOCKS and not names and clock is not None:
         names = frozenset({clock.id})
-    if effect.late is Late.POSES and not names:
-        state = replace(
-            final.state, timing=tuple(replace(one, pose_delay_s=0.0) for one in final.state.timing)
-        )
-        without = arena.enter(state)
-    else:
-        without = arena.drop(final, names)
-    metric, unit = arena.metric, arena.problem.unit
-    before = np.bincount(unit, metric.cost(without.held))
-    after = np.bincount(unit, metric.cost(final.held))
+    held = arena.drop(final, names).held if names else _delay_poses(arena.part, final.state)
+    before = np.bincount(arena.part.unit, arena.weights.cost(held))
+    after = np.bincount(arena.part.unit, arena.weights.cost(final.held))
     gain = float(before.sum()) / max(float(after.sum()), 1e-12) - 1.0
     draws = np.random.default_rng(0).integers(0, before.size, (_DRAWS, before.size))
     falls = 1.0 - after[draws].sum(axis=1) / np.maximum(before[draws].sum(axis=1), 1e-12)
     return gain, float(np.mean(falls >= _WORTH))
+
+
+def _delay_poses(part: Part, state: State) -> Floats:
+    """Residuals of poses that stand where they were stamped, before they were aligned."""
+    if not isinstance(part, BodyPart):
+        return part.find_residuals(state)
+    delays = [comparison.run.alignment.heading_delay_s for comparison in part.comparisons]
+    return np.concatenate([part.shift_poses(state, run, -late) for run, late in enumerate(delays)])
 
 
 def _rungs(judgement: Judgement) -> list[Mapping[str, Json]]:
@@ -336,21 +344,3 @@ def _describe_ways(ways: Sequence[Explored], source: Input, measured: Judgement 
         ],
     }
     return described
-
-
-def _compare_ways(named: Sequence[Named], judgement: Judgement | None) -> dict[str, Json]:
-    """Values found on an effect's own way against those of the whole way from command to body."""
-    compared: dict[str, Json] = {}
-    by_id = {effect.id: effect for effect in named}
-    for item in () if judgement is None else judgement.estimates.items:
-        effect = by_id.get(item.free.effect)
-        value = None if effect is None else effect.parameters.get(item.free.name)
-        if value is None or not math.isfinite(item.standard_error):
-            continue
-        span = max(3.0 * item.standard_error, 0.05 * abs(item.value))
-        compared[item.free.label] = {
-            "on_its_way": round(value.value, 6),
-            "command_to_body": round(item.value, 6),
-            "agrees": abs(value.value - item.value) <= span,
-        }
-    return compared

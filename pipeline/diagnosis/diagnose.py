@@ -9,7 +9,6 @@ import numpy as np
 
 from pipeline.diagnosis import conclude
 from pipeline.diagnosis.diagnosis import Diagnosis, RunDiagnosis
-from pipeline.diagnosis.errors import DiagnosisError
 from pipeline.diagnosis.excitation import find_unobservable
 from pipeline.diagnosis.ground import prepare
 from pipeline.diagnosis.naming import Search, search_body, search_wheels
@@ -81,29 +80,19 @@ def diagnose_runs(
     if fatal:
         return Diagnosis(tuple(conclude.refuse(recording, leading, recordings) for recording in recordings))
     runs = [load_recording(recording, vehicle) for recording in recordings]
-    vehicle = runs[0].correct_vehicle(vehicle)
-    ground = prepare(runs, vehicle)
     known = () if model is None else model.effects
-    chosen = choose_input(ground.runs, inputs[0] if len(inputs) == 1 else None, known)
-    leading = chosen.source.value
-    if not ground.compare(chosen.source):
-        other = "measured" if leading == "command" else "command"
-        raise DiagnosisError(
-            "no_input",
-            f"there is no {'command' if leading == 'command' else 'measured wheel'} to diagnose from",
-            where=", ".join(run.name for run in ground.runs),
-            hint=f"Try --input {other}.",
-        )
-    ways, clocks = _explore(ground, leading, known)
+    chosen = choose_input(runs, inputs[0] if len(inputs) == 1 else None, known)
+    ground = prepare(runs, vehicle, chosen.source)
+    ways, clocks = _explore(ground, chosen.source, known)
     return _conclude(recordings, ground, chosen, ways, clocks)
 
 
-def _explore(ground: Ground, leading: str, known: Sequence[Effect]) -> tuple[list[Explored], Clocks]:
+def _explore(ground: Ground, source: Input, known: Sequence[Effect]) -> tuple[list[Explored], Clocks]:
     """All ways that the recording opens: the ground alone and the drivetrain alone, or both at once."""
-    if leading == "measured" or ground.measured:
+    if source is Input.MEASURED or ground.has_encoders:
         body = _explore_body(ground, Input.MEASURED, known)
         ways = [body]
-        if leading == "command":
+        if source is Input.COMMAND:
             ways.append(_explore_wheels(ground, known, body.search))
     else:
         body = _explore_body(ground, Input.COMMAND, known)
@@ -113,7 +102,7 @@ def _explore(ground: Ground, leading: str, known: Sequence[Effect]) -> tuple[lis
 
 def _explore_body(ground: Ground, source: Input, known: Sequence[Effect]) -> Explored:
     found = search_body(ground, source, known)
-    comparisons = ground.compare(source)
+    comparisons = found.arena.part.comparisons
     places = np.concatenate([find_places(comparison) for comparison in comparisons])
     final = search_formula(found.arena, found.start, found.final, places)
     features, _ = describe_windows(comparisons)

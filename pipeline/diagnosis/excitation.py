@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.diagnosis.judge import LEAST_STRETCHES, SHORT_S
-from pipeline.diagnosis.problem import number_units
+from pipeline.identification.parts import number_units
 from pipeline.models.effect import Excitation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.diagnosis.arena import Arena, Contender
-    from pipeline.diagnosis.screen import Candidate
+    from pipeline.identification.proposals import Candidate
     from pipeline.models.effect import Effect
 
 Floats = NDArray[np.float64]
@@ -81,30 +81,30 @@ def suggest_manoeuvre(*effects: Effect) -> str:
 
 
 def _shift(arena: Arena, final: Contender, candidate: Candidate) -> Floats:
-    changed = arena.problem.find_residuals(final.state.add(candidate().make_usual(arena.largest)))
-    shift: Floats = final.fitted.residual - changed
+    changed = arena.part.find_residuals(final.state.add(candidate().make_usual(arena.largest)))
+    shift: Floats = final.fit.residual - changed
     return shift
 
 
 def _evidence(arena: Arena, final: Contender, shift: Floats) -> tuple[float, float]:
     """How many standard errors the shift is, alone and beside the model's own numbers."""
-    fitted, metric = final.fitted, arena.metric
-    factor = metric.weights(fitted.residual)
+    fit, weights = final.fit, arena.weights
+    factor = weights.factors(fit.residual)
     column = shift * factor
     beside = column
-    if fitted.slots:
-        rows = (fitted.jacobian * factor[:, :, None]).reshape(-1, len(fitted.slots))
+    if fit.free:
+        rows = (fit.jacobian * factor[:, :, None]).reshape(-1, len(fit.free))
         solution = np.linalg.lstsq(rows, column.reshape(-1), rcond=1e-8)[0]
         beside = (column.reshape(-1) - rows @ solution).reshape(column.shape)
-    rest = metric.weigh(fitted.residual)
+    rest = weights.weigh(fit.residual)
     noise = _inflation(rest, arena)
     return tuple(float(np.sqrt(np.sum(c**2) / noise)) for c in (column, beside))  # type: ignore[return-value]
 
 
 def _count_stretches(arena: Arena, shift: Floats) -> float:
     """Number of short stretches over which a shift of the prediction is spread."""
-    moved = ((shift / arena.metric.scale) ** 2).sum(axis=1)
-    stretch = number_units(arena.problem.run, arena.problem.times, SHORT_S)
+    moved = ((shift / arena.weights.scale) ** 2).sum(axis=1)
+    stretch = number_units(arena.part.run, arena.part.times, SHORT_S)
     action = np.bincount(stretch, moved)
     power = float(np.sum(action**2))
     return float(action.sum()) ** 2 / power if power > 0.0 else 0.0
@@ -113,8 +113,8 @@ def _count_stretches(arena: Arena, shift: Floats) -> float:
 def _inflation(rest: Floats, arena: Arena) -> float:
     """Variance of weighted residuals times the number of neighbours that repeat them."""
     largest = 0.0
-    for channel in arena.problem.channels:
-        values = np.clip(rest[arena.problem.live, channel], -3.0, 3.0)
+    for channel in arena.part.channels:
+        values = np.clip(rest[arena.part.live, channel], -3.0, 3.0)
         total = float(np.mean(values**2))
         for lag in range(1, 8):
             total += 2.0 * max(float(np.mean(values[lag:] * values[:-lag])), 0.0)

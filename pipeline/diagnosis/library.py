@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.diagnosis.screen import TERM
+from pipeline.identification.proposals import TERM
 from pipeline.models.effect import ANY, Parameter, Search
 from pipeline.models.formula.formula_effect import FormulaEffect
 
@@ -135,8 +135,8 @@ def list_waves(arena: Arena, final: Contender, places: Floats, mark: str = "") -
         places: x, y [m] in the map at every window, shape (n, 2).
         mark: tells terms of several models apart.
     """
-    lags = arena.problem.find_ideal()[:, 0, :]
-    rest = arena.metric.weigh(final.fitted.residual)
+    lags = arena.part.find_ideal()[:, 0, :]
+    rest = arena.weights.weigh(final.fit.residual)
     found = []
     for channel, name in enumerate(CHANNELS):
         for axis, place in zip("xy", places.T, strict=True):

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Literal
 
 from pipeline.diagnosis.arena import open_arena
 from pipeline.diagnosis.search import search_effects
-from pipeline.diagnosis.state import State
 from pipeline.identification.comparison import Input
+from pipeline.identification.state import State
 from pipeline.models.effect import Place
 
 if TYPE_CHECKING:
@@ -52,9 +52,10 @@ class Search:
 def search_body(ground: Ground, source: Input, known: Sequence[Effect]) -> Search:
     """Search from an input to the body."""
     usable = [e for e in known if source is Input.COMMAND or e.place > Place.DRIVE]
-    start = State((), ground.start_timing()).add(*usable)
+    start = State((), ground.timing).add(*usable)
     candidates = ground.list_candidates(source)
-    arena, first = open_arena(ground.pose_body(source), start, candidates, ground.evidence)
+    problem = ground.problem.behind_wheels if source is Input.MEASURED else ground.problem
+    arena, first = open_arena(problem.whole, start, candidates, ground.evidence)
     return Search(source.value, arena, first, search_effects(arena, first))
 
 
@@ -62,6 +63,6 @@ def search_wheels(ground: Ground, known: Sequence[Effect], body: Search) -> Sear
     """Search from command to wheels, the encoders' own delay taken from the way to the body."""
     usable = [e for e in known if e.place <= Place.DRIVE]
     start = State((), body.final.state.timing).add(*usable)
-    arena, first = open_arena(ground.pose_wheels(), start, ground.list_drivetrain(), ground.evidence)
+    arena, first = open_arena(ground.problem.parts[1], start, ground.list_drivetrain(), ground.evidence)
     arena.least_share = _LEAST_SHARE
     return Search("wheels", arena, first, search_effects(arena, first))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.diagnosis.excitation import suggest_manoeuvre
+from pipeline.diagnosis.ground import is_late
 from pipeline.diagnosis.undecided import Undecided
 from pipeline.models.catalogue import find_late_effect, list_effects
 from pipeline.models.effect import Late, find_late
@@ -45,15 +46,16 @@ def read_clocks(ground: Ground, body: Search) -> Clocks:
     extra = find_late(state.effects, Late.POSES)
     more = extra.delay if extra is not None else 0.0
     rows, positions, certain = [], [], []
-    for timing, yaw in zip(state.timing, ground.yaw_delays, strict=True):
-        late = timing.pose_delay_s + more
+    for timing, run in zip(state.timing, ground.runs, strict=True):
+        yaw = run.alignment.heading_delay_s
+        late = yaw + more
         positions.append(late)
-        certain.append(yaw is not None and yaw.is_certain)
+        certain.append(is_late(run))
         rows.append(
             {
-                "heading": "gyro" if yaw is not None else "pose",
+                "heading": "gyro" if run.gyro_fit is not None else "pose",
                 "pose_delay_s": round(late, 4),
-                "yaw_delay_s": None if yaw is None else round(yaw.seconds, 4),
+                "yaw_delay_s": None if run.gyro_fit is None else round(yaw, 4),
                 "wheel_delay_s": round(timing.wheel_delay_s, 4) if body.way == "measured" else None,
             }
         )

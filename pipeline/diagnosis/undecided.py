@@ -77,7 +77,7 @@ def _list_alike(arena: Arena, without: Contender, final: Contender, effect: Effe
 
 
 def _is_as_good(arena: Arena, final: Contender, rival: Contender) -> bool:
-    if arena.metric.loss(rival.held) < (1.0 + _AS_GOOD) * arena.metric.loss(final.held):
+    if arena.weights.loss(rival.held) < (1.0 + _AS_GOOD) * arena.weights.loss(final.held):
         return True
     verdict = arena.judge(rival, final)
     return verdict.gain < _AS_GOOD or verdict.t < _DECIDED_T or verdict.z < _DECIDED_Z
@@ -85,9 +85,9 @@ def _is_as_good(arena: Arena, final: Contender, rival: Contender) -> bool:
 
 def _does_the_same(arena: Arena, without: Contender, final: Contender, rival: Contender) -> bool:
     """Whether two effects push the prediction alike: two small ones that do not are no alternatives."""
-    base = without.fitted.residual
-    one = (base - final.fitted.residual) / arena.metric.scale
-    other = (base - rival.fitted.residual) / arena.metric.scale
+    base = without.fit.residual
+    one = (base - final.fit.residual) / arena.weights.scale
+    other = (base - rival.fit.residual) / arena.weights.scale
     size = float(np.sqrt(np.sum(one**2) * np.sum(other**2)))
     return size > 0.0 and float(np.sum(one * other)) > _ALIKE * size
 

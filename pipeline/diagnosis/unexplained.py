@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.diagnosis.judge import GAP_S
 from pipeline.diagnosis.library import is_term, list_terms, list_waves
 from pipeline.diagnosis.search import prune
+from pipeline.identification.folds import find_near
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -118,19 +118,19 @@ def boost_residuals(arena: Arena, final: Contender, features: Floats) -> Explain
     from sklearn.ensemble import HistGradientBoostingRegressor  # noqa: PLC0415 - heavy
     from threadpoolctl import threadpool_limits  # noqa: PLC0415 - heavy
 
-    problem = arena.problem
-    rest = np.clip(arena.metric.weigh(final.held), -6.0, 6.0)
-    middle = problem.times.mean(axis=1)
-    stretch = np.unique(
-        problem.run * 1_000_000 + (middle // _STRETCH_S).astype(np.int64), return_inverse=True
-    )[1]
+    part = arena.part
+    rest = np.clip(arena.weights.weigh(final.held), -6.0, 6.0)
+    middle = part.times.mean(axis=1)
+    stretch = np.unique(part.run * 1_000_000 + (middle // _STRETCH_S).astype(np.int64), return_inverse=True)[
+        1
+    ]
     predicted = np.zeros(rest.shape)
     for fold in range(_FOLDS):
         test = stretch % _FOLDS == fold
-        train = ~test & ~_is_near(problem.run, problem.times, test)
+        train = ~test & ~find_near(part, part, test)
         if not test.any() or train.sum() < 50:  # noqa: PLR2004 - too few to learn from
             continue
-        for channel in problem.channels:
+        for channel in part.channels:
             model = HistGradientBoostingRegressor(
                 max_iter=_TREES, learning_rate=0.1, max_leaf_nodes=10, min_samples_leaf=25,
                 l2_regularization=5.0, early_stopping=False, random_state=0,
@@ -139,7 +139,7 @@ def boost_residuals(arena: Arena, final: Contender, features: Floats) -> Explain
             with threadpool_limits(limits=1, user_api="openmp"):
                 model.fit(features[train], rest[train, channel])
                 predicted[test, channel] = model.predict(features[test])
-    live = problem.live
+    live = part.live
     before = (rest[live] ** 2).mean(axis=0)
     after = ((rest - predicted)[live] ** 2).mean(axis=0)
     shares = 1.0 - after / np.maximum(before, 1e-12)
@@ -149,17 +149,6 @@ def boost_residuals(arena: Arena, final: Contender, features: Floats) -> Explain
 def is_explainable(explainable: Explainable) -> bool:
     """Whether enough of any channel is predictable to be called structure."""
     return bool((explainable.shares > _EXPLAINABLE).any())
-
-
-def _is_near(run: NDArray[np.int64], times: Floats, test: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    near = np.zeros(test.size, dtype=bool)
-    for number in np.unique(run).tolist():
-        rows = run == number
-        starts, ends = np.sort(times[rows & test, 0]), np.sort(times[rows & test, 1])
-        later = np.searchsorted(starts, times[rows, 1] + GAP_S)
-        earlier = np.searchsorted(ends, times[rows, 0] - GAP_S)
-        near[rows] = later > earlier
-    return near
 
 
 def describe_windows(comparisons: Sequence[Comparison]) -> tuple[Floats, tuple[str, ...]]:

@@ -89,7 +89,7 @@ def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str
             "value": _round(item.value),
             "low": _round(item.low),
             "high": _round(item.high),
-            "unit": item.free.parameter.unit if item.free.parameter else "s",
+            "unit": item.free.unit,
             "fitted": True,
             "at_bound": item.at_bound,
             "observable": item.observable,

@@ -92,7 +92,7 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
                 "run": comparison.run.name,
                 "sha256": comparison.run.sha256,
                 "terrain": comparison.run.terrain,
-                "pose_delay_s": timing.pose_delay_s,
+                "pose_delay_s": comparison.run.alignment.heading_delay_s,
                 "wheel_delay_s": timing.wheel_delay_s,
             }
             for comparison, timing in zip(problem.comparisons, judgement.fitted.state.timing, strict=True)

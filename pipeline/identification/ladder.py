@@ -111,7 +111,7 @@ def _take_best(
     for name in sorted(hoped, key=lambda one: -hoped[one]):
         if best is not None and best[0] >= hoped[name]:
             break
-        candidate = fit_model(problem, fitted.model + model.effect(name), per_run=per_run)
+        candidate = fit_model(problem, fitted.model + model.effect(name), per_run=per_run, start=fitted)
         hoped[name] = below - _scale_free(candidate)
         if best is None or hoped[name] > best[0]:
             best = hoped[name], name, candidate

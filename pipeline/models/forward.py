@@ -40,11 +40,9 @@ class Timing:
     """Delays that are no physics, per run.
 
     Attributes:
-        pose_delay_s: how late the reported poses are against the gyro's clock, or the input's without one.
         wheel_delay_s: how late measured wheels are.
     """
 
-    pose_delay_s: float = 0.0
     wheel_delay_s: float = 0.0
 
 

@@ -41,9 +41,8 @@ def view_diagnosis(
     asked = diagnosis.get("input")
     try:
         run = load_run(tables, vehicle, name=str(diagnosis.get("run", "")))
-        problem = Problem(
-            [run], vehicle, choose_input([run], asked if isinstance(asked, str) else None).source
-        )
+        source = choose_input([run], asked if isinstance(asked, str) else None).source
+        problem = Problem([run], vehicle, source)
         state = fit_model(problem, model).state
     except MotionError:
         # A log that is too poor for a model has its slip all the same.

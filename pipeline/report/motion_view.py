@@ -99,7 +99,7 @@ class MotionStage:
         comparison = self._comparison
         cells, around = comparison.cells, comparison.surroundings
         velocity = comparison.predict_velocity((), Timing())
-        times, span = comparison.windows.times - comparison.usual_delay, comparison.windows.span_s
+        times, span = comparison.windows.times, comparison.windows.span_s
         edges = cells.locate_edges(times.ravel())
         index = np.arange(cells.times.size + 1, dtype=np.float64)
         middle = times.mean(axis=1)
@@ -133,7 +133,7 @@ class MotionStage:
             floor: the noise floor as JSON.
         """
         comparison = self._comparison
-        rows = self.problem.run_of == 0
+        rows = self.problem.whole.run == 0
         ideal, model = self.ideal.residuals[rows], self.problem.find_run_residuals(state, 0)
         effects, timing = state.effects_of(0), state.timing[0]
         residuals = pl.DataFrame(
@@ -146,7 +146,7 @@ class MotionStage:
         )
         return MotionView(
             input=self.problem.source.value,
-            effects=state.model.ids,
+            effects=state.ids,
             ladder=ladder,
             floor=floor,
             residuals=residuals,
@@ -163,7 +163,7 @@ class MotionStage:
         columns = {f"v_{name}": getattr(velocity, name)[kept] for name in COMPONENTS}
         return pl.DataFrame(
             {
-                "t": cells.times[kept] + state.timing[0].pose_delay_s,
+                "t": cells.times[kept],
                 "piece": cells.span[kept].astype(np.int32),
                 **columns,
             }

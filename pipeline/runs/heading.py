@@ -71,7 +71,7 @@ def choose_heading(run: MotionRun, cells: Cells, source: HeadingSource) -> Headi
     times, rate = run.gyro
     on_cells = fit.signed_scale * np.interp(cells.times, times, rate) + fit.bias
     edges = cells.sum_up(on_cells)
-    seen = np.interp(cells.locate_edges(track.times - fit.yaw_delay_s), np.arange(edges.size), edges)
+    seen = np.interp(cells.locate_edges(track.times), np.arange(edges.size), edges)
     difference = track.heading - seen
     good = ~mark_barred(run, track.times)
     offset = align_heading(track, difference, good, cells.find_span(track.times))

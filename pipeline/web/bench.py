@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 _MOST_RUNS = 6
 _MOST_FITS = 60
-_COARSE_RATE_HZ = 50.0
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class Stand:
     stage: MotionStage
     lock: threading.RLock = field(default_factory=threading.RLock)
     _fits: OrderedDict[object, Judged] = field(default_factory=OrderedDict)
-    _coarse: Problem | None = None
+    _second: Problem | None = None
 
     def judge(self, model: Model) -> Judged:
         """Fit a model and score it on data that the fit has not seen; remembered.
@@ -92,12 +91,12 @@ class Stand:
     def score(self, model: Model, timing: Sequence[float]) -> Errors:
         """Errors of a model as it stands, nothing fitted."""
         with self.lock:
-            return score(self.problem, self.state(model, timing), self.stage.ideal.weights).pooled
+            return score(self.problem, self.state(model, timing)).pooled
 
     def state(self, model: Model, timing: Sequence[float]) -> State:
         """A model with the recording's delays."""
-        pose, wheel = timing
-        return State(model, {}, (Timing(pose, wheel),))
+        _, wheel = timing
+        return State(model.effects, (Timing(wheel),))
 
     def view(
         self,
@@ -110,12 +109,12 @@ class Stand:
         with self.lock:
             return self.stage.view(self.state(model, timing), ladder, floor)
 
-    def coarse_problem(self) -> Problem:
-        """The run on a coarser grid, for trying many effects beside the work in front."""
+    def second_problem(self) -> Problem:
+        """The run made ready once more, for trying many effects beside the work in front."""
         with self.lock:
-            if self._coarse is None:
-                self._coarse = Problem([self.run], self.vehicle, self.problem.source, rate_hz=_COARSE_RATE_HZ)
-            return self._coarse
+            if self._second is None:
+                self._second = Problem([self.run], self.vehicle, self.problem.source)
+            return self._second
 
 
 class Bench:

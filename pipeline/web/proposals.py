@@ -6,11 +6,11 @@ import threading
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from pipeline.core.errors import SlipError
+from pipeline.diagnosis.judge import compare
 from pipeline.identification import fit_model, hold_out
 from pipeline.identification.ladder import compare_losses
+from pipeline.identification.weights import make_weights
 from pipeline.models import list_effects
 from pipeline.runs import MotionError
 from pipeline.web.cards import describe_shortly
@@ -22,10 +22,8 @@ if TYPE_CHECKING:
     from pipeline.web.bench import Stand
 
 _WORTH = 0.99
-_SURE = 2.5
 _EACH_NUMBER = 1.02
 _MOST_KEPT = 40
-_CLIP = 6.0
 
 
 @dataclass
@@ -114,7 +112,7 @@ def _try_all(stand: Stand, model: Model, names: list[str], trial: Trial) -> None
 
 
 def _try_each(stand: Stand, model: Model, names: list[str], trial: Trial) -> None:
-    problem = stand.coarse_problem()
+    problem = stand.second_problem()
     base: HeldOut = hold_out(problem, fit_model(problem, model))
     kinds = {effect.id: effect for effect in list_effects()}
     for name in names:
@@ -152,12 +150,6 @@ def _reaches_further(base: HeldOut, new: HeldOut) -> bool:
 
 
 def _is_sure(problem: Problem, base: HeldOut, new: HeldOut) -> bool:
-    """Whether the loss falls in most blocks, not by luck in a few: t over blocks of command steps."""
-    known = np.isfinite(base.residuals).all(axis=1) & np.isfinite(new.residuals).all(axis=1)
-    sizes = [base.weights.normalise(side.residuals, problem)[known] for side in (base, new)]
-    before, after = (np.minimum(size**2, _CLIP**2).mean(axis=1) for size in sizes)
-    block = problem.block_of[known]
-    count = np.bincount(block)
-    gain = np.bincount(block, before - after)[count > 0] / count[count > 0]
-    error = float(gain.std(ddof=1)) / np.sqrt(gain.size) if gain.size > 1 else np.inf
-    return bool(gain.mean() > _SURE * error)
+    """Whether the loss falls beyond doubt, not by luck in a few stretches."""
+    weights = make_weights(base.residuals, problem.whole)
+    return compare(problem.whole, weights, base.residuals, new.residuals).accepts()

@@ -161,7 +161,7 @@ def _fit_anew(
         ladder.append(rung)
     ladder.append(rung_as_json(shown, whole.errors))
     timing = whole.fitted.state.timing[0]
-    delays = (timing.pose_delay_s, timing.wheel_delay_s)
+    delays = (stand.run.alignment.heading_delay_s, timing.wheel_delay_s)
     step = Step(
         said=said,
         model=format_step(model.swap(*fitted.effects), whole.intervals),
