@@ -187,7 +187,7 @@ def _judge_ways(
         effect
         for effect in effects
         if not _was_aligned(effect, ground)
-        and not (effect.id in open_ids and any(other.scale_without(effect) != 1.0 for other in effects))
+        and not (effect.id in open_ids and any(other.depends_on(effect) for other in effects))
     ]
     found = {}
     for source in inputs:
@@ -306,7 +306,7 @@ def _delay_poses(part: Part, state: State) -> Floats:
     if not isinstance(part, BodyPart):
         return part.find_residuals(state)
     delays = [comparison.run.alignment.heading_delay_s for comparison in part.comparisons]
-    return np.concatenate([part.shift_poses(state, run, -late) for run, late in enumerate(delays)])
+    return np.concatenate([part.shift_clock(state, run, -late) for run, late in enumerate(delays)])
 
 
 def _rungs(judgement: Judgement) -> list[Mapping[str, Json]]:

@@ -137,7 +137,6 @@ class RunDiagnosis:
         where: the few that carry most of it.
         timing: delays, and whose heading was used.
         by_way: ladders of the drivetrain and of the ground apart, where there are encoders.
-        consistency: whether the ways agree.
         disturbance: rms of what is left in x, y, w, and the part of it that lasts for seconds.
         proposal: model file with what was named, fitted; None where nothing could be judged.
     """
@@ -158,7 +157,6 @@ class RunDiagnosis:
     where: tuple[Region, ...] = ()
     timing: Mapping[str, Json] = field(default_factory=dict)
     by_way: Mapping[str, Json] = field(default_factory=dict)
-    consistency: Mapping[str, Json] = field(default_factory=dict)
     disturbance: Mapping[str, Json] = field(default_factory=dict)
     proposal: ModelFile | None = None
 
@@ -197,7 +195,6 @@ class RunDiagnosis:
             ],
             "timing": dict(self.timing),
             "by_way": dict(self.by_way),
-            "consistency": dict(self.consistency),
             "disturbance": dict(self.disturbance),
         }
 

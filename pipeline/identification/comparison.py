@@ -211,14 +211,19 @@ class Comparison:
         rest /= self.windows.span_s[:, None]
         return rest
 
-    def find_reach(self, effects: Sequence[Effect], timing: Timing) -> Reach:
+    def find_reach(self, effects: Sequence[Effect], timing: Timing, late_s: float = 0.0) -> Reach:
         """Errors of two-second predictions from a measured state, integrating the model's own yaw.
 
         A prediction begins with the measured pose, the wheel speeds of the encoders where there are any, and
         the body velocity of the half second before: what a planner knows at that moment.
+
+        Args:
+            effects: of the model, with their values.
+            timing: of the run.
+            late_s: how much later the poses are than they are taken for [s].
         """
         velocity = self._run(self._reaching, effects, timing)
-        delay = self._find_delay(effects)
+        delay = late_s + self._find_delay(effects)
         place = self._find_place(delay)
         edges = self.cells.sum_up(velocity.w)
         own = np.exp(0.5j * (edges[1:] + edges[:-1]))

@@ -8,9 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.identification.parts import BodyPart
-from pipeline.models.effect import Late, find_late
-
 if TYPE_CHECKING:
     from pipeline.identification.fit import Fitted, PartFit
     from pipeline.identification.parts import Part
@@ -122,7 +119,7 @@ def _estimate_part(part: Part, fit: PartFit) -> Estimates:
         correlation[np.ix_(rows, rows)] = spread / deviation
     freedom = max(pieces - rows.size, 2)
     wide = float(student.ppf(0.975, freedom)) * np.sqrt(pieces / max(pieces - rows.size, 1))
-    errors[rows] = np.hypot(errors[rows], _carry_delays(part, fit, total, rows, size))
+    errors[rows] = np.hypot(errors[rows], _carry_clocks(part, fit, total, rows, size))
     items = []
     for index, number in enumerate(fit.free):
         value = fit.state.get(number)
@@ -148,26 +145,21 @@ def stands_at_bound(value: float, bounds: tuple[float, float]) -> bool:
     return not low + margin < value < high - margin
 
 
-def _carry_delays(part: Part, fit: PartFit, total: Floats, rows: Integers, size: Floats) -> Floats:
-    """Standard errors that come from not knowing the delay of the poses exactly, shape (rows,)."""
+def _carry_clocks(part: Part, fit: PartFit, total: Floats, rows: Integers, size: Floats) -> Floats:
+    """Standard errors that come from not knowing the clocks exactly, shape (rows,)."""
     carried = np.zeros(rows.size)
-    if (
-        not isinstance(part, BodyPart)
-        or rows.size == 0
-        or find_late(fit.state.effects, Late.POSES) is not None
-    ):
+    if rows.size == 0:
         return carried
     scaled = total[np.ix_(rows, rows)] / np.outer(size[rows], size[rows]) + 1e-9 * np.eye(rows.size)
     factor = fit.weights.factors(fit.residual)
-    for run, comparison in enumerate(part.comparisons):
-        gyro = comparison.heading.gyro
-        if gyro is None:
+    for run, error in enumerate(part.list_clock_errors().tolist()):
+        if error == 0.0:
             continue
         mine = part.run == run
-        late = (part.shift_poses(fit.state, run, _DELAY_STEP) - fit.residual[mine]) / _DELAY_STEP
+        late = (part.shift_clock(fit.state, run, _DELAY_STEP) - fit.residual[mine]) / _DELAY_STEP
         pull = np.einsum("ncp,nc->p", fit.jacobian[mine] * factor[mine][:, :, None], late * factor[mine])
         shift = np.linalg.solve(scaled, pull[rows] / size[rows]) / size[rows]
-        carried = np.hypot(carried, np.abs(shift) * gyro.delay_error_s)
+        carried = np.hypot(carried, np.abs(shift) * error)
     return carried
 
 

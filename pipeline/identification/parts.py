@@ -5,7 +5,8 @@ A part of the way from command to body: the whole of it, from the wheels to the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -88,6 +89,14 @@ class Part:
         """
         return np.concatenate([average_lags(c, c.predict_velocity((), _NO_DELAY)) for c in self.comparisons])
 
+    def list_clock_errors(self) -> Floats:
+        """Standard error of each run's clock that is no free number of this part [s], shape (runs,)."""
+        raise NotImplementedError
+
+    def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
+        """Residuals of one run's windows if that clock were late by ``late_s`` [s], shape (m, 3)."""
+        raise NotImplementedError
+
     @cached_property
     def noise(self) -> Floats:
         """Spread that remains when nearly anything linear in the input's past may act, shape (n, 3)."""
@@ -127,8 +136,17 @@ class BodyPart(Part):
         """See `Part`."""
         return self.comparisons[run].find_residuals(state.effects_of(run), state.timing[run])
 
-    def shift_poses(self, state: State, run: int, late_s: float) -> Floats:
-        """Residuals of one run's windows if its poses were later by ``late_s`` than they are taken for."""
+    def list_clock_errors(self) -> Floats:
+        """See `Part`: of the poses against the gyro, or against encoders that read now and then."""
+        return np.array([self._find_clock_error(comparison) for comparison in self.comparisons])
+
+    def _find_clock_error(self, comparison: Comparison) -> float:
+        if comparison.heading.gyro is not None:
+            return comparison.heading.gyro.delay_error_s
+        return 0.0 if self.whole else find_sampling_error(comparison)
+
+    def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
+        """See `Part`: of poses that are later by ``late_s`` than they are taken for."""
         return self.comparisons[run].find_residuals(state.effects_of(run), state.timing[run], late_s)
 
 
@@ -167,6 +185,22 @@ class WheelPart(Part):
         driven = comparison.predict_velocity(drive, _NO_DELAY)
         residual: Floats = self._seen[run, late] - average_windows(comparison, driven, self._spans[run])
         return residual
+
+    def list_clock_errors(self) -> Floats:
+        """See `Part`: wheels that are read now and then step somewhere between two readings."""
+        return np.array([find_sampling_error(comparison) for comparison in self.comparisons])
+
+    def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
+        """See `Part`: of encoders that are later by ``late_s`` than they are taken for."""
+        timing = list(state.timing)
+        timing[run] = Timing(timing[run].wheel_delay_s + late_s)
+        return self.find_run_residuals(replace(state, timing=tuple(timing)), run)
+
+
+def find_sampling_error(comparison: Comparison) -> float:
+    """Standard deviation [s] of when wheels step that are read now and then; zero without encoders."""
+    wheels = comparison.run.wheels
+    return 0.0 if wheels is None else float(np.median(np.diff(wheels.times))) / math.sqrt(12.0)
 
 
 def number_units(run: Integers, times: Floats, length: float = UNIT_S) -> Integers:

@@ -278,10 +278,10 @@ class Effect(ABC):
         del largest
         return ()
 
-    def scale_without(self, other: Effect) -> float:
-        """What its numbers are to be multiplied with where another effect is left out of the same motion."""
+    def depends_on(self, other: Effect) -> bool:
+        """Whether one motion shows only the ratio of its number to that of another effect."""
         del other
-        return 1.0
+        return False
 
     def is_used(self, parameter: Parameter) -> bool:
         """Whether a parameter takes part: of two that stand for each other only the one that is given."""

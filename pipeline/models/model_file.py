@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.core.toml import TomlError, parse_toml, require_finite, shorten
+from pipeline.core.errors import shorten
+from pipeline.core.toml import TomlError, parse_toml, require_finite
 from pipeline.models.catalogue import find_effect, run_effects
 from pipeline.models.formula.formula_effect import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.model import Model

@@ -105,15 +105,14 @@ def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFa
     }
     run = load_run(tables, vehicle(), name="run")
     model = Model(vehicle(), (find_effect("effective_track")(k=1.7),))
-    timing = Timing(0.02, 0.0)
     places = manifest.read("velocities").select("t", "x", "y")
     view = MotionStage(Problem([run], vehicle(), Input.COMMAND), places).view(
-        State(model, {}, (timing,)), (), None
+        State(model.effects, (Timing(),)), (), None
     )
-    made = predict(model, run, Input.COMMAND, timing=timing)
+    made = predict(model, run, Input.COMMAND)
 
     shown = view.velocity.sort("t")
-    expected = np.interp(shown["t"], made.times + timing.pose_delay_s, made.velocity[:, 2])
+    expected = np.interp(shown["t"], made.times, made.velocity[:, 2])
     assert np.allclose(shown["v_w"], expected, atol=1e-9)
     starts = view.arcs.group_by("piece", maintain_order=True).first()
     for axis in "xy":

@@ -53,6 +53,6 @@ class EffectiveTrack(KinematicEffect):
         del around
         return rolling.scale(1.0, 1.0 / self.values["k"])
 
-    def scale_without(self, other: Effect) -> float:
+    def depends_on(self, other: Effect) -> bool:
         """The yaw rate is that of the ratio k_radius / k_track: for nominal wheels the track is that wide."""
-        return 1.0 / other.values["k"] if isinstance(other, WheelRadius) else 1.0
+        return isinstance(other, WheelRadius)
