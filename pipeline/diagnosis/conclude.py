@@ -222,7 +222,7 @@ def _describe(
         gain=gain,
         equivalent_to=list_equivalents(effect, ground),
         confused_with=effect.confused_with,
-        corrected=effect.late in _CLOCKS and ground.has_gyro,
+        corrected=_was_aligned(effect, ground),
         way=way.search.way,
         selected=selected,
     )

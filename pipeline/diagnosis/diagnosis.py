@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 from pipeline.diagnosis.where import tabulate_regions
-from pipeline.identification.intervals import stands_at_bound
-from pipeline.models import find_effect
+from pipeline.models.model_text import format_model
 
 if TYPE_CHECKING:
     import polars as pl
@@ -26,12 +25,13 @@ _DIGITS = 6
 
 @dataclass(frozen=True)
 class Value:
-    """A number with its 95 % interval; NaN where there is none."""
+    """A number with its 95 % interval, NaN where there is none, and whether it may go no further."""
 
     value: float
     low: float
     high: float
     unit: str
+    at_bound: bool = False
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Named:
         gain: relative rise of the held-out loss when it alone is dropped.
         equivalent_to: other names of the same thing.
         confused_with: what it looks like at first order.
-        corrected: whether it is a timing error that was corrected before anything else was judged.
+        corrected: whether it is a clock that was put right before any model: no effect of the written one.
         way: on which way it was found: `command`, `measured` or `wheels`.
         selected: share of resampled recordings in which it is still worth its place.
         tentative: far more structure stays in its channel than it explains; or it lowers no error on its own
@@ -66,7 +66,13 @@ class Named:
         return {
             "id": self.id,
             "parameters": {
-                name: {"value": _clean(v.value), "low": _clean(v.low), "high": _clean(v.high), "unit": v.unit}
+                name: {
+                    "value": _clean(v.value),
+                    "low": _clean(v.low),
+                    "high": _clean(v.high),
+                    "unit": v.unit,
+                    "at_bound": v.at_bound,
+                }
                 for name, v in self.parameters.items()
             },
             "gain": _clean(self.gain),
@@ -196,6 +202,7 @@ class RunDiagnosis:
             "timing": dict(self.timing),
             "by_way": dict(self.by_way),
             "disturbance": dict(self.disturbance),
+            "model": None if self.proposal is None else format_model(self.proposal),
         }
 
 
@@ -239,7 +246,7 @@ class Diagnosis:
                 "low": _clean(value.low),
                 "high": _clean(value.high),
                 "unit": value.unit,
-                "at_bound": stands_at_bound(value.value, find_effect(effect.id)().parameter(name).bounds),
+                "at_bound": value.at_bound,
             }
             for item in self.runs
             if item.run == run

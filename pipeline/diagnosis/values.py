@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.diagnosis.diagnosis import Value
+from pipeline.identification.intervals import stands_at_bound
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,7 +33,8 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
         least, most = parameter.bounds
         if high - low > most - least:
             low = high = math.nan
-        values[parameter.name] = Value(value, low, high, parameter.unit)
+        at_bound = stands_at_bound(value, parameter.bounds)
+        values[parameter.name] = Value(value, low, high, parameter.unit, at_bound)
     return values
 
 

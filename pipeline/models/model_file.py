@@ -65,6 +65,15 @@ class ModelFile:
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
+    def find_wheel_delay(self, run: str) -> float:
+        """How late the encoders of a run were in the last fit [s]; zero where it was not fitted on it."""
+        runs = self.fit.get("runs")
+        for entry in runs if isinstance(runs, list) else []:
+            late = entry.get("wheel_delay_s") if isinstance(entry, dict) and entry.get("run") == run else None
+            if isinstance(late, float):
+                return late
+        return 0.0
+
 
 def read_model(path: Path) -> ModelFile:
     """Read a model file.

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pipeline.models.model_text import write_model
+from pipeline.report.diagnosed import read_model_text
 from pipeline.store import Store
 from pipeline.store.files import make_folder
 from pipeline.web import work
@@ -142,8 +143,9 @@ class Hall:
     def _change(self, file: DeskFile, stand: Stand, desk: Desk, ask: Ask) -> Desk:
         changes: dict[str, Callable[[], Desk]] = {
             "open": lambda: desk,
-            "add": lambda: work.add_effect(file, stand, desk, ask.effect),
-            "formula": lambda: work.add_effect(file, stand, desk, _read_formula(ask)),
+            "add": lambda: work.add_effect(file, stand, desk, ask.effect, anyway=ask.anyway),
+            "add_named": lambda: self._add_named(file, stand, desk, ask),
+            "formula": lambda: work.add_effect(file, stand, desk, _read_formula(ask), anyway=ask.anyway),
             "drop": lambda: work.drop_effect(file, stand, desk, ask.effect),
             "switch": lambda: work.switch_effect(file, stand, desk, ask.effect),
             "set": lambda: work.set_value(file, stand, desk, ask.effect, {ask.parameter: ask.value}),
@@ -154,6 +156,17 @@ class Hall:
             "try": lambda: self._begin_trial(file, stand, desk),
         }
         return changes[ask.action]()
+
+    def _add_named(self, file: DeskFile, stand: Stand, desk: Desk, ask: Ask) -> Desk:
+        found = read_diagnosis(self.results, stand.manifest)
+        named = None if found is None else read_model_text(found)
+        if named is None:
+            raise WorkbenchError(
+                "not_diagnosed", "nothing was named on this run", where=ask.run, hint="Diagnose it first."
+            )
+        missing = [effect for effect in named.model if effect.id not in desk.step.order]
+        said = f"+ all {len(missing)} that were named"
+        return work.add_effects(file, stand, desk, missing, said, anyway=ask.anyway)
 
     def _begin_trial(self, file: DeskFile, stand: Stand, desk: Desk) -> Desk:
         model = switch_off(file.parse(desk.step.model).model, desk.step.off)

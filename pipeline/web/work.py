@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from pipeline.identification.describe import errors_as_json
+from pipeline.identification.ladder import is_risen
 from pipeline.models import find_effect
 from pipeline.web.bench import rung_as_json
 from pipeline.web.cards import show_desk
@@ -15,7 +16,7 @@ from pipeline.web.desk import Desk, Step, begin_desk, format_step, switch_off
 from pipeline.web.errors import WorkbenchError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from pipeline.identification import Errors
     from pipeline.models import Effect, Model
@@ -64,12 +65,50 @@ def _can_open(file: DeskFile, desk: Desk) -> bool:
     return True
 
 
-def add_effect(file: DeskFile, stand: Stand, desk: Desk, effect: Effect | str) -> Desk:
-    """Put an effect on top of the model and fit all of it."""
+def add_effect(
+    file: DeskFile, stand: Stand, desk: Desk, effect: Effect | str, *, anyway: bool = False
+) -> Desk:
+    """Put an effect on top of the model and fit all of it.
+
+    Raises:
+        WorkbenchError: ``error_rises``, see `add_effects`.
+    """
     made = find_effect(effect)() if isinstance(effect, str) else effect
-    model = _model_of(file, desk) + made
-    order, known = [*desk.step.order, made.id], _known_rungs(desk.step)
-    return _fit_anew(stand, desk, model, order, f"+ {made.id}", off=desk.step.off, known=known)
+    return add_effects(file, stand, desk, [made], f"+ {made.id}", anyway=anyway)
+
+
+def add_effects(
+    file: DeskFile, stand: Stand, desk: Desk, effects: Sequence[Effect], said: str, *, anyway: bool
+) -> Desk:
+    """Put effects on top of the model at once, and fit all of it.
+
+    Raises:
+        WorkbenchError: ``error_rises``, an error over 2 s is higher with them and nobody said to take them
+            anyway.
+    """
+    model = _model_of(file, desk)
+    for made in effects:
+        model = model + made
+    order = [*desk.step.order, *(made.id for made in effects)]
+    changed = _fit_anew(stand, desk, model, order, said, off=desk.step.off, known=_known_rungs(desk.step))
+    rises = _describe_rises(desk.step.ladder[-1], changed.step.ladder[-1])
+    if rises and not anyway:
+        raise WorkbenchError(
+            "error_rises",
+            f"with {said.removeprefix('+ ')} {' and '.join(rises)}: it was not taken",
+            where=desk.run,
+            hint="Take something else, or take it anyway",
+        )
+    return changed
+
+
+def _describe_rises(before: Mapping[str, object], after: Mapping[str, object]) -> list[str]:
+    told = []
+    for key, (word, unit) in {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}.items():
+        old, new = before.get(key), after.get(key)
+        if isinstance(old, float) and isinstance(new, float) and is_risen(old, new):
+            told.append(f"the {word} error over 2 s rises from {old:.3g} to {new:.3g} {unit}")
+    return told
 
 
 def drop_effect(file: DeskFile, stand: Stand, desk: Desk, name: str) -> Desk:

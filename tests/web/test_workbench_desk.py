@@ -114,7 +114,7 @@ def test_a_damaged_desk_is_begun_anew(workbench: Workbench, content: bytes) -> N
 
 def test_two_desks_of_a_run_do_not_touch_each_other(workbench: Workbench) -> None:
     workbench.desk(RUN, "add", effect="effective_track")
-    other = workbench.desk(RUN, "add", effect="wheel_radius", slot="b")
+    other = workbench.desk(RUN, "add", effect="wheel_radius", anyway=True, slot="b")
     assert [effect["id"] for effect in effects(other)] == ["wheel_radius"]
     assert [effect["id"] for effect in effects(workbench.desk(RUN))] == ["effective_track"]
 
