@@ -125,7 +125,7 @@ def test_an_error_that_rises_is_said_and_not_taken_unless_asked_for(
     for below, rung in itertools.pairwise(found["ladder"]):
         assert all(rung[key] <= 1.001 * below[key] for key in ERRORS)
 
-    slip("model", "drop", model, "drive_lag", "--on", RUN, "--out", results)
+    slip("model", "drop", model, "drive_lag", "turn_lag", "--on", RUN, "--out", results)
     printed = capsys.readouterr().out
     assert "  ! position error rises 0." in printed
     assert "done because asked for" in printed
