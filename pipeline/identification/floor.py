@@ -92,8 +92,8 @@ def _remove_predictable(problem: Problem, residuals: Floats, known: Flags) -> Fl
     features = np.concatenate([describe_inputs(comparison) for comparison in problem.comparisons])
     left = residuals.copy()
     best = np.sqrt(np.mean(residuals[known] ** 2, axis=0))
-    for ridge in _RIDGES:
-        rest = residuals - _predict_held_out(problem, features, residuals, known, ridge)
+    for predicted in _predict_held_out(problem, features, residuals, known):
+        rest = residuals - predicted
         size = np.sqrt(np.mean(rest[known] ** 2, axis=0))
         better = size < best
         left[:, better], best[better] = rest[:, better], size[better]
@@ -151,15 +151,13 @@ def _average(signal: Floats, step_s: float) -> Floats:
     return mean
 
 
-def _predict_held_out(
-    problem: Problem,
-    features: Floats,
-    residuals: Floats,
-    known: Flags,
-    ridge: float,
-) -> Floats:
-    """Residuals as predicted from the inputs by regressions that had not seen their blocks."""
-    predicted = np.zeros(residuals.shape)
+def _predict_held_out(problem: Problem, features: Floats, residuals: Floats, known: Flags) -> Floats:
+    """Residuals as predicted from the inputs by regressions that had not seen their stretches.
+
+    Returns:
+        shape (ridges, n, 3).
+    """
+    predicted = np.zeros((len(_RIDGES), *residuals.shape))
     spread = 1.4826 * np.median(np.abs(residuals[known]), axis=0) + 1e-12
     target = np.clip(residuals, -_CLIP * 3.0 * spread, _CLIP * 3.0 * spread)
     for fold in problem.folds:
@@ -170,8 +168,11 @@ def _predict_held_out(
         scale = features[rows].std(axis=0)
         scale[scale == 0.0] = 1.0
         design = (features[rows] - centre) / scale
-        normal = design.T @ design / design.shape[0] + ridge * np.eye(design.shape[1])
+        normal = design.T @ design / design.shape[0]
         mean = target[rows].mean(axis=0)
-        weights = np.linalg.solve(normal, design.T @ (target[rows] - mean) / design.shape[0])
-        predicted[tested] = mean + (features[tested] - centre) / scale @ weights
+        pull = design.T @ (target[rows] - mean) / design.shape[0]
+        looked_at = (features[tested] - centre) / scale
+        for number, ridge in enumerate(_RIDGES):
+            weights = np.linalg.solve(normal + ridge * np.eye(normal.shape[0]), pull)
+            predicted[number, tested] = mean + looked_at @ weights
     return predicted

@@ -8,6 +8,7 @@ are grouped in spans; between spans the recording had a hole.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
@@ -128,6 +129,17 @@ class Resets:
     first: Integers
     at: Integers
     start: Floats
+
+    @cached_property
+    def since_first(self) -> Integers:
+        """How many cells after its reset each cell comes, shape (n,)."""
+        since: Integers = np.arange(self.number.size) - self.first[self.number]
+        return since
+
+    @cached_property
+    def since_set(self) -> Integers:
+        """How many cells after the state was set each cell comes, -1 before, shape (n,)."""
+        return np.maximum(np.arange(self.number.size) - self.at[self.number], -1)
 
 
 @dataclass(frozen=True)
