@@ -31,6 +31,9 @@ _GRID_ROUNDS = 4
 _STIFFEST = 30.0
 _REWEIGHTED = 3
 _SAME_SCALE = 0.01
+_SETTLED = 1e-9
+_SETTLED_ROUNDS = 8
+_SAME_NUMBER = 2e-4
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,12 @@ class Fitted:
 
 
 def fit_model(
-    problem: Problem, model: Model, *, per_run: Sequence[str] = (), start: Fitted | None = None
+    problem: Problem,
+    model: Model,
+    *,
+    per_run: Sequence[str] = (),
+    start: Fitted | None = None,
+    exact: bool = False,
 ) -> Fitted:
     """Fit a model's free parameters and the recording's delays.
 
@@ -100,6 +108,8 @@ def fit_model(
         model: effects at neutral values are searched from several starts; others start where they are.
         per_run: labels ``effect.name`` or ids whose values belong to each run alone.
         start: a fit of nearly the same model, of which parts that have not changed are taken over.
+        exact: go on until nothing moves any more, so that the same model ends at the same numbers whatever
+            it was started from; without, until the loss stands still, which is enough to compare models.
 
     Returns:
         The fit; a number at its bound says that the data ask for more.
@@ -114,7 +124,7 @@ def fit_model(
             fit = known
         else:
             fit = _fit_part(problem, part, mine, per_run)
-        fits.append(fit)
+        fits.append(_settle(part, fit, per_run) if exact else fit)
         state = replace(fit.state, effects=state.effects).add(*fit.state.effects)
     return Fitted(problem, state, tuple(fits), problem.find_residuals(state))
 
@@ -136,6 +146,18 @@ def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]
         if np.allclose(weights.scale, fit.weights.scale, rtol=_SAME_SCALE):
             break
         fit = fit_part(part, weights, fit.state, per_run=per_run)
+    return fit
+
+
+def _settle(part: Part, fit: PartFit, per_run: Sequence[str]) -> PartFit:
+    """The fit after which neither numbers nor weights move."""
+    for _ in range(_SETTLED_ROUNDS):
+        before = np.array([fit.state.get(number) for number in fit.free])
+        weights = make_weights(fit.residual, part)
+        fit = fit_part(part, weights, fit.state, per_run=per_run, enough=_SETTLED)
+        after = np.array([fit.state.get(number) for number in fit.free])
+        if np.allclose(before, after, rtol=_SAME_NUMBER, atol=1e-6):
+            break
     return fit
 
 
@@ -171,14 +193,24 @@ def fit_part(
     iterations: int = _ITERATIONS,
     *,
     per_run: Sequence[str] = (),
+    enough: float = _ENOUGH,
 ) -> PartFit:
-    """Fit all free numbers of a state to one part of the way, grids included."""
+    """Fit all free numbers of a state to one part of the way, grids included.
+
+    Args:
+        part: of the way.
+        weights: what a residual costs.
+        state: to start from.
+        iterations: most of them.
+        per_run: as in `fit_model`.
+        enough: relative fall of the loss at which the fit ends.
+    """
     free = state.list_free(part.delays, per_run)
-    fit = _descend(part, weights, state, free, iterations)
+    fit = _descend(part, weights, state, free, (iterations, enough))
     for number in free:
         moved = None if number.is_smooth else _walk_grid(part, fit, number)
         if moved is not None:
-            fit = _descend(part, weights, moved, free, iterations)
+            fit = _descend(part, weights, moved, free, (iterations, enough))
     return fit
 
 
@@ -207,7 +239,10 @@ def solve_step(
     return step, normal
 
 
-def _descend(part: Part, weights: Weights, state: State, free: tuple[Free, ...], iterations: int) -> PartFit:
+def _descend(
+    part: Part, weights: Weights, state: State, free: tuple[Free, ...], until: tuple[int, float]
+) -> PartFit:
+    iterations, enough = until
     residual = part.find_residuals(state)
     loss = weights.loss(residual)
     smooth = [place for place, number in enumerate(free) if number.is_smooth]
@@ -222,7 +257,7 @@ def _descend(part: Part, weights: Weights, state: State, free: tuple[Free, ...],
         step, _ = solve_step(jacobian[:, :, moving], residual, weights, damping)
         # What the step promises, were the model linear: where that is nothing, the fit is done.
         promised = weights.loss(residual - jacobian[:, :, moving] @ step)
-        if (loss - promised) / max(loss, 1e-12) < 0.5 * _ENOUGH:
+        if (loss - promised) / max(loss, 1e-12) < 0.5 * enough:
             break
         trial = state.move([free[place] for place in moving], step.tolist())
         after = part.find_residuals(trial)
@@ -242,7 +277,7 @@ def _descend(part: Part, weights: Weights, state: State, free: tuple[Free, ...],
         is_fresh = fall > _NEWS
         if is_fresh:
             jacobian = part.differentiate(state, residual, free)
-        if fall < _ENOUGH:
+        if fall < enough:
             break
     return PartFit(state, free, residual, jacobian, weights, loss)
 

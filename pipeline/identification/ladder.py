@@ -69,7 +69,7 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
         model: whose effects may be taken, with their values as starts.
         per_run: as in `fit_model`.
     """
-    fitted = fit_model(problem, model.ideal)
+    fitted = fit_model(problem, model.ideal, exact=True)
     rungs = [Rung(fitted, hold_out(problem, fitted))]
     hoped = dict.fromkeys((effect.id for effect in problem.active_effects(model)), inf)
     last = rungs[0]

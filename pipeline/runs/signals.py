@@ -139,7 +139,8 @@ class Resets:
     @cached_property
     def since_set(self) -> Integers:
         """How many cells after the state was set each cell comes, -1 before, shape (n,)."""
-        return np.maximum(np.arange(self.number.size) - self.at[self.number], -1)
+        since: Integers = np.maximum(np.arange(self.number.size) - self.at[self.number], -1)
+        return since
 
 
 @dataclass(frozen=True)

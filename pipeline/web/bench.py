@@ -72,7 +72,7 @@ class Stand:
         key = model.effects
         with self.lock:
             if key not in self._fits:
-                fitted = fit_model(self.problem, model)
+                fitted = fit_model(self.problem, model, exact=True)
                 held_out = hold_out(self.problem, fitted)
                 floor = estimate_floor(self.problem, held_out)
                 items = estimate_intervals(self.problem, fitted).items if model.effects else ()
@@ -86,7 +86,7 @@ class Stand:
     def judge_quickly(self, model: Model) -> Errors:
         """Held-out errors of a fitted model, without floor and intervals."""
         with self.lock:
-            return hold_out(self.problem, fit_model(self.problem, model)).pooled
+            return hold_out(self.problem, fit_model(self.problem, model, exact=not model.effects)).pooled
 
     def score(self, model: Model, timing: Sequence[float]) -> Errors:
         """Errors of a model as it stands, nothing fitted."""

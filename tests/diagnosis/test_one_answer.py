@@ -116,11 +116,14 @@ def check_model_verbs(told: Json, file: ModelFile, problem: Problem) -> Json:
     found: Json = parameters_as_json(judged.fitted.model, judged.estimates)
     for effect, name, number in list_numbers(told):
         entry = found[f"{effect}.{name}"]
-        assert same(number["value"], entry["value"]), (effect, name)
         assert number["at_bound"] == entry["at_bound"]
-        if number["low"] is not None:
-            width = number["high"] - number["low"]
-            assert all(abs(number[end] - entry[end]) < 0.03 * width + 1e-6 for end in ("low", "high"))
+        if number["low"] is None:
+            assert same(number["value"], entry["value"]), (effect, name)
+        else:
+            # Limits make the loss rough: where a fit of it stops is known to a small part of the interval.
+            near = 0.03 * (number["high"] - number["low"]) + 1e-6
+            for end in ("value", "low", "high"):
+                assert abs(number[end] - entry[end]) < near, (effect, name, end)
     floor = errors_as_json(judged.floor)
     ladder = ladder_as_json(judged.ladder, judged.floor)
     (carried,) = carry_over(file.model, list(problem.runs), problem.source)
@@ -145,7 +148,9 @@ def check_workbench(told: Json, file: ModelFile, own: Json, manifest: Manifest, 
     kept = desk_file.parse(desk.step.model).model
     for effect in file.model:
         for name, value in effect.values.items():
-            assert same(kept.effect(effect.id).values[name], value) or math.isnan(value)
+            low, high = file.intervals.get(f"{effect.id}.{name}", (value, value))
+            found = kept.effect(effect.id).values[name]
+            assert same(found, value) or math.isnan(value) or abs(found - value) < 0.03 * (high - low)
 
 
 def require_no_rise(ladder: list[Mapping[str, float]]) -> None:
