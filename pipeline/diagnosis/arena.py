@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.diagnosis.budget import Budget
 from pipeline.diagnosis.judge import LEAST_GAIN, Verdict, compare
 from pipeline.diagnosis.plausibility import is_nameable
 from pipeline.identification.fit import PartFit, fit_part
@@ -68,6 +69,7 @@ class Arena:
         evidence: what the runs can show.
         kept: effects that are never dropped: those of the model to start from.
         weights: cost of residuals at the current model.
+        budget: how long the search may take.
         work: how many times candidates were looked through.
         least_share: share of the asked motion (rms) that an effect must account for.
     """
@@ -79,6 +81,7 @@ class Arena:
     weights: Weights
     kept: frozenset[str] = frozenset()
     least_share: float = 0.0
+    budget: Budget = field(default_factory=Budget)
     _dropped: dict[tuple[str, ...], Contender] = field(default_factory=dict)
     _suggested: dict[tuple[object, ...], list[Contender]] = field(default_factory=dict)
     _proposed: dict[tuple[object, ...], list[Proposal]] = field(default_factory=dict)
@@ -91,8 +94,12 @@ class Arena:
         """The same arena with other candidates; nothing that was tried here counts there."""
         return Arena(
             self.part, candidates, self.evidence, self.folds, self.weights,
-            kept=self.kept, least_share=self.least_share,
+            kept=self.kept, least_share=self.least_share, budget=self.budget,
         )  # fmt: skip
+
+    def is_done(self, most: int) -> bool:
+        """Whether candidates were looked through often enough, or for too long."""
+        return self.work > most or self.budget.is_spent()
 
     @property
     def largest(self) -> Largest:
@@ -142,6 +149,7 @@ class Arena:
         self._proposed.clear()
         self._tried.clear()
         self._finished.clear()
+        self.budget.report(self.part.way, contender.ids)
         return self.enter(contender.state)
 
     def suggest(self, base: Contender, count: int, without: Iterable[str] = ()) -> list[Contender]:
@@ -206,9 +214,11 @@ class Arena:
 
 
 def open_arena(
-    part: Part, start: State, candidates: tuple[Candidate, ...], evidence: Evidence
+    part: Part, start: State, candidates: tuple[Candidate, ...], evidence: Evidence, budget: Budget
 ) -> tuple[Arena, Contender]:
     """The arena of a part of the way, and the model to start from, fitted."""
     weights = make_weights(part.find_residuals(start), part)
-    arena = Arena(part, candidates, evidence, make_folds(part), weights, kept=frozenset(start.ids))
+    arena = Arena(
+        part, candidates, evidence, make_folds(part), weights, kept=frozenset(start.ids), budget=budget
+    )
     return arena, arena.adapt(arena.enter(start))

@@ -32,6 +32,7 @@ from pipeline.runs.windows import WINDOW_S
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.diagnosis.budget import Budget
     from pipeline.diagnosis.diagnose import Explored
     from pipeline.diagnosis.diagnosis import Json
     from pipeline.diagnosis.ground import Ground
@@ -104,7 +105,11 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
         undecided=tuple(undecided),
         unobservable=tuple(unobservable.values()),
         unexplained=unexplained,
-        findings=(*_note_doubts(described), *(_note_idle(effect) for effect in idle)),
+        findings=(
+            *_note_cut(body.search.arena.budget),
+            *_note_doubts(described),
+            *(_note_idle(effect) for effect in idle),
+        ),
         ladder=() if judgement is None else tuple(_rungs(judgement)),
         noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
         explained_share=math.nan if last is None else last,
@@ -155,6 +160,17 @@ def _note_brevity(ground: Ground, common: RunDiagnosis) -> list[Mapping[str, Jso
         "with turns and speeds of both signs"
     )
     return [{"id": "little_driving", "text": text, "where": "diagnosis", "severity": "warning"}]
+
+
+def _note_cut(budget: Budget) -> list[Mapping[str, Json]]:
+    """A word where the search was ended before it had come to its own end."""
+    if not budget.was_cut:
+        return []
+    text = (
+        f"the search was cut after {budget.seconds:g} s of CPU: this is the best answer so far, and other "
+        f"explanations of it were not all tried (--budget {2.0 * budget.seconds:g}s lets it go on)"
+    )
+    return [{"id": "search_cut", "text": text, "where": "diagnosis", "severity": "warning"}]
 
 
 def _note_idle(effect: Effect) -> Mapping[str, Json]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.diagnosis import conclude
+from pipeline.diagnosis.budget import Budget, usual_budget
 from pipeline.diagnosis.diagnosis import Diagnosis, RunDiagnosis
 from pipeline.diagnosis.excitation import find_unobservable
 from pipeline.diagnosis.ground import prepare
@@ -25,7 +26,7 @@ from pipeline.diagnosis.unexplained import (
 from pipeline.identification import Input, choose_input
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from pipeline.diagnosis.excitation import Unobservable
     from pipeline.diagnosis.ground import Ground
@@ -59,6 +60,8 @@ def diagnose_runs(
     *,
     inputs: Sequence[str] = ("command", "measured"),
     model: Model | None = None,
+    budget_s: float | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Say which physical effects are missing from the model of one run, or of several of one vehicle jointly.
 
@@ -68,6 +71,8 @@ def diagnose_runs(
         inputs: `command`, `measured` or both; with both, the command leads and the wheels serve to tell the
             drivetrain from the ground.
         model: what is known already; what is missing beyond it is said. The ideal model when None.
+        budget_s: CPU time that the search may take [s]; by default a minute for ten minutes of driving.
+        tell: told what was found so far.
 
     Returns:
         One diagnosis a run; runs that were judged together share their effects.
@@ -83,25 +88,29 @@ def diagnose_runs(
     known = () if model is None else model.effects
     chosen = choose_input(runs, inputs[0] if len(inputs) == 1 else None, known)
     ground = prepare(runs, vehicle, chosen.source)
-    ways, clocks = _explore(ground, chosen.source, known)
+    driven = sum(run.duration_s for run in runs)
+    budget = Budget(usual_budget(driven) if budget_s is None else budget_s, tell)
+    ways, clocks = _explore(ground, chosen.source, known, budget)
     return _conclude(recordings, ground, chosen, ways, clocks)
 
 
-def _explore(ground: Ground, source: Input, known: Sequence[Effect]) -> tuple[list[Explored], Clocks]:
+def _explore(
+    ground: Ground, source: Input, known: Sequence[Effect], budget: Budget
+) -> tuple[list[Explored], Clocks]:
     """All ways that the recording opens: the ground alone and the drivetrain alone, or both at once."""
     if source is Input.MEASURED or ground.has_encoders:
-        body = _explore_body(ground, Input.MEASURED, known)
+        body = _explore_body(ground, Input.MEASURED, known, budget)
         ways = [body]
         if source is Input.COMMAND:
-            ways.append(_explore_wheels(ground, known, body.search))
+            ways.append(_explore_wheels(ground, known, body.search, budget))
     else:
-        body = _explore_body(ground, Input.COMMAND, known)
+        body = _explore_body(ground, Input.COMMAND, known, budget)
         ways = [body]
     return ways, read_clocks(ground, body.search)
 
 
-def _explore_body(ground: Ground, source: Input, known: Sequence[Effect]) -> Explored:
-    found = search_body(ground, source, known)
+def _explore_body(ground: Ground, source: Input, known: Sequence[Effect], budget: Budget) -> Explored:
+    found = search_body(ground, source, known, budget)
     comparisons = found.arena.part.comparisons
     places = np.concatenate([find_places(comparison) for comparison in comparisons])
     final = search_formula(found.arena, found.start, found.final, places)
@@ -116,8 +125,8 @@ def _explore_body(ground: Ground, source: Input, known: Sequence[Effect]) -> Exp
     )
 
 
-def _explore_wheels(ground: Ground, known: Sequence[Effect], body: Search) -> Explored:
-    found = search_wheels(ground, known, body)
+def _explore_wheels(ground: Ground, known: Sequence[Effect], body: Search, budget: Budget) -> Explored:
+    found = search_wheels(ground, known, body, budget)
     return Explored(
         found,
         tuple(find_undecided(found.arena, found.final)),

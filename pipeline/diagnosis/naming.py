@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.diagnosis.arena import Arena, Contender
+    from pipeline.diagnosis.budget import Budget
     from pipeline.diagnosis.ground import Ground
     from pipeline.models.effect import Effect
 
@@ -49,20 +50,21 @@ class Search:
         return tuple(name for name in self.final.ids if name not in self.arena.kept)
 
 
-def search_body(ground: Ground, source: Input, known: Sequence[Effect]) -> Search:
+def search_body(ground: Ground, source: Input, known: Sequence[Effect], budget: Budget) -> Search:
     """Search from an input to the body."""
     usable = [e for e in known if source is Input.COMMAND or e.place > Place.DRIVE]
     start = State((), ground.timing).add(*usable)
     candidates = ground.list_candidates(source)
     problem = ground.problem.behind_wheels if source is Input.MEASURED else ground.problem
-    arena, first = open_arena(problem.whole, start, candidates, ground.evidence)
+    arena, first = open_arena(problem.whole, start, candidates, ground.evidence, budget)
     return Search(source.value, arena, first, search_effects(arena, first))
 
 
-def search_wheels(ground: Ground, known: Sequence[Effect], body: Search) -> Search:
+def search_wheels(ground: Ground, known: Sequence[Effect], body: Search, budget: Budget) -> Search:
     """Search from command to wheels, the encoders' own delay taken from the way to the body."""
     usable = [e for e in known if e.place <= Place.DRIVE]
     start = State((), body.final.state.timing).add(*usable)
-    arena, first = open_arena(ground.problem.parts[1], start, ground.list_drivetrain(), ground.evidence)
+    part, candidates = ground.problem.parts[1], ground.list_drivetrain()
+    arena, first = open_arena(part, start, candidates, ground.evidence, budget)
     arena.least_share = _LEAST_SHARE
     return Search("wheels", arena, first, search_effects(arena, first))

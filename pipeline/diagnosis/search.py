@@ -33,7 +33,7 @@ def search_effects(arena: Arena, start: Contender) -> Contender:
     """
     current = grow(arena, start)
     for _ in range(_ROUNDS):
-        if arena.work > _MOST_WORK:
+        if arena.is_done(_MOST_WORK):
             return current
         moved = _swap(arena, current) or _join(arena, current) or _split(arena, current)
         if moved is None:
@@ -44,7 +44,7 @@ def search_effects(arena: Arena, start: Contender) -> Contender:
 
 def grow(arena: Arena, current: Contender) -> Contender:
     """Add effects while one is accepted, dropping what has become superfluous."""
-    while len(current.ids) < _MOST_EFFECTS:
+    while len(current.ids) < _MOST_EFFECTS and not arena.budget.is_spent():
         added = _add(arena, current)
         if added is None:
             return current
@@ -90,7 +90,7 @@ def _swap(arena: Arena, current: Contender) -> Contender | None:
     """One effect for another: better, or as good with fewer in the end."""
     best: Contender | None = None
     for name in _free(arena, current):
-        if arena.work > _MOST_WORK:
+        if arena.is_done(_MOST_WORK):
             return best
         without = arena.drop(current, [name])
         for rival in arena.suggest(without, _SWAPPED, without=[name]):
@@ -111,7 +111,7 @@ def _join(arena: Arena, current: Contender) -> Contender | None:
     slow = tuple(effect.id for effect in current.state.effects if effect.is_slow and effect.id in free)
     groups = [*combinations(free, 2), *([slow] if len(slow) > 2 else [])]  # noqa: PLR2004 - pairs are there
     for group in groups:
-        if arena.work > _MOST_WORK:
+        if arena.is_done(_MOST_WORK):
             return None
         without = arena.drop(current, group)
         for rival in arena.suggest(without, _SWAPPED, without=group):
@@ -122,7 +122,7 @@ def _join(arena: Arena, current: Contender) -> Contender | None:
 
 def _split(arena: Arena, current: Contender) -> Contender | None:
     """Two effects in the place of one, where the model leaves room for them."""
-    if not arena.has_room(current) or len(current.ids) > _MOST_SPLIT or arena.work > _MOST_WORK:
+    if not arena.has_room(current) or len(current.ids) > _MOST_SPLIT or arena.is_done(_MOST_WORK):
         return None
     for name in _free(arena, current):
         without = arena.drop(current, [name])

@@ -39,7 +39,7 @@ def find_undecided(arena: Arena, final: Contender) -> list[Undecided]:
     """For every effect that was named, the others that would do in its place."""
     found = []
     for effect in final.state.effects:
-        if effect.id in arena.kept:
+        if effect.id in arena.kept or arena.budget.is_spent():
             continue
         without = arena.drop(final, [effect.id])
         rivals = [

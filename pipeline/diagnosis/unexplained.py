@@ -70,7 +70,7 @@ def search_formula(arena: Arena, start: Contender, final: Contender, places: Flo
     narrow = {effect.id for effect in arena.candidates}
     current = final
     for _ in range(_MOST_TERMS + 1):
-        if sum(is_term(name) for name in current.ids) >= _MOST_TERMS or wide.work > _MOST_WORK:
+        if sum(is_term(name) for name in current.ids) >= _MOST_TERMS or wide.is_done(_MOST_WORK):
             return current
         moved = _replace(wide, current, narrow) or _add(wide, current, narrow)
         if moved is None:
@@ -92,7 +92,7 @@ def _replace(arena: Arena, current: Contender, narrow: set[str]) -> Contender | 
     free = [name for name in current.ids if name not in arena.kept and not is_term(name)]
     pairs = combinations(free, 2) if len(free) <= _MOST_PAIRED else ()
     for names in (*((name,) for name in free), *pairs):
-        if arena.work > _MOST_WORK:
+        if arena.is_done(_MOST_WORK):
             return None
         without = arena.drop(current, names)
         for rival in arena.suggest(without, _TRIED, without={*narrow, *names}):

@@ -53,9 +53,11 @@ class Part:
         channels: which of x, y, w say anything.
         live: whether the input moves the vehicle during a window or just before, shape (n,).
         least: spread below which a residual is rounding of stamps [m/s, m/s, rad/s], shape (3,).
+        way: from where to where, in words.
     """
 
     channels: tuple[int, ...] = (0, 1, 2)
+    way: str
 
     def __init__(self, comparisons: Sequence[Comparison], delays: tuple[DelayName, ...] = ()) -> None:
         self.comparisons = tuple(comparisons)
@@ -127,6 +129,7 @@ class BodyPart(Part):
     ) -> None:
         super().__init__(comparisons, delays)
         self.whole = whole
+        self.way = "from the command to the body" if whole else "from the wheels to the body"
 
     def owns(self, effect: Effect) -> bool:
         """All effects from the command on, those behind the wheels from them on."""
@@ -160,6 +163,7 @@ class WheelPart(Part):
     """
 
     channels = (0, 2)
+    way = "from the command to the wheels"
 
     def __init__(
         self, commanded: Sequence[Comparison], measured: Sequence[Comparison], *, speed: float, turn: float
