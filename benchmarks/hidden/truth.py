@@ -125,7 +125,7 @@ def _judge_late(problem: Problem, fitted: Model) -> Held:
     state = fit_model(problem, fitted).state
     late = -problem.runs[0].alignment.heading_delay_s
     part, comparison = problem.whole, problem.comparisons[0]
-    reach = comparison.find_reach(state.effects, state.timing[0], late)
+    reach = comparison.find_horizon_errors(state.effects, state.timing[0], late)
     errors = measure_errors(part.shift_clock(state, 0, late), reach.position, reach.yaw)
     return Held(errors.t_mrmse_m, errors.r_mrmse_rad, *errors.velocity_rms)
 

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.diagnosis import leftover
+from pipeline.diagnosis import residual_structure
 from pipeline.diagnosis.diagnosis import Named, RunDiagnosis
+from pipeline.diagnosis.error_regions import map_errors, pick_regions
 from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.naming_rules import join_classes, list_equivalents
 from pipeline.diagnosis.plausibility import find_implausible
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.values import list_values, read_clock
-from pipeline.diagnosis.where import map_errors, pick_regions
 from pipeline.identification import Input
 from pipeline.identification.describe import errors_as_json, ladder_as_json
 from pipeline.identification.judgement import judge_model, note_fit
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis.budget import Budget
+    from pipeline.diagnosis.context import Context
     from pipeline.diagnosis.diagnose import Explored
     from pipeline.diagnosis.diagnosis import Json
-    from pipeline.diagnosis.ground import Ground
     from pipeline.diagnosis.naming_rules import Clocks
     from pipeline.diagnosis.subject import Recording
     from pipeline.identification.judgement import Judgement
@@ -63,32 +63,32 @@ def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -
     )
 
 
-def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: Clocks) -> RunDiagnosis:
+def summarize(context: Context, source: Input, ways: Sequence[Explored], clocks: Clocks) -> RunDiagnosis:
     """What is common to the runs that were judged together."""
     body = ways[0]
     undecided = [item for way in ways for item in way.undecided if not is_term(item.candidates[0])]
     undecided += clocks.undecided
     open_ids = {item.candidates[0] for item in undecided}
     found = _gather(ways, clocks)
-    known = frozenset().union(*(way.search.arena.kept for way in ways))
+    known = frozenset().union(*(way.search.selection.kept for way in ways))
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
     inputs = tuple(dict.fromkeys((source, Input(body.search.way))))
-    judgements = _judge_ways(ground, inputs, [*found, *terms], open_ids)
+    judgements = _judge_ways(context, inputs, [*found, *terms], open_ids)
     idle = [e for e in _find_idle(found, ways, judgements.get(source.value)) if e.id not in known]
     if idle:
         found = [effect for effect in found if effect not in idle]
         # From measured wheels the drivetrain's effects were not in it.
-        judgements |= _judge_ways(ground, [source], [*found, *terms], open_ids)
+        judgements |= _judge_ways(context, [source], [*found, *terms], open_ids)
     judgement = judgements.get(source.value)
-    unexplained = leftover.describe(ways)
+    unexplained = residual_structure.describe(ways)
     described = tuple(
-        _describe(effect, ground, ways, judgement)
+        _describe(effect, context, ways, judgement)
         for effect in _order(found, judgement)
         if not effect.searched_as & open_ids and effect.id not in known
     )
     named = tuple(effect for effect in described if _doubt(effect) is None)
-    named = leftover.mark_tentative(_mark_idle(named, judgements), ways, unexplained)
-    part, start = ground.problem.whole, body.search.start
+    named = residual_structure.mark_tentative(_mark_idle(named, judgements), ways, unexplained)
+    part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
     places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
     regions = map_errors(part, residual, places)
@@ -100,13 +100,13 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
     return RunDiagnosis(
         run="",
         input=source.value,
-        joint=tuple(run.name for run in ground.runs),
+        joint=tuple(run.name for run in context.runs),
         effects=named,
         undecided=tuple(undecided),
         unobservable=tuple(unobservable.values()),
         unexplained=unexplained,
         findings=(
-            *_note_cut(body.search.arena.budget),
+            *_note_cut(body.search.selection.budget),
             *_note_doubts(described),
             *(_note_idle(effect) for effect in idle),
         ),
@@ -117,16 +117,16 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
         where=tuple(pick_regions(regions, residual, part.noise)),
         timing={"runs": cast("Json", list(clocks.timing))},
         by_way=_describe_ways(ways, source, judgements.get("measured")),
-        disturbance=leftover.describe_disturbance(body, unexplained),
+        disturbance=residual_structure.describe_disturbance(body, unexplained),
         proposal=None if judgement is None else note_fit(ModelFile(judgement.fitted.model), judgement),
     )
 
 
-def of_run(common: RunDiagnosis, recording: Recording, number: int, ground: Ground) -> RunDiagnosis:
+def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Context) -> RunDiagnosis:
     """The common diagnosis with one run's own name, findings and delays."""
     findings = list(common.findings)
     findings += [cast("Mapping[str, Json]", f) for f in recording.list_findings()]
-    findings += _note_brevity(ground, common)
+    findings += _note_brevity(context, common)
     runs = cast("Sequence[Mapping[str, Json]]", common.timing["runs"])
     return replace(common, run=recording.name, findings=tuple(findings), timing=runs[number])
 
@@ -146,12 +146,12 @@ def _note_doubts(described: Sequence[Named]) -> list[Mapping[str, Json]]:
     ]
 
 
-def _note_brevity(ground: Ground, common: RunDiagnosis) -> list[Mapping[str, Json]]:
+def _note_brevity(context: Context, common: RunDiagnosis) -> list[Mapping[str, Json]]:
     """A word where there was less driving than names can be trusted on."""
     least, words = _LEAST_DRIVING_S[common.input]
     driven = sum(
         float(np.minimum(np.diff(comparison.windows.times[:, 0], append=np.inf), WINDOW_S).sum())
-        for comparison in ground.problem.comparisons
+        for comparison in context.problem.comparisons
     )
     if driven >= least:
         return []
@@ -192,7 +192,7 @@ def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
 
 
 def _judge_ways(
-    ground: Ground, inputs: Sequence[Input], effects: Sequence[Effect], open_ids: set[str]
+    context: Context, inputs: Sequence[Input], effects: Sequence[Effect], open_ids: set[str]
 ) -> dict[str, Judgement]:
     """The model of these effects judged from each input to the body.
 
@@ -202,32 +202,32 @@ def _judge_ways(
     kept = [
         effect
         for effect in effects
-        if not _was_aligned(effect, ground)
+        if not _was_aligned(effect, context)
         and not (effect.id in open_ids and any(other.depends_on(effect) for other in effects))
     ]
     found = {}
     for source in inputs:
-        problem = ground.problem if source is ground.problem.source else ground.problem.behind_wheels
+        problem = context.problem if source is context.problem.source else context.problem.behind_wheels
         with contextlib.suppress(MotionError):
-            found[source.value] = judge_model(problem, Model(ground.vehicle, tuple(kept)))
+            found[source.value] = judge_model(problem, Model(context.vehicle, tuple(kept)))
     return found
 
 
-def _was_aligned(effect: Effect, ground: Ground) -> bool:
+def _was_aligned(effect: Effect, context: Context) -> bool:
     """Whether an effect says what the gyro had put right before any model was fitted."""
-    return effect.late is Late.POSES and ground.has_gyro
+    return effect.late is Late.POSES and context.has_gyro
 
 
 def _describe(
     effect: Effect,
-    ground: Ground,
+    context: Context,
     ways: Sequence[Explored],
     judgement: Judgement | None,
 ) -> Named:
     way = _way_of(effect, ways)
     gain, selected = _measure_gain(effect, way)
-    if _was_aligned(effect, ground):
-        values = read_clock(effect, ground.runs)
+    if _was_aligned(effect, context):
+        values = read_clock(effect, context.runs)
     elif judgement is not None and effect.id in judgement.fitted.model:
         values = list_values(judgement.fitted.model.effect(effect.id), judgement.estimates)
     else:
@@ -236,9 +236,9 @@ def _describe(
         id=effect.id,
         parameters=values,
         gain=gain,
-        equivalent_to=list_equivalents(effect, ground),
+        equivalent_to=list_equivalents(effect, context),
         confused_with=effect.confused_with,
-        corrected=_was_aligned(effect, ground),
+        corrected=_was_aligned(effect, context),
         way=way.search.way,
         selected=selected,
     )
@@ -303,14 +303,14 @@ def _way_of(effect: Effect, ways: Sequence[Explored]) -> Explored:
 
 def _measure_gain(effect: Effect, way: Explored) -> tuple[float, float]:
     """Relative rise of the held-out loss without an effect, and how often that is worth a name."""
-    arena, final = way.search.arena, way.search.final
+    selection, final = way.search.selection, way.search.final
     names = effect.searched_as & set(final.ids)
     clock = find_late(final.state.effects, Late.POSES)
     if effect.late in _CLOCKS and not names and clock is not None:
         names = frozenset({clock.id})
-    held = arena.drop(final, names).held if names else _delay_poses(arena.part, final.state)
-    before = np.bincount(arena.part.unit, arena.weights.cost(held))
-    after = np.bincount(arena.part.unit, arena.weights.cost(final.held))
+    held = selection.drop(final, names).held if names else _delay_poses(selection.part, final.state)
+    before = np.bincount(selection.part.unit, selection.weights.cost(held))
+    after = np.bincount(selection.part.unit, selection.weights.cost(final.held))
     gain = float(before.sum()) / max(float(after.sum()), 1e-12) - 1.0
     draws = np.random.default_rng(0).integers(0, before.size, (_DRAWS, before.size))
     falls = 1.0 - after[draws].sum(axis=1) / np.maximum(before[draws].sum(axis=1), 1e-12)

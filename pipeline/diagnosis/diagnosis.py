@@ -7,15 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
-from pipeline.diagnosis.where import tabulate_regions
+from pipeline.diagnosis.error_regions import tabulate_regions
 from pipeline.models.model_text import format_model
 
 if TYPE_CHECKING:
     import polars as pl
 
+    from pipeline.diagnosis.error_regions import Region
     from pipeline.diagnosis.excitation import Unobservable
     from pipeline.diagnosis.undecided import Undecided
-    from pipeline.diagnosis.where import Region
     from pipeline.models import ModelFile
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]

@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Late, ReportEffect
-from pipeline.models.forward import Forward, Timing, replace_surroundings
+from pipeline.models.forward import Forward, Timing, replace_context
 from pipeline.runs.errors import MotionError
-from pipeline.runs.grid import make_cells
+from pipeline.runs.grid import lay_grid
 from pipeline.runs.heading import HeadingSource, choose_heading
-from pipeline.runs.signals import Resets, Signal, Surroundings
+from pipeline.runs.signals import Resets, RunContext, Signal
 from pipeline.runs.windows import WINDOW_S, find_lead, gather_nodes, join_horizons, join_windows
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from pipeline.models.effect import Effect
-    from pipeline.runs.grid import Cells
+    from pipeline.runs.grid import Grid
     from pipeline.runs.recording import MotionRun
     from pipeline.runs.signals import Velocity
     from pipeline.vehicles import Vehicle
@@ -47,7 +47,7 @@ class Input(enum.Enum):
 
 
 @dataclass(frozen=True)
-class Reach:
+class HorizonErrors:
     """Errors of predictions at each row of the horizons, shape (n,).
 
     Attributes:
@@ -115,7 +115,7 @@ class Comparison:
         vehicle = run.correct_vehicle(vehicle)
         self.run = run
         self.source = source
-        self.cells = make_cells(run, choose_rate([run]) if rate_hz is None else rate_hz)
+        self.cells = lay_grid(run, choose_rate([run]) if rate_hz is None else rate_hz)
         self.heading = choose_heading(run, self.cells, heading)
         self.nodes = gather_nodes(run.track, self.cells)
         if self.nodes.times.size == 0:
@@ -135,7 +135,7 @@ class Comparison:
         self._measured: dict[float, Measured] = {}
         base = self._look_around(vehicle)
         self._forward = Forward(series, self.cells, base, encoders=run.wheels, has_gyro=self.has_gyro)
-        self._reaching = replace_surroundings(self._forward, self._look_from_horizons(base))
+        self._reaching = replace_context(self._forward, self._look_from_horizons(base))
 
     @property
     def has_gyro(self) -> bool:
@@ -143,7 +143,7 @@ class Comparison:
         return self.heading.gyro is not None
 
     @property
-    def surroundings(self) -> Surroundings:
+    def context(self) -> RunContext:
         """What effects may know of the run."""
         return self._forward.around
 
@@ -211,7 +211,9 @@ class Comparison:
         rest /= self.windows.span_s[:, None]
         return rest
 
-    def find_reach(self, effects: Sequence[Effect], timing: Timing, late_s: float = 0.0) -> Reach:
+    def find_horizon_errors(
+        self, effects: Sequence[Effect], timing: Timing, late_s: float = 0.0
+    ) -> HorizonErrors:
         """Errors of two-second predictions from a measured state, integrating the model's own yaw.
 
         A prediction begins with the measured pose, the wheel speeds of the encoders where there are any, and
@@ -235,7 +237,7 @@ class Comparison:
         predicted = self._path[origin] + turn * (travelled[node] - travelled[origin])
         yaw = (heading[node] - heading[origin]) - (turned[node] - turned[origin])
         wrapped = np.abs(np.angle(np.exp(1j * yaw)))
-        return Reach(np.abs(predicted - self._path[node]), wrapped, np.abs(yaw))
+        return HorizonErrors(np.abs(predicted - self._path[node]), wrapped, np.abs(yaw))
 
     def list_starts(self) -> tuple[Floats, Floats]:
         """Where predictions begin: stamps [s], shape (k,), and poses (x, y [m], yaw [rad]), shape (k, 3)."""
@@ -300,7 +302,7 @@ class Comparison:
             self._frames[key] = np.exp(1j * heading)
         return self._frames[key]
 
-    def _look_around(self, vehicle: Vehicle) -> Surroundings:
+    def _look_around(self, vehicle: Vehicle) -> RunContext:
         cells, track = self.cells, self.run.track
         at = cells.times
         first, last = self._first_moments()
@@ -309,7 +311,7 @@ class Comparison:
         known = (self._locate_nodes(last), velocity)
         unknown = np.full((cells.first.size, 2), np.nan)
         spans = Resets(cells.span, cells.first, cells.first, unknown)
-        return Surroundings(
+        return RunContext(
             vehicle=vehicle,
             times=at,
             step_s=cells.step_s,
@@ -321,7 +323,7 @@ class Comparison:
             place=np.column_stack([np.interp(at, track.times, column) for column in track.place.T]),
         )
 
-    def _look_from_horizons(self, base: Surroundings) -> Surroundings:
+    def _look_from_horizons(self, base: RunContext) -> RunContext:
         """The run with states that begin anew at every horizon, with what is known by then."""
         cells, nodes = self.cells, self.nodes
         origin = np.unique(self.horizons.origin)
@@ -377,7 +379,7 @@ def choose_rate(runs: Iterable[MotionRun]) -> float:
     return _COARSE_HZ if sum(run.duration_s for run in runs) * _RATE_HZ > _MOST_CELLS else _RATE_HZ
 
 
-def _reset_body(cells: Cells, first: Integers, known: tuple[Integers, Floats]) -> Resets:
+def _reset_body(cells: Grid, first: Integers, known: tuple[Integers, Floats]) -> Resets:
     """Resets of the body's state: at the cells given where a velocity is known, else at the first cell."""
     at, velocity = known
     good = np.isfinite(velocity).all(axis=1)

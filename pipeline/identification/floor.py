@@ -104,12 +104,12 @@ def _measure_speed(comparison: Comparison) -> Floats:
     """Forward speed of the input at the middle of every window [m/s], shape (n,)."""
     velocity = comparison.predict_velocity((), Timing())
     middle = comparison.windows.times.mean(axis=1)
-    return np.asarray(np.interp(middle, comparison.surroundings.times, velocity.x), dtype=np.float64)
+    return np.asarray(np.interp(middle, comparison.context.times, velocity.x), dtype=np.float64)
 
 
 def describe_inputs(comparison: Comparison) -> Floats:
     """Functions of the input at the middle of every window, shape (n, features)."""
-    around = comparison.surroundings
+    around = comparison.context
     velocity = comparison.predict_velocity((), Timing())
     middle = comparison.windows.times.mean(axis=1)
     along, around_w = _average(velocity.x, around.step_s), _average(velocity.w, around.step_s)

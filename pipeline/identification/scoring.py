@@ -95,7 +95,7 @@ def hold_out(problem: Problem, fitted: Fitted) -> HeldOut:
                 residuals[rows & fold.test] = whole.find_run_residuals(state, run)[fold.test[rows]]
             told = _find_tested(comparison, whole.times[rows], fold.test[rows])
             if told.any():
-                reach = comparison.find_reach(state.effects_of(run), state.timing[run])
+                reach = comparison.find_horizon_errors(state.effects_of(run), state.timing[run])
                 position[run][told], yaw[run][told] = reach.position[told], reach.yaw[told]
     return summarize(problem, residuals, position, yaw)
 
@@ -110,7 +110,8 @@ def _find_tested(comparison: Comparison, times: Floats, test: Flags) -> Flags:
 def score(problem: Problem, state: State) -> HeldOut:
     """Score a state as it is, nothing fitted."""
     reach = [
-        c.find_reach(state.effects_of(run), state.timing[run]) for run, c in enumerate(problem.comparisons)
+        c.find_horizon_errors(state.effects_of(run), state.timing[run])
+        for run, c in enumerate(problem.comparisons)
     ]
     return summarize(
         problem, problem.find_residuals(state), [r.position for r in reach], [r.yaw for r in reach]

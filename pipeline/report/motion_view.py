@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.identification import Fitted, Problem, State
-    from pipeline.identification.comparison import Reach
+    from pipeline.identification.comparison import HorizonErrors
 
 Floats = NDArray[np.float64]
 
@@ -91,13 +91,13 @@ class MotionStage:
         return fit_model(self.problem, Model(self.problem.vehicle))
 
     @cached_property
-    def _ideal_reach(self) -> Reach:
-        return self._comparison.find_reach((), self.ideal.state.timing[0])
+    def _ideal_reach(self) -> HorizonErrors:
+        return self._comparison.find_horizon_errors((), self.ideal.state.timing[0])
 
     @cached_property
     def _signals(self) -> dict[str, Floats]:
         comparison = self._comparison
-        cells, around = comparison.cells, comparison.surroundings
+        cells, around = comparison.cells, comparison.context
         velocity = comparison.predict_velocity((), Timing())
         times, span = comparison.windows.times, comparison.windows.span_s
         edges = cells.locate_edges(times.ravel())
@@ -151,7 +151,7 @@ class MotionStage:
             floor=floor,
             residuals=residuals,
             velocity=self._draw_velocity(state),
-            reach=self._gather_reach(comparison.find_reach(effects, timing)),
+            reach=self._gather_reach(comparison.find_horizon_errors(effects, timing)),
             arcs=self._draw_arcs(state),
         )
 
@@ -169,7 +169,7 @@ class MotionStage:
             }
         )
 
-    def _gather_reach(self, reach: Reach) -> pl.DataFrame:
+    def _gather_reach(self, reach: HorizonErrors) -> pl.DataFrame:
         horizons, ideal = self._comparison.horizons, self._ideal_reach
         count = np.maximum(np.bincount(horizons.number), 1)
 

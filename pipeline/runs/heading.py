@@ -18,7 +18,7 @@ from pipeline.core import timegrid
 from pipeline.runs.recording import GyroFit
 
 if TYPE_CHECKING:
-    from pipeline.runs.grid import Cells
+    from pipeline.runs.grid import Grid
     from pipeline.runs.recording import MotionRun, Track
 
 Floats = NDArray[np.float64]
@@ -62,7 +62,7 @@ class Heading:
     offset: Floats
 
 
-def choose_heading(run: MotionRun, cells: Cells, source: HeadingSource) -> Heading:
+def choose_heading(run: MotionRun, cells: Grid, source: HeadingSource) -> Heading:
     """The gyro's heading where it agrees with the poses, else the poses' own."""
     track = run.track
     fit = run.gyro_fit if source is HeadingSource.AUTO else None

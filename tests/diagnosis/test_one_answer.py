@@ -23,9 +23,9 @@ from pipeline.identification.describe import errors_as_json, ladder_as_json, par
 from pipeline.identification.judgement import judge_model
 from pipeline.models import read_model, write_model
 from pipeline.report.diagnosed import read_model_text, view_diagnosis
-from pipeline.web.bench import Bench
-from pipeline.web.desk import DeskFile
-from pipeline.web.work import add_effects, open_desk
+from pipeline.web.actions import add_effects, open_session
+from pipeline.web.run_cache import RunCache
+from pipeline.web.session import SessionFile
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -82,7 +82,7 @@ def compare_everywhere(log: Path, source: Input, results: Path, tmp_path: Path) 
     )
     require_no_rise(told["ladder"])
     if file.model.effects:
-        check_workbench(told, file, own, manifest, DeskFile(tmp_path, manifest.run, "a"))
+        check_workbench(told, file, own, manifest, SessionFile(tmp_path, manifest.run, "a"))
         view = view_diagnosis(recording.tables, vehicle, told)
         assert view is not None
         assert set(view.effects) == set(file.model.ids)
@@ -138,12 +138,14 @@ def check_model_verbs(told: Json, file: ModelFile, problem: Problem) -> Json:
     return own
 
 
-def check_workbench(told: Json, file: ModelFile, own: Json, manifest: Manifest, desk_file: DeskFile) -> None:
+def check_workbench(
+    told: Json, file: ModelFile, own: Json, manifest: Manifest, desk_file: SessionFile
+) -> None:
     """*Add all* enters the fit of the diagnosis."""
-    stand = Bench().stand(manifest, str(told["input"]))
-    desk = open_desk(desk_file, stand)
+    prepared = RunCache().prepared(manifest, str(told["input"]))
+    desk = open_session(desk_file, prepared)
     assert all(same(desk.step.ladder[0][key], told["ladder"][0][key]) for key in ERRORS)
-    desk = add_effects(desk_file, stand, desk, file.model.effects, "+ all", anyway=True)
+    desk = add_effects(desk_file, prepared, desk, file.model.effects, "+ all", anyway=True)
     assert all(same(desk.step.ladder[-1][key], own[key]) for key in ERRORS)
     kept = desk_file.parse(desk.step.model).model
     for effect in file.model:

@@ -152,7 +152,7 @@ def measure(run: MotionRun, vehicle: Vehicle, source: Input, effects: tuple[str,
     problem = Problem([run], vehicle, source)
     late = -run.alignment.heading_delay_s
     comparison, ideal = problem.comparisons[0], problem.start_state()
-    recorded = comparison.find_reach((), ideal.timing[0], late)
+    recorded = comparison.find_horizon_errors((), ideal.timing[0], late)
     before = measure_errors(problem.whole.shift_clock(ideal, 0, late), recorded.position, recorded.yaw)
     fitted = fit_model(problem, make_model(vehicle, effects))
     after = hold_out(problem, fitted).pooled
@@ -175,5 +175,5 @@ def _hold_out_turning(problem: Problem, fitted: Fitted) -> np.ndarray:
         for part, fit, rows in zip(problem.parts, fitted.fits, training, strict=True):
             state = state.take_over(refit(part, fit, rows), fit.free)
         told = fold.test[nearest_indices(comparison.horizons.times.mean(axis=1), middle)]
-        turned[told] = comparison.find_reach(state.effects_of(0), state.timing[0]).turned[told]
+        turned[told] = comparison.find_horizon_errors(state.effects_of(0), state.timing[0]).turned[told]
     return turned[np.isfinite(turned)]

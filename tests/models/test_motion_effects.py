@@ -116,7 +116,7 @@ WRITTEN = [e for e in EFFECTS if issubclass(e, LinearEffect | KinematicEffect) a
 @pytest.mark.parametrize("effect", WRITTEN, ids=ids(tuple(WRITTEN)))
 def test_the_formula_of_the_page_is_that_of_the_code(effect: type[Effect]) -> None:
     comparison = comparison_of(effect.kinds[0])
-    around = comparison.surroundings
+    around = comparison.context
     generator = np.random.default_rng(3)
     size = around.times.size
     wheels = Wheels(

@@ -24,7 +24,7 @@ from pipeline.models.effects.wheel_radius import WheelRadius
 
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
-    from pipeline.runs.signals import Rolling, Surroundings
+    from pipeline.runs.signals import Rolling, RunContext
 
 
 class EffectiveTrack(KinematicEffect):
@@ -48,7 +48,7 @@ class EffectiveTrack(KinematicEffect):
     needs = (Excitation.TURNING,)
     confused_with = ("wheel_radius", "terrain_change")
 
-    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
         del around
         return rolling.scale(1.0, 1.0 / self.values["k"])

@@ -30,7 +30,7 @@ _SURE = 4.0
 
 
 @dataclass(frozen=True)
-class Ground:
+class Context:
     """Runs of one vehicle, ready to be asked.
 
     Attributes:
@@ -102,7 +102,7 @@ class Ground:
         )
 
 
-def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Ground:
+def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Context:
     """Make runs ready.
 
     Raises:
@@ -130,7 +130,7 @@ def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Groun
             where=where,
             hint=f"{_FEWEST_WINDOWS} are needed: drive longer, or check the poses with `slip inspect`.",
         )
-    return Ground(problem)
+    return Context(problem)
 
 
 def is_late(run: MotionRun) -> bool:

@@ -43,7 +43,7 @@ class Judged:
 
 
 @dataclass
-class Stand:
+class PreparedRun:
     """One run and input, ready; one thread at a time.
 
     Attributes:
@@ -117,11 +117,11 @@ class Stand:
             return self._second
 
 
-class Bench:
+class RunCache:
     """The runs that were opened last."""
 
     def __init__(self) -> None:
-        self._stands: OrderedDict[tuple[str, str, str], Stand] = OrderedDict()
+        self._prepared: OrderedDict[tuple[str, str, str], PreparedRun] = OrderedDict()
         self._runs: OrderedDict[tuple[str, str], tuple[Vehicle, MotionRun]] = OrderedDict()
         self._lock = threading.Lock()
         self._making: dict[tuple[str, str, str], threading.Lock] = {}
@@ -147,7 +147,7 @@ class Bench:
         found += [Input.MEASURED] if run.wheels is not None else []
         return [source.value for source in found]
 
-    def stand(self, manifest: Manifest, source: str | None) -> Stand:
+    def prepared(self, manifest: Manifest, source: str | None) -> PreparedRun:
         """A run ready for an input; made where it is not there yet.
 
         Raises:
@@ -160,19 +160,19 @@ class Bench:
             making = self._making.setdefault(key, threading.Lock())
         with making:
             with self._lock:
-                if key in self._stands:
-                    self._stands.move_to_end(key)
-                    return self._stands[key]
+                if key in self._prepared:
+                    self._prepared.move_to_end(key)
+                    return self._prepared[key]
             problem = Problem([run], vehicle, chosen)
             places = None
             if "velocities" in manifest.tables:
                 places = manifest.read("velocities").select(pl.col("t", "x", "y")).sort("t")
-            stand = Stand(manifest, vehicle, run, problem, MotionStage(problem, places))
+            prepared = PreparedRun(manifest, vehicle, run, problem, MotionStage(problem, places))
             with self._lock:
-                self._stands[key] = stand
-                while len(self._stands) > _MOST_RUNS:
-                    self._stands.popitem(last=False)
-            return stand
+                self._prepared[key] = prepared
+                while len(self._prepared) > _MOST_RUNS:
+                    self._prepared.popitem(last=False)
+            return prepared
 
 
 def rung_as_json(effects: Sequence[str], errors: Errors) -> dict[str, object]:

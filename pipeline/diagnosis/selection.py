@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.diagnosis.budget import Budget
-from pipeline.diagnosis.judge import LEAST_GAIN, Verdict, compare
 from pipeline.diagnosis.plausibility import is_nameable
+from pipeline.diagnosis.verdict import LEAST_GAIN, Verdict, compare
 from pipeline.identification.fit import PartFit, fit_part
 from pipeline.identification.folds import hold_out_part, make_folds
 from pipeline.identification.proposals import propose
@@ -35,7 +35,7 @@ _FLOOR = 1.1
 
 
 @dataclass(frozen=True)
-class Contender:
+class CandidateModel:
     """A fitted model with its held-out residuals.
 
     Attributes:
@@ -60,7 +60,7 @@ class Contender:
 
 
 @dataclass
-class Arena:
+class Selection:
     """A part of the way with what is needed to judge models of it.
 
     Attributes:
@@ -82,17 +82,17 @@ class Arena:
     kept: frozenset[str] = frozenset()
     least_share: float = 0.0
     budget: Budget = field(default_factory=Budget)
-    _dropped: dict[tuple[str, ...], Contender] = field(default_factory=dict)
-    _suggested: dict[tuple[object, ...], list[Contender]] = field(default_factory=dict)
+    _dropped: dict[tuple[str, ...], CandidateModel] = field(default_factory=dict)
+    _suggested: dict[tuple[object, ...], list[CandidateModel]] = field(default_factory=dict)
     _proposed: dict[tuple[object, ...], list[Proposal]] = field(default_factory=dict)
     _tried: dict[tuple[object, ...], PartFit] = field(default_factory=dict)
-    _finished: dict[tuple[object, ...], Contender] = field(default_factory=dict)
+    _finished: dict[tuple[object, ...], CandidateModel] = field(default_factory=dict)
     work: int = 0
     _columns: dict[str, list[Trial]] = field(default_factory=dict)
 
-    def widen(self, candidates: tuple[Candidate, ...]) -> Arena:
-        """The same arena with other candidates; nothing that was tried here counts there."""
-        return Arena(
+    def widen(self, candidates: tuple[Candidate, ...]) -> Selection:
+        """The same selection with other candidates; nothing that was tried here counts there."""
+        return Selection(
             self.part, candidates, self.evidence, self.folds, self.weights,
             kept=self.kept, least_share=self.least_share, budget=self.budget,
         )  # fmt: skip
@@ -106,34 +106,34 @@ class Arena:
         """What was asked for."""
         return self.evidence.largest
 
-    def enter(self, state: State) -> Contender:
+    def enter(self, state: State) -> CandidateModel:
         """Fit a state and hold it out."""
         return self._present(fit_part(self.part, self.weights, state))
 
-    def drop(self, current: Contender, names: Iterable[str]) -> Contender:
+    def drop(self, current: CandidateModel, names: Iterable[str]) -> CandidateModel:
         """A model without some of its effects, fitted anew."""
         state = current.state.drop(names)
         if state.ids not in self._dropped:
             self._dropped[state.ids] = self.enter(state)
         return self._dropped[state.ids]
 
-    def _present(self, fit: PartFit) -> Contender:
+    def _present(self, fit: PartFit) -> CandidateModel:
         held = hold_out_part(fit, self.folds)
         price = 1.0 + sum(
             effect.price + _PRICE_OF_A_NUMBER * sum(np.isfinite(value) for value in effect.values.values())
             for effect in fit.state.effects
         )
-        return Contender(fit, held, self.weights.loss(held) * price)
+        return CandidateModel(fit, held, self.weights.loss(held) * price)
 
-    def judge(self, before: Contender, after: Contender) -> Verdict:
+    def judge(self, before: CandidateModel, after: CandidateModel) -> Verdict:
         """How much better ``after`` is."""
         return compare(self.part, self.weights, before.held, after.held)
 
-    def prefers(self, before: Contender, after: Contender, least_gain: float = LEAST_GAIN) -> bool:
+    def prefers(self, before: CandidateModel, after: CandidateModel, least_gain: float = LEAST_GAIN) -> bool:
         """Whether ``after`` is better beyond doubt, and by enough to matter."""
         return self.judge(before, after).accepts(least_gain) and self._matters(before, after)
 
-    def _matters(self, before: Contender, after: Contender) -> bool:
+    def _matters(self, before: CandidateModel, after: CandidateModel) -> bool:
         """Whether enough of the motion is explained: encoders are so exact that all else is certain."""
         if self.least_share == 0.0:
             return True
@@ -141,18 +141,18 @@ class Arena:
         fall = (before.held**2 - after.held**2).mean(axis=0)[[0, 2]]
         return bool((fall > self.least_share**2 * asked).any())
 
-    def adapt(self, contender: Contender) -> Contender:
+    def adapt(self, tested: CandidateModel) -> CandidateModel:
         """Take the weights from a model's own residuals, and fit it anew."""
-        self.weights = make_weights(contender.fit.residual, self.part)
+        self.weights = make_weights(tested.fit.residual, self.part)
         self._dropped.clear()
         self._suggested.clear()
         self._proposed.clear()
         self._tried.clear()
         self._finished.clear()
-        self.budget.report(self.part.way, contender.ids)
-        return self.enter(contender.state)
+        self.budget.report(self.part.way, tested.ids)
+        return self.enter(tested.state)
 
-    def suggest(self, base: Contender, count: int, without: Iterable[str] = ()) -> list[Contender]:
+    def suggest(self, base: CandidateModel, count: int, without: Iterable[str] = ()) -> list[CandidateModel]:
         """The best few models with one effect more, fitted, by score."""
         barred = frozenset(without)
         key = (base.ids, count, barred)
@@ -166,12 +166,12 @@ class Arena:
         entered = [
             self._finish(base.ids, fit) if fit.loss < _WORTH * best else self._present(fit) for fit in tried
         ]
-        entered = [self._simplify(contender) for contender in entered]
+        entered = [self._simplify(tested) for tested in entered]
         ranked = sorted((c for c in entered if self.is_sound(c)), key=lambda c: c.score)
         self._suggested[key] = ranked
         return ranked
 
-    def _propose(self, base: Contender, barred: frozenset[str]) -> list[Proposal]:
+    def _propose(self, base: CandidateModel, barred: frozenset[str]) -> list[Proposal]:
         """Effects beside a model by what they promise; asked again and again for another count of them."""
         key = (base.ids, barred)
         if key not in self._proposed:
@@ -185,40 +185,40 @@ class Arena:
             self._tried[key] = fit_part(self.part, self.weights, state, _FIRST_STEPS)
         return self._tried[key]
 
-    def _finish(self, base: tuple[str, ...], fit: PartFit) -> Contender:
+    def _finish(self, base: tuple[str, ...], fit: PartFit) -> CandidateModel:
         key = (base, fit.state.ids)
         if key not in self._finished:
             self._finished[key] = self.enter(fit.state)
         return self._finished[key]
 
-    def _simplify(self, contender: Contender) -> Contender:
+    def _simplify(self, tested: CandidateModel) -> CandidateModel:
         """The model with a simpler effect for one that has become it beside a new effect."""
-        known = {candidate.id for candidate in self.candidates} - set(contender.ids)
-        for effect in contender.state.effects:
+        known = {candidate.id for candidate in self.candidates} - set(tested.ids)
+        for effect in tested.state.effects:
             simpler = None if effect.id in self.kept else effect.collapse()
             if simpler is None or simpler.id not in known or is_nameable(effect, self.evidence):
                 continue
-            return self.enter(contender.state.drop([effect.id]).add(simpler))
-        return contender
+            return self.enter(tested.state.drop([effect.id]).add(simpler))
+        return tested
 
-    def has_room(self, contender: Contender) -> bool:
+    def has_room(self, tested: CandidateModel) -> bool:
         """Whether a model leaves more than a saturated fit does in any channel."""
-        own = measure_spread(contender.fit.residual, self.part)[:, self.part.channels]
+        own = measure_spread(tested.fit.residual, self.part)[:, self.part.channels]
         return bool((own > _FLOOR * self.part.noise[:, self.part.channels]).any())
 
-    def is_sound(self, contender: Contender) -> bool:
+    def is_sound(self, tested: CandidateModel) -> bool:
         """Whether every effect is large enough to be named, and no degenerate form of another."""
         return all(
-            effect.id in self.kept or is_nameable(effect, self.evidence) for effect in contender.state.effects
+            effect.id in self.kept or is_nameable(effect, self.evidence) for effect in tested.state.effects
         )
 
 
-def open_arena(
+def open_selection(
     part: Part, start: State, candidates: tuple[Candidate, ...], evidence: Evidence, budget: Budget
-) -> tuple[Arena, Contender]:
-    """The arena of a part of the way, and the model to start from, fitted."""
+) -> tuple[Selection, CandidateModel]:
+    """The selection of a part of the way, and the model to start from, fitted."""
     weights = make_weights(part.find_residuals(start), part)
-    arena = Arena(
+    selection = Selection(
         part, candidates, evidence, make_folds(part), weights, kept=frozenset(start.ids), budget=budget
     )
-    return arena, arena.adapt(arena.enter(start))
+    return selection, selection.adapt(selection.enter(start))
