@@ -72,7 +72,7 @@ class Trials:
         """Try every effect on top of a model, in the background; what its owner had begun before ends.
 
         Args:
-            stand: the run.
+            prepared: the run.
             model: as it stands.
             owner: who asks: one trial each.
         """
