@@ -124,7 +124,9 @@ def fit_model(
             fit = known
         else:
             fit = _fit_part(problem, part, mine, per_run)
-        fits.append(_settle(part, fit, per_run) if exact else fit)
+        if exact:
+            fit = _settle(part, fit, per_run)
+        fits.append(fit)
         state = replace(fit.state, effects=state.effects).add(*fit.state.effects)
     return Fitted(problem, state, tuple(fits), problem.find_residuals(state))
 
