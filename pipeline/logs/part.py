@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Final
@@ -9,13 +10,17 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from pipeline.logs import records as rec
+from pipeline.logs.bags import LONGEST_HEAD, LONGEST_MAGIC, catalog_bag, is_whole, tell_container
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import checksum
 from pipeline.logs.loading import checksum_holds, load_spans
+from pipeline.logs.remote import to_location
 from pipeline.logs.scan import Catalog, Scanner
 from pipeline.logs.spans import Loaded, Span, SpanKind, StoredAs
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pipeline.logs.source import ByteSource
 
 _MAX_SUMMARY: Final = 1 << 29
@@ -45,10 +50,14 @@ def catalog_file(source: ByteSource, *, threads: int = 1) -> Catalog:
         threads: how many chunks are inflated at once where the summary is missing.
 
     Raises:
-        LogError: ``not_mcap``.
+        LogError: ``not_mcap``; of a bag, ``log_unreadable``.
     """
+    head = source.read_at(0, LONGEST_MAGIC)
+    container = tell_container(head)
+    if container:
+        return catalog_bag(to_location(source.name), container)
     catalog = Catalog()
-    start = _check_magic(source, catalog)
+    start = _check_magic(head[: len(rec.MAGIC)], source, catalog)
     ends_well = source.read_at(max(0, source.size - len(rec.MAGIC)), len(rec.MAGIC)) == rec.MAGIC
     stop = source.size - len(rec.MAGIC) if ends_well and source.size >= 2 * len(rec.MAGIC) else source.size
     try:
@@ -70,8 +79,22 @@ def catalog_file(source: ByteSource, *, threads: int = 1) -> Catalog:
     return catalog
 
 
-def _check_magic(source: ByteSource, catalog: Catalog) -> int:
-    head = source.read_at(0, len(rec.MAGIC))
+def is_finished(path: Path) -> bool:
+    """Whether a recorder has put an end to a file, as far as its first and last bytes tell.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(LONGEST_HEAD)
+        size = stream.seek(0, os.SEEK_END)
+        if tell_container(head):
+            return is_whole(path, head, size)
+        stream.seek(max(0, size - len(rec.MAGIC)))
+        return size >= 2 * len(rec.MAGIC) and stream.read() == rec.MAGIC
+
+
+def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> int:
     if head == rec.MAGIC:
         return len(rec.MAGIC)
     alike = sum(a == b for a, b in zip(head, rec.MAGIC, strict=False))
@@ -85,9 +108,9 @@ def _check_magic(source: ByteSource, catalog: Catalog) -> int:
     if alike < len(rec.MAGIC) - 2:
         raise LogError(
             "not_mcap",
-            "the file does not begin as MCAP does",
+            "the file begins neither as MCAP does nor as a bag of ROS 1 or ROS 2",
             where=source.name,
-            hint="Give an .mcap file, or convert the recording (`ros2 bag convert`, `mcap convert`)",
+            hint="Give an .mcap, .bag or .db3 file, or convert the recording (`ros2 bag convert`)",
         )
     catalog.losses.append(Loss("damaged_record", "the file's first 8 bytes are damaged", bytes=8))
     return len(rec.MAGIC)

@@ -28,10 +28,12 @@ _MAX_SIDE_RECORD: Final = 1 << 26
 class Catalog:
     """What is known of a file.
 
-    ``metadata`` and ``attachments`` keep the order of the file, ``side_records`` are their places, lengths
-    and names; ``counts`` are messages by channel number.
+    ``container`` is what kind of file it is, empty for MCAP. ``metadata`` and ``attachments`` keep the order
+    of the file, ``side_records`` are their places, lengths and names; ``counts`` are messages by channel
+    number.
     """
 
+    container: str = ""
     profile: str = ""
     library: str = ""
     schemas: dict[int, rec.SchemaRecord] = field(default_factory=dict)

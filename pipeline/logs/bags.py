@@ -1,0 +1,247 @@
+"""Recordings that are not MCAP: bags of ROS 1 and the SQLite files of rosbag2, read through rosbags.
+
+Their messages come one by one and are decoded in blocks, as those of MCAP files are.
+"""
+
+from __future__ import annotations
+
+import bz2
+import re
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import quote
+
+from pipeline.logs.errors import LogError, Loss
+from pipeline.logs.inflate import InflateError, inflate_message, largest_plausible
+from pipeline.logs.payloads import Payloads, join_payloads
+from pipeline.logs.records import ChannelRecord, SchemaRecord
+from pipeline.logs.remote import RemotePath
+from pipeline.logs.scan import Catalog
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from collections.abc import Set as AbstractSet
+
+    from rosbags.interfaces import Connection
+    from rosbags.rosbag1 import Reader as BagReader
+    from rosbags.rosbag1.reader import Chunk
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+    from pipeline.logs.records import Buffer
+
+    Opened = BagReader | Sqlite3Reader
+
+ROS1_BAG: Final = "ROS 1 bag"
+SQLITE_BAG: Final = "rosbag2 SQLite file"
+_MAGICS: Final = {b"#ROSBAG V": ROS1_BAG, b"SQLite format 3\0": SQLITE_BAG}
+
+LONGEST_MAGIC: Final = max(map(len, _MAGICS))
+LONGEST_HEAD: Final = 1 << 12
+"""So many bytes at the start of a bag tell what it is and how long it should be."""
+
+_INDEX_PLACE: Final = re.compile(rb"index_pos=(.{8})", re.DOTALL)
+
+_TOGETHER: Final = 4 << 20
+"""Payload bytes that are handed on at once."""
+
+_LAST_TIME: Final = (1 << 63) - 1
+
+
+def tell_container(head: bytes) -> str:
+    """What kind of bag a file is that begins so; empty for everything else."""
+    return next((kind for magic, kind in _MAGICS.items() if head.startswith(magic)), "")
+
+
+def is_whole(path: Path, head: bytes, size: int) -> bool:
+    """Whether a bag is as long as it says of itself, and nobody has a transaction in it under way.
+
+    Args:
+        path: the file.
+        head: its first `LONGEST_HEAD` bytes.
+        size: bytes of all of it.
+    """
+    if tell_container(head) == ROS1_BAG:
+        # The recorder tells where the index stands when it has written it.
+        found = _INDEX_PLACE.search(head)
+        return found is not None and 0 < int.from_bytes(found[1], "little") <= size
+    page = int.from_bytes(head[16:18], "big")
+    pages = int.from_bytes(head[28:32], "big")
+    # A page of 64 KiB is written as 1.
+    whole = size >= pages * (page if page > 1 else 1 << 16)
+    return whole and not any(path.with_name(path.name + end).exists() for end in ("-journal", "-wal"))
+
+
+def catalog_bag(path: Path, container: str) -> Catalog:
+    """Find out what a bag holds.
+
+    Args:
+        path: the file.
+        container: `ROS1_BAG` or `SQLITE_BAG`.
+
+    Raises:
+        LogError: ``log_unreadable``.
+    """
+    catalog = Catalog(container=container, profile="ros1" if container == ROS1_BAG else "ros2")
+    with _open(path, container) as reader:
+        for connection in reader.connections:
+            number = connection.id
+            encoding, form = _encodings(connection, container)
+            schema = SchemaRecord(number, connection.msgtype, form, connection.msgdef.data.encode())
+            catalog.schemas[number] = schema
+            catalog.channels[number] = ChannelRecord(number, number, connection.topic, encoding, {})
+            catalog.counts[number] = connection.msgcount
+        told: Any = getattr(reader, "metadata", reader)
+        if any(catalog.counts.values()):
+            catalog.start_ns, catalog.end_ns = told.start_time, told.end_time - 1
+    catalog.notes.append(f"it is a {container}, read through rosbags; MCAP is read faster and in less memory")
+    return catalog
+
+
+@dataclass(slots=True)
+class BagMessages:
+    """Some messages of a bag: payloads by channel number, and what was lost up to here."""
+
+    payloads: dict[int, Payloads] = field(default_factory=dict)
+    losses: list[Loss] = field(default_factory=list)
+
+
+def read_bag(path: Path, container: str, numbers: AbstractSet[int]) -> Iterator[BagMessages]:
+    """Read the messages of some channels in the order of their times, a few megabytes at once.
+
+    Args:
+        path: the file.
+        container: `ROS1_BAG` or `SQLITE_BAG`.
+        numbers: of the channels.
+
+    Raises:
+        LogError: ``log_unreadable``.
+    """
+    collected = _Collected()
+    with _open(path, container) as reader:
+        wanted = [connection for connection in reader.connections if connection.id in numbers]
+        if not wanted:
+            return
+        try:
+            for connection, time, data in reader.messages(wanted):
+                collected.add(connection.id, time, data)
+                if collected.size > _TOGETHER:
+                    yield BagMessages(collected.take())
+        except MemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001 - what damage raises in there has no common type
+            text = f"the {container} breaks off: what comes after {collected.count} messages cannot be read"
+            text += f" ({_tell(error)})"
+            collected.losses.append(Loss("damaged_record", text, start_ns=collected.last))
+    if collected.odd:
+        text = f"{collected.odd} messages of the {container} have no time or no content that can be read"
+        collected.losses.append(Loss("damaged_record", text))
+    yield BagMessages(collected.take(), collected.losses)
+
+
+@dataclass(slots=True)
+class _Collected:
+    """Messages that wait to be handed on."""
+
+    size: int = 0
+    count: int = 0
+    odd: int = 0
+    last: int | None = None
+    losses: list[Loss] = field(default_factory=list)
+    messages: dict[int, tuple[list[int], list[Buffer]]] = field(default_factory=dict)
+
+    def add(self, number: int, time: object, data: object) -> None:
+        # Columns of SQLite hold what somebody put there, whatever their type says.
+        if not isinstance(time, int) or not 0 <= time <= _LAST_TIME or not isinstance(data, bytes):
+            self.odd += 1
+            return
+        try:
+            payload = inflate_message(data)
+        except InflateError:
+            self.odd += 1
+            return
+        times, payloads = self.messages.setdefault(number, ([], []))
+        times.append(time)
+        payloads.append(payload)
+        self.size += len(payload)
+        self.count += 1
+        self.last = time
+
+    def take(self) -> dict[int, Payloads]:
+        taken = {number: join_payloads(*lists) for number, lists in self.messages.items()}
+        self.messages, self.size = {}, 0
+        return taken
+
+
+def _encodings(connection: Connection, container: str) -> tuple[str, str]:
+    """Encodings of a connection's messages and of their definition, by the names that MCAP gives them."""
+    if container == ROS1_BAG:
+        return "ros1", "ros1msg"
+    form = "ros2idl" if connection.msgdef.format.name == "IDL" else "ros2msg"
+    return getattr(connection.ext, "serialization_format", "cdr"), form
+
+
+@contextmanager
+def _open(path: Path, container: str) -> Iterator[Opened]:
+    """Open a bag; whatever is wrong with it is one error."""
+    if isinstance(path, RemotePath):
+        raise LogError(
+            "log_unreadable",
+            f"a {container} is not read from an object store",
+            where=str(path),
+            hint="Copy it to this machine, or convert it to MCAP",
+        )
+    reader = _make_reader(path, container)
+    try:
+        reader.open()
+        _bound_chunks(getattr(reader, "chunks", {}))
+    except MemoryError:
+        raise
+    except Exception as error:
+        raise LogError(
+            "log_unreadable",
+            f"the {container} cannot be opened ({_tell(error)})",
+            where=str(path),
+            hint="Copy it from its origin again, or repair it there: `rosbag reindex`, `ros2 bag reindex`",
+        ) from error
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+def _make_reader(path: Path, container: str) -> Opened:
+    if container == ROS1_BAG:
+        from rosbags.rosbag1 import Reader  # noqa: PLC0415 - few logs need it
+
+        return Reader(path)
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader  # noqa: PLC0415 - few logs need it
+
+    # It is made part of an address, where marks such as ? and % have a meaning.
+    return Sqlite3Reader(Path(quote(str(path.absolute()))))
+
+
+def _bound_chunks(chunks: dict[int, Chunk]) -> None:
+    """Have the chunks of a ROS 1 bag inflated to no more than is plausible."""
+    from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415 - few logs need it
+    from rosbags.rosbag1.reader import decompressors  # noqa: PLC0415 - few logs need it
+
+    makers = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor}
+    bounded = {decompressors[name]: partial(_inflate_chunk, maker) for name, maker in makers.items()}
+    for place, chunk in chunks.items():
+        if chunk.decompressor in bounded:
+            chunks[place] = chunk._replace(decompressor=bounded[chunk.decompressor])
+
+
+def _inflate_chunk(maker: Callable[[], bz2.BZ2Decompressor], stored: bytes) -> bytes:
+    decompressor = maker()
+    found = decompressor.decompress(stored, max_length=largest_plausible(len(stored)))
+    if not decompressor.eof:
+        raise InflateError(f"{len(stored)} bytes of a chunk are cut, or hold more than is plausible")
+    return found
+
+
+def _tell(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
