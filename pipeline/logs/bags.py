@@ -18,7 +18,7 @@ from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import InflateError, inflate_message, largest_plausible
 from pipeline.logs.payloads import Payloads, join_payloads
 from pipeline.logs.records import ChannelRecord, SchemaRecord
-from pipeline.logs.remote import RemotePath
+from pipeline.logs.remote import RemotePath, to_location
 from pipeline.logs.scan import Catalog
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
     from pipeline.logs.records import Buffer
+    from pipeline.logs.source import ByteSource
 
     Opened = BagReader | Sqlite3Reader
 
@@ -44,6 +45,8 @@ LONGEST_HEAD: Final = 1 << 12
 
 _INDEX_PLACE: Final = re.compile(rb"index_pos=(.{8})", re.DOTALL)
 
+_REPAIRS: Final = {ROS1_BAG: "`rosbag reindex`", SQLITE_BAG: "`sqlite3 FILE .recover`"}
+
 _TOGETHER: Final = 4 << 20
 """Payload bytes that are handed on at once."""
 
@@ -55,11 +58,10 @@ def tell_container(head: bytes) -> str:
     return next((kind for magic, kind in _MAGICS.items() if head.startswith(magic)), "")
 
 
-def is_whole(path: Path, head: bytes, size: int) -> bool:
-    """Whether a bag is as long as it says of itself, and nobody has a transaction in it under way.
+def is_whole(head: bytes, size: int) -> bool:
+    """Whether a bag is as long as it says of itself.
 
     Args:
-        path: the file.
         head: its first `LONGEST_HEAD` bytes.
         size: bytes of all of it.
     """
@@ -70,22 +72,26 @@ def is_whole(path: Path, head: bytes, size: int) -> bool:
     page = int.from_bytes(head[16:18], "big")
     pages = int.from_bytes(head[28:32], "big")
     # A page of 64 KiB is written as 1.
-    whole = size >= pages * (page if page > 1 else 1 << 16)
-    return whole and not any(path.with_name(path.name + end).exists() for end in ("-journal", "-wal"))
+    return size >= max(pages, 1) * (page if page > 1 else 1 << 16)
 
 
-def catalog_bag(path: Path, container: str) -> Catalog:
+def is_written_to(path: Path) -> bool:
+    """Whether a transaction is under way in an SQLite file."""
+    return any(path.with_name(path.name + end).exists() for end in ("-journal", "-wal"))
+
+
+def catalog_bag(source: ByteSource, container: str) -> Catalog:
     """Find out what a bag holds.
 
     Args:
-        path: the file.
+        source: the file.
         container: `ROS1_BAG` or `SQLITE_BAG`.
 
     Raises:
         LogError: ``log_unreadable``.
     """
     catalog = Catalog(container=container, profile="ros1" if container == ROS1_BAG else "ros2")
-    with _open(path, container) as reader:
+    with _open(to_location(source.name), container) as reader:
         for connection in reader.connections:
             number = connection.id
             encoding, form = _encodings(connection, container)
@@ -96,6 +102,9 @@ def catalog_bag(path: Path, container: str) -> Catalog:
         told: Any = getattr(reader, "metadata", reader)
         if any(catalog.counts.values()):
             catalog.start_ns, catalog.end_ns = told.start_time, told.end_time - 1
+    if not is_whole(source.read_at(0, LONGEST_HEAD), source.size):
+        text = f"the {container} is shorter than it says of itself: its end is missing"
+        catalog.losses.append(Loss("truncated", text))
     catalog.notes.append(f"it is a {container}, read through rosbags; MCAP is read faster and in less memory")
     return catalog
 
@@ -204,7 +213,7 @@ def _open(path: Path, container: str) -> Iterator[Opened]:
             "log_unreadable",
             f"the {container} cannot be opened ({_tell(error)})",
             where=str(path),
-            hint="Copy it from its origin again, or repair it there: `rosbag reindex`, `ros2 bag reindex`",
+            hint=f"Copy it from its origin again, or repair it there with {_REPAIRS[container]}",
         ) from error
     try:
         yield reader
@@ -244,4 +253,5 @@ def _inflate_chunk(maker: Callable[[], bz2.BZ2Decompressor], stored: bytes) -> b
 
 
 def _tell(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    # The cause says what is wrong without the path, which is told anyway.
+    return " ".join(str(error.__cause__ or error).split()) or type(error).__name__

@@ -10,11 +10,17 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from pipeline.logs import records as rec
-from pipeline.logs.bags import LONGEST_HEAD, LONGEST_MAGIC, catalog_bag, is_whole, tell_container
+from pipeline.logs.bags import (
+    LONGEST_HEAD,
+    LONGEST_MAGIC,
+    catalog_bag,
+    is_whole,
+    is_written_to,
+    tell_container,
+)
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import checksum
 from pipeline.logs.loading import checksum_holds, load_spans
-from pipeline.logs.remote import to_location
 from pipeline.logs.scan import Catalog, Scanner
 from pipeline.logs.spans import Loaded, Span, SpanKind, StoredAs
 
@@ -55,7 +61,7 @@ def catalog_file(source: ByteSource, *, threads: int = 1) -> Catalog:
     head = source.read_at(0, LONGEST_MAGIC)
     container = tell_container(head)
     if container:
-        return catalog_bag(to_location(source.name), container)
+        return catalog_bag(source, container)
     catalog = Catalog()
     start = _check_magic(head[: len(rec.MAGIC)], source, catalog)
     ends_well = source.read_at(max(0, source.size - len(rec.MAGIC)), len(rec.MAGIC)) == rec.MAGIC
@@ -89,7 +95,7 @@ def is_finished(path: Path) -> bool:
         head = stream.read(LONGEST_HEAD)
         size = stream.seek(0, os.SEEK_END)
         if tell_container(head):
-            return is_whole(path, head, size)
+            return is_whole(head, size) and not is_written_to(path)
         stream.seek(max(0, size - len(rec.MAGIC)))
         return size >= 2 * len(rec.MAGIC) and stream.read() == rec.MAGIC
 
