@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
+from mcap.records import Channel, Schema
+
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import InflateError, inflate_message, largest_plausible
 from pipeline.logs.payloads import Payloads, join_payloads
-from pipeline.logs.records import ChannelRecord, SchemaRecord
 from pipeline.logs.remote import RemotePath, to_location
 from pipeline.logs.scan import Catalog
 
@@ -95,9 +96,9 @@ def catalog_bag(source: ByteSource, container: str) -> Catalog:
         for connection in reader.connections:
             number = connection.id
             encoding, form = _encodings(connection, container)
-            schema = SchemaRecord(number, connection.msgtype, form, connection.msgdef.data.encode())
+            schema = Schema(number, connection.msgdef.data.encode(), form, connection.msgtype)
             catalog.schemas[number] = schema
-            catalog.channels[number] = ChannelRecord(number, number, connection.topic, encoding, {})
+            catalog.channels[number] = Channel(number, connection.topic, encoding, {}, number)
             catalog.counts[number] = connection.msgcount
         told: Any = getattr(reader, "metadata", reader)
         if any(catalog.counts.values()):

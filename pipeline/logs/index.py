@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from pipeline.logs.records import ChannelRecord, SchemaRecord
+    from mcap.records import Channel, Schema
+
     from pipeline.logs.scan import Catalog
     from pipeline.logs.spans import Span
 
@@ -74,8 +75,8 @@ class Part:
 
     path: Path
     spans: tuple[Span, ...]
-    channels: Mapping[int, ChannelRecord]
-    schemas: Mapping[int, SchemaRecord]
+    channels: Mapping[int, Channel]
+    schemas: Mapping[int, Schema]
     numbers: Mapping[int, int]
     data_end: int | None = None
     data_crc: int = 0

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import struct
 from dataclasses import dataclass, replace
 from functools import cache
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
 
 from pipeline.logs import records as rec
 from pipeline.logs.bags import (
@@ -29,6 +32,7 @@ if TYPE_CHECKING:
 
     from pipeline.logs.source import ByteSource
 
+_FOOTER: Final = struct.Struct("<QQI")
 _MAX_SUMMARY: Final = 1 << 29
 
 
@@ -43,8 +47,8 @@ class _DamagedSummaryError(_NoSummaryError):
 @dataclass(frozen=True, slots=True)
 class _Summary:
     start: int
-    statistics: rec.StatisticsRecord
-    chunks: list[rec.ChunkIndexRecord]
+    statistics: Statistics
+    chunks: list[ChunkIndex]
     side_records: set[tuple[int, int, str]]
 
 
@@ -130,8 +134,7 @@ def _read_summary(source: ByteSource, catalog: Catalog) -> _Summary:
     opcode, length = rec.HEAD.unpack_from(tail, 0)
     if opcode != rec.FOOTER or length != rec.LEAST_BODY[rec.FOOTER]:
         raise _DamagedSummaryError("the footer is damaged")
-    parser = rec.Parser(tail[rec.HEAD_SIZE :])
-    start, _offsets, crc = parser.number(8), parser.number(8), parser.number(4)
+    start, _offsets, crc = _FOOTER.unpack_from(tail, rec.HEAD_SIZE)
     footer_at = source.size - rec.FOOTER_SIZE - len(rec.MAGIC)
     if start == 0:
         raise _NoSummaryError("there is no summary")
@@ -149,17 +152,17 @@ def _read_summary(source: ByteSource, catalog: Catalog) -> _Summary:
     return summary
 
 
-def _compare_chunks(source: ByteSource, chunks: list[rec.ChunkIndexRecord]) -> None:
+def _compare_chunks(source: ByteSource, chunks: list[ChunkIndex]) -> None:
     """Look whether chunks stand where a summary without checksum says."""
     for chunk in chunks:
-        head = source.read_at(chunk.offset, rec.HEAD_SIZE)
-        if head != rec.HEAD.pack(rec.CHUNK, chunk.length - rec.HEAD_SIZE):
+        head = source.read_at(chunk.chunk_start_offset, rec.HEAD_SIZE)
+        if head != rec.HEAD.pack(rec.CHUNK, chunk.chunk_length - rec.HEAD_SIZE):
             raise _DamagedSummaryError("the summary disagrees with the chunks")
 
 
 def _parse_summary(body: bytes, start: int, catalog: Catalog) -> _Summary:
-    statistics: rec.StatisticsRecord | None = None
-    chunks: list[rec.ChunkIndexRecord] = []
+    statistics: Statistics | None = None
+    chunks: list[ChunkIndex] = []
     listed: set[tuple[int, int, str]] = set()
     place = 0
     view = memoryview(body)
@@ -172,51 +175,47 @@ def _parse_summary(body: bytes, start: int, catalog: Catalog) -> _Summary:
             raise rec.RecordError("a record is cut")
         record = view[place : place + length]
         place += length
-        if opcode == rec.SCHEMA:
-            schema = rec.parse_schema(record)
-            catalog.schemas[schema.id] = schema
-        elif opcode == rec.CHANNEL:
-            channel = rec.parse_channel(record)
-            catalog.channels[channel.id] = channel
-        elif opcode == rec.STATISTICS:
-            statistics = rec.parse_statistics(record)
-        elif opcode == rec.CHUNK_INDEX:
-            chunks.append(rec.parse_chunk_index(record))
-        elif opcode in {rec.ATTACHMENT_INDEX, rec.METADATA_INDEX}:
-            listed.add(rec.parse_side_index(opcode, record))
+        parsed = rec.parse_record(opcode, record)
+        if isinstance(parsed, Schema):
+            catalog.schemas[parsed.id] = parsed
+        elif isinstance(parsed, Channel):
+            catalog.channels[parsed.id] = parsed
+        elif isinstance(parsed, Statistics):
+            statistics = parsed
+        elif isinstance(parsed, ChunkIndex):
+            chunks.append(parsed)
+        elif isinstance(parsed, AttachmentIndex | MetadataIndex):
+            listed.add((parsed.offset, parsed.length, parsed.name))
     if statistics is None:
         raise _NoSummaryError("the summary has no statistics")
     _check_summary(statistics, chunks, start, catalog)
     return _Summary(start, statistics, chunks, listed)
 
 
-def _check_summary(
-    statistics: rec.StatisticsRecord, chunks: list[rec.ChunkIndexRecord], start: int, catalog: Catalog
-) -> None:
+def _check_summary(statistics: Statistics, chunks: list[ChunkIndex], start: int, catalog: Catalog) -> None:
     if len(chunks) != statistics.chunk_count:
         raise _NoSummaryError("the summary does not list its chunks")
-    if sum(statistics.message_counts.values()) != statistics.message_count:
+    if sum(statistics.channel_message_counts.values()) != statistics.message_count:
         raise _NoSummaryError("the summary does not count its messages by channel")
-    if any(number not in catalog.channels for number in statistics.message_counts):
+    if any(number not in catalog.channels for number in statistics.channel_message_counts):
         raise _NoSummaryError("the summary does not list its channels")
     if any(c.schema_id and c.schema_id not in catalog.schemas for c in catalog.channels.values()):
         raise _NoSummaryError("the summary does not list its schemas")
     end = len(rec.MAGIC)
-    for chunk in sorted(chunks, key=lambda each: each.offset):
-        if chunk.offset < end or chunk.length < rec.LEAST_BODY[rec.CHUNK]:
+    for chunk in sorted(chunks, key=attrgetter("chunk_start_offset")):
+        if chunk.chunk_start_offset < end or chunk.chunk_length < rec.LEAST_BODY[rec.CHUNK]:
             raise _DamagedSummaryError("the summary places its chunks one over the other")
-        end = chunk.offset + chunk.length + chunk.index_length
+        end = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
         catalog.compressions.add(chunk.compression)
-        known = frozenset(chunk.index_offsets) or None
         catalog.spans.append(
             Span(
                 SpanKind.CHUNK,
-                chunk.offset,
-                chunk.length,
-                chunk.index_length,
-                chunk.start_ns,
-                chunk.end_ns,
-                known,
+                chunk.chunk_start_offset,
+                chunk.chunk_length,
+                chunk.message_index_length,
+                chunk.message_start_time,
+                chunk.message_end_time,
+                frozenset(chunk.message_index_offsets) or None,
                 StoredAs(chunk.compression, chunk.compressed_size, chunk.uncompressed_size),
                 chunk.uncompressed_size,
             )
@@ -250,15 +249,15 @@ def _compare_side_records(catalog: Catalog, summary: _Summary) -> None:
 
 def _take_statistics(source: ByteSource, catalog: Catalog, summary: _Summary, threads: int) -> None:
     statistics = summary.statistics
-    unlisted = {chunk.offset for chunk in summary.chunks}
+    unlisted = {chunk.chunk_start_offset for chunk in summary.chunks}
     extra = [s for s in catalog.spans if s.kind is not SpanKind.LOOSE and s.offset not in unlisted]
     if extra:
         catalog.notes.append(f"{len(extra)} chunks that the summary does not list were found")
         _examine(source, catalog, threads)
         return
-    catalog.counts = dict(statistics.message_counts)
+    catalog.counts = dict(statistics.channel_message_counts)
     if statistics.message_count:
-        catalog.start_ns, catalog.end_ns = statistics.start_ns, statistics.end_ns
+        catalog.start_ns, catalog.end_ns = statistics.message_start_time, statistics.message_end_time
 
 
 def _rebuild(source: ByteSource, catalog: Catalog, start: int, stop: int, threads: int) -> None:
@@ -273,8 +272,8 @@ def _examine(source: ByteSource, catalog: Catalog, threads: int) -> None:
     """
     catalog.counts = {}
     examined: list[Span] = []
-    schemas: dict[int, rec.SchemaRecord] = {}
-    channels: dict[int, rec.ChannelRecord] = {}
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
 
     @cache
     def file_holds() -> bool:
