@@ -4,6 +4,7 @@ Reading is columnar and as fast as inflating the chunks; what is damaged is told
 read. Nothing here knows what the numbers mean.
 """
 
+from pipeline.logs.bags import ROS1_BAG, SQLITE_BAG
 from pipeline.logs.buckets import FETCHED, open_store
 from pipeline.logs.columns import Ragged, RaggedStrings, Strings
 from pipeline.logs.definitions import bundled_types, definition_text, field_names
@@ -18,6 +19,8 @@ from pipeline.logs.writer import LogWriter
 
 __all__ = [
     "FETCHED",
+    "ROS1_BAG",
+    "SQLITE_BAG",
     "SUFFIXES",
     "ChannelInfo",
     "LogData",

@@ -9,7 +9,7 @@ import bz2
 import re
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
@@ -103,6 +103,7 @@ def catalog_bag(source: ByteSource, container: str) -> Catalog:
         told: Any = getattr(reader, "metadata", reader)
         if any(catalog.counts.values()):
             catalog.start_ns, catalog.end_ns = told.start_time, told.end_time - 1
+        catalog.compressions = _name_compressions(getattr(reader, "chunks", {}))
     if not is_whole(source.read_at(0, LONGEST_HEAD), source.size):
         text = f"the {container} is shorter than it says of itself: its end is missing"
         catalog.losses.append(Loss("truncated", text))
@@ -233,16 +234,30 @@ def _make_reader(path: Path, container: str) -> Opened:
     return Sqlite3Reader(Path(quote(str(path.absolute()))))
 
 
-def _bound_chunks(chunks: dict[int, Chunk]) -> None:
-    """Have the chunks of a ROS 1 bag inflated to no more than is plausible."""
+@cache
+def _inflaters() -> dict[str, Callable[[bytes], bytes]]:
+    """By the name of a compression, what inflates a chunk to no more than is plausible."""
     from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415 - few logs need it
-    from rosbags.rosbag1.reader import decompressors  # noqa: PLC0415 - few logs need it
 
     makers = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor}
-    bounded = {decompressors[name]: partial(_inflate_chunk, maker) for name, maker in makers.items()}
+    return {name: partial(_inflate_chunk, maker) for name, maker in makers.items()}
+
+
+def _bound_chunks(chunks: dict[int, Chunk]) -> None:
+    """Have the chunks of a ROS 1 bag inflated to no more than is plausible."""
+    if not chunks:
+        return
+    from rosbags.rosbag1.reader import decompressors  # noqa: PLC0415 - few logs need it
+
+    bounded = {decompressors[name]: inflater for name, inflater in _inflaters().items()}
     for place, chunk in chunks.items():
         if chunk.decompressor in bounded:
             chunks[place] = chunk._replace(decompressor=bounded[chunk.decompressor])
+
+
+def _name_compressions(chunks: dict[int, Chunk]) -> set[str]:
+    names = {inflater: name for name, inflater in _inflaters().items()}
+    return {names.get(chunk.decompressor, "") for chunk in chunks.values()}
 
 
 def _inflate_chunk(maker: Callable[[], bz2.BZ2Decompressor], stored: bytes) -> bytes:

@@ -130,6 +130,11 @@ class LogIndex:
         return (self.end_ns - self.start_ns) * 1e-9
 
     @property
+    def containers(self) -> frozenset[str]:
+        """What kinds of file its parts are: empty for MCAP, else the name of a kind of bag."""
+        return frozenset(part.container for part in self.parts)
+
+    @property
     def complete(self) -> bool:
         """Whether nothing is known to be lost."""
         return not self.losses
