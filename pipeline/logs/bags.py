@@ -107,7 +107,7 @@ def catalog_bag(source: ByteSource, container: str) -> Catalog:
     if not is_whole(source.read_at(0, LONGEST_HEAD), source.size):
         text = f"the {container} is shorter than it says of itself: its end is missing"
         catalog.losses.append(Loss("truncated", text))
-    catalog.notes.append(f"it is a {container}, read through rosbags; MCAP is read faster and in less memory")
+    catalog.notes.append(f"it is a {container}, read through rosbags, which stops where the file is damaged")
     return catalog
 
 
