@@ -6,11 +6,13 @@ Their messages come one by one and are decoded in blocks, as those of MCAP files
 from __future__ import annotations
 
 import bz2
+import os
 import re
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, partial
-from pathlib import Path
+from io import BufferedReader, FileIO
+from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
@@ -92,23 +94,33 @@ def catalog_bag(source: ByteSource, container: str) -> Catalog:
         LogError: ``log_unreadable``.
     """
     catalog = Catalog(container=container, profile="ros1" if container == ROS1_BAG else "ros2")
-    with _open(to_location(source.name), container) as reader:
+    path = to_location(source.name)
+    with _refuse_damage(path, container), _open(path, container) as reader:
         for connection in reader.connections:
-            number = connection.id
-            encoding, form = _encodings(connection, container)
-            schema = Schema(number, connection.msgdef.data.encode(), form, connection.msgtype)
-            catalog.schemas[number] = schema
-            catalog.channels[number] = Channel(number, connection.topic, encoding, {}, number)
-            catalog.counts[number] = connection.msgcount
+            _note_connection(connection, catalog)
         told: Any = getattr(reader, "metadata", reader)
         if any(catalog.counts.values()):
-            catalog.start_ns, catalog.end_ns = told.start_time, told.end_time - 1
+            catalog.start_ns = max(0, int(told.start_time))
+            catalog.end_ns = min(_LAST_TIME, int(told.end_time) - 1)
         catalog.compressions = _name_compressions(getattr(reader, "chunks", {}))
     if not is_whole(source.read_at(0, LONGEST_HEAD), source.size):
         text = f"the {container} is shorter than it says of itself: its end is missing"
         catalog.losses.append(Loss("truncated", text))
     catalog.notes.append(f"it is a {container}, read through rosbags, which stops where the file is damaged")
     return catalog
+
+
+def _note_connection(connection: Connection, catalog: Catalog) -> None:
+    number, encoding, form = connection.id, "ros1", "ros1msg"
+    if catalog.container == SQLITE_BAG:
+        encoding = str(getattr(connection.ext, "serialization_format", ""))
+        form = "ros2idl" if connection.msgdef.format.name == "IDL" else "ros2msg"
+    # Columns of SQLite hold what somebody put there, whatever their type says.
+    if not all(isinstance(name, str) and name for name in (connection.topic, connection.msgtype)):
+        raise ValueError("a topic has no name or no type")
+    catalog.schemas[number] = Schema(number, connection.msgdef.data.encode(), form, connection.msgtype)
+    catalog.channels[number] = Channel(number, connection.topic, encoding, {}, number)
+    catalog.counts[number] = connection.msgcount
 
 
 @dataclass(slots=True)
@@ -164,7 +176,6 @@ class _Collected:
     messages: dict[int, tuple[list[int], list[Buffer]]] = field(default_factory=dict)
 
     def add(self, number: int, time: object, data: object) -> None:
-        # Columns of SQLite hold what somebody put there, whatever their type says.
         if not isinstance(time, int) or not 0 <= time <= _LAST_TIME or not isinstance(data, bytes):
             self.odd += 1
             return
@@ -186,29 +197,12 @@ class _Collected:
         return taken
 
 
-def _encodings(connection: Connection, container: str) -> tuple[str, str]:
-    """Encodings of a connection's messages and of their definition, by the names that MCAP gives them."""
-    if container == ROS1_BAG:
-        return "ros1", "ros1msg"
-    form = "ros2idl" if connection.msgdef.format.name == "IDL" else "ros2msg"
-    return getattr(connection.ext, "serialization_format", "cdr"), form
-
-
 @contextmanager
-def _open(path: Path, container: str) -> Iterator[Opened]:
-    """Open a bag; whatever is wrong with it is one error."""
-    if isinstance(path, RemotePath):
-        raise LogError(
-            "log_unreadable",
-            f"a {container} is not read from an object store",
-            where=str(path),
-            hint="Copy it to this machine, or convert it to MCAP",
-        )
-    reader = _make_reader(path, container)
+def _refuse_damage(path: Path, container: str) -> Iterator[None]:
+    """Whatever is wrong with a bag is one error."""
     try:
-        reader.open()
-        _bound_chunks(getattr(reader, "chunks", {}))
-    except MemoryError:
+        yield
+    except (MemoryError, LogError):
         raise
     except Exception as error:
         raise LogError(
@@ -217,17 +211,49 @@ def _open(path: Path, container: str) -> Iterator[Opened]:
             where=str(path),
             hint=f"Copy it from its origin again, or repair it there with {_REPAIRS[container]}",
         ) from error
+
+
+@contextmanager
+def _open(path: Path, container: str) -> Iterator[Opened]:
+    if isinstance(path, RemotePath):
+        raise LogError(
+            "log_unreadable",
+            f"a {container} is not read from an object store",
+            where=str(path),
+            hint="Copy it to this machine, or convert it to MCAP",
+        )
+    with _refuse_damage(path, container):
+        reader = _make_reader(path, container)
+        reader.open()
+        _bound_chunks(getattr(reader, "chunks", {}))
     try:
         yield reader
     finally:
         reader.close()
 
 
+class _BoundedFile(BufferedReader):
+    """A file that is not asked for more than it holds: lengths in a bag may be damaged."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """The next bytes; memory is taken for no more than are there."""
+        left = os.fstat(self.fileno()).st_size - self.tell()
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
+class _BoundedPath(PosixPath):
+    """A path as rosbags takes it, whose file is bounded."""
+
+    def open(self, *_args: object, **_options: object) -> _BoundedFile:  # type: ignore[override]
+        """Open it for reading."""
+        return _BoundedFile(FileIO(self))
+
+
 def _make_reader(path: Path, container: str) -> Opened:
     if container == ROS1_BAG:
         from rosbags.rosbag1 import Reader  # noqa: PLC0415 - few logs need it
 
-        return Reader(path)
+        return Reader(_BoundedPath(path))
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader  # noqa: PLC0415 - few logs need it
 
     # It is made part of an address, where marks such as ? and % have a meaning.

@@ -4,54 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import sqlite3
+import tracemalloc
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from mcap_files import FLOAT, JOINTS, SHARED, START, payloads, small_truth, value_of, write_small
+from bag_files import STORE_1, write_bag, write_db3
+from mcap_files import FLOAT, SHARED, START, small_truth, value_of, write_small
 from rosbags.rosbag1 import Writer as BagWriter
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
-from rosbags.rosbag2 import Writer as FolderWriter
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag2 import CompressionMode
 
 from pipeline.logs import LogError, Wanted, hash_log, is_finished, open_log, read_topics
 from pipeline.logs import inflate as inflate_module
 
 if TYPE_CHECKING:
     from mcap_files import Truth
-
-STORE = get_typestore(Stores.ROS2_HUMBLE)
-STORE_1 = get_typestore(Stores.ROS1_NOETIC)
-
-
-def write_db3(folder: Path, *, mode: CompressionMode = CompressionMode.NONE) -> Path:
-    """The small log as a folder of rosbag2 with an SQLite file."""
-    writer = FolderWriter(folder, version=9, storage_plugin=StoragePlugin.SQLITE3)
-    writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        for topic, (kind, times, fields) in small_truth()[0].items():
-            connection = writer.add_connection(topic, kind, typestore=STORE)
-            for time, payload in zip(times.tolist(), payloads(kind, times.size, fields), strict=True):
-                writer.write(connection, time, payload)
-    return folder
-
-
-def write_bag(path: Path, form: BagWriter.CompressionFormat | None = None) -> Path:
-    """The small log as a bag of ROS 1."""
-    writer = BagWriter(path)
-    if form is not None:
-        writer.set_compression(form)
-    with writer:
-        for topic, (kind, times, fields) in small_truth()[0].items():
-            connection = writer.add_connection(topic, kind, typestore=STORE_1)
-            for time, payload in zip(times.tolist(), payloads(kind, times.size, fields), strict=True):
-                message = STORE.deserialize_cdr(payload, kind)
-                if kind == JOINTS:
-                    old = STORE_1.types["std_msgs/msg/Header"]
-                    message.header = old(0, message.header.stamp, message.header.frame_id)
-                writer.write(connection, time, STORE_1.serialize_ros1(message, kind))
-    return path
 
 
 def read_all(path: Path) -> Truth:
@@ -189,6 +157,18 @@ def test_what_no_recorder_puts_into_a_table_is_left_out_and_said(tmp_path: Path)
     assert [loss.text.split()[0] for loss in data.losses] == ["5"]
 
 
+@pytest.mark.parametrize("change", ["name = NULL", "type = NULL", "name = x'00ff'"])
+def test_a_topic_without_name_or_type_is_refused(tmp_path: Path, change: str) -> None:
+    (file,) = write_db3(tmp_path / "run").glob("*.db3")
+    with sqlite3.connect(file) as database:
+        database.execute("CREATE TABLE odd AS SELECT * FROM topics")
+        database.execute(f"UPDATE odd SET {change}")  # noqa: S608 - our own words
+        database.executescript("DROP TABLE topics; ALTER TABLE odd RENAME TO topics")
+    database.close()
+    with pytest.raises(LogError, match="no name or no type"):
+        open_log(file)
+
+
 @pytest.mark.parametrize("form", [BagWriter.CompressionFormat.BZ2, BagWriter.CompressionFormat.LZ4], ids=str)
 def test_a_chunk_that_grows_beyond_what_is_plausible_is_refused(
     tmp_path: Path, form: BagWriter.CompressionFormat, monkeypatch: pytest.MonkeyPatch
@@ -230,3 +210,17 @@ def test_the_foreign_bags_hold_what_their_readers_say() -> None:
     (joints,) = read_topics(database, [Wanted("/joint_states")]).of("/joint_states")
     assert len(joints) == 672
     assert joints.fields["name"].row(0) == ["wheel_left_joint", "wheel_right_joint"]
+
+
+def test_a_damaged_length_asks_for_no_memory(tmp_path: Path) -> None:
+    content = bytearray(write_bag(tmp_path / "run.bag").read_bytes())
+    told = content.index(b"index_pos=") + len(b"index_pos=")
+    place = int.from_bytes(content[told : told + 8], "little")
+    content[place : place + 4] = b"\xff\xff\xff\xff"
+    (tmp_path / "run.bag").write_bytes(content)
+    tracemalloc.start()
+    with pytest.raises(LogError, match="cannot be opened"):
+        open_log(tmp_path / "run.bag")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50_000_000
