@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.records import Schema
 from mcap_files import (
     FLOAT,
     JOINTS,
@@ -18,6 +19,7 @@ from mcap_files import (
     text_of,
     write_channels,
 )
+from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.logs import (
     Strings,
@@ -74,6 +76,20 @@ def test_other_encapsulations_are_named_never_decoded_as_plain(tmp_path: Path, k
     assert loss.kind == "unsupported_encoding"
     assert name in loss.text
     assert (loss.start_ns, loss.end_ns) == (START + 1, START + 1)
+
+
+def test_the_official_decoder_takes_other_encapsulations_for_plain_ones() -> None:
+    """Why they are not left to it. When this fails, it has learnt them, and they may be."""
+    delimited = b"\x00\x09\x00\x00" + struct.pack("<Id", 8, 1.5)
+    listed = b"\x00\x03\x00\x00" + struct.pack("<HHdHH", 1, 8, 1.5, 1, 0)
+    decode = DecoderFactory().decoder_for("cdr", Schema(1, b"float64 x\n", "ros2msg", "demo/msg/X"))
+    assert decode is not None
+    for payload in (delimited, listed):
+        assert decode(payload).x != 1.5
+    wide = DecoderFactory().decoder_for("cdr", Schema(1, b"wstring x\n", "ros2msg", "demo/msg/X"))
+    assert wide is not None
+    with pytest.raises(NotImplementedError):
+        wide(b"\0\1\0\0" + bytes(8))
 
 
 def test_payloads_that_do_not_fit_their_type_are_lost_and_counted(tmp_path: Path) -> None:
