@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
 
@@ -37,12 +36,23 @@ class _Type(NamedTuple):
     structure: Structure
 
 
-class _Message(NamedTuple):
-    log_time: int
+class _Rows(NamedTuple):
+    """Serialized messages of one length of one channel: times [ns] and numbers (n,), payloads (n, length)."""
+
     channel: int
-    publish_time: int
-    sequence: int
-    payload: bytes
+    log_time: Ints
+    publish_time: Ints
+    sequence: Ints
+    payloads: NDArray[np.uint8]
+
+    def select(self, chosen: NDArray[np.bool_]) -> _Rows:
+        return _Rows(
+            self.channel,
+            self.log_time[chosen],
+            self.publish_time[chosen],
+            self.sequence[chosen],
+            self.payloads[chosen],
+        )
 
 
 class LogWriter:
@@ -73,7 +83,7 @@ class LogWriter:
         self._types: dict[str, _Type] = {}
         self._channels: dict[tuple[str, str], int] = {}
         self._sequences: dict[int, int] = {}
-        self._waiting: list[_Message] = []
+        self._waiting: list[_Rows] = []
         try:
             self._file: BinaryIO = self._draft.open("wb")
         except OSError as error:
@@ -141,16 +151,10 @@ class LogWriter:
         if header_time is not None:
             given = {**_stamp_fields(kind.structure, np.asarray(header_time, dtype=np.int64), topic), **given}
         channel = self._channel(topic, kind)
-        payloads = [b""] * log.size
-        for rows, block in encode_rows(kind.structure, log.size, given, where=topic):
-            for row, payload in zip(rows.tolist(), block, strict=True):
-                payloads[row] = payload.tobytes()
         first = self._sequences[channel]
         self._sequences[channel] += log.size
-        numbers = range(first, first + log.size)
-        self._waiting += map(
-            _Message, log.tolist(), [channel] * log.size, publish.tolist(), numbers, payloads
-        )
+        for rows, payloads in encode_rows(kind.structure, log.size, given, where=topic):
+            self._waiting.append(_Rows(channel, log[rows], publish[rows], first + rows, payloads))
 
     def write_before(self, log_time: int) -> None:
         """Write what was logged before a time, so that memory holds only what comes later.
@@ -161,8 +165,10 @@ class LogWriter:
         Args:
             log_time: [ns].
         """
-        self._write([message for message in self._waiting if message.log_time < log_time])
-        self._waiting = [message for message in self._waiting if message.log_time >= log_time]
+        waiting = self._waiting
+        self._write([rows.select(rows.log_time < log_time) for rows in waiting])
+        later = [rows.select(rows.log_time >= log_time) for rows in waiting]
+        self._waiting = [rows for rows in later if rows.log_time.size]
 
     def close(self) -> None:
         """Write everything and put the file in its place."""
@@ -174,10 +180,22 @@ class LogWriter:
         self._file.close()
         self._draft.replace(self._path)
 
-    def _write(self, messages: list[_Message]) -> None:
+    def _write(self, waiting: list[_Rows]) -> None:
+        empty = np.empty(0, dtype=np.int64)
+        log = np.concatenate([empty, *(rows.log_time for rows in waiting)])
+        owner = np.concatenate([empty, *(np.full(rows.log_time.size, n) for n, rows in enumerate(waiting))])
+        inside = np.concatenate([empty, *(np.arange(rows.log_time.size) for rows in waiting)])
         # Of one time, what was given first comes first.
-        for log_time, channel, publish_time, sequence, payload in sorted(messages, key=itemgetter(0)):
-            self._mcap.add_message(channel, log_time, payload, publish_time, sequence)
+        order = np.argsort(log, kind="stable")
+        for number, row in zip(owner[order].tolist(), inside[order].tolist(), strict=True):
+            rows = waiting[number]
+            self._mcap.add_message(
+                rows.channel,
+                int(rows.log_time[row]),
+                rows.payloads[row].tobytes(),
+                int(rows.publish_time[row]),
+                int(rows.sequence[row]),
+            )
 
     def discard(self) -> None:
         """Leave no trace."""

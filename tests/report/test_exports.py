@@ -166,7 +166,7 @@ def test_a_long_run_is_exported_in_stretches_that_nobody_sees(
     write_before = LogWriter.write_before
 
     def measure(self: LogWriter, log_time: int) -> None:
-        largest.append(sum(len(message.payload) for message in self._waiting))
+        largest.append(sum(rows.payloads.nbytes for rows in self._waiting))
         write_before(self, log_time)
 
     monkeypatch.setattr(LogWriter, "write_before", measure)
