@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season format fuzz inspect lock map samples \
+.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season format fuzz inspect lock map platforms samples \
 	serve test test-long trend
 
 help: ## print this list
@@ -81,6 +81,9 @@ hidden-table: $(VENV)/.ready-dev ## SCORES=scores.jsonl: the score of what was p
 
 mysteries: $(VENV)/.ready-dev ## make the mystery logs in data_samples again, and their seals
 	$(BIN)/python benchmarks/hidden/mystery.py write data_samples
+
+platforms: $(VENV)/.ready-dev ## what comes of logs as popular platforms publish them [ARGS="turtlebot4 panther"]
+	@$(BIN)/python benchmarks/platforms.py $$ARGS
 
 reveal: $(VENV)/.ready-dev ## LOG=data_samples/mystery_1.mcap: open the seal of a mystery log
 	@[ -n "$$LOG" ] || { echo "Say which log: make reveal LOG=data_samples/mystery_1.mcap" >&2; exit 2; }

@@ -35,6 +35,14 @@ def shared_logs() -> Path:
 
 
 @pytest.fixture(scope="session")
+def foreign_logs() -> Path:
+    folder = SHARED / "foreign"
+    if not folder.is_dir():
+        pytest.skip("../shared/foreign is not here: others' recordings are not part of the repository")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where pictures of pages are kept: SLIP_PICTURES, or the tests' own folder."""
     kept = os.environ.get("SLIP_PICTURES")

@@ -110,11 +110,12 @@ def _identify(path: Path, subject: Subject, store: Store, progress: Progress) ->
     """Hash of the log: remembered, or computed beside reading it."""
     identities = LogIdentities(store)
     known = identities.lookup(path)
+    read = subject.choice.data
     if known is not None:
-        return known, None
+        return known, read
     progress("read")
     seen = see_log(path)
-    data = read_subject(subject)
+    data = read_subject(subject) if read is None else read
     identities.remember(path, data.sha256, seen=seen)
     return data.sha256, data
 

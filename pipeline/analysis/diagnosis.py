@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 STAGE = "diagnosis"
 DIAGNOSIS = "diagnosis.json"
+_SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
 VERSION = 4
 _WRITTEN = ("ladder", "parameters")
@@ -107,6 +108,12 @@ def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
         log if isinstance(log, dict) else {},
     )
     return msgspec.convert(manifest.details["vehicle"], Vehicle), recording
+
+
+def read_choices(manifest: Manifest) -> dict[str, object]:
+    """Topics and vehicle that were chosen for a stored run: ``choices`` and ``vehicle_source``."""
+    summary = manifest.read_json(_SUMMARY) if _SUMMARY in manifest.files else {}
+    return {key: summary[key] for key in ("choices", "vehicle_source") if key in summary}
 
 
 def _make_recording(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.analysis.choice import UNKNOWN_VEHICLE, Choice, choose
 from pipeline.core.errors import SlipError
 from pipeline.logs import ChannelInfo, LogIndex, Loss, Wanted, open_log, read_topics
 from pipeline.vehicles import (
@@ -16,7 +17,6 @@ from pipeline.vehicles import (
     choose_sources,
     find_preset,
     load_configuration,
-    resolve_vehicle,
 )
 
 if TYPE_CHECKING:
@@ -60,10 +60,20 @@ class Inspection:
     topics: tuple[TopicHealth, ...]
     losses: tuple[Loss, ...]
     notes: tuple[str, ...]
-    vehicle: Vehicle | None
-    sources: Sources | None
+    choice: Choice | None
     problem: str
     unchecked: str = ""
+
+    @property
+    def vehicle(self) -> Vehicle | None:
+        """The vehicle; None where it is not known."""
+        known = self.choice is not None and not self.problem and self.choice.vehicle.id != UNKNOWN_VEHICLE
+        return self.choice.vehicle if known and self.choice is not None else None
+
+    @property
+    def sources(self) -> Sources | None:
+        """Topics that would serve; None where they cannot be chosen."""
+        return self.choice.sources if self.choice is not None else None
 
 
 def inspect_log(path: Path, *, config: Path | None, overrides: Mapping[str, object]) -> Inspection:
@@ -82,12 +92,12 @@ def inspect_log(path: Path, *, config: Path | None, overrides: Mapping[str, obje
         _measure_topic(channel, *times.get(channel.id, (np.zeros(0, dtype=np.int64), None)))
         for channel in index.channels
     )
-    vehicle, sources, problem = _choose(index, configuration)
+    choice, problem = _choose(index, configuration, overrides)
     notes = data.notes + tuple(
         f"{count} messages of {topic} stand in the log again, byte for byte: each counts once"
         for topic, count in data.repeated.items()
     )
-    return Inspection(index, topics, data.losses, notes, vehicle, sources, problem, data.unchecked)
+    return Inspection(index, topics, data.losses, notes, choice, problem, data.unchecked)
 
 
 def _measure_topic(
@@ -112,23 +122,20 @@ def _measure_topic(
     )
 
 
-def _choose(index: LogIndex, configuration: Configuration) -> tuple[Vehicle | None, Sources | None, str]:
+def _choose(
+    index: LogIndex, configuration: Configuration, overrides: Mapping[str, object]
+) -> tuple[Choice | None, str]:
     """Vehicle and sources as an analysis would choose them; a problem is told, not raised."""
-    recorded = index.deployment.get("vehicle")
-    problem, vehicle = "", None
     try:
-        vehicle = resolve_vehicle(configuration.vehicle, recorded=recorded, where=str(index.path))
+        return choose(index, configuration, overrides), ""
     except SlipError as error:
         problem = str(error)
     # Which topics would serve hardly depends on the vehicle: any differential one stands in for an unknown.
-    stand_in = vehicle or find_preset("husky_a200")
+    stand_in = find_preset("husky_a200")
     if stand_in is None:
-        return vehicle, None, problem
+        return None, problem
     try:
-        return (
-            vehicle,
-            choose_sources(index.channels, configuration, stand_in, where=str(index.path)),
-            problem,
-        )
-    except SlipError as error:
-        return vehicle, None, problem or str(error)
+        sources = choose_sources(index.channels, configuration, stand_in, where=str(index.path))
+    except SlipError:
+        return None, problem
+    return Choice(stand_in, "fitted", sources), problem

@@ -6,15 +6,14 @@ import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from pipeline.analysis.choice import Choice, choose
 from pipeline.analysis.errors import JobError
 from pipeline.logs import LogIndex, open_log, spell_location
 from pipeline.vehicles import (
     Configuration,
     Sources,
     Vehicle,
-    choose_sources,
     load_configuration,
-    resolve_vehicle,
 )
 
 if TYPE_CHECKING:
@@ -37,6 +36,7 @@ class Subject:
     terrain: str
     dataset: str
     sources: Sources
+    choice: Choice
 
 
 def describe_subject(path: Path, options: Options) -> Subject:
@@ -66,21 +66,23 @@ def describe_subject(path: Path, options: Options) -> Subject:
             where=str(path),
             hint="Check that the recording was not cut off before its first message.",
         )
-    vehicle = resolve_vehicle(configuration.vehicle, recorded=recorded.get("vehicle"), where=str(path))
+    chosen = choose(index, configuration, options.overrides)
+    _require_sources(chosen.sources, index, options)
+    vehicle = chosen.vehicle
     terrain = configuration.run.terrain or recorded.get("terrain") or UNKNOWN
     dataset = configuration.run.dataset or f"{vehicle.id}_{terrain}"
-    sources = choose_sources(index.channels, configuration, vehicle, where=str(path))
-    _require_sources(sources, index, options)
-    return Subject(path, index, configuration, vehicle, terrain, dataset, sources)
+    return Subject(path, index, configuration, vehicle, terrain, dataset, chosen.sources, chosen)
 
 
 def _require_sources(sources: Sources, index: LogIndex, options: Options) -> None:
-    there = ", ".join(sorted({f"{channel.topic} ({channel.type_name})" for channel in index.channels}))
+    topics = {channel.topic: f"{channel.topic} ({channel.type_name})" for channel in index.channels}
+    empty = {channel.topic for channel in index.channels if channel.message_count == 0}
+    there = ", ".join(text for topic, text in sorted(topics.items()) if topic not in empty)
+    there += f". Without any message: {', '.join(sorted(empty))}" if empty else ""
     if sources.pose is None:
         raise JobError(
             "no_pose",
-            "no topic can serve as pose (Odometry, PoseStamped, PoseWithCovarianceStamped or transforms)"
-            + _blame_damage(index),
+            "no topic can serve as pose (an odometry, a pose, or transforms)" + _blame_damage(index),
             where=str(index.path),
             hint=f"Name it in run.toml ([pose] topic = ...). The log has: {there}.",
         )

@@ -60,6 +60,7 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
         },
         "quarantined": work.contexts["extract"].get("quarantined"),
         "topics": _describe_topics(work),
+        **subject.choice.to_json({channel.topic: channel.type_name for channel in subject.index.channels}),
         "findings": list_findings(generation.read_table("findings")),
     }
 

@@ -88,7 +88,7 @@ class Work:
     def _is_body_commanded(self) -> bool:
         """Whether the command is a body command, which the controller turns into wheel speeds."""
         source = self.subject.sources.command
-        return source is not None and source.form in {DriveForm.BODY, DriveForm.BODY_SIGNALS}
+        return source is not None and source.form is DriveForm.BODY
 
     def run_stages(self) -> None:
         """Run every stage up to the last one asked for, reusing what has not changed."""
@@ -196,7 +196,7 @@ class Work:
             "losses": [describe_loss(loss, data.index.start_ns) for loss in data.losses],
             "unchecked": data.unchecked or None,
         }
-        return StageOutcome((*made.findings, *found, *notes), context)
+        return StageOutcome((*subject.choice.findings, *made.findings, *found, *notes), context)
 
     def _align(self) -> StageOutcome:
         previous = self.generation.previous

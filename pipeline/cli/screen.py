@@ -11,6 +11,7 @@ from pipeline.cli.output import tidy_line
 Summary = Mapping[str, object]
 
 _LABEL = 26
+_READ_FROM_LOG = ("robot_description", "namespace", "message_types", "fitted")
 _SHOWN = 6
 
 
@@ -106,10 +107,18 @@ def _describe_slip(summary: Summary) -> list[str]:
 def _describe_topics(summary: Summary) -> list[str]:
     topics = _part(summary, "topics")
     lines: list[str] = []
-    for role in ("command", "wheels", "pose", "imu", "interval"):
+    if summary.get("vehicle_source") in _READ_FROM_LOG:
+        told = str(summary["vehicle_source"]).replace("_", " ")
+        lines.append(_row("vehicle", f"{summary['vehicle_name']}    told by: {told}"))
+    roles = [role for role in ("command", "wheels", "pose", "imu", "interval") if _part(topics, role)]
+    first = next(iter(roles), "")
+    for role in roles:
         source = _part(topics, role)
-        if source:
-            lines.append(_row("" if lines else "topics", f"{role:<9}{source['topic']}    {source['reason']}"))
+        label = "topics" if role == first else ""
+        lines.append(_row(label, f"{role:<9}{source['topic']}    {source['reason']}"))
+    others = _part(_part(summary, "choices"), "pose").get("others")
+    rejected = others if isinstance(others, list) else []
+    lines.extend(_row("", f"{'not':<9}{other['topic']}    {other['reason']}") for other in rejected)
     return lines
 
 

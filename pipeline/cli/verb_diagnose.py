@@ -70,15 +70,15 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     budget_s = None if budget is None else parse_budget(budget)
     diagnoses: list[Diagnosis] = []
     at_work = [logs[0]]
+    chosen: dict[str, dict[str, object]] = {}
 
     def conclude(error: SlipError) -> None:
         if json:
-            runs = [run for diagnosis in diagnoses for run in diagnosis.runs]
             told = describe_error(at_work[0], error)
-            print_json({"runs": [run.to_json() for run in runs], "errors": [told]})
+            print_json({"runs": _to_json(diagnoses, chosen), "errors": [told]})
 
     with limited_memory(memory, lambda: at_work[0], conclude):
-        gathered, errors, lossy = _gather(logs, options, at_work, quiet=quiet or json)
+        gathered, errors, lossy = _gather(logs, options, at_work, chosen, quiet=quiet or json)
         for vehicle, recordings in gathered.values():
             at_work[0] = recordings[0].path
             try:
@@ -92,7 +92,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         _apply([run.proposal for run in runs], apply, quiet=quiet or json)
     if json:
         left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
-        print_json({"runs": [run.to_json() for run in runs], "errors": errors, **left_out})
+        print_json({"runs": _to_json(diagnoses, chosen), "errors": errors, **left_out})
     elif not quiet:
         from pipeline.diagnosis.words import describe  # noqa: PLC0415 - only for people
 
@@ -102,10 +102,18 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
 
 
 def _gather(
-    logs: list[str], options: Options, at_work: list[str], *, quiet: bool
+    logs: list[str],
+    options: Options,
+    at_work: list[str],
+    chosen: dict[str, dict[str, object]],
+    *,
+    quiet: bool,
 ) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], bool]:
-    """Recordings by vehicle; an error costs one log. ``at_work`` is told which log it is."""
-    from pipeline.analysis.diagnosis import read_recording  # noqa: PLC0415 - heavy
+    """Recordings by vehicle; an error costs one log.
+
+    ``at_work`` is told which log it is, ``chosen`` what was chosen in each run.
+    """
+    from pipeline.analysis.diagnosis import read_choices, read_recording  # noqa: PLC0415 - heavy
     from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
 
     gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
@@ -119,6 +127,7 @@ def _gather(
                 open_run(log, options, progress) as opened,
             ):
                 vehicle, recording = read_recording(opened.manifest)
+                chosen[recording.name] = read_choices(opened.manifest)
         except SlipError as error:
             print_error(error)
             errors.append(describe_error(log, error))
@@ -128,6 +137,12 @@ def _gather(
         lossy |= opened.lossy
         gathered.setdefault(repr(vehicle), (vehicle, []))[1].append(recording)
     return gathered, errors, lossy
+
+
+def _to_json(diagnoses: list[Diagnosis], chosen: dict[str, dict[str, object]]) -> list[dict[str, object]]:
+    """The runs as JSON objects, with the topics and the vehicle that were chosen."""
+    runs = [run.to_json() for diagnosis in diagnoses for run in diagnosis.runs]
+    return [{**run, **chosen.get(str(run["run"]), {})} for run in runs]
 
 
 def _agree(known: ModelFile, vehicle: Vehicle, recordings: list[Recording], owner: Owner | None) -> Vehicle:

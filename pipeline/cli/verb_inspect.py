@@ -15,7 +15,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.analysis.inspection import Inspection, TopicHealth
+    from pipeline.stages.extract.choice import PoseRating
 
+_OTHER_CLOCK_S = 3600.0
+"""Stamps further from the log time are of another clock: simulated time, time since boot, time never set."""
 _ROLES = ("command", "wheels", "pose", "imu", "interval")
 
 
@@ -77,6 +80,11 @@ def _as_json(seen: Inspection) -> dict[str, object]:
             else {"topic": str(source), "reason": source.reason}
             for role in _ROLES
         },
+        **(
+            seen.choice.to_json({topic.topic: topic.type_name for topic in seen.topics})
+            if seen.choice
+            else {}
+        ),
         "problem": seen.problem or None,
     }
 
@@ -102,20 +110,45 @@ def _describe(seen: Inspection) -> list[str]:
         )
     lines += ["", *_describe_topics(seen.topics), ""]
     lines.append(f"vehicle   {seen.vehicle.name if seen.vehicle else 'unknown'}")
+    if seen.choice is not None and seen.vehicle is not None:
+        lines[-1] += f"    told by: {seen.choice.vehicle_source.replace('_', ' ')}"
     if seen.sources is not None:
         for role in _ROLES:
             source = getattr(seen.sources, role)
             lines.append(f"{role:<10}{f'{source}    {source.reason}' if source else '-'}")
-        lines += [f"          {note}" for note in seen.sources.notes]
+        lines += [f"          {note}" for note in seen.sources.notes if not note.startswith("pose")]
+    if seen.choice is not None:
+        lines += _describe_ratings(seen.choice.ratings)
+        lines += [f"note      {finding.text}" for finding in seen.choice.findings]
     if seen.problem:
         lines.append(f"problem   {seen.problem}")
     return lines
 
 
+def _describe_ratings(ratings: Sequence[PoseRating]) -> list[str]:
+    """What every candidate for the pose is worth, the chosen one first."""
+    if not ratings:
+        return []
+    rows = [("pose candidates", "frames", "new Hz", "of time", "not wheels'", "verdict")]
+    for rating in ratings:
+        share = "-" if rating.beside_wheels is None else f"{rating.beside_wheels:.1%}"
+        frames = f"{rating.parent or '?'} -> {rating.child or '?'}"
+        numbers = (f"{rating.rate_hz:.3g}", f"{rating.coverage:.0%}", share)
+        rows.append((str(rating.source), frames, *numbers, rating.refused or rating.reason))
+    widths = [max(len(row[column]) for row in rows) for column in range(5)]
+    return [
+        "",
+        *(
+            "  ".join([*(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=False)), row[5]])
+            for row in rows
+        ),
+    ]
+
+
 def _describe_topics(topics: Sequence[TopicHealth]) -> list[str]:
     width = max([len(topic.topic) for topic in topics] + [5])
     kind = max([len(topic.type_name) for topic in topics] + [4])
-    numbers = f"{'messages':>8}  {'Hz':>7}  {'gaps':>5}  {'longest':>8}  {'late':>8}"
+    numbers = f"{'messages':>8}  {'Hz':>7}  {'gaps':>5}  {'longest':>8}  {'late':>11}"
     head = f"{'topic':<{width}}  {'type':<{kind}}  {numbers}"
     return [head, *(_describe_topic(topic, width, kind) for topic in topics)]
 
@@ -124,7 +157,9 @@ def _describe_topic(topic: TopicHealth, width: int, kind: int) -> str:
     rate = "-" if topic.rate_hz is None else f"{topic.rate_hz:.4g}"
     gap = "-" if topic.largest_gap_s is None else f"{topic.largest_gap_s:.3g} s"
     late = "-" if topic.latency_s is None else f"{topic.latency_s * 1e3:.0f} ms"
+    if topic.latency_s is not None and abs(topic.latency_s) > _OTHER_CLOCK_S:
+        late = "other clock"
     return (
         f"{topic.topic:<{width}}  {topic.type_name:<{kind}}  {topic.messages:>8}  {rate:>7}  "
-        f"{topic.gaps:>5}  {gap:>8}  {late:>8}"
+        f"{topic.gaps:>5}  {gap:>8}  {late:>11}"
     )

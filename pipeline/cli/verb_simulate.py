@@ -31,6 +31,7 @@ def simulate(  # noqa: D417 - arguments document themselves
     vehicle: str | None = None,
     layout: str | None = None,
     program: str | None = None,
+    platform: str | None = None,
     cases: Annotated[bool, Parameter(negative=())] = False,
     json: bool = False,
 ) -> int:
@@ -43,15 +44,20 @@ def simulate(  # noqa: D417 - arguments document themselves
         vehicle: simulated vehicle.
         layout: layout of topics.
         program: how the vehicle is driven.
+        platform: whose vehicle, topics, types and frames the log has (husky_a200, turtlebot4, ...).
         cases: list the cases and effects instead.
         json: print one JSON object.
     """
-    from pipeline.simulate import list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy
+    from pipeline.simulate import PLATFORMS, list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy
 
     if cases:
         _print_catalogue(
             [(found.name, found.shows) for found in list_cases()],
             [(found.id, found.formula) for found in list_effects()],
+            [
+                (name, ", ".join(topic.topic for topic in PLATFORMS[name].topics))
+                for name in sorted(PLATFORMS)
+            ],
             json=json,
         )
         return CLEAN
@@ -65,6 +71,7 @@ def simulate(  # noqa: D417 - arguments document themselves
         vehicle=vehicle,
         layout=layout,
         program=program,
+        platform=platform,
     )
     if json:
         print_json({"path": str(path), "effects": effects})
@@ -91,11 +98,17 @@ def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:
         ) from None
 
 
-def _print_catalogue(cases: list[tuple[str, str]], effects: list[tuple[str, str]], *, json: bool) -> None:
+def _print_catalogue(
+    cases: list[tuple[str, str]],
+    effects: list[tuple[str, str]],
+    platforms: list[tuple[str, str]],
+    *,
+    json: bool,
+) -> None:
     if json:
-        print_json({"cases": dict(cases), "effects": dict(effects)})
+        print_json({"cases": dict(cases), "effects": dict(effects), "platforms": dict(platforms)})
         return
-    for title, rows in (("cases", cases), ("effects", effects)):
+    for title, rows in (("cases", cases), ("effects", effects), ("platforms", platforms)):
         print(title)
         for name, text in rows:
             print(f"  {name:<24}{text}")

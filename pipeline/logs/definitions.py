@@ -65,6 +65,61 @@ FIELDS: Final[dict[str, str]] = {
     "geometry_msgs/Pose pose; geometry_msgs/Vector3 scale; std_msgs/ColorRGBA color; "
     "builtin_interfaces/Duration lifetime; bool frame_locked; geometry_msgs/Point[] points; "
     "std_msgs/ColorRGBA[] colors; string text; string mesh_resource; bool mesh_use_embedded_materials",
+    "autoware_control_msgs/Control": "builtin_interfaces/Time stamp; builtin_interfaces/Time control_time; "
+    "autoware_control_msgs/Lateral lateral; autoware_control_msgs/Longitudinal longitudinal",
+    "autoware_control_msgs/Lateral": "builtin_interfaces/Time stamp; builtin_interfaces/Time control_time; "
+    "float32 steering_tire_angle; float32 steering_tire_rotation_rate; "
+    "bool is_defined_steering_tire_rotation_rate",
+    "autoware_control_msgs/Longitudinal": "builtin_interfaces/Time stamp; "
+    "builtin_interfaces/Time control_time; "
+    ""
+    "float32 velocity; float32 acceleration; float32 jerk; bool is_defined_acceleration; "
+    "bool is_defined_jerk",
+    "autoware_vehicle_msgs/SteeringReport": "builtin_interfaces/Time stamp; float32 steering_tire_angle",
+    "autoware_vehicle_msgs/VelocityReport": f"{_HEADER}; float32 longitudinal_velocity; "
+    "float32 lateral_velocity; float32 heading_rate",
+    "control_msgs/SteeringControllerStatus": f"{_HEADER}; float64[] traction_wheels_position; "
+    "float64[] traction_wheels_velocity; float64[] steer_positions; float64[] traction_command; "
+    "float64[] steering_angle_command",
+    "duckietown_msgs/WheelEncoderStamped": f"{_HEADER}; int32 data; uint16 resolution; uint8 type",
+    "duckietown_msgs/WheelsCmdStamped": f"{_HEADER}; float32 vel_left; float32 vel_right",
+    "hunter_msgs/HunterActuatorState": "uint8 motor_id; int16 rpm; float64 current; int32 pulse_count; "
+    "float32 driver_voltage; float32 driver_temperature; int8 motor_temperature; uint8 driver_state",
+    "hunter_msgs/HunterStatus": f"{_HEADER}; float64 linear_velocity; float64 steering_angle; "
+    "uint8 vehicle_state; "
+    "uint8 control_mode; uint16 error_code; float64 battery_voltage; "
+    "hunter_msgs/HunterActuatorState[3] actuator_states",
+    "irobot_create_msgs/WheelTicks": f"{_HEADER}; int32 ticks_left; int32 ticks_right",
+    "irobot_create_msgs/WheelVels": f"{_HEADER}; float32 velocity_left; float32 velocity_right",
+    "leo_msgs/WheelOdom": "builtin_interfaces/Time stamp; float32 velocity_lin; float32 velocity_ang; "
+    "float32 pose_x; float32 pose_y; float32 pose_yaw",
+    "leo_msgs/WheelStates": "builtin_interfaces/Time stamp; float32[4] position; float32[4] velocity; "
+    "float32[4] torque; float32[4] pwm_duty_cycle",
+    "px4_msgs/RoverRateSetpoint": "uint64 timestamp; float32 yaw_rate_setpoint",
+    "px4_msgs/RoverSpeedSetpoint": "uint64 timestamp; float32 speed_body_x; float32 speed_body_y",
+    "px4_msgs/SensorCombined": "uint64 timestamp; float32[3] gyro_rad; uint32 gyro_integral_dt; "
+    "int32 accelerometer_timestamp_relative; float32[3] accelerometer_m_s2; "
+    "uint32 accelerometer_integral_dt; uint8 accelerometer_clipping; uint8 gyro_clipping; "
+    "uint8 accel_calibration_count; uint8 gyro_calibration_count",
+    "px4_msgs/VehicleOdometry": "uint64 timestamp; uint64 timestamp_sample; "
+    "uint8 pose_frame; float32[3] position; "
+    "float32[4] q; uint8 velocity_frame; float32[3] velocity; float32[3] angular_velocity; "
+    "float32[3] position_variance; float32[3] orientation_variance; float32[3] velocity_variance; "
+    "uint8 reset_counter; int8 quality",
+    "px4_msgs/WheelEncoders": "uint64 timestamp; float32[2] wheel_speed; float32[2] wheel_angle",
+    "scout_msgs/ScoutActuatorState": "uint8 motor_id; int16 rpm; float64 current; int32 pulse_count; "
+    "float32 driver_voltage; float32 driver_temperature; int8 motor_temperature; uint8 driver_state",
+    "scout_msgs/ScoutLightState": "uint8 mode; uint8 custom_value",
+    "scout_msgs/ScoutStatus": f"{_HEADER}; float64 linear_velocity; float64 angular_velocity; "
+    "uint8 vehicle_state; "
+    "uint8 control_mode; uint16 error_code; float64 battery_voltage; "
+    "scout_msgs/ScoutActuatorState[4] actuator_states; bool light_control_enabled; "
+    "scout_msgs/ScoutLightState front_light_state; scout_msgs/ScoutLightState rear_light_state",
+    "vesc_msgs/VescState": "float64 voltage_input; float64 temperature_pcb; float64 current_motor; "
+    "float64 current_input; float64 speed; float64 duty_cycle; float64 charge_drawn; "
+    "float64 charge_regen; float64 energy_drawn; float64 energy_regen; float64 displacement; "
+    "float64 distance_traveled; int32 fault_code",
+    "vesc_msgs/VescStateStamped": f"{_HEADER}; vesc_msgs/VescState state",
 }
 """Fields of every bundled type, by ``package/Name``."""
 

@@ -19,6 +19,8 @@ from pipeline.simulate.effects import EffectSpec, ParameterSpec
 from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.layouts import LAYOUTS, CommandTopic, Layout, PoseTopic, WheelTopic
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
+from pipeline.simulate.platform_table import PLATFORMS, find_platform
+from pipeline.simulate.platforms import Platform
 from pipeline.simulate.record import write_log
 from pipeline.simulate.run import SimulatedRun, Truth, simulate_run
 from pipeline.simulate.scenario import (
@@ -38,6 +40,7 @@ from pipeline.simulate.vehicles import VEHICLES, Vehicle, find_vehicle
 __all__ = [
     "LAYOUTS",
     "MACHINES",
+    "PLATFORMS",
     "VEHICLES",
     "Case",
     "Clock",
@@ -49,6 +52,7 @@ __all__ = [
     "Imu",
     "Layout",
     "ParameterSpec",
+    "Platform",
     "PoseSensor",
     "PoseTopic",
     "Program",
@@ -62,6 +66,7 @@ __all__ = [
     "Vehicle",
     "WheelTopic",
     "find_case",
+    "find_platform",
     "find_vehicle",
     "list_cases",
     "list_effects",

@@ -11,6 +11,7 @@ from pipeline.simulate.effects import CATALOGUE, EffectSpec, resolve_effects
 from pipeline.simulate.errors import SimulateError, unknown_name
 from pipeline.simulate.layouts import find_layout
 from pipeline.simulate.mujoco_vehicle import simulate_skid_steer
+from pipeline.simulate.platform_table import find_platform
 from pipeline.simulate.record import write_log
 from pipeline.simulate.run import simulate_run
 from pipeline.simulate.scenario import Ground, ProgramName, Scenario
@@ -56,6 +57,7 @@ def simulate_case(
     vehicle: str | None = None,
     layout: str | None = None,
     program: str | None = None,
+    platform: str | None = None,
 ) -> Path:
     """Simulate a named case, or a plain one, with changes, and write its log.
 
@@ -69,6 +71,7 @@ def simulate_case(
         vehicle: a name of `VEHICLES`; brings its usual layout along.
         layout: a name of `LAYOUTS`.
         program: what is driven.
+        platform: a name of `PLATFORMS`; brings its vehicle and topics along.
 
     Returns:
         The file that was written.
@@ -78,7 +81,14 @@ def simulate_case(
             combination, or a folder that cannot be written.
     """
     scenario = make_scenario(
-        name, effects, seed=seed, duration_s=duration_s, vehicle=vehicle, layout=layout, program=program
+        name,
+        effects,
+        seed=seed,
+        duration_s=duration_s,
+        vehicle=vehicle,
+        layout=layout,
+        program=program,
+        platform=platform,
     )
     target = out / f"{name or 'simulated'}.mcap" if out.is_dir() else out
     try:
@@ -105,10 +115,11 @@ def make_scenario(
     vehicle: str | None = None,
     layout: str | None = None,
     program: str | None = None,
+    platform: str | None = None,
 ) -> Scenario:
     """The scenario of a named case with changes; see `simulate_case`."""
     scenario = Scenario() if name is None else find_case(name).scenario
-    if vehicle is not None and name is not None and find_case(name).machine is not None:
+    if (vehicle or platform) and name is not None and find_case(name).machine is not None:
         raise SimulateError(
             "wrong_vehicle",
             "a case of rigid bodies keeps its own vehicle",
@@ -120,6 +131,10 @@ def make_scenario(
         scenario = replace(scenario, vehicle=find_vehicle(vehicle), recording=usual)
     if layout is not None:
         scenario = replace(scenario, recording=replace(scenario.recording, layout=layout))
+    if platform is not None:
+        made = find_platform(platform)
+        recording = replace(scenario.recording, layout=made.layout, deployment="absent")
+        scenario = replace(scenario, vehicle=made.vehicle, recording=recording)
     find_layout(scenario.recording.layout, scenario.vehicle)
     if program is not None:
         known = get_args(ProgramName)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from pipeline.simulate.errors import SimulateError, unknown_name
 
 if TYPE_CHECKING:
+    from pipeline.simulate.published import Published
     from pipeline.simulate.vehicles import Kind, Vehicle
 
 CommandForm = Literal[
@@ -55,6 +56,7 @@ class Layout:
         pose: where the localization reports.
         imu: topic of the inertial unit, empty when there is none.
         joints: names of the wheel joints of JointState messages, with ``{}`` for ``front_left`` and the like.
+        topics: everything in the log of a platform; nothing else is written then.
     """
 
     kind: Kind
@@ -63,6 +65,7 @@ class Layout:
     pose: PoseTopic
     imu: str = ""
     joints: str = "{}_wheel"
+    topics: tuple[Published, ...] = ()
 
 
 _ICP = PoseTopic("odometry", "/mapping/icp_odom")

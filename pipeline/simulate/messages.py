@@ -36,6 +36,7 @@ class Sheet:
         log_s: when the recorder got them, shape (n,).
         header_s: what their headers say, shape (n,), or None for a type without header.
         fields: values by field path; an array has one row a message.
+        stamp: where the stamp stands: ``header``, or a field, microseconds if it begins with ``timestamp``.
     """
 
     topic: str
@@ -43,6 +44,7 @@ class Sheet:
     log_s: Floats
     header_s: Floats | None
     fields: dict[str, Field]
+    stamp: str = "header"
 
 
 def command_sheets(run: SimulatedRun, layout: Layout) -> list[Sheet]:

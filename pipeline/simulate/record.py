@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from pipeline.simulate.layouts import find_layout
 from pipeline.simulate.messages import (
     command_sheets,
@@ -15,12 +17,18 @@ from pipeline.simulate.messages import (
     static_sheets,
     wheel_sheets,
 )
-from pipeline.simulate.stamps import stamp_times
+from pipeline.simulate.published import publish
+from pipeline.simulate.stamps import stamp_headers, stamp_times
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
+    from pipeline.simulate.messages import Field
     from pipeline.simulate.run import SimulatedRun
+
+_BOOTED_NS = 100_000_000_000
 
 
 def write_log(run: SimulatedRun, path: Path) -> None:
@@ -38,26 +46,41 @@ def write_log(run: SimulatedRun, path: Path) -> None:
 
     scenario = run.scenario
     layout = find_layout(scenario.recording.layout, scenario.vehicle)
-    sheets = [
-        *command_sheets(run, layout),
-        *wheel_sheets(run, layout),
-        *pose_sheets(run, layout.pose),
-        *static_sheets(run, layout),
-        *imu_sheets(run, layout),
-        *state_sheets(run),
-        *decoy_sheets(run),
-    ]
+    sheets = (
+        publish(run, layout.topics)
+        if layout.topics
+        else [
+            *command_sheets(run, layout),
+            *wheel_sheets(run, layout),
+            *pose_sheets(run, layout.pose),
+            *static_sheets(run, layout),
+            *imu_sheets(run, layout),
+            *state_sheets(run),
+            *decoy_sheets(run),
+        ]
+    )
     with LogWriter(path) as writer:
         for sheet in cut_gaps(run, sheets):
-            header = None if sheet.header_s is None else stamp_times(scenario.clock, sheet.header_s)
+            header = None if sheet.header_s is None else stamp_headers(scenario.clock, sheet.header_s)
+            fields = sheet.fields
+            if header is not None and sheet.stamp != "header":
+                fields, header = fields | _write_stamp(sheet.stamp, header, scenario.clock.start_ns), None
             writer.write_columns(
                 sheet.topic,
                 sheet.type_name,
                 stamp_times(scenario.clock, sheet.log_s),
-                sheet.fields,
+                fields,
                 header_time=header,
             )
         if scenario.recording.deployment == "written":
             writer.metadata(
                 "deployment", {"vehicle": scenario.vehicle.name, "terrain": scenario.recording.terrain}
             )
+
+
+def _write_stamp(field: str, stamps: NDArray[np.int64], start_ns: int) -> dict[str, Field]:
+    """Fields of a stamp [ns] outside a header; a counter of microseconds began some time before the run."""
+    if field.startswith("timestamp"):
+        return {field: ((stamps - start_ns + _BOOTED_NS) // 1000).astype(np.float64)}
+    seconds, rest = np.divmod(stamps, 1_000_000_000)
+    return {f"{field}.sec": seconds.astype(np.float64), f"{field}.nanosec": rest.astype(np.float64)}

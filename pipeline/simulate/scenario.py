@@ -204,12 +204,15 @@ class Clock:
         start_ns: stamp of the run's start, nanoseconds since 1970; 0 is a clock that was never set.
         unset_s: for this long the clock counts from zero, then it is set.
         backward_at_s, backward_s: at this time the clock goes back by that much; none when NaN.
+        real_time_factor: stamps count simulated time from zero, of which so much passes in a second of the
+            recorder's clock; None where one clock serves both.
     """
 
     start_ns: int = 1_717_000_000_000_000_000
     unset_s: float = 0.0
     backward_at_s: float = float("nan")
     backward_s: float = 0.0
+    real_time_factor: float | None = None
 
 
 @dataclass(frozen=True)

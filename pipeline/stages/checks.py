@@ -16,6 +16,7 @@ from pipeline.models.effect import Late
 from pipeline.stages.delays import estimate_delay
 from pipeline.stages.finding import Finding
 from pipeline.stages.samples import Samples, gather_samples
+from pipeline.stages.scale import check_scale
 from pipeline.stages.trust import check_live_commands
 
 if TYPE_CHECKING:
@@ -38,8 +39,12 @@ _SURE = 5.0
 
 
 def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
-    """All checks; where the vehicle does not move, only the ones that say so."""
-    stuck = check_dead_wheels(samples, vehicle) + check_motion(samples, vehicle)
+    """All checks; where the vehicle does not move, only the ones that say so.
+
+    Wheels on a wrong scale may look as if nothing moved: the scale is judged first.
+    """
+    scaled = check_scale(samples, vehicle)
+    stuck = check_dead_wheels(samples, vehicle) + ([] if scaled else check_motion(samples, vehicle))
     if stuck:
         return stuck
     checks: tuple[Callable[[Samples, Vehicle], list[Finding]], ...] = (
@@ -47,7 +52,7 @@ def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         check_limits,
         check_delays,
     )
-    return [finding for check in checks for finding in check(samples, vehicle)]
+    return scaled + [finding for check in checks for finding in check(samples, vehicle)]
 
 
 def check_dead_wheels(samples: Samples, _vehicle: Vehicle) -> list[Finding]:

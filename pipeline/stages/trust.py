@@ -87,11 +87,11 @@ def _share_beside_wheels(
     for moved, axis in ((way, 0), (turned, 2)):
         rate = np.nan_to_num(measured[:, axis])
         driven = timegrid.integrate_rate(times, rate)
-        shares.append(_share_left(moved, driven[last] - driven[first], rate[last] - rate[first]))
+        shares.append(measure_rest(moved, driven[last] - driven[first], rate[last] - rate[first]))
     return shares[0], shares[1]
 
 
-def _share_left(moved: Floats, driven: Floats, changed: Floats) -> float | None:
+def measure_rest(moved: Floats, driven: Floats, changed: Floats) -> float | None:
     """Median rest of a robust fit of ``moved`` on ``driven`` and ``changed``, over the size of ``moved``."""
     size = float(np.sqrt(np.mean(moved**2)))
     if size < _LIVE * _SPAN:

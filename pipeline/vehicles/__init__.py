@@ -5,28 +5,54 @@ chosen by type and name, with a reason that is printed.
 """
 
 from pipeline.vehicles.configuration import Configuration, DriveSection
+from pipeline.vehicles.description import Description, read_description
 from pipeline.vehicles.errors import ConfigurationError
 from pipeline.vehicles.loading import list_configuration_files, load_configuration
 from pipeline.vehicles.presets import Vehicle, find_preset, list_presets, resolve_vehicle
-from pipeline.vehicles.sources import DriveForm, DriveSource, PoseSource, Signal, Sources, TopicSource
+from pipeline.vehicles.recognition import (
+    Recognized,
+    VehicleSource,
+    find_alike,
+    list_contradictions,
+    recognize_vehicle,
+)
+from pipeline.vehicles.sources import (
+    CONFIGURED,
+    DriveForm,
+    DriveSource,
+    PoseSource,
+    Signal,
+    Sources,
+    TopicSource,
+)
 from pipeline.vehicles.topics import DEFAULT_INTERVAL, choose_sources
+from pipeline.vehicles.units import convert_unit
 
 __all__ = [
+    "CONFIGURED",
     "DEFAULT_INTERVAL",
     "Configuration",
     "ConfigurationError",
+    "Description",
     "DriveForm",
     "DriveSection",
     "DriveSource",
     "PoseSource",
+    "Recognized",
     "Signal",
     "Sources",
     "TopicSource",
     "Vehicle",
+    "VehicleSource",
     "choose_sources",
+    "convert_unit",
+    "find_alike",
     "find_preset",
     "list_configuration_files",
+    "list_contradictions",
     "list_presets",
     "load_configuration",
+    "read_description",
+    "recognize_vehicle",
     "resolve_vehicle",
 ]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 else:
     Kind = Literal[list_kinds()]
 Clock = Literal["header", "log", "publish"]
-Unit = Literal["rad/s", "rpm", "m/s"]
+Unit = Literal["rad/s", "rpm", "deg/s", "m/s", "mm/s", "rad", "deg", "ticks", "erpm", "duty"]
 
 
 class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -75,7 +75,8 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         yaw_rate_topic: yaw rate of a body command.
         steering_topic: steering angle [rad].
         steering_joint: joint of ``topic`` whose position is the steering angle.
-        unit: unit of wheel speeds.
+        unit: unit of wheel speeds, or of wheel angles; what the message type says where it is not given.
+        per_turn: how many ticks a turn of the wheel has.
         sign: -1 where forward is recorded as negative.
         time: which of the message's times to use.
         hold_s: how long a command stays valid.
@@ -90,7 +91,8 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     yaw_rate_topic: str | None = None
     steering_topic: str | None = None
     steering_joint: str | None = None
-    unit: Unit = "rad/s"
+    unit: Unit | None = None
+    per_turn: Positive | None = None
     sign: Literal[1, -1] = 1
     time: Clock | None = None
     hold_s: Positive | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import tomllib
 from importlib import resources
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -23,11 +23,42 @@ class UsualTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     imu: list[str] = []
 
 
+class VendorController(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the vendor's controller does with the body commands that it receives.
+
+    Attributes:
+        topics: ends of the names of the topics that it listens to.
+        track_multiplier: what it multiplies the vehicle's track width by.
+    """
+
+    topics: list[str] = []
+    track_multiplier: Positive = 1.0
+
+
+class OwnUnit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A unit that only the platform knows: raw = per * value + offset.
+
+    Attributes:
+        per: raw units a unit of the value.
+        unit: of the value.
+        offset: raw number at zero.
+    """
+
+    per: float
+    unit: Literal["rad/s", "m/s", "rad"]
+    offset: float = 0.0
+
+
 class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A vehicle's geometry and limits; units are in the names.
 
     Attributes:
         id: name in tables and file names, lower case with underscores.
+        source: where a preset's numbers were read.
+        recognized_by: words of namespaces, hosts and robot descriptions, and packages of message types, that
+            tell the platform.
+        controller: the vendor's.
+        units: of what the platform publishes, by name.
     """
 
     id: str
@@ -44,6 +75,10 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     controller_track_multiplier: Positive = 1.0
     aliases: Annotated[list[str], msgspec.Meta(description="other names")] = []
     topics: UsualTopics = UsualTopics()
+    source: str = ""
+    recognized_by: list[str] = []
+    controller: VendorController = VendorController()
+    units: dict[str, OwnUnit] = {}
 
     @property
     def kinematics(self) -> Kinematics:
@@ -76,13 +111,16 @@ def _plain(name: str) -> str:
     return name.strip().lower().replace("-", "_").replace(" ", "_")
 
 
-def resolve_vehicle(section: VehicleSection, *, recorded: str | None, where: str) -> Vehicle:
+def resolve_vehicle(
+    section: VehicleSection, *, recorded: str | None, where: str, told: Vehicle | None = None
+) -> Vehicle:
     """The vehicle of a run.
 
     Args:
         section: what the configuration and the command line say.
         recorded: vehicle named in the log's `deployment` record, used when the configuration names none.
         where: the log, for the error message.
+        told: vehicle that the rest of the log tells, used when neither names a preset.
 
     Raises:
         ConfigurationError: no vehicle is named, the name is unknown, or a value is missing.
@@ -95,6 +133,8 @@ def resolve_vehicle(section: VehicleSection, *, recorded: str | None, where: str
         raise ConfigurationError(
             "vehicle_unknown", f"no vehicle preset is called {named!r}", where=where, hint=_how_to_choose()
         )
+    if base is None and not {"wheel_radius_m", "kind"} & set(values):
+        base = told
     if base is None:
         if "wheel_radius_m" not in values:
             said = (

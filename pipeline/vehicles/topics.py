@@ -10,9 +10,19 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, TypeVar
 
+from pipeline.vehicles.candidates import DEAD_RECKONED, LOCALIZED, Topics
 from pipeline.vehicles.errors import ConfigurationError
+from pipeline.vehicles.message_types import find_type, list_types, plain_type
 from pipeline.vehicles.robots import choose_robot, find_robots
-from pipeline.vehicles.sources import DriveForm, DriveSource, PoseSource, Signal, Sources, TopicSource
+from pipeline.vehicles.sources import (
+    CONFIGURED,
+    DriveForm,
+    DriveSource,
+    PoseSource,
+    Signal,
+    Sources,
+    TopicSource,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -21,37 +31,13 @@ if TYPE_CHECKING:
     from pipeline.vehicles.configuration import Configuration, DriveSection, IntervalSection
     from pipeline.vehicles.presets import Vehicle
 
-JOINTS = "sensor_msgs/JointState"
-BODY_TYPES = ("geometry_msgs/Twist", "geometry_msgs/TwistStamped")
-ACKERMANN_TYPES = ("ackermann_msgs/AckermannDrive", "ackermann_msgs/AckermannDriveStamped")
-FLOAT_TYPES = ("std_msgs/Float64", "std_msgs/Float32")
-POSE_TYPES = (
-    "nav_msgs/Odometry",
-    "geometry_msgs/PoseStamped",
-    "geometry_msgs/PoseWithCovarianceStamped",
-)
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
-IMU_TYPE = "sensor_msgs/Imu"
 STRING_TYPE = "std_msgs/String"
 DEFAULT_INTERVAL = ("/drive/calib_state", "calib")
 
-_COMMANDED = re.compile(r"cmd|command|setpoint|target|desired|reference")
-_MEASURED = re.compile(r"status|state|feedback|measured|encoder|actual")
-_RECEIVED = re.compile(r"controller|mux/cmd|cmd_vel_out|platform/cmd|drive/cmd|base/cmd|vehicle/")
-_UPSTREAM = re.compile(r"joy|teleop|nav|web|key|interactive|plan|raw|key_vel")
-_LOCALIZED = re.compile(
-    r"icp|slam|lidar|laser|map|locali|loam|gnss|gps|rtk|ground_truth|truth|mocap|vicon|optitrack|amcl|vio|lio"
-)
-_DEAD_RECKONED = re.compile(r"controller|wheel|encoder|diff_drive|drive_odom|platform/odom|dead")
 _NOT_A_POSE = re.compile(r"goal|initialpose|initial_pose|target|waypoint|desired|reference|setpoint|cmd")
 
-
 Source = TypeVar("Source", DriveSource, PoseSource, TopicSource)
-
-
-def plain_type(type_name: str) -> str:
-    """ROS 1 and ROS 2 spellings of a type made one: `sensor_msgs/Imu`."""
-    return type_name.replace("/msg/", "/")
 
 
 def choose_sources(
@@ -71,14 +57,16 @@ def choose_sources(
     """
     chooser = _Chooser([channel for channel in channels if channel.message_count != 0], vehicle, where)
     chooser.settle_robot(configuration)
-    return Sources(
+    sources = Sources(
         command=chooser.choose_drive(configuration.command, commanded=True),
         wheels=chooser.choose_drive(configuration.wheels, commanded=False),
         pose=chooser.choose_pose(configuration.pose.topic, configuration.pose.frames),
         imu=chooser.choose_imu(configuration.imu.topic),
         interval=chooser.choose_interval(configuration),
         notes=tuple(chooser.notes),
+        others=chooser.others,
     )
+    return sources.separated()
 
 
 class _Chooser:
@@ -90,16 +78,20 @@ class _Chooser:
         self.vehicle = vehicle
         self.where = where
         self.notes: list[str] = []
+        self.others: dict[str, tuple[DriveSource | PoseSource | TopicSource, ...]] = {}
         self._robot: str | None = None
 
     def settle_robot(self, configuration: Configuration) -> None:
         """Find out whose topics may be chosen, where the log holds those of several robots."""
-        pairs = (*self._pairs_of_sides(), *self._pairs_of_speed_and_steering())
+        numbers = Topics(self.types)
+        pairs = (*numbers.pairs_of_sides(), *numbers.pairs_of_speed_and_steering())
         drives = {
-            *self.of_type(JOINTS, *BODY_TYPES, *ACKERMANN_TYPES),
+            *self.with_part("joints"),
+            *(topic for topic in self.with_part("drive") if topic not in self.with_part("pose")),
+            *(topic for topic, number in numbers.numbers().items() if number.quantity),
             *(side for pair in pairs for side in pair),
         }
-        poses = {topic for topic in self.of_type(*POSE_TYPES) if self._rank_pose(topic) is not None}
+        poses = {topic for topic in self.with_part("pose") if self._rank_pose(topic) is not None}
         poses |= {topic for topic in self.of_type(*TRANSFORM_TYPES) if "static" not in topic}
         robots = find_robots(drives, poses)
         named = (*_list_topics(configuration.command), *_list_topics(configuration.wheels))
@@ -117,6 +109,10 @@ class _Chooser:
             if kind in types and topic.startswith(self._robot or "")
         ]
 
+    def with_part(self, part: str) -> list[str]:
+        """Topics whose type has a part, of one robot."""
+        return self.of_type(*list_types(part))
+
     def require(self, text: str, role: str) -> Signal:
         """A configured signal, or an error when its topic is not in the log."""
         signal = Signal.parse(text)
@@ -133,21 +129,25 @@ class _Chooser:
         """A configured topic that must be of one type."""
         name = self.require(topic, role).topic
         if self.types[name] != kind:
-            raise ConfigurationError(
-                "type_not_usable",
-                f"the topic {name!r} of type {self.types[name]} cannot serve as {role}",
-                where=self.where,
-                hint=f"Use a topic of type {kind}.",
-            )
+            raise self._unusable(name, role, kind)
         return name
+
+    def _unusable(self, topic: str, role: str, kind: str) -> ConfigurationError:
+        return ConfigurationError(
+            "type_not_usable",
+            f"the topic {topic!r} of type {self.types[topic]} cannot serve as {role}",
+            where=self.where,
+            hint=f"Use a topic of type {kind}.",
+        )
 
     def require_number(self, text: str, role: str) -> Signal:
         """A configured signal that must come to one number."""
         signal = self.require(text, role)
         if signal.field:
             return signal
-        if self.types[signal.topic] in FLOAT_TYPES:
-            return Signal(signal.topic, "data")
+        number = find_type(self.types[signal.topic]).number
+        if number is not None:
+            return Signal(signal.topic, number.field, number.unit, number.sign, number.per_turn)
         raise ConfigurationError(
             "field_needed",
             f"the topic {signal.topic!r} configured as {role} is of type {self.types[signal.topic]}",
@@ -162,91 +162,39 @@ class _Chooser:
         if configured is not None:
             return configured
         usual = self.vehicle.topics.command if commanded else self.vehicle.topics.wheels
-        candidates = list(self._drive_candidates(commanded=commanded))
-        return self._best(candidates, usual, role)
+        topics = Topics({topic: self.types[topic] for topic in self.of_type(*self.types.values())})
+        steered = self.vehicle.kinematics.has_inputs("speed", "steering")
+        return self._best(topics.list_drives(commanded=commanded, steered=steered), usual, role)
 
     def _configured_drive(self, section: DriveSection, role: str) -> DriveSource | None:
-        reason = "configured"
+        reason = CONFIGURED
         if section.left_topic and section.right_topic:
             sides = (section.left_topic, section.right_topic)
             return DriveSource(
                 DriveForm.SIDES, tuple(self.require_number(side, role) for side in sides), reason
             )
         if section.speed_topic and (section.yaw_rate_topic or section.steering_topic):
-            form = DriveForm.BODY_SIGNALS if section.yaw_rate_topic else DriveForm.STEERING_SIGNALS
+            form = DriveForm.BODY if section.yaw_rate_topic else DriveForm.STEERING
             pair = (section.speed_topic, section.yaw_rate_topic or section.steering_topic or "")
             return DriveSource(form, tuple(self.require_number(text, role) for text in pair), reason)
         if section.topic:
             signal = self.require(section.topic, role)
-            found = self._form_of(signal.topic)
-            if found is None:
+            topics = Topics({signal.topic: self.types[signal.topic]})
+            steered = self.vehicle.kinematics.has_inputs("speed", "steering")
+            found = [
+                source
+                for commanded in (True, False)
+                for _, source in topics.list_drives(commanded=commanded, steered=steered)
+            ]
+            if not found or (role == "command" and find_type(self.types[signal.topic]).pose is not None):
                 raise ConfigurationError(
                     "type_not_usable",
                     f"the topic {signal.topic!r} ({self.types[signal.topic]}) cannot serve as {role} alone",
                     where=self.where,
                     hint=f"Give {role}.left_topic and {role}.right_topic with field paths.",
                 )
-            return DriveSource(found, (signal,), reason)
+            return DriveSource(found[0].form, found[0].signals, reason, found[0].name)
         return None
-
-    def _form_of(self, topic: str) -> DriveForm | None:
-        kind = self.types[topic]
-        if kind == JOINTS:
-            return DriveForm.JOINTS
-        if kind in BODY_TYPES:
-            return DriveForm.BODY
-        return DriveForm.ACKERMANN if kind in ACKERMANN_TYPES else None
-
-    def _drive_candidates(self, *, commanded: bool) -> Iterable[tuple[float, DriveSource]]:
-        """Candidates with their rank: wheel commands before body commands, since the drive received them."""
-        ackermann = self.vehicle.kinematics.has_inputs("speed", "steering")
-        for topic in self.of_type(JOINTS):
-            says_command = bool(_COMMANDED.search(topic.lower()))
-            if says_command == commanded:
-                word = "says command" if says_command else "does not say command"
-                rank = 2.0 if ackermann else 3.0
-                yield rank, DriveSource(DriveForm.JOINTS, (Signal(topic),), f"JointState whose name {word}")
-        form = DriveForm.STEERING_SIGNALS if ackermann else DriveForm.SIDES
-        pairs = self._pairs_of_speed_and_steering() if ackermann else self._pairs_of_sides()
-        for rank, pair, reason in _rank_pairs(pairs, commanded=commanded):
-            yield rank, DriveSource(form, (Signal(pair[0], "data"), Signal(pair[1], "data")), reason)
-        for topic in self.of_type(*ACKERMANN_TYPES) if ackermann else []:
-            if bool(_MEASURED.search(topic.lower())) != commanded:
-                yield 3.0, DriveSource(DriveForm.ACKERMANN, (Signal(topic),), "speed and steering angle")
-        for topic in self.of_type(*BODY_TYPES) if commanded else []:
-            yield self._rank_body(topic)
-
-    def _rank_body(self, topic: str) -> tuple[float, DriveSource]:
-        name = topic.lower()
-        if _MEASURED.search(name):
-            rank, reason = 0.5, "a twist whose name says it is measured"
-        elif _RECEIVED.search(name) and not _UPSTREAM.search(name):
-            rank, reason = 2.0, "the body command that the controller received"
-        elif _UPSTREAM.search(name):
-            rank, reason = 1.0, "a body command upstream of the controller"
-        else:
-            rank, reason = 1.5, "a body command"
-        return rank, DriveSource(DriveForm.BODY, (Signal(topic),), reason)
-
-    def _pairs_of_sides(self) -> list[tuple[str, str]]:
-        """Topics of one number whose names differ in left and right."""
-        floats = set(self.of_type(*FLOAT_TYPES))
-        return [
-            (topic, topic.replace("left", "right"))
-            for topic in sorted(floats)
-            if "left" in topic and topic.replace("left", "right") in floats
-        ]
-
-    def _pairs_of_speed_and_steering(self) -> list[tuple[str, str]]:
-        """Topics of one number whose names differ in speed (or velocity) and steering."""
-        floats = set(self.of_type(*FLOAT_TYPES))
-        return [
-            (speed, topic)
-            for topic in sorted(floats)
-            for word in ("speed", "velocity")
-            for turn in ("steering_angle", "steering", "steer")
-            if turn in topic and (speed := topic.replace(turn, word)) in floats
-        ]
 
     def choose_pose(self, topic: str | None, frames: list[str] | None) -> PoseSource | None:
         """The localization: configured, else the best named one, else transforms, else any odometry."""
@@ -259,21 +207,21 @@ class _Chooser:
                     where=self.where,
                     hint="Configure pose.topic.",
                 )
-            return PoseSource(transforms, "configured", from_transforms=True, frames=(frames[0], frames[1]))
+            return PoseSource(transforms, CONFIGURED, from_transforms=True, frames=(frames[0], frames[1]))
         if topic:
             name = self.require(topic, "pose").topic
             if self.types[name] in TRANSFORM_TYPES:
-                return PoseSource(name, "configured", from_transforms=True)
-            if self.types[name] not in POSE_TYPES:
+                return PoseSource(name, CONFIGURED, from_transforms=True)
+            if find_type(self.types[name]).pose is None:
                 raise ConfigurationError(
                     "type_not_usable",
                     f"the topic {name!r} of type {self.types[name]} cannot serve as pose",
                     where=self.where,
-                    hint=f"Use one of: {', '.join(POSE_TYPES)}; or pose.frames.",
+                    hint=f"Use one of: {', '.join(list_types('pose'))}; or pose.frames.",
                 )
-            return PoseSource(name, "configured")
+            return PoseSource(name, CONFIGURED)
         candidates = [
-            ranked for name in self.of_type(*POSE_TYPES) if (ranked := self._rank_pose(name)) is not None
+            ranked for name in self.with_part("pose") if (ranked := self._rank_pose(name)) is not None
         ]
         if transforms:
             candidates.append((2.5, PoseSource(transforms, "the chain of transforms", from_transforms=True)))
@@ -291,17 +239,20 @@ class _Chooser:
         name = topic.lower()
         if _NOT_A_POSE.search(name):
             return None
-        if _DEAD_RECKONED.search(name):
+        if DEAD_RECKONED.search(name):
             return 0.5, PoseSource(topic, "an odometry whose name says it comes from the wheels")
-        if _LOCALIZED.search(name):
+        if LOCALIZED.search(name):
             return 3.0, PoseSource(topic, "a localization by its name")
         return 2.0, PoseSource(topic, "a pose by its type")
 
     def choose_imu(self, topic: str | None) -> TopicSource | None:
         """The gyro: configured, else the usual one, else the one with most messages."""
         if topic:
-            return TopicSource(self._require_type(topic, "imu", IMU_TYPE), "configured")
-        candidates = [(1.0, TopicSource(name, "an IMU by its type")) for name in self.of_type(IMU_TYPE)]
+            name = self.require(topic, "imu").topic
+            if find_type(self.types[name]).imu is None:
+                raise self._unusable(name, "imu", " or ".join(list_types("imu")))
+            return TopicSource(name, CONFIGURED)
+        candidates = [(1.0, TopicSource(name, "an IMU by its type")) for name in self.with_part("imu")]
         return self._best(candidates, self.vehicle.topics.imu, "imu")
 
     def choose_interval(self, configuration: Configuration) -> TopicSource | None:
@@ -316,7 +267,7 @@ class _Chooser:
                 hint="Give one state topic; it may have several [[interval]] with different `equals`.",
             )
         if configured:
-            return TopicSource(self._require_type(configured[0], "interval", STRING_TYPE), "configured")
+            return TopicSource(self._require_type(configured[0], "interval", STRING_TYPE), CONFIGURED)
         topic, value = DEFAULT_INTERVAL
         if sections or configuration.use_intervals == "all" or self.types.get(topic) != STRING_TYPE:
             return None
@@ -334,7 +285,8 @@ class _Chooser:
             return -rank, place, -self.counts[topic], topic
 
         ranked = sorted(candidates, key=order)
-        others = ", ".join(str(source) for _, source in ranked[1:])
+        self.others[role] = tuple(source for _, source in ranked[1:])
+        others = ", ".join(str(source) for source in self.others[role])
         if others:
             self.notes.append(f"{role}: {ranked[0][1]} was preferred to {others}")
         return ranked[0][1]
@@ -344,26 +296,3 @@ def _list_topics(section: DriveSection) -> Iterable[str]:
     """Topics that the configuration of a drive names."""
     pairs = (section.left_topic, section.right_topic, section.speed_topic, section.steering_topic)
     return filter(None, (section.topic, *pairs, section.yaw_rate_topic))
-
-
-def _rank_pairs(
-    pairs: Sequence[tuple[str, str]], *, commanded: bool
-) -> Iterable[tuple[float, tuple[str, str], str]]:
-    """Pairs of topics that may serve in a role, ranked by what their names say.
-
-    A pair that says nothing is a command, unless another pair says that it is the command.
-    """
-    wanted, unwanted = (_COMMANDED, _MEASURED) if commanded else (_MEASURED, _COMMANDED)
-    command_is_named = any(
-        _COMMANDED.search(pair[0].lower()) and not _MEASURED.search(pair[0].lower()) for pair in pairs
-    )
-    for pair in pairs:
-        name = pair[0].lower()
-        if unwanted.search(name):
-            continue
-        if wanted.search(name):
-            yield 3.0, pair, "a pair of topics whose names fit the role"
-        elif commanded and not command_is_named:
-            yield 2.5, pair, "a pair of topics that do not say they are measured"
-        elif not commanded and command_is_named:
-            yield 2.5, pair, "a pair of topics beside one that says command"

@@ -167,11 +167,12 @@ def test_what_a_diagnosis_stores_does_not_depend_on_its_input(tmp_path: Path, an
 def test_a_log_without_the_input_that_is_asked_for_is_said_to_lack_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = Path(__file__).parents[2] / "data_samples" / "mystery_2.mcap"
+    log = tmp_path / "no_wheels.mcap"
+    simulate_case(None, out=log, duration_s=30.0, layout="body_command")
     assert slip("diagnose", log, "--out", tmp_path, "--input", "measured", "--quiet") == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "no topic can serve as measured wheels" in line
-    assert "/platform/odom" in line
+    assert "/mapping/icp_odom" in line
     assert not (tmp_path / "runs").exists()
 
 

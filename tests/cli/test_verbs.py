@@ -47,8 +47,11 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with LogWriter(folder / "no_command.mcap") as log:
         log.metadata("deployment", {"vehicle": "husky_a200", "terrain": "tile"})
         log.write_columns("/odom", "nav_msgs/msg/Odometry", stamps, pose, header_time=stamps)
+    with LogWriter(folder / "only_images.mcap") as log:
+        log.write_columns("/camera", "std_msgs/msg/String", stamps, {"data": "an image"})
     with LogWriter(folder / "no_vehicle.mcap") as log:
-        log.write_columns("/cmd_vel", "geometry_msgs/msg/Twist", stamps, {"linear.x": np.ones(200)})
+        for side in ("left", "right"):
+            log.write_columns(f"/{side}_drive/velocity", "std_msgs/msg/Float64", stamps, {"data": 0.0})
         log.write_columns("/odom", "nav_msgs/msg/Odometry", stamps, pose, header_time=stamps)
     with LogWriter(folder / "no_messages.mcap") as log:
         log.metadata("deployment", {"vehicle": "husky_a200", "terrain": "tile"})
@@ -64,6 +67,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("no_pose.mcap", ["pose", "[pose] topic", "/cmd_vel"]),
         ("no_command.mcap", ["command", "[command] topic", "/odom"]),
         ("no_vehicle.mcap", ["vehicle", "--vehicle", "husky_a200", "--wheel-radius"]),
+        ("only_images.mcap", ["no topic", "pose", "/camera"]),
         ("no_messages.mcap", ["no message"]),
     ],
 )

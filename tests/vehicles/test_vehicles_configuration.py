@@ -166,7 +166,7 @@ def test_a_wrong_override_names_the_command_line(log: Path) -> None:
         ('[comand]\ntopic = "/a"', 1, "unknown key `comand`", "command, imu"),
         ('[[interval]]\nstart_s = 1\n[[interval]]\nend_s = "late"', 4, "interval[1].end_s", "README.md"),
         (('[[match]]\nglob = "*"\n[match.command]\nunit = "rpm"\n'
-         '[[match]]\nglob = "b*"\n[match.command]\nunit = "km/h"'), 8, "'km/h'", "m/s, rad/s, rpm"),
+         '[[match]]\nglob = "b*"\n[match.command]\nunit = "km/h"'), 8, "'km/h'", "m/s, mm/s, rad"),
     ],
 )  # fmt: skip
 def test_a_wrong_word_is_named_with_its_line_and_the_right_ones(

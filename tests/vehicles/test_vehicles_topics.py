@@ -221,8 +221,9 @@ def test_every_simulated_layout_is_understood(name: str) -> None:
     topics |= {layout.pose.topic: types[layout.pose.form]} | ({layout.imu: IMU} if layout.imu else {})
     sources = choose(topics, "ackermann_car" if layout.kind == "ackermann" else "husky")
     assert sources.command is not None
-    assert tuple(signal.topic for signal in sources.command.signals) == layout.commands[0].topics
-    measured = () if sources.wheels is None else tuple(signal.topic for signal in sources.wheels.signals)
+    assert tuple(dict.fromkeys(each.topic for each in sources.command.signals)) == layout.commands[0].topics
+    signals = () if sources.wheels is None else sources.wheels.signals
+    measured = tuple(dict.fromkeys(signal.topic for signal in signals))
     assert measured == (layout.wheels[0].topics if layout.wheels else ())
     assert sources.pose is not None
     assert sources.pose.topic == layout.pose.topic

@@ -32,6 +32,10 @@ _AROUND = 20
 _BIN_NS = 500_000_000
 _FREQUENT = 4
 _DENSE = 1.6
+_KNOT_NS = 2_000_000_000
+_FEWEST_KNOTS = 5
+_OTHER_RATE = 5e-3
+"""No two real clocks differ by so much; simulated time does."""
 
 
 @dataclass(frozen=True)
@@ -84,12 +88,72 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
     Returns:
         The clocks by the same keys, and what was noticed.
     """
+    recorded, findings = _follow_simulated_time(recorded)
     clocks = {key: _read_clock(times) for key, times in recorded.items()}
-    findings = [found for clock in clocks.values() for found in clock.findings]
+    findings += [found for clock in clocks.values() for found in clock.findings]
     findings += _check_early_stamps(clocks)
     shifted, more = _join_time_bases(clocks)
     single, still_more = leave_out_twice_told(shifted)
     return single, findings + more + still_more
+
+
+def _follow_simulated_time(
+    recorded: Mapping[str, Recorded],
+) -> tuple[Mapping[str, Recorded], list[Finding]]:
+    """Log times on the clock of the stamps where that runs at another rate than the recorder's.
+
+    In simulation stamps count simulated time, which may run slower or faster than the recorder's clock and
+    stand still now and then. The topic with most stamps tells, for every two seconds of log time, what the
+    stamps' clock showed; all log times are mapped through that, so that topics without stamps fit.
+    """
+    stamped = [
+        times
+        for times in recorded.values()
+        if times.header_time is not None and times.clock is None and times.header_time.any()
+    ]
+    if not stamped:
+        return recorded, []
+    leading = max(stamped, key=lambda times: times.log_time.size)
+    knots = _find_knots(leading)
+    if knots is None:
+        return recorded, []
+    log, stamp = knots
+    rate = float(np.median(np.diff(stamp) / np.diff(log)))
+    if abs(rate - 1.0) < _OTHER_RATE or abs(rate - 1.0) * (log[-1] - log[0]) < _JUMP_NS:
+        return recorded, []
+
+    def follow(times: Stamps) -> Stamps:
+        # Beyond the first and the last knot the clock runs on as it did there.
+        inside = np.interp(times, log, stamp)
+        before = np.minimum(times - log[0], 0.0) * (stamp[1] - stamp[0]) / (log[1] - log[0])
+        after = np.maximum(times - log[-1], 0.0) * (stamp[-1] - stamp[-2]) / (log[-1] - log[-2])
+        # Log times become those of stamps that are as late as the leading topic's.
+        mapped: Stamps = np.rint(inside + before + after).astype(np.int64)
+        return mapped
+
+    mapped = {
+        key: replace(times, log_time=follow(times.log_time), publish_time=follow(times.publish_time))
+        for key, times in recorded.items()
+    }
+    text = (
+        f"the stamps run {rate:.3g} times as fast as the recorder's clock (simulated time): log times were "
+        f"mapped onto them by those of {leading.topic}"
+    )
+    return mapped, [Finding("simulated_time", "info", text, where=leading.topic, value=rate)]
+
+
+def _find_knots(times: Recorded) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Medians of log time and stamp [ns] in bins of log time; None where there are too few to tell a rate."""
+    header = times.header_time
+    if header is None or times.log_time.size < _FEWEST_KNOTS:
+        return None
+    bins = (times.log_time - times.log_time[0]) // _KNOT_NS
+    places = np.unique(bins)
+    if places.size < _FEWEST_KNOTS:
+        return None
+    log = np.array([np.median(times.log_time[bins == place]) for place in places])
+    stamp = np.array([np.median(header[bins == place]) for place in places])
+    return (log, stamp) if (np.diff(stamp) >= 0.0).all() else None
 
 
 def _read_clock(times: Recorded) -> TopicClock:
@@ -225,11 +289,12 @@ def _join_time_bases(
             continue
         if clock.clock == "header":
             shift = round(away * 1e9)
-            text = f"the stamps of {clock.topic} lie {-away:.3g} s from the other topics' and were shifted"
+            apart = _say_offset(-away)
+            text = f"the stamps of {clock.topic} lie {apart} from the other topics' and were shifted"
         else:
             shift = round(-home * 1e9)
             text = (
-                f"the recorder's clock lies {home:.3g} s from the stamps: "
+                f"the recorder's clock lies {_say_offset(home)} from the stamps: "
                 f"{clock.topic}, which has none, was shifted"
             )
         name = find_late_effect(Late.POSES).id
@@ -238,6 +303,10 @@ def _join_time_bases(
             clock.topic, clock.clock, clock.stamp + shift, clock.usable, clock.breaks, clock.latency_s
         )
     return joined, findings
+
+
+def _say_offset(seconds: float) -> str:
+    return f"{seconds:.3g} s" if abs(seconds) * 1e9 < DAY_NS else "more than a day (another epoch)"
 
 
 def leave_out_twice_told(

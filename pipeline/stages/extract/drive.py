@@ -7,25 +7,38 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.stages.errors import StageError
+from pipeline.stages.extract import reading
 from pipeline.stages.finding import Finding
-from pipeline.vehicles import DriveForm, DriveSection, Vehicle
+from pipeline.vehicles import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit
+from pipeline.vehicles.presets import OwnUnit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from pipeline.vehicles.configuration import Unit
 
 Floats = NDArray[np.float64]
 
 _LEFT = re.compile(r"left|(^|[_/])(l|lf|fl|rl|bl|ml|lb)([_/\d]|$)")
 _RIGHT = re.compile(r"right|(^|[_/])(r|rf|fr|rr|br|mr|rb)([_/\d]|$)")
 _STEERS = re.compile(r"steer")
-_RPM = 2.0 * np.pi / 60.0
-
-BODY_FIELDS = {"geometry_msgs/Twist": "", "geometry_msgs/TwistStamped": "twist."}
-ACKERMANN_FIELDS = {"ackermann_msgs/AckermannDrive": "", "ackermann_msgs/AckermannDriveStamped": "drive."}
+_USUAL_UNITS = {
+    DriveForm.SIDES: ("rad/s", "rad/s"),
+    DriveForm.BODY: ("m/s", "rad/s"),
+    DriveForm.STEERING: ("m/s", "rad"),
+}
+_UNIT_GAINS: dict[Unit, float] = {"rpm": 60.0 / (2.0 * np.pi), "deg/s": 180.0 / np.pi}
+_UNIT_NEAR = 0.1
+_LIVE = 0.2
+_STILL_RADPS = 0.05
+_FEWEST_LIVE = 50
+_COUNTERS = (2.0**16, 2.0**32)
+"""After so many ticks counters of encoders begin again."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +101,16 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
         if not _is_known(position, joint):
             raise _no_wheels(columns.topic, joints)
         velocity[joint] = differentiate_angle(times, position[joint])
+    if section.unit is None:
+        both = [joint for joint in (*left, *right) if joint not in missing and _is_known(position, joint)]
+        unit = _recognize_unit(times, [(velocity[joint], position[joint]) for joint in both])
+        if unit:
+            section = structs.replace(section, unit=unit)
+            text = (
+                f"the velocities of {columns.topic} are what its positions turn, in {unit}: they were "
+                'converted ([wheels] unit = "rad/s" in run.toml where the positions are wrong)'
+            )
+            found.append(Finding("unit_wrong", "warning", text, where=columns.topic))
     if vehicle.kinematics.has_inputs("steering"):
         steering = _mean_steering(position, section.steering_joint, columns.topic)
         wheels = [velocity[joint] for joint in (*left, *right)]
@@ -102,6 +125,29 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
         for side in (left, right)
     ]
     return Drive(left=sides[0], right=sides[1], findings=tuple(found))
+
+
+def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> Unit | None:
+    """Unit of velocities that are not what the positions beside them turn in rad/s; None where they are.
+
+    Only a gain that is a unit's, and the same throughout, tells one.
+    """
+    gains = []
+    for velocity, position in joints:
+        turned = differentiate_angle(times, position)
+        live = np.isfinite(turned) & np.isfinite(velocity)
+        live &= np.abs(turned) > _LIVE * float(np.max(np.abs(turned[live]), initial=_STILL_RADPS / _LIVE))
+        if live.sum() < _FEWEST_LIVE:
+            return None
+        ratio = velocity[live] / turned[live]
+        gain = float(np.median(ratio))
+        if float(np.median(np.abs(ratio - gain))) > _UNIT_NEAR * abs(gain):
+            return None
+        gains.append(gain)
+    for unit, gain in _UNIT_GAINS.items():
+        if gains and all(abs(one / gain - 1.0) < _UNIT_NEAR for one in gains):
+            return unit
+    return None
 
 
 def _mean_steering(position: Mapping[str, Floats], configured: str | None, topic: str) -> Floats:
@@ -172,11 +218,88 @@ def differentiate_angle(times: Floats, angle: Floats) -> Floats:
 
 
 def _to_radps(values: Floats, section: DriveSection, vehicle: Vehicle) -> Floats:
-    scale = {"rad/s": 1.0, "rpm": _RPM, "m/s": 1.0 / vehicle.wheel_radius_m}[section.unit]
-    return values * (scale * section.sign)
+    scale, offset, unit = convert_unit(section.unit or "rad/s", vehicle.units, where="wheels")
+    return (values - offset) * scale * section.sign / (vehicle.wheel_radius_m if unit == "m/s" else 1.0)
 
 
-def read_sides(left: Floats, right: Floats, section: DriveSection, vehicle: Vehicle) -> Drive:
+def read_signal(
+    columns: TopicColumns, source: DriveSource, number: int, section: DriveSection, vehicle: Vehicle
+) -> Floats:
+    """One signal of a pair as it comes, in rad/s or m/s; a wheel angle in rad, unwrapped.
+
+    Args:
+        columns: the signal's topic.
+        source: the pair.
+        number: 0 for the left wheels or the speed, 1 for the other.
+        section: unit and ticks a turn, where they are configured.
+        vehicle: whose own units may be in use.
+
+    Raises:
+        ConfigurationError: ``unit_unknown``.
+    """
+    signal = source.signals[number]
+    raw = np.mean([reading.numbers(columns, path) for path in signal.fields()], axis=0) * signal.sign
+    own = dict(vehicle.units)
+    per_turn = section.per_turn
+    if per_turn is None and signal.per_turn:
+        per_turn = float(np.nanmedian(reading.numbers(columns, signal.per_turn))) or None
+    if per_turn is not None:
+        own["ticks"] = OwnUnit(per_turn / (2.0 * np.pi), "rad")
+    asked = section.unit if number == 0 or source.form is DriveForm.SIDES else None
+    unit = asked or signal.unit or _USUAL_UNITS[source.form][number]
+    if unit == "ticks":
+        raw = unwrap_counter(raw)
+    scale, offset, made = convert_unit(unit, own, where=signal.topic)
+    values: Floats = (raw - offset) * scale
+    if number == 0 or source.form is DriveForm.SIDES:
+        if source.form is DriveForm.SIDES and made == "m/s":
+            return values / vehicle.wheel_radius_m
+        if source.form is DriveForm.STEERING and made == "rad/s":
+            return values * vehicle.wheel_radius_m
+    return values
+
+
+def is_angle(source: DriveSource, section: DriveSection) -> bool:
+    """Whether the signals of a pair are wheel angles, to be differentiated."""
+    unit = section.unit or source.signals[0].unit
+    return source.form is DriveForm.SIDES and unit in {"rad", "deg", "ticks"}
+
+
+def unwrap_counter(count: Floats) -> Floats:
+    """A counter that goes on where the encoder's began again at 2^16 or 2^32."""
+    for period in _COUNTERS:
+        if count.size > 1 and np.ptp(count) <= period and np.abs(np.diff(count)).max() > 0.5 * period:
+            return np.asarray(np.unwrap(count, period=period), dtype=np.float64)
+    return count
+
+
+def read_pair(
+    form: DriveForm, first: Floats, second: Floats, section: DriveSection, vehicle: Vehicle, *, nominal: bool
+) -> Drive:
+    """Two signals at common times as what the drive is told.
+
+    Args:
+        form: what they are.
+        first: speeds of the left wheels [rad/s], or speed [m/s].
+        second: speeds of the right wheels [rad/s], yaw rate [rad/s] or steering angle [rad].
+        section: sign.
+        vehicle: its kind and geometry.
+        nominal: whether a body motion is meant with the nominal track width, whatever the controller
+            multiplies it by.
+
+    Raises:
+        StageError: the vehicle is of a kind that is told something else.
+    """
+    if form is DriveForm.SIDES:
+        return read_sides(first * section.sign, second * section.sign, vehicle)
+    if form is DriveForm.STEERING:
+        return read_steering(first * section.sign, second, vehicle)
+    if nominal:
+        vehicle = structs.replace(vehicle, controller_track_multiplier=1.0)
+    return read_body(first * section.sign, second, vehicle)
+
+
+def read_sides(left: Floats, right: Floats, vehicle: Vehicle) -> Drive:
     """A signal a side, already at common times."""
     if vehicle.kinematics.has_inputs("steering"):
         raise StageError(
@@ -185,17 +308,16 @@ def read_sides(left: Floats, right: Floats, section: DriveSection, vehicle: Vehi
             where="configuration",
             hint="Configure speed_topic and steering_topic, or an AckermannDrive topic.",
         )
-    return Drive(left=_to_radps(left, section, vehicle), right=_to_radps(right, section, vehicle))
+    return Drive(left=left, right=right)
 
 
-def read_body(forward: Floats, yaw_rate: Floats, section: DriveSection, vehicle: Vehicle) -> Drive:
+def read_body(forward: Floats, yaw_rate: Floats, vehicle: Vehicle) -> Drive:
     """A body command, turned into the drive's by the vehicle's ideal inverse."""
-    forward = forward * section.sign
     inputs = vehicle.kinematics.inverse((forward, np.zeros_like(forward), yaw_rate), vehicle)
     return Drive(**inputs, body_x=forward, body_w=yaw_rate, findings=())
 
 
-def read_steering(speed: Floats, steering: Floats, section: DriveSection, vehicle: Vehicle) -> Drive:
+def read_steering(speed: Floats, steering: Floats, vehicle: Vehicle) -> Drive:
     """Speed and steering angle, as recorded."""
     if not vehicle.kinematics.has_inputs("speed", "steering"):
         raise StageError(
@@ -204,9 +326,4 @@ def read_steering(speed: Floats, steering: Floats, section: DriveSection, vehicl
             where="configuration",
             hint='Set vehicle.kind = "ackermann" and vehicle.wheelbase_m.',
         )
-    return Drive(speed=speed * section.sign, steering=steering)
-
-
-def is_single_topic(form: DriveForm) -> bool:
-    """Whether a form reads everything from one topic."""
-    return form in {DriveForm.JOINTS, DriveForm.BODY, DriveForm.ACKERMANN}
+    return Drive(speed=speed, steering=steering)

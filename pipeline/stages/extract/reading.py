@@ -2,66 +2,100 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.core import rigid
 from pipeline.logs import Strings, TopicColumns, Wanted, wanted_transforms
 from pipeline.stages.errors import StageError
-from pipeline.stages.extract.drive import ACKERMANN_FIELDS, BODY_FIELDS
-from pipeline.vehicles import DriveForm, DriveSource, Signal, Sources
-from pipeline.vehicles.topics import TRANSFORM_TYPES, plain_type
+from pipeline.vehicles import DriveForm, DriveSource, PoseSource, Signal, Sources
+from pipeline.vehicles.message_types import find_type, plain_type
+from pipeline.vehicles.topics import TRANSFORM_TYPES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
 
 Floats = NDArray[np.float64]
 
-_POSE_PREFIX = {
-    "nav_msgs/Odometry": "pose.pose.",
-    "geometry_msgs/PoseStamped": "pose.",
-    "geometry_msgs/PoseWithCovarianceStamped": "pose.pose.",
-}
 _LONGEST_NAME = 200
-_POSITION = ("position.x", "position.y", "position.z")
-_ORIENTATION = ("orientation.x", "orientation.y", "orientation.z", "orientation.w")
-_RATES = tuple(f"angular_velocity.{axis}" for axis in "xyz")
-_FORCES = tuple(f"linear_acceleration.{axis}" for axis in "xyz")
+_NANOSECONDS = 1_000_000_000
+_NED_IN_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+_FLU_IN_FRD = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def axis_fields(fields: str | list[str], axes: str) -> list[str]:
+    """Fields of a vector: those listed, or the axes of a structure."""
+    return fields if isinstance(fields, list) else [f"{fields}.{axis}" for axis in axes]
 
 
 def drive_fields(source: DriveSource, types: dict[str, str]) -> list[Signal]:
     """Every field that a drive source needs."""
-    topic = source.signals[0].topic
-    kind = plain_type(types[topic])
     if source.form is DriveForm.JOINTS:
-        return [Signal(topic, name) for name in ("name", "velocity", "position")]
-    if source.form is DriveForm.BODY:
-        prefix = BODY_FIELDS[kind]
-        return [Signal(topic, f"{prefix}linear.x"), Signal(topic, f"{prefix}angular.z")]
-    if source.form is DriveForm.ACKERMANN:
-        prefix = ACKERMANN_FIELDS[kind]
-        return [Signal(topic, f"{prefix}speed"), Signal(topic, f"{prefix}steering_angle")]
-    return list(source.signals)
+        topic = source.signals[0].topic
+        joints = find_type(types[topic]).joints
+        names = () if joints is None else (joints.names, joints.velocity, joints.position)
+        return [Signal(topic, name) for name in names]
+    fields = [Signal(signal.topic, path) for signal in source.signals for path in signal.fields()]
+    fields += [Signal(signal.topic, signal.per_turn) for signal in source.signals if signal.per_turn]
+    sideways = sideways_field(source, types)
+    return fields if sideways is None else [*fields, sideways]
 
 
-def list_wanted(sources: Sources, types: dict[str, str]) -> list[Wanted]:
+def is_of_base(source: DriveSource, types: Mapping[str, str]) -> bool:
+    """Whether the base measured a body motion; an odometry is made by the controller, with its own track."""
+    drive = find_type(types[source.signals[0].topic]).drive
+    return drive is None or drive.role != "odometry"
+
+
+def sideways_field(source: DriveSource, types: Mapping[str, str]) -> Signal | None:
+    """Where a body command of a known type asks for sideways motion."""
+    topic = source.signals[0].topic
+    drive = find_type(types[topic]).drive
+    if source.form is not DriveForm.BODY or not source.name or drive is None or not drive.sideways:
+        return None
+    return Signal(topic, drive.sideways)
+
+
+def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:
+    """Every field that poses of a topic need; none where they come from transforms."""
+    pose = None if source.from_transforms else find_type(types[source.topic]).pose
+    if pose is None:
+        return []
+    names = [
+        *axis_fields(pose.position, "xyz"),
+        *axis_fields(pose.orientation, "xyzw"),
+        pose.parent,
+        pose.child,
+    ]
+    return [Signal(source.topic, name) for name in names if name]
+
+
+def list_wanted(
+    sources: Sources, types: dict[str, str], rivals: Iterable[DriveSource | PoseSource] = ()
+) -> list[Wanted]:
     """What to read for the chosen sources.
 
     Args:
         sources: the choice.
         types: type name by topic.
+        rivals: what else to read, to compare it.
     """
+    every = [
+        source for source in (sources.command, sources.wheels, sources.pose, *rivals) if source is not None
+    ]
     signals: list[Signal] = []
-    for drive in (sources.command, sources.wheels):
-        if drive is not None:
-            signals += drive_fields(drive, types)
-    if sources.pose is not None and not sources.pose.from_transforms:
-        topic = sources.pose.topic
-        kind = plain_type(types[topic])
-        names = ["header.frame_id", *(f"{_POSE_PREFIX[kind]}{name}" for name in (*_POSITION, *_ORIENTATION))]
-        if kind == "nav_msgs/Odometry":
-            names.append("child_frame_id")
-        signals += [Signal(topic, name) for name in names]
+    for source in every:
+        signals += (
+            drive_fields(source, types) if isinstance(source, DriveSource) else pose_fields(source, types)
+        )
     if sources.imu is not None:
-        signals += [Signal(sources.imu.topic, name) for name in (*_RATES, *_FORCES)]
+        imu = find_type(types[sources.imu.topic]).imu
+        if imu is not None:
+            names = [*axis_fields(imu.rate, "xyz"), *axis_fields(imu.force, "xyz")]
+            signals += [Signal(sources.imu.topic, name) for name in names]
     if sources.interval is not None:
         signals.append(Signal(sources.interval.topic, "data"))
     by_topic: dict[str, list[str]] = {}
@@ -69,19 +103,41 @@ def list_wanted(sources: Sources, types: dict[str, str]) -> list[Wanted]:
         fields = by_topic.setdefault(signal.topic, [])
         if signal.field not in fields:
             fields.append(signal.field)
-    wanted = [Wanted(topic, tuple(fields)) for topic, fields in by_topic.items()]
-    return wanted + _list_wanted_transforms(sources, types)
+    wanted = [Wanted(topic, (*fields, *_stamp_fields(types[topic]))) for topic, fields in by_topic.items()]
+    return wanted + _list_wanted_transforms(every, types)
 
 
-def _list_wanted_transforms(sources: Sources, types: dict[str, str]) -> list[Wanted]:
+def _stamp_fields(kind: str) -> tuple[str, ...]:
+    stamp = find_type(kind).stamp
+    if stamp is None:
+        return ()
+    return (stamp.field,) if stamp.tick_ns else (f"{stamp.field}.sec", f"{stamp.field}.nanosec")
+
+
+def _list_wanted_transforms(
+    sources: Iterable[DriveSource | PoseSource], types: dict[str, str]
+) -> list[Wanted]:
     """All transforms where poses come from them; else the static ones, which may place the pose's frame."""
-    if sources.pose is None:
+    poses = [source for source in sources if isinstance(source, PoseSource)]
+    if not poses:
         return []
     transforms = [topic for topic, kind in types.items() if plain_type(kind) in TRANSFORM_TYPES]
     wanted = wanted_transforms(transforms)
-    if sources.pose.from_transforms:
+    if any(source.from_transforms for source in poses):
         return wanted
     return [one for one in wanted if "static" in one.topic]
+
+
+def with_stamps(columns: TopicColumns) -> TopicColumns:
+    """A topic with the stamps of its type in the place of a header's, where it has no header."""
+    stamp = find_type(columns.type_name).stamp
+    if columns.header_time is not None or stamp is None:
+        return columns
+    if stamp.tick_ns:
+        ticks = numbers(columns, stamp.field)
+        return replace(columns, header_time=np.asarray(ticks * stamp.tick_ns, dtype=np.int64))
+    seconds, rest = (numbers(columns, f"{stamp.field}.{part}") for part in ("sec", "nanosec"))
+    return replace(columns, header_time=seconds.astype(np.int64) * _NANOSECONDS + rest.astype(np.int64))
 
 
 @dataclass(frozen=True)
@@ -95,23 +151,50 @@ class PoseArrays:
 
 
 def read_pose_topic(columns: TopicColumns) -> PoseArrays:
-    """Poses of an Odometry, PoseStamped or PoseWithCovarianceStamped topic."""
-    kind = plain_type(columns.type_name)
-    prefix = _POSE_PREFIX[kind]
-    return PoseArrays(
-        np.stack([numbers(columns, f"{prefix}{name}") for name in _POSITION], axis=-1),
-        np.stack([numbers(columns, f"{prefix}{name}") for name in _ORIENTATION], axis=-1),
-        first_text(columns, "header.frame_id"),
-        first_text(columns, "child_frame_id") if kind == "nav_msgs/Odometry" else "",
+    """Poses of a topic whose type has a pose, axes ahead, left, up."""
+    pose = find_type(columns.type_name).pose
+    if pose is None:
+        raise StageError(
+            "no_pose",
+            f"{columns.type_name} holds no pose",
+            where=columns.topic,
+            hint="Name another pose.topic.",
+        )
+    arrays = PoseArrays(
+        np.stack([numbers(columns, name) for name in axis_fields(pose.position, "xyz")], axis=-1),
+        np.stack([numbers(columns, name) for name in axis_fields(pose.orientation, "xyzw")], axis=-1),
+        first_text(columns, pose.parent) if pose.parent else "",
+        first_text(columns, pose.child) if pose.child else "",
     )
+    return _turn_axes(arrays) if pose.convention == "ned_frd" else arrays
+
+
+def _turn_axes(arrays: PoseArrays) -> PoseArrays:
+    """Poses in north-east-down of a body ahead-right-down, as east-north-up and ahead-left-up."""
+    position = arrays.position[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0])
+    turned = rigid.multiply_quaternions(
+        np.broadcast_to(_NED_IN_ENU, arrays.quaternion.shape),
+        rigid.multiply_quaternions(arrays.quaternion, np.broadcast_to(_FLU_IN_FRD, arrays.quaternion.shape)),
+    )
+    return replace(arrays, position=position, quaternion=turned)
 
 
 def read_imu(columns: TopicColumns) -> tuple[Floats, Floats]:
     """Angular velocity [rad/s] and specific force [m/s^2] of an IMU topic, each (n, 3)."""
-    return (
-        np.stack([numbers(columns, name) for name in _RATES], axis=-1),
-        np.stack([numbers(columns, name) for name in _FORCES], axis=-1),
+    imu = find_type(columns.type_name).imu
+    if imu is None:
+        raise StageError(
+            "no_imu",
+            f"{columns.type_name} holds no gyro",
+            where=columns.topic,
+            hint="Name another imu.topic.",
+        )
+    signs = np.array([1.0, -1.0, -1.0]) if imu.convention == "ned_frd" else np.ones(3)
+    rates, forces = (
+        signs * np.stack([numbers(columns, name) for name in axis_fields(fields, "xyz")], axis=-1)
+        for fields in (imu.rate, imu.force)
     )
+    return rates, forces
 
 
 def numbers(columns: TopicColumns, name: str) -> Floats:

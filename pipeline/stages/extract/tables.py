@@ -13,6 +13,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from pipeline.core.errors import SlipError
 from pipeline.logs import join_channels
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract import localization, reading
@@ -20,14 +21,20 @@ from pipeline.stages.extract.absurd import remove_absurd
 from pipeline.stages.extract.clocks import Recorded, TopicClock, align_clocks
 from pipeline.stages.extract.drive import (
     Drive,
-    is_single_topic,
-    read_body,
+    differentiate_angle,
+    is_angle,
     read_joints,
-    read_sides,
-    read_steering,
+    read_pair,
+    read_signal,
 )
 from pipeline.stages.extract.intervals import Span, find_spans_given, find_spans_of_state, is_inside
-from pipeline.stages.extract.transforms import chain_poses, describe_chain, is_transforms, to_base_link
+from pipeline.stages.extract.transforms import (
+    chain_poses,
+    describe_chain,
+    describe_frame,
+    is_transforms,
+    to_base_link,
+)
 from pipeline.stages.finding import Finding
 from pipeline.vehicles import (
     DEFAULT_INTERVAL,
@@ -50,6 +57,9 @@ Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
+_SIDEWAYS_MPS = 0.02
+_SIDEWAYS_SHARE = 0.01
+"""A hundredth of the commands is no slip of a joystick."""
 _DEFAULT_SECTION = IntervalSection(topic=DEFAULT_INTERVAL[0], equals=DEFAULT_INTERVAL[1])
 
 
@@ -62,12 +72,14 @@ class Extracted:
         findings: what was noticed.
         start_ns: stamp at which t is zero.
         clocks: by topic: which time was used and how late messages were recorded [s].
+        frames: the frame the poses are given in, and the one they place; empty where it is not said.
     """
 
     tables: Mapping[str, pl.DataFrame]
     findings: tuple[Finding, ...]
     start_ns: int
     clocks: Mapping[str, Mapping[str, str | float]]
+    frames: tuple[str, str] = ("", "")
 
 
 def extract_tables(
@@ -100,8 +112,10 @@ class _Extraction:
         self.configuration = configuration
         self.vehicle = vehicle
         self.where = where
+        self.frames = ("", "")
+        self._orders: dict[str, NDArray[np.int64]] = {}
         self.columns = {
-            topic: found
+            topic: reading.with_stamps(found)
             for topic in dict.fromkeys(columns.topic for columns in topics)
             if (found := self._join_channels(topic)) is not None
         }
@@ -123,7 +137,7 @@ class _Extraction:
             clock.topic: {"clock": clock.clock, "latency_s": round(clock.latency_s, 6)}
             for clock in self.clocks.values()
         }
-        return Extracted(tables, tuple(self.findings), self.start_ns, clocks)
+        return Extracted(tables, tuple(self.findings), self.start_ns, clocks, self.frames)
 
     def _join_channels(self, topic: str) -> TopicColumns | None:
         """All channels of a topic as one series; where they cannot be one, the one with most messages."""
@@ -184,7 +198,9 @@ class _Extraction:
         columns, clock = self.columns.get(topic), self.clocks.get(topic)
         if columns is None or clock is None:
             return None
-        return columns, clock, self._order(clock)
+        if topic not in self._orders:
+            self._orders[topic] = self._order(clock)
+        return columns, clock, self._orders[topic]
 
     def _order(self, clock: TopicClock) -> NDArray[np.int64]:
         """Usable messages in the order of their stamps; disorder is noted."""
@@ -271,6 +287,9 @@ class _Extraction:
             recorded, log_times = reading.read_pose_topic(columns), columns.log_time
         if clock is None or not clock.usable.any():
             raise self._nothing("pose", topic)
+        self.frames = (recorded.parent, recorded.child)
+        if self.chain is None:
+            self.findings += describe_frame(topic, recorded.parent)
         order = self._order(clock)
         stamp, log_time = clock.stamp[order], log_times[order]
         breaks = np.zeros(order.size, dtype=bool)
@@ -306,17 +325,17 @@ class _Extraction:
     ) -> pl.DataFrame:
         if source is None:
             return pl.DataFrame()
-        found = self._ordered(source.signals[0].topic)
-        if found is None:
-            raise self._nothing("command" if held else "wheels", source.signals[0].topic)
-        columns, clock, order = found
-        if is_single_topic(source.form):
-            drive = self._read_single(source, section, columns, self._seconds(clock.stamp))
+        if source.form is DriveForm.JOINTS:
+            columns, clock, order = self._require(source.signals[0].topic, held=held)
+            drive = read_joints(columns, self._seconds(clock.stamp), section, self.vehicle)
             drive = _take(drive, order)
             stamp, log_time = clock.stamp[order], columns.log_time[order]
         else:
-            stamp, log_time, pair = self._read_pair(source, held=held)
-            drive = self._read_pair_as_drive(source, section, pair)
+            stamp, log_time, (first, second) = self._read_pair(source, section, held=held)
+            topic = source.signals[0].topic
+            nominal = not held and reading.is_of_base(source, {topic: self.columns[topic].type_name})
+            drive = read_pair(source.form, first, second, section, self.vehicle, nominal=nominal)
+            self.findings += self._check_sideways(source)
         self.findings += drive.findings
         times = self._seconds(stamp)
         empty = np.full(times.size, np.nan)
@@ -337,34 +356,46 @@ class _Extraction:
         section = self.configuration.wheels
         try:
             return self._drive_table(source, section, spans, held=False)
-        except StageError as error:
+        except SlipError as error:
             if source is None or section != DriveSection():
                 raise
             text = f"{source} was taken for measured wheels by its type, but {error.what}: left out"
             self.findings.append(Finding("no_measured_wheels", "info", text, where=str(source)))
             return pl.DataFrame()
 
-    def _read_single(
-        self, source: DriveSource, section: DriveSection, columns: TopicColumns, times: Floats
-    ) -> Drive:
-        if source.form is DriveForm.JOINTS:
-            return read_joints(columns, times, section, self.vehicle)
-        types = {columns.topic: columns.type_name}
-        first, second = (
-            reading.numbers(columns, signal.field) for signal in reading.drive_fields(source, types)
-        )
-        reader = read_body if source.form is DriveForm.BODY else read_steering
-        return reader(first, second, section, self.vehicle)
+    def _require(self, topic: str, *, held: bool) -> tuple[TopicColumns, TopicClock, NDArray[np.int64]]:
+        found = self._ordered(topic)
+        if found is None:
+            raise self._nothing("command" if held else "wheels", topic)
+        return found
 
-    def _read_pair(self, source: DriveSource, *, held: bool) -> tuple[Stamps, Stamps, tuple[Floats, Floats]]:
+    def _check_sideways(self, source: DriveSource) -> list[Finding]:
+        """Commands that no vehicle of this kind can follow: it moves along its wheels alone."""
+        topic = source.signals[0].topic
+        columns = self.columns[topic]
+        signal = reading.sideways_field(source, {topic: columns.type_name})
+        if signal is None:
+            return []
+        share = float(np.mean(np.abs(reading.numbers(columns, signal.field)) > _SIDEWAYS_MPS))
+        if share < _SIDEWAYS_SHARE:
+            return []
+        text = (
+            f"{share:.0%} of the commands of {topic} ask for sideways motion, which {self.vehicle.name} "
+            f"({self.vehicle.kind}) cannot do: mecanum and other omnidirectional drives have no model here, "
+            "and that motion is left out"
+        )
+        return [Finding("sideways_command", "error", text, where=topic, value=share)]
+
+    def _read_pair(
+        self, source: DriveSource, section: DriveSection, *, held: bool
+    ) -> tuple[Stamps, Stamps, tuple[Floats, Floats]]:
         """Two signals at common times: held commands at the stamps of either, measurements at the first's."""
         series = []
-        for signal in source.signals:
-            found = self._ordered(signal.topic)
-            if found is None:
-                raise self._nothing("command" if held else "wheels", signal.topic)
-            columns, clock, order = found
-            values = reading.numbers(columns, signal.field)[order]
+        for number, signal in enumerate(source.signals):
+            columns, clock, order = self._require(signal.topic, held=held)
+            values = read_signal(columns, source, number, section, self.vehicle)[order]
+            if is_angle(source, section):
+                values = differentiate_angle(self._seconds(clock.stamp[order]), values)
             series.append((clock.stamp[order], columns.log_time[order], values))
         (first, log_first, a), (second, log_second, b) = series
         if np.array_equal(first, second):
@@ -378,16 +409,6 @@ class _Extraction:
         union, log_time = union[known], log_time[known]
         at = [np.searchsorted(stamps, union, side="right") - 1 for stamps in (first, second)]
         return union, log_time, (a[at[0]], b[at[1]])
-
-    def _read_pair_as_drive(
-        self, source: DriveSource, section: DriveSection, pair: tuple[Floats, Floats]
-    ) -> Drive:
-        readers = {
-            DriveForm.SIDES: read_sides,
-            DriveForm.BODY_SIGNALS: read_body,
-            DriveForm.STEERING_SIGNALS: read_steering,
-        }
-        return readers[source.form](pair[0], pair[1], section, self.vehicle)
 
     def _imu(self, spans: Sequence[Span] | None) -> pl.DataFrame:
         source = self.sources.imu

@@ -11,7 +11,9 @@ from pipeline.stages.errors import StageError
 from pipeline.stages.extract.localization import move_to_base, normalize_quaternions
 from pipeline.stages.extract.reading import PoseArrays
 from pipeline.stages.finding import Finding
-from pipeline.vehicles.topics import TRANSFORM_TYPES, plain_type
+from pipeline.vehicles.candidates import LOCALIZED
+from pipeline.vehicles.message_types import plain_type
+from pipeline.vehicles.topics import TRANSFORM_TYPES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -91,6 +93,17 @@ def describe_chain(series: TransformSeries, topic: str) -> list[Finding]:
         )
         findings.append(Finding("pose_is_odometry", "warning", text, where=topic))
     return findings + [Finding("transform_note", "info", note, where=topic) for note in series.notes]
+
+
+def describe_frame(topic: str, parent: str) -> list[Finding]:
+    """Whether a topic's poses may be an odometry, by their frame and its name."""
+    if parent.rsplit("/", 1)[-1] != "odom" or LOCALIZED.search(topic.lower()):
+        return []
+    text = (
+        f"{topic} gives poses in {parent}: they are an odometry, which drifts and may come from the wheels; "
+        "slip against the wheels themselves is zero"
+    )
+    return [Finding("pose_is_odometry", "warning", text, where=topic)]
 
 
 def to_base_link(

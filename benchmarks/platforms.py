@@ -1,0 +1,85 @@
+"""What the program makes of logs as platforms publish them: `make platforms`.
+
+Every platform's log is simulated with hidden effects and handed to `slip diagnose` without any configuration;
+where the platform says nowhere what it is, its geometry is given, as a user would.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.options import Options
+from pipeline.simulate import PLATFORMS, Platform, simulate_case
+
+CAR = {"steering_offset": 0.05, "drive_lag": 0.3}
+SIDES = {"effective_track": 1.5, "drive_lag": 0.3}
+
+
+@dataclass(frozen=True)
+class Row:
+    """What became of one platform's log."""
+
+    platform: str
+    command: str
+    wheels: str
+    pose: str
+    vehicle: str
+    effects: tuple[str, ...]
+    hidden: tuple[str, ...]
+
+    @property
+    def named(self) -> bool:
+        return set(self.effects) == set(self.hidden)
+
+
+def hidden_effects(platform: Platform) -> dict[str, float]:
+    return CAR if platform.vehicle.kind == "ackermann" else SIDES
+
+
+def give_geometry(platform: Platform) -> dict[str, object]:
+    if platform.geometry:
+        return {}
+    vehicle = platform.vehicle
+    return {"vehicle": {"wheel_radius_m": vehicle.wheel_radius_m, "track_width_m": vehicle.track_width_m}}
+
+
+def try_platform(name: str, folder: Path, *, duration_s: float = 180.0, seed: int = 3) -> Row:
+    platform = PLATFORMS[name]
+    hidden = hidden_effects(platform)
+    log = simulate_case(
+        None, hidden, out=folder / f"{name}.mcap", seed=seed, duration_s=duration_s, platform=name
+    )
+    options = Options(out=folder / "results", overrides=give_geometry(platform), report=False, diagnosis=True)
+    summary = analyze_log(log, options).summary
+    topics, diagnosis = summary["topics"], summary["diagnosis"]
+    chosen = {role: (topics[role] or {}).get("topic", "-") for role in ("command", "wheels", "pose")}
+    effects = tuple(effect["id"] for effect in diagnosis["effects"])
+    vehicle = f"{summary['vehicle']} ({str(summary['vehicle_source']).replace('_', ' ')})"
+    return Row(name, **chosen, vehicle=vehicle, effects=effects, hidden=tuple(hidden))
+
+
+def print_table(rows: list[Row]) -> None:
+    print("| platform | command | wheels | pose | vehicle (told by) | hidden effects named |")
+    print("|---|---|---|---|---|---|")
+    for row in rows:
+        named = "yes" if row.named else f"no: {', '.join(row.effects) or 'nothing'}"
+        cells = (row.platform, row.command, row.wheels, row.pose, row.vehicle, named)
+        print(f"| {' | '.join(cells)} |", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("platforms", nargs="*", help="which; all without")
+    parser.add_argument("--seed", type=int, default=3)
+    chosen = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="slip-platforms-") as folder:
+        names = chosen.platforms or list(PLATFORMS)
+        print_table([try_platform(name, Path(folder), seed=chosen.seed) for name in names])
+
+
+if __name__ == "__main__":
+    main()

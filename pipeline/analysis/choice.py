@@ -1,0 +1,299 @@
+"""What a log is of: its vehicle and the topics of every role, from the log and the configuration.
+
+1. Words of names, message types and a robot description tell the vehicle where nobody names it.
+2. Types and names rank the topics of every role.
+3. Where several may be the pose, or the vehicle is unknown, the candidates are read, with all that the run
+   needs, and compared by their content; the columns are kept for the stages.
+4. A vehicle that nothing tells gets the geometry that the wheels and the pose show.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from pipeline.logs import LogError, Strings, Wanted, read_topics
+from pipeline.stages.extract import extract_tables, list_wanted
+from pipeline.stages.extract.choice import PoseRating, fit_geometry, rate_poses, replace_pose
+from pipeline.stages.finding import Finding
+from pipeline.vehicles import (
+    CONFIGURED,
+    ConfigurationError,
+    DriveForm,
+    DriveSource,
+    PoseSource,
+    Vehicle,
+    choose_sources,
+    find_alike,
+    find_preset,
+    list_contradictions,
+    read_description,
+    recognize_vehicle,
+    resolve_vehicle,
+)
+from pipeline.vehicles.candidates import LOCALIZED
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.logs import LogData, LogIndex
+    from pipeline.store import JSON
+    from pipeline.vehicles import Configuration, Description, Recognized, Sources, VehicleSource
+
+UNKNOWN_VEHICLE = "unknown"
+_STAND_IN_RADIUS_M = 0.1
+_STAND_IN_TRACK_M = 0.5
+_STEERED = ("ackermann_msgs/", "autoware_control_msgs/", "hunter_msgs/")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A log's vehicle and topics.
+
+    Attributes:
+        vehicle: geometry and limits.
+        vehicle_source: what told it.
+        sources: topics of every role.
+        ratings: candidates for the pose, the best first; empty where there was nothing to compare.
+        findings: what is to be said of the choice.
+        data: columns that were read to choose; None where names were enough.
+    """
+
+    vehicle: Vehicle
+    vehicle_source: VehicleSource
+    sources: Sources
+    ratings: tuple[PoseRating, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    data: LogData | None = None
+
+    def to_json(self, types: Mapping[str, str]) -> dict[str, JSON]:
+        """The promised keys ``choices`` and ``vehicle_source``.
+
+        Args:
+            types: message type by topic.
+        """
+        choices: dict[str, JSON] = {}
+        for role in ("command", "wheels", "pose", "imu"):
+            source = getattr(self.sources, role)
+            choices[role] = (
+                None
+                if source is None
+                else {
+                    "topic": str(source),
+                    "type": types.get(
+                        source.signals[0].topic if isinstance(source, DriveSource) else source.topic
+                    ),
+                    "reason": source.reason,
+                    "others": [
+                        {"topic": str(other), "reason": other.reason}
+                        for other in self.sources.others.get(role, ())
+                    ],
+                }
+            )
+        return {"choices": choices, "vehicle_source": self.vehicle_source}
+
+
+def choose(
+    index: LogIndex,
+    configuration: Configuration,
+    overrides: Mapping[str, object],
+    *,
+    sha256: str | None = None,
+) -> Choice:
+    """Choose vehicle and topics of a log.
+
+    Args:
+        index: what the log holds.
+        configuration: what the user says, the command line included.
+        overrides: what of it was said on the command line.
+        sha256: hash of the log where it is known.
+
+    Raises:
+        ConfigurationError: the configuration cannot be followed; the vehicle is unknown and cannot be fitted;
+            several robots.
+        LogError: the log cannot be read.
+    """
+    where = str(index.path)
+    told = recognize_vehicle(index.channels, index.metadata, _find_description(index))
+    problem: ConfigurationError | None = None
+    try:
+        vehicle, source = _name_vehicle(index, configuration, overrides, told)
+    except ConfigurationError as error:
+        if error.code != "vehicle_unknown" or configuration.vehicle.preset is not None:
+            raise
+        problem, vehicle, source = error, _stand_in(index, configuration), "fitted"
+    sources = choose_sources(index.channels, configuration, vehicle, where=where)
+    vehicle = _apply_vendor_controller(vehicle, sources, configuration)
+    findings = [
+        Finding("vehicle_choice", "info", note, where="vehicle") for note in (told.notes if told else ())
+    ]
+    findings += _check_contradiction(told, vehicle, source)
+    if sources.command is None and sources.wheels is not None:
+        text = "the log holds no command: it is analyzed on the measured wheels"
+        findings.append(Finding("no_command", "info", text, where="command"))
+    chosen = Choice(vehicle, source, sources, findings=tuple(findings))
+    rivals = [one for one in sources.others.get("pose", ()) if isinstance(one, PoseSource)]
+    fits = (
+        problem is not None and sources.pose is not None and (sources.wheels or sources.command) is not None
+    )
+    if rivals or fits or _may_be_odometry(sources.pose):
+        chosen = _compare(chosen, index, configuration, rivals, sha256)
+    # What a log lacks altogether is said before what is not known of its vehicle.
+    return chosen if problem is None or not fits else _fit_vehicle(chosen, configuration, problem, where)
+
+
+def _may_be_odometry(pose: PoseSource | None) -> bool:
+    """Whether only its content can tell a pose from an odometry of the wheels."""
+    return pose is not None and pose.reason != CONFIGURED and not LOCALIZED.search(pose.topic.lower())
+
+
+def _find_description(index: LogIndex) -> Description | None:
+    topics = [
+        channel.topic
+        for channel in index.channels
+        if channel.message_count != 0 and channel.topic.endswith("robot_description")
+    ]
+    for topic in topics:
+        try:
+            data = read_topics(index, [Wanted(topic, ("data",))], sha256="unused")
+        except LogError:
+            continue
+        for columns in data.topics:
+            texts = columns.fields.get("data")
+            found = (
+                read_description(texts.to_list()[-1]) if isinstance(texts, Strings) and len(texts) else None
+            )
+            if found is not None:
+                return found
+    return None
+
+
+def _name_vehicle(
+    index: LogIndex, configuration: Configuration, overrides: Mapping[str, object], told: Recognized | None
+) -> tuple[Vehicle, VehicleSource]:
+    section, recorded = configuration.vehicle, index.deployment.get("vehicle")
+    vehicle = resolve_vehicle(
+        section, recorded=recorded, told=told.vehicle if told else None, where=str(index.path)
+    )
+    if section.preset is not None or section.wheel_radius_m is not None:
+        return vehicle, "flag" if "vehicle" in overrides else "configuration"
+    if find_preset(recorded or "") is not None or told is None:
+        return vehicle, "metadata"
+    return vehicle, told.source
+
+
+def _stand_in(index: LogIndex, configuration: Configuration) -> Vehicle:
+    """Any vehicle of the kind that the topics are made for; unit geometry makes gains lengths."""
+    types = {channel.type_name for channel in index.channels if channel.message_count != 0}
+    steered = any(name.startswith(_STEERED) for name in types)
+    kind = configuration.vehicle.kind or ("ackermann" if steered else "differential")
+    return Vehicle(
+        id=UNKNOWN_VEHICLE,
+        name="unknown vehicle",
+        kind=kind,
+        wheel_radius_m=1.0,
+        track_width_m=1.0,
+        wheelbase_m=1.0,
+    )
+
+
+def _apply_vendor_controller(vehicle: Vehicle, sources: Sources, configuration: Configuration) -> Vehicle:
+    """The vendor's track multiplier where its own controller received the command."""
+    command = sources.command
+    if command is None or configuration.vehicle.controller_track_multiplier is not None:
+        return vehicle
+    if not command.signals[0].topic.endswith(tuple(vehicle.controller.topics)):
+        return vehicle
+    multiplier = vehicle.controller.track_multiplier
+    return msgspec.structs.replace(vehicle, controller_track_multiplier=multiplier)
+
+
+def _check_contradiction(told: Recognized | None, vehicle: Vehicle, source: VehicleSource) -> list[Finding]:
+    if told is None or source not in {"flag", "configuration", "metadata"}:
+        return []
+    differing = list_contradictions(told.vehicle, vehicle)
+    if not differing:
+        return []
+    text = (
+        f"the log looks like a {told.vehicle.name} (by its {told.source.replace('_', ' ')}: "
+        f"{', '.join(differing)}), but {vehicle.name} was named: check --vehicle"
+    )
+    return [Finding("vehicle_contradiction", "warning", text, where="vehicle")]
+
+
+def _compare(
+    chosen: Choice,
+    index: LogIndex,
+    configuration: Configuration,
+    rivals: list[PoseSource],
+    sha256: str | None,
+) -> Choice:
+    types = {channel.topic: channel.type_name for channel in index.channels}
+    data = read_topics(index, list_wanted(chosen.sources, types, rivals), sha256=sha256)
+    ratings = rate_poses(data, chosen.sources, configuration, chosen.vehicle, where=str(index.path))
+    findings = chosen.findings
+    if ratings and ratings[0].from_wheels:
+        text = (
+            f"the position of {ratings[0].source} is computed from the wheels, and the log has no other "
+            "pose: the way ahead cannot slip against itself; only what turning shows is the heading's"
+        )
+        findings += (Finding("pose_is_odometry", "error", text, where=str(ratings[0].source)),)
+    sources = replace_pose(chosen.sources, ratings)
+    return replace(chosen, sources=sources, ratings=ratings, findings=findings, data=data)
+
+
+def _fit_vehicle(
+    chosen: Choice, configuration: Configuration, problem: ConfigurationError, where: str
+) -> Choice:
+    """The vehicle that nothing tells, as wheels and pose show it."""
+    sources, vehicle, data = chosen.sources, chosen.vehicle, chosen.data
+    drives = [drive for drive in (sources.wheels, sources.command) if drive is not None]
+    # Body motion is the same whatever the wheels are.
+    drive = next((one for one in drives if one.form is not DriveForm.BODY), None)
+    if not drives or data is None:
+        raise problem
+    if drive is None:
+        values: dict[str, float] = {"wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": _STAND_IN_TRACK_M}
+        name = "fitted_body"
+        text = (
+            "no vehicle is named and none is needed: the drive is told and measured as body motion, whose "
+            "slip does not depend on wheel radius and track width"
+        )
+    else:
+        measured = replace(sources, wheels=drive, command=None, imu=None, interval=None)
+        made = extract_tables(data, measured, configuration, vehicle, where=where)
+        fitted = fit_geometry(made.tables["wheels"], made.tables["poses"], vehicle.kind)
+        if fitted is None:
+            raise problem
+        values, (name, text) = fitted, _describe_fit(fitted)
+    section = msgspec.structs.asdict(configuration.vehicle)
+    given = {key: value for key, value in section.items() if value is not None and key != "preset"}
+    known = {"name": "fitted vehicle", "id": name, "track_width_m": None, "wheelbase_m": None, **values}
+    if vehicle.kind == "ackermann":
+        known = {**known, "wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": None}
+    vehicle = msgspec.structs.replace(vehicle, **{**known, **given})
+    findings = (*chosen.findings, Finding("vehicle_fitted", "warning", text, where="vehicle"))
+    return replace(chosen, vehicle=vehicle, vehicle_source="fitted", findings=findings)
+
+
+def _describe_fit(fitted: Mapping[str, float]) -> tuple[str, str]:
+    """A name, the same for the same geometry, and what is said of it."""
+    if "wheelbase_m" in fitted:
+        return f"fitted_{1e3 * fitted['wheelbase_m']:.0f}", (
+            "the log does not say which vehicle it is of: a wheelbase of "
+            f"{fitted['wheelbase_m']:.3g} m was fitted; vehicle.wheelbase_m in run.toml gives the true one"
+        )
+    radius, track = fitted["wheel_radius_m"], fitted["track_width_m"]
+    alike = find_alike(radius, track)
+    guess = (
+        f"a {alike.name}? then --vehicle {alike.id}"
+        if alike
+        else "--wheel-radius and --track-width give others"
+    )
+    name = alike.id if alike else f"{1e3 * radius:.0f}_{1e3 * track:.0f}"
+    return f"fitted_{name}", (
+        f"the log does not say which vehicle it is of: a wheel radius of {radius:.3g} m and an effective "
+        f"track of {track:.3g} m were fitted, so that neither can be missing from the model ({guess})"
+    )

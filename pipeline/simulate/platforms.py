@@ -1,0 +1,134 @@
+"""A platform: a vehicle and the topics it publishes, made of a few that many platforms share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from pipeline.simulate.description import describe_robot
+from pipeline.simulate.layouts import Layout, PoseTopic
+from pipeline.simulate.published import Published, Q, Source
+
+if TYPE_CHECKING:
+    from pipeline.simulate.vehicles import Vehicle
+
+_XYZ, _XYZW = "xyz", "xyzw"
+
+Fields = dict[str, Q | tuple[Q, ...] | str | list[str] | float]
+
+
+@dataclass(frozen=True)
+class Platform:
+    """A platform: the vehicle, and what it publishes.
+
+    Attributes:
+        vehicle: geometry as the vendor states it.
+        topics: everything in a log.
+        geometry: whether the log says what the vehicle is; else a user has to say it.
+    """
+
+    vehicle: Vehicle
+    topics: tuple[Published, ...]
+    geometry: bool = True
+
+    @property
+    def layout(self) -> Layout:
+        """As a layout of topics."""
+        return Layout(self.vehicle.kind, (), (), PoseTopic("odometry", ""), topics=self.topics)
+
+
+def pose_fields(position: str, orientation: str) -> dict[str, Q]:
+    """Fields of a pose."""
+    fields = {f"{position}.{axis}": Q(axis) for axis in _XYZ}
+    return fields | {f"{orientation}.{axis}": Q(f"q{axis}") for axis in _XYZW}
+
+
+def twist(topic: str, *, stamped: bool = False, source: Source = "command") -> Published:
+    """A body command; a ``wish`` is one that never reaches the controller."""
+    prefix, name = ("twist.", "TwistStamped") if stamped else ("", "Twist")
+    fields = {f"{prefix}linear.x": Q("speed"), f"{prefix}angular.z": Q("yaw_rate")}
+    return Published(
+        topic, f"geometry_msgs/msg/{name}", source, fields, stamp="header" if stamped else "none"
+    )
+
+
+def odometry(topic: str, source: Source, parent: str, child: str) -> Published:
+    """An odometry; one of the wheels says their speed as well."""
+    fields: Fields = {
+        **pose_fields("pose.pose.position", "pose.pose.orientation"),
+        "header.frame_id": parent,
+        "child_frame_id": child,
+    }
+    if source != "localization":
+        fields |= {"twist.twist.linear.x": Q("speed"), "twist.twist.angular.z": Q("yaw_rate")}
+    return Published(topic, "nav_msgs/msg/Odometry", source, fields)
+
+
+def transform(topic: str, source: Source, parent: str, child: str) -> Published:
+    """A moving transform."""
+    inner = "transforms[].transform."
+    fields: Fields = {
+        **pose_fields(f"{inner}translation", f"{inner}rotation"),
+        "transforms[].header.frame_id": parent,
+        "transforms[].child_frame_id": child,
+    }
+    return Published(topic, "tf2_msgs/msg/TFMessage", source, fields)
+
+
+def joints(topic: str, template: str, places: tuple[str, ...], fields: str = "both") -> Published:
+    """Joint states of the wheels; ``fields`` may be ``position`` alone."""
+    names = [template.format(place.removeprefix("steer_")) for place in places]
+    names = [
+        _steering_name(name) if place.startswith("steer") else name
+        for name, place in zip(names, places, strict=True)
+    ]
+    turned = tuple(Q("steering") if p.startswith("steer") else Q(f"{_side(p)}_angle") for p in places)
+    rolling = tuple(Q("zero") if p.startswith("steer") else Q(_side(p)) for p in places)
+    values: Fields = {"name": names, "position": turned}
+    return Published(
+        topic,
+        "sensor_msgs/msg/JointState",
+        "wheels",
+        values if fields == "position" else values | {"velocity": rolling},
+    )
+
+
+def _side(place: str) -> str:
+    return place.rsplit("_", 1)[-1]
+
+
+def _steering_name(name: str) -> str:
+    return name.replace("wheel", "steering")
+
+
+def imu(topic: str) -> Published:
+    """An inertial unit."""
+    fields: Fields = {
+        "header.frame_id": "imu_link",
+        "orientation.w": 1.0,
+    }
+    fields |= {f"angular_velocity.{axis}": Q(f"rate_{axis}") for axis in _XYZ}
+    fields |= {f"linear_acceleration.{axis}": Q(f"force_{axis}") for axis in _XYZ}
+    return Published(topic, "sensor_msgs/msg/Imu", "imu", fields)
+
+
+def pose_with_covariance(topic: str, every: int) -> Published:
+    """A slow localization."""
+    fields: Fields = {
+        **pose_fields("pose.pose.position", "pose.pose.orientation"),
+        "header.frame_id": "map",
+    }
+    name = "geometry_msgs/msg/PoseWithCovarianceStamped"
+    return Published(topic, name, "localization", fields, every=every)
+
+
+def describe(topic: str, name: str, vehicle: Vehicle, template: str, places: tuple[str, ...]) -> Published:
+    """A robot description."""
+    named = {
+        place: _steering_name(template.format(place.removeprefix("steer_")))
+        if place.startswith("steer")
+        else template.format(place)
+        for place in places
+    }
+    text = describe_robot(name, vehicle, named)
+    return Published(topic, "std_msgs/msg/String", "once", {"data": text}, stamp="none")

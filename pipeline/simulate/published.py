@@ -1,0 +1,232 @@
+"""Topics as platforms publish them: a type and its fields, each filled from a quantity of the run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core.rigid import (
+    interpolate_poses,
+    invert_quaternions,
+    multiply_quaternions,
+    quaternions_from_yaw,
+    rotate,
+)
+from pipeline.simulate.drivetrain import apply_ideal_model, invert_ideal_model
+from pipeline.simulate.errors import SimulateError
+from pipeline.simulate.messages import Sheet
+from pipeline.simulate.programs import make_commands
+from pipeline.simulate.scenario import Program
+from pipeline.simulate.signals import integrate_cells
+from pipeline.simulate.streams import open_stream
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from pipeline.simulate.messages import Field
+    from pipeline.simulate.run import SimulatedRun
+
+Floats = NDArray[np.float64]
+Series = dict[str, Floats]
+Source = Literal[
+    "command", "wish", "wheels", "odometry", "filter", "localization", "correction", "imu", "once"
+]
+
+_LATE_S = 0.002
+_TURN = 2.0 * np.pi
+_ENU_IN_NED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+_FRD_IN_FLU = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Q:
+    """A quantity of the run: ``gain * quantity + offset``, cut to a whole number where one is wanted."""
+
+    name: str
+    gain: float = 1.0
+    offset: float = 0.0
+    whole: bool = False
+
+
+@dataclass(frozen=True)
+class Published:
+    """A topic.
+
+    Attributes:
+        topic, type_name: where and what.
+        source: whose times and quantities it has: ``command``; ``wheels``; ``odometry`` integrated from them,
+            ``filter`` the same with the gyro's heading; ``localization``; ``correction``, the transform from
+            the localization's frame to the odometry's; ``imu``; ``once`` at the start; ``wish``, a body
+            command that the controller never gets.
+        fields: by field path a quantity, several for an array, or a constant.
+        every: one message in so many is published.
+        stamp: ``header``; ``none``; or the field that holds the time, ``timestamp`` in microseconds.
+    """
+
+    topic: str
+    type_name: str
+    source: Source
+    fields: Mapping[str, Q | tuple[Q, ...] | str | list[str] | float] = field(default_factory=dict)
+    every: int = 1
+    stamp: str = "header"
+
+
+def publish(run: SimulatedRun, topics: tuple[Published, ...]) -> list[Sheet]:
+    """Messages of every topic.
+
+    Raises:
+        SimulateError: ``encoders_needed``, a topic needs wheels or a gyro that the scenario leaves out.
+    """
+    known: dict[str, tuple[Floats, Floats, Series]] = {}
+    sheets = []
+    for one in topics:
+        if one.source not in known:
+            known[one.source] = _SOURCES[one.source](run)
+        stamp, log, series = known[one.source]
+        kept = slice(None, None, one.every)
+        fields = {path: _fill(value, series, kept) for path, value in one.fields.items()}
+        header = None if one.stamp == "none" else stamp[kept]
+        sheets.append(Sheet(one.topic, one.type_name, log[kept], header, fields, one.stamp))
+    return sheets
+
+
+def _fill(value: Q | tuple[Q, ...] | str | list[str] | float, series: Series, kept: slice) -> Field:
+    if isinstance(value, tuple):
+        return np.stack([_take(each, series, kept) for each in value], axis=1)
+    return _take(value, series, kept) if isinstance(value, Q) else value
+
+
+def _take(quantity: Q, series: Series, kept: slice) -> Floats:
+    values = quantity.gain * series[quantity.name][kept] + quantity.offset
+    return np.floor(values) if quantity.whole else values
+
+
+def _of_command(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    commands, vehicle = run.commands, run.scenario.vehicle
+    left, right = invert_ideal_model(vehicle, commands.speed_mps, commands.turn)
+    rate = commands.turn
+    if vehicle.kind == "ackermann":
+        rate = commands.speed_mps * np.tan(commands.turn) / vehicle.wheelbase_m
+    series = {
+        "speed": commands.speed_mps,
+        "yaw_rate": rate,
+        "steering": commands.turn,
+        "left": left,
+        "right": right,
+    }
+    return commands.time_s, commands.time_s + run.scenario.recording.command_latency_s, series
+
+
+def _of_wish(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    scenario = run.scenario
+    wished = make_commands(
+        Program("smooth", rate_hz=10.0),
+        scenario.vehicle,
+        duration_s=scenario.duration_s,
+        generator=open_stream(scenario.seed, "wish"),
+    )
+    return wished.time_s, wished.time_s, {"speed": wished.speed_mps, "yaw_rate": wished.turn}
+
+
+def _of_wheels(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    wheels = run.wheels
+    if wheels is None:
+        raise _missing("encoders")
+    speed, rate = apply_ideal_model(run.scenario.vehicle, wheels.left, wheels.right, wheels.steering)
+    series = {
+        name: getattr(wheels, name) for name in ("left", "right", "left_angle", "right_angle", "steering")
+    }
+    series |= {"speed": speed, "yaw_rate": rate, "zero": np.zeros_like(speed)}
+    series |= {f"{side}_turns": series[f"{side}_angle"] / _TURN for side in ("left", "right")}
+    return wheels.time_s, wheels.time_s + _LATE_S, series
+
+
+def _of_odometry(run: SimulatedRun, *, gyro: bool = False) -> tuple[Floats, Floats, Series]:
+    stamp, log, series = _of_wheels(run)
+    rate = series["yaw_rate"]
+    if gyro:
+        if run.imu is None:
+            raise _missing("an inertial unit")
+        rate = np.interp(stamp, run.imu.time_s, run.imu.rates[:, 2])
+    step = float(np.median(np.diff(stamp)))
+    heading = integrate_cells(rate, step_s=step)
+    middle = 0.5 * (heading[:-1] + heading[1:])
+    way = [integrate_cells(series["speed"] * turn(middle), step_s=step)[:-1] for turn in (np.cos, np.sin)]
+    position = np.stack((*way, np.zeros_like(stamp)), axis=1)
+    return (
+        stamp,
+        log,
+        _name(position, quaternions_from_yaw(heading[:-1])) | {"speed": series["speed"], "yaw_rate": rate},
+    )
+
+
+def _of_filter(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    return _of_odometry(run, gyro=True)
+
+
+def _of_localization(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    position, quaternion = run.poses.in_map()
+    ned = multiply_quaternions(
+        np.broadcast_to(_ENU_IN_NED, quaternion.shape),
+        multiply_quaternions(quaternion, np.broadcast_to(_FRD_IN_FLU, quaternion.shape)),
+    )
+    series = _name(position, quaternion) | {f"ned_q{axis}": ned[:, i] for i, axis in enumerate("xyzw")}
+    return run.poses.stamp_s, run.poses.log_s, series
+
+
+def _of_correction(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    """The localization over the odometry at the odometry's stamps, as a matcher of every scan gives it."""
+    stamp, _, drift = _of_odometry(run)
+    position, quaternion = run.poses.in_map()
+    at = np.clip(stamp, run.poses.stamp_s[0], run.poses.stamp_s[-1])
+    order = np.argsort(run.poses.stamp_s, kind="stable")
+    there, turned = interpolate_poses(at, run.poses.stamp_s[order], position[order], quaternion[order])
+    place = np.stack([drift[axis] for axis in "xyz"], axis=1)
+    turn = multiply_quaternions(
+        turned, invert_quaternions(np.stack([drift[f"q{axis}"] for axis in "xyzw"], axis=1))
+    )
+    series = _name(there - rotate(turn, place), turn)
+    return stamp, stamp + run.scenario.pose.latency_s, series
+
+
+def _of_imu(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    if run.imu is None:
+        raise _missing("an inertial unit")
+    series = {f"rate_{axis}": run.imu.rates[:, i] for i, axis in enumerate("xyz")}
+    series |= {f"force_{axis}": run.imu.accelerations[:, i] for i, axis in enumerate("xyz")}
+    return run.imu.time_s, run.imu.time_s + _LATE_S, series
+
+
+def _once(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    del run
+    return np.zeros(1), np.zeros(1), {}
+
+
+def _name(position: Floats, quaternion: Floats) -> Series:
+    named = {axis: position[:, i] for i, axis in enumerate("xyz")}
+    return named | {f"q{axis}": quaternion[:, i] for i, axis in enumerate("xyzw")}
+
+
+def _missing(what: str) -> SimulateError:
+    return SimulateError(
+        "encoders_needed",
+        f"the platform publishes {what}, and the scenario has none",
+        where="platform",
+        hint="Choose a case with encoders and an inertial unit",
+    )
+
+
+_SOURCES: dict[Source, Callable[[SimulatedRun], tuple[Floats, Floats, Series]]] = {
+    "command": _of_command,
+    "wish": _of_wish,
+    "wheels": _of_wheels,
+    "odometry": _of_odometry,
+    "filter": _of_filter,
+    "localization": _of_localization,
+    "correction": _of_correction,
+    "imu": _of_imu,
+    "once": _once,
+}

@@ -1,0 +1,143 @@
+"""Which vehicle a log is of, from what it holds: words of names, and a robot description.
+
+A platform is recognized by a word of a namespace, a host, the robot's name, or by the package of its own
+message types. A description gives the geometry of a vehicle that is no platform.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import msgspec
+
+from pipeline.vehicles.presets import Vehicle, list_presets
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from pipeline.logs import ChannelInfo
+    from pipeline.vehicles.description import Description
+
+VehicleSource = Literal[
+    "flag", "configuration", "metadata", "robot_description", "namespace", "message_types", "fitted"
+]
+_DIFFERS = 0.1
+_OTHER_TRACK = 0.25
+_GEOMETRY = ("wheel_radius_m", "track_width_m", "wheelbase_m")
+
+
+@dataclass(frozen=True)
+class Recognized:
+    """A vehicle that the log tells.
+
+    Attributes:
+        vehicle: the vehicle.
+        source: what told it.
+        notes: what to say of it.
+    """
+
+    vehicle: Vehicle
+    source: VehicleSource
+    notes: tuple[str, ...] = ()
+
+
+def recognize_vehicle(
+    channels: Iterable[ChannelInfo],
+    metadata: Mapping[str, Mapping[str, str]],
+    description: Description | None,
+) -> Recognized | None:
+    """The vehicle that a log tells; None where it tells none.
+
+    Args:
+        channels: what the log holds.
+        metadata: its records.
+        description: its robot description.
+    """
+    held = [channel for channel in channels if channel.message_count != 0]
+    spaces = {part for channel in held for part in channel.topic.split("/")[1:-1]}
+    hosts = {text for record in metadata.values() for key, text in record.items() if "host" in key.lower()}
+    packages = {channel.type_name.split("/")[0] for channel in held}
+    told: tuple[tuple[VehicleSource, set[str]], ...] = (
+        ("robot_description", {description.name} if description is not None else set()),
+        ("namespace", spaces | hosts),
+        ("message_types", packages),
+    )
+    for source, words in told:
+        preset = _find_platform(words)
+        if preset is not None:
+            return _compare(preset, source, description)
+    return None if description is None else _build(description)
+
+
+def _find_platform(words: Iterable[str]) -> Vehicle | None:
+    """The platform that words name; the longest word wins."""
+    found: list[tuple[int, Vehicle]] = []
+    for preset in list_presets():
+        for word in preset.recognized_by:
+            pattern = re.compile(rf"(^|[^a-z0-9]){re.escape(word)}([^a-z]|$)")
+            if any(pattern.search(text.lower()) for text in words):
+                found.append((len(word), preset))
+    return max(found, key=lambda one: one[0])[1] if found else None
+
+
+def _compare(preset: Vehicle, source: VehicleSource, description: Description | None) -> Recognized:
+    """A platform as its preset has it; where the description differs, both are said."""
+    if description is None:
+        return Recognized(preset, source)
+    notes = []
+    for name in _GEOMETRY:
+        known, said = getattr(preset, name), getattr(description, name)
+        if known and said and abs(said / known - 1.0) > _DIFFERS:
+            notes.append(
+                f"the robot description says {name} = {said:.4g}, the preset {preset.id} {known:g}: the "
+                f"preset counts; vehicle.{name} = {said:.4g} takes the other"
+            )
+    return Recognized(preset, "robot_description", tuple(notes))
+
+
+def _build(description: Description) -> Recognized | None:
+    """A vehicle of a description alone, where it is complete."""
+    name = description.name or "robot"
+    values = {
+        "id": re.sub(r"\W+", "_", name.lower()),
+        "name": name,
+        "kind": description.kind,
+        "wheel_radius_m": description.wheel_radius_m,
+        "track_width_m": description.track_width_m,
+        "wheelbase_m": description.wheelbase_m,
+        "base_to_rear_axle_m": description.base_to_rear_axle_m,
+    }
+    try:
+        vehicle = msgspec.convert(values, Vehicle)
+    except msgspec.ValidationError:
+        return None
+    required = [quantity.name for quantity in vehicle.kinematics.geometry if quantity.required]
+    complete = all(getattr(vehicle, each) is not None for each in required)
+    return Recognized(vehicle, "robot_description") if complete else None
+
+
+def find_alike(radius_m: float, track_m: float) -> Vehicle | None:
+    """The platform whose geometry is within a tenth of a radius and a track width; None where none is."""
+    alike = [
+        (abs(vehicle.wheel_radius_m / radius_m - 1.0) + abs(vehicle.track_width_m / track_m - 1.0), vehicle)
+        for vehicle in list_presets()
+        if vehicle.kind == "differential" and vehicle.track_width_m
+    ]
+    near = [(off, vehicle) for off, vehicle in alike if off < 2.0 * _DIFFERS]
+    return min(near, key=lambda one: one[0])[1] if near else None
+
+
+def list_contradictions(told: Vehicle, chosen: Vehicle) -> list[str]:
+    """Numbers in which the vehicle that the log tells and the chosen one cannot be the same vehicle."""
+    found = [] if told.kind == chosen.kind else [f"kind {told.kind}, not {chosen.kind}"]
+    for name, limit in (
+        ("wheel_radius_m", _DIFFERS),
+        ("track_width_m", _OTHER_TRACK),
+        ("wheelbase_m", _OTHER_TRACK),
+    ):
+        said, taken = getattr(told, name), getattr(chosen, name)
+        if said and taken and abs(said / taken - 1.0) > limit:
+            found.append(f"{name} {said:.4g}, not {taken:g}")
+    return found

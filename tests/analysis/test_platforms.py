@@ -1,0 +1,162 @@
+"""Logs as popular platforms publish them: chosen rightly and diagnosed without any configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from platforms import give_geometry, hidden_effects, try_platform
+
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.choice import Choice, choose
+from pipeline.analysis.errors import JobError
+from pipeline.analysis.options import Options
+from pipeline.analysis.subject import describe_subject
+from pipeline.logs import open_log
+from pipeline.simulate import PLATFORMS, simulate_case
+from pipeline.vehicles import load_configuration
+
+VESC = "/sensors/core.state.speed, /sensors/servo_position_command.data"
+AUTOWARE = (
+    "/vehicle/status/velocity_status.longitudinal_velocity, "
+    "/vehicle/status/steering_status.steering_tire_angle"
+)
+PX4 = "/fmu/in/rover_speed_setpoint.speed_body_x, /fmu/in/rover_rate_setpoint.yaw_rate_setpoint"
+TICKS = "/autobot01/left_wheel_encoder_node/tick.data, /autobot01/right_wheel_encoder_node/tick.data"
+
+EXPECTED: dict[str, tuple[str, str, str, str, str]] = {
+    "husky_a200": (
+        "/a200_0042/platform/cmd_vel_unstamped",
+        "/a200_0042/platform/joint_states",
+        "/a200_0042/lidar/icp_odom",
+        "husky_a200",
+        "robot_description",
+    ),
+    "jackal": (
+        "/j100_0042/platform/cmd_vel_unstamped",
+        "/j100_0042/platform/joint_states",
+        "/j100_0042/lidar/icp_odom",
+        "jackal",
+        "robot_description",
+    ),
+    "warthog": (
+        "/w200_0042/platform/cmd_vel_unstamped",
+        "/w200_0042/platform/joint_states",
+        "/w200_0042/lidar/icp_odom",
+        "warthog",
+        "robot_description",
+    ),
+    "turtlebot3_burger": ("/cmd_vel", "/joint_states", "/tf", "turtlebot3_burger", "robot_description"),
+    "turtlebot3_waffle": ("/cmd_vel", "/joint_states", "/tf", "turtlebot3_waffle", "robot_description"),
+    "turtlebot4": ("/cmd_vel", "/wheel_vels", "/tf", "turtlebot4", "message_types"),
+    "panther": ("/panther/cmd_vel", "/panther/joint_states", "/kiss/odometry", "panther", "namespace"),
+    "lynx": ("/lynx/cmd_vel", "/lynx/joint_states", "/kiss/odometry", "lynx", "namespace"),
+    "rosbot_2r": ("/cmd_vel", "/joint_states", "/slam/odom", "rosbot_2r", "robot_description"),
+    "scout_2": ("/cmd_vel", "/scout_status", "/Odometry", "scout_2", "message_types"),
+    "hunter_2": ("/cmd_vel", "/hunter_status", "/Odometry", "hunter_2", "message_types"),
+    "diff_drive_controller": (
+        "/diffbot_base_controller/cmd_vel_out",
+        "/joint_states",
+        "/tf",
+        "diffbot",
+        "robot_description",
+    ),
+    "ackermann_steering_controller": (
+        "/ackermann_steering_controller/reference",
+        "/ackermann_steering_controller/controller_state",
+        "/lio/odometry",
+        "ackermann_bot",
+        "robot_description",
+    ),
+    "nav2": ("/cmd_vel", "/joint_states", "/tf", "turtlebot3_waffle", "robot_description"),
+    "autoware": (
+        "/control/command/control_cmd",
+        AUTOWARE,
+        "/localization/kinematic_state",
+        "autoware_sample",
+        "message_types",
+    ),
+    "f1tenth": (
+        "/commands/motor/speed.data, /commands/servo/position.data",
+        VESC,
+        "/pf/pose/odom",
+        "f1tenth",
+        "message_types",
+    ),
+    "px4_rover": (PX4, "/fmu/out/wheel_encoders", "/fmu/out/vehicle_odometry", "vehicle", "flag"),
+    "duckiebot": (
+        "/autobot01/wheels_driver_node/wheels_cmd_executed",
+        TICKS,
+        "/mocap/autobot01/pose",
+        "duckiebot",
+        "message_types",
+    ),
+    "leo_rover": ("/cmd_vel", "/firmware/wheel_states", "/rtabmap/odom", "leo_rover", "message_types"),
+    "linorobot2": (
+        "/cmd_vel",
+        "/odom/unfiltered",
+        "/lio_sam/mapping/odometry",
+        "linorobot2_4wd",
+        "robot_description",
+    ),
+}
+
+
+def record(name: str, folder: Path, duration_s: float = 20.0) -> Choice:
+    """The choice that is made for a short log of a platform."""
+    platform = PLATFORMS[name]
+    effects = hidden_effects(platform)
+    log = simulate_case(None, effects, out=folder / "run.mcap", seed=5, duration_s=duration_s, platform=name)
+    geometry = give_geometry(platform)
+    return choose(open_log(log), load_configuration(log, overrides=geometry), geometry)
+
+
+@pytest.mark.parametrize("name", PLATFORMS)
+def test_topics_and_vehicle_of_a_platform_are_chosen_without_configuration(name: str, tmp_path: Path) -> None:
+    chosen = record(name, tmp_path)
+    roles = (chosen.sources.command, chosen.sources.wheels, chosen.sources.pose)
+    assert (*map(str, roles), chosen.vehicle.id, chosen.vehicle_source) == EXPECTED[name]
+
+
+@pytest.mark.parametrize("name", ["turtlebot4", "f1tenth", "duckiebot"])
+def test_hidden_effects_of_a_platform_are_named(name: str, tmp_path: Path) -> None:
+    assert try_platform(name, tmp_path).named
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", PLATFORMS)
+def test_hidden_effects_of_every_platform_are_named(name: str, tmp_path: Path) -> None:
+    assert try_platform(name, tmp_path).named
+
+
+def test_an_odometry_of_the_wheels_is_never_preferred_and_says_what_it_is(tmp_path: Path) -> None:
+    chosen = record("turtlebot4", tmp_path)
+    verdicts = {str(rating.source): rating for rating in chosen.ratings}
+    assert verdicts["/odom"].from_wheels
+    assert not verdicts["/tf"].from_wheels
+    assert "too slow" in verdicts["/amcl_pose"].reason
+    assert [note for note in chosen.sources.notes if note.startswith("pose, not taken: /odom")]
+
+
+def test_a_field_of_one_of_several_structures_can_be_a_side(tmp_path: Path) -> None:
+    record("scout_2", tmp_path)
+    paths = {
+        side: f"/scout_status.actuator_states[{number}].rpm" for side, number in (("left", 1), ("right", 0))
+    }
+    text = f'[wheels]\nleft_topic = "{paths["left"]}"\nright_topic = "{paths["right"]}"\nunit = "rpm"\n'
+    (tmp_path / "run.toml").write_text(text, encoding="utf-8")
+    options = Options(out=tmp_path / "out", report=False, through="extract")
+    wheels = analyze_log(tmp_path / "run.mcap", options).manifest.read("wheels")
+    poses = analyze_log(tmp_path / "run.mcap", options).manifest.read("poses")
+    assert wheels["left"].abs().max() > 1.0
+    turned = (0.16459 * 0.5 * (wheels["left"] + wheels["right"])).to_numpy()
+    driven = np.diff(poses["x"].to_numpy()) ** 2 + np.diff(poses["y"].to_numpy()) ** 2
+    assert np.abs(turned).sum() / 20.0 == pytest.approx(np.sqrt(driven).sum(), rel=0.2)
+
+
+def test_a_robot_without_a_pose_is_refused_before_its_vehicle_is_asked_for(foreign_logs: Path) -> None:
+    with pytest.raises(JobError) as caught:
+        describe_subject(foreign_logs / "abitobot.mcap", Options())
+    assert caught.value.code == "no_pose"
+    assert "/joint_states" in str(caught.value)

@@ -1,0 +1,255 @@
+"""The pose by frame and content; wheels in the units of their types; the scale of wheels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from msgspec import structs
+from stage_logs import FIELD, PLAIN, TakeThrough
+
+from pipeline.analysis.choice import Choice, choose
+from pipeline.logs import LogWriter, Ragged, RaggedStrings, TopicColumns, open_log, read_topics
+from pipeline.simulate import Clock, Encoders, PoseSensor, Recording, Scenario, simulate_run, write_log
+from pipeline.simulate.cases import make_scenario
+from pipeline.stages.extract import extract_tables, list_wanted
+from pipeline.stages.extract.clocks import Recorded, align_clocks
+from pipeline.stages.extract.drive import read_joints, read_pair, unwrap_counter
+from pipeline.stages.extract.reading import read_pose_topic
+from pipeline.vehicles import Configuration, DriveForm, DriveSection, find_preset, load_configuration
+
+SECOND = 10**9
+COUNT = 600
+
+
+def look(log: Path) -> Choice:
+    return choose(open_log(log), load_configuration(log), {})
+
+
+def record(scenario: Scenario, folder: Path) -> Path:
+    write_log(simulate_run(scenario), folder / "run.mcap")
+    return folder / "run.mcap"
+
+
+def write_wheels_and(log: LogWriter, position: np.ndarray, yaw: np.ndarray, stamps: np.ndarray) -> None:
+    """Wheels that drive at half a metre a second, and one odometry that says what is given."""
+    sides = {"name": ["left_wheel", "right_wheel"], "velocity": np.full((stamps.size, 2), 0.5 / 0.165)}
+    log.metadata("deployment", {"vehicle": "husky_a200"})
+    log.write_columns("/joint_states", "sensor_msgs/msg/JointState", stamps, sides, header_time=stamps)
+    pose = {
+        "pose.pose.position.x": position,
+        "pose.pose.orientation.z": np.sin(yaw / 2),
+        "pose.pose.orientation.w": np.cos(yaw / 2),
+        "header.frame_id": "map",
+    }
+    log.write_columns("/state", "nav_msgs/msg/Odometry", stamps, pose, header_time=stamps)
+
+
+@pytest.fixture
+def stamps() -> np.ndarray:
+    return 1_700_000_000 * SECOND + np.arange(COUNT) * SECOND // 20
+
+
+def test_a_position_that_never_changes_while_the_heading_lives_is_refused(
+    tmp_path: Path, stamps: np.ndarray
+) -> None:
+    with LogWriter(tmp_path / "run.mcap") as log:
+        write_wheels_and(log, np.zeros(COUNT), np.linspace(0.0, 6.0, COUNT), stamps)
+    (rating,) = look(tmp_path / "run.mcap").ratings
+    assert "never changes while its heading turns" in rating.refused
+
+
+def test_a_pose_of_the_wheels_alone_is_said_loudly(tmp_path: Path) -> None:
+    scenario = replace(
+        FIELD,
+        duration_s=40.0,
+        pose=PoseSensor(source="wheels", noise_m=0.0, noise_rad=0.0),
+        recording=Recording("tf"),
+    )
+    chosen = look(record(scenario, tmp_path))
+    assert chosen.ratings[0].from_wheels
+    assert {(finding.id, finding.severity) for finding in chosen.findings} == {("pose_is_odometry", "error")}
+
+
+def test_a_localization_is_never_taken_for_the_wheels(tmp_path: Path) -> None:
+    chosen = look(record(replace(FIELD, duration_s=40.0, recording=Recording("tf")), tmp_path))
+    assert not chosen.ratings[0].from_wheels
+    assert chosen.findings == ()
+
+
+def test_what_needs_no_comparison_is_not_read(tmp_path: Path) -> None:
+    chosen = look(record(replace(FIELD, duration_s=20.0), tmp_path))
+    assert str(chosen.sources.pose) == "/mapping/icp_odom"
+    assert chosen.data is None
+
+
+def test_an_unknown_vehicle_gets_the_geometry_that_its_motion_shows(tmp_path: Path) -> None:
+    scenario = make_scenario(None, {"effective_track": 1.5}, seed=2, duration_s=60.0, vehicle="turtlebot3")
+    chosen = look(record(replace(scenario, recording=Recording("tf", deployment="absent")), tmp_path))
+    assert chosen.vehicle_source == "fitted"
+    assert chosen.vehicle.wheel_radius_m == pytest.approx(0.033, rel=0.02)
+    assert chosen.vehicle.track_width_m == pytest.approx(0.16 * 1.5, rel=0.03)
+    assert {finding.id for finding in chosen.findings} == {"vehicle_fitted"}
+
+
+def test_body_commands_alone_need_no_vehicle(tmp_path: Path) -> None:
+    scenario = make_scenario(None, {}, seed=2, duration_s=30.0, vehicle="husky", layout="body_command")
+    unnamed = replace(scenario, encoders=None, recording=Recording("body_command", deployment="absent"))
+    chosen = look(record(unnamed, tmp_path))
+    (finding,) = chosen.findings
+    assert "none is needed" in finding.text
+
+
+@pytest.mark.parametrize("period", [2**16, 2**32])
+def test_a_counter_that_begins_again_goes_on(period: int) -> None:
+    true = np.arange(0.0, 3.0 * period, period / 40.0)
+    assert np.array_equal(unwrap_counter(true % period), true)
+
+
+def test_a_body_in_north_east_down_is_turned_upright() -> None:
+    # Heading east, rolled onto nothing, one metre north of the start and two metres up.
+    heading = np.pi / 2.0
+    fields = {f"position[{i}]": np.array([value]) for i, value in enumerate((1.0, 0.0, -2.0))}
+    quaternion = (np.cos(heading / 2.0), 0.0, 0.0, np.sin(heading / 2.0))
+    fields |= {f"q[{i}]": np.array([value]) for i, value in enumerate(quaternion)}
+    times = np.zeros(1, dtype=np.int64)
+    columns = TopicColumns("/o", 0, "px4_msgs/msg/VehicleOdometry", times, times, None, fields, ())
+    pose = read_pose_topic(columns)
+    assert pose.position[0] == pytest.approx([0.0, 1.0, 2.0])
+    assert np.abs(pose.quaternion[0]) == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=1e-12)
+
+
+@pytest.mark.parametrize("factor", [0.05, 0.4, 3.0])
+def test_simulated_time_carries_topics_without_stamps_along(factor: float) -> None:
+    simulated = np.arange(2000) * SECOND // 20
+    log = 1_700_000_000 * SECOND + (simulated / factor).astype(np.int64)
+    clocks, findings = align_clocks(
+        {
+            "pose": Recorded("/pose", log, log, simulated),
+            "cmd": Recorded("/cmd_vel", log[::7], log[::7], None),
+        }
+    )
+    assert "simulated_time" in {finding.id for finding in findings}
+    assert np.array_equal(clocks["pose"].stamp, simulated)
+    assert np.abs(clocks["cmd"].stamp - simulated[::7]).max() < SECOND // 100
+
+
+def test_a_pause_of_the_simulation_moves_no_command() -> None:
+    simulated = np.arange(2000) * SECOND // 20
+    log = 1_700_000_000 * SECOND + (simulated / 0.5).astype(np.int64)
+    log[1000:] += 30 * SECOND
+    clocks, _ = align_clocks(
+        {
+            "pose": Recorded("/pose", log, log, simulated),
+            "cmd": Recorded("/cmd_vel", log, log, None),
+        }
+    )
+    late = np.abs(clocks["cmd"].stamp - simulated) > SECOND // 10
+    assert late.mean() < 0.05
+
+
+def test_a_simulated_log_keeps_its_effects(tmp_path: Path) -> None:
+    scenario = make_scenario(None, {}, seed=3, duration_s=40.0, platform="nav2")
+    chosen = look(record(replace(scenario, clock=Clock(real_time_factor=0.3)), tmp_path))
+    assert str(chosen.sources.pose) == "/tf"
+    assert chosen.ratings[0].coverage == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("wheels", "vehicle", "found", "value"),
+    [
+        ({}, {"wheel_radius_m": 0.1}, "wheel_radius_wrong", 0.165),
+        ({"unit": "deg/s"}, {}, "wheel_radius_wrong", None),
+        ({}, {}, None, None),
+    ],
+)
+def test_wheels_of_another_scale_than_the_motion_are_told(
+    drive: TakeThrough,
+    wheels: dict[str, object],
+    vehicle: dict[str, object],
+    found: str | None,
+    value: float | None,
+) -> None:
+    taken = drive(PLAIN, {"wheels": wheels, "vehicle": vehicle})
+    assert ({"wheel_radius_wrong", "unit_wrong"} & taken.ids()) == ({found} if found else set())
+    if found and value:
+        assert taken.finding(found).value == pytest.approx(value, rel=0.03)
+
+
+def test_wheels_in_turns_a_minute_are_recognized(drive: TakeThrough) -> None:
+    taken = drive(replace(PLAIN, encoders=Encoders(gain=60.0 / (2.0 * np.pi))), {})
+    assert "rpm" in taken.finding("unit_wrong").text
+
+
+def test_a_command_to_move_sideways_is_said_to_have_no_model(tmp_path: Path, stamps: np.ndarray) -> None:
+    with LogWriter(tmp_path / "run.mcap") as log:
+        write_wheels_and(log, np.arange(COUNT) * 0.025, np.zeros(COUNT), stamps)
+        command = {"linear.x": 0.5, "linear.y": np.where(np.arange(COUNT) > 300, 0.3, 0.0)}
+        log.write_columns("/cmd_vel", "geometry_msgs/msg/Twist", stamps, command)
+    index = open_log(tmp_path / "run.mcap")
+    chosen = choose(index, Configuration(), {})
+    types = {channel.topic: channel.type_name for channel in index.channels}
+    data = read_topics(index, list_wanted(chosen.sources, types))
+    made = extract_tables(data, chosen.sources, Configuration(), chosen.vehicle, where="run.mcap")
+    (finding,) = [found for found in made.findings if found.id == "sideways_command"]
+    assert "mecanum" in finding.text
+    assert finding.value == pytest.approx(0.5, abs=0.02)
+
+
+def test_an_odometry_of_a_controller_is_read_with_the_controllers_track() -> None:
+    # The controller's odometry divides by its own track; the base's own status by the nominal one.
+    husky = find_preset("husky_a200")
+    assert husky is not None
+    vehicle = structs.replace(husky, controller_track_multiplier=1.5)
+    half = 0.5 * 1.0 * vehicle.track_width_m / vehicle.wheel_radius_m  # type: ignore[operator]
+    for nominal, factor in ((True, 1.0), (False, 1.5)):
+        still, turning = np.zeros(3), np.ones(3)
+        drive = read_pair(DriveForm.BODY, still, turning, DriveSection(), vehicle, nominal=nominal)
+        assert drive.right == pytest.approx(half * factor)
+        assert drive.left == pytest.approx(-half * factor)
+
+
+@pytest.mark.parametrize(
+    ("unit", "gain"), [("rpm", 60.0 / (2.0 * np.pi)), ("deg/s", 180.0 / np.pi), (None, 1.0)]
+)
+def test_velocities_in_another_unit_than_their_positions_are_converted(unit: str | None, gain: float) -> None:
+    husky = find_preset("husky_a200")
+    assert husky is not None
+    count = 400
+    times = np.arange(count) / 20.0
+    speed = 3.0 + np.sin(times)
+    angle = 3.0 * times - np.cos(times)
+    names = RaggedStrings(np.tile([0, 1], count), ("left_wheel", "right_wheel"), np.arange(count + 1) * 2)
+    fields = {
+        "name": names,
+        "velocity": Ragged(np.repeat(speed * gain, 2), names.offsets),
+        "position": Ragged(np.repeat(angle, 2), names.offsets),
+    }
+    stamps = (times * SECOND).astype(np.int64)
+    columns = TopicColumns(
+        "/joint_states", 0, "sensor_msgs/msg/JointState", stamps, stamps, stamps, fields, ()
+    )
+    drive = read_joints(columns, times, DriveSection(), husky)
+    assert drive.left == pytest.approx(speed)
+    assert [finding.id for finding in drive.findings] == (["unit_wrong"] if unit else [])
+    assert all(str(unit) in finding.text for finding in drive.findings)
+
+
+def test_a_pose_whose_heading_does_not_follow_the_gyro_loses(tmp_path: Path, stamps: np.ndarray) -> None:
+    turn = np.sin(np.arange(COUNT) / 40.0)
+    with LogWriter(tmp_path / "run.mcap") as log:
+        write_wheels_and(log, np.arange(COUNT) * 0.02, np.cos(np.arange(COUNT) / 25.0), stamps)
+        good = {
+            "pose.position.x": np.arange(COUNT) * 0.02,
+            "pose.orientation.z": np.sin(turn / 2),
+            "pose.orientation.w": np.cos(turn / 2),
+            "header.frame_id": "map",
+        }
+        log.write_columns("/other", "geometry_msgs/msg/PoseStamped", stamps, good, header_time=stamps)
+        rate = {"angular_velocity.z": np.gradient(turn, 0.05)}
+        log.write_columns("/imu", "sensor_msgs/msg/Imu", stamps, rate, header_time=stamps)
+    chosen = look(tmp_path / "run.mcap")
+    assert str(chosen.sources.pose) == "/other"
+    assert "not the gyro's" in chosen.ratings[1].reason

@@ -1,0 +1,68 @@
+"""What is known of message types: fields that exist, units that are known."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipeline.logs import bundled_types, field_names
+from pipeline.vehicles import ConfigurationError, Signal, convert_unit, find_preset
+from pipeline.vehicles.message_types import MessageType, find_type, list_types
+
+PARTS = ("drive", "number", "joints", "pose", "imu")
+KNOWN = sorted({kind for part in PARTS for kind in list_types(part)})
+BUNDLED = {name.replace("/msg/", "/") for name in bundled_types()}
+
+
+def list_paths(kind: MessageType) -> list[str]:
+    paths: list[str] = []
+    if kind.drive is not None:
+        paths += [*kind.drive.first.split("+"), *kind.drive.second.split("+")]
+    if kind.number is not None:
+        paths += [kind.number.field, *filter(None, [kind.number.per_turn])]
+    if kind.joints is not None:
+        paths += [kind.joints.names, kind.joints.velocity, kind.joints.position]
+    for vectors in (
+        kind.pose and (kind.pose.position, kind.pose.orientation),
+        kind.imu and (kind.imu.rate, kind.imu.force),
+    ):
+        for fields in vectors or ():
+            paths += fields if isinstance(fields, list) else [f"{fields}.{axis}" for axis in "xyz"]
+    return paths
+
+
+@pytest.mark.parametrize("name", [name for name in KNOWN if name in BUNDLED])
+def test_every_field_is_one_of_the_type(name: str) -> None:
+    leaves = field_names(name)
+    wrong = [path for path in list_paths(find_type(name)) if path.split("[")[0] not in leaves]
+    assert wrong == []
+
+
+def test_an_index_inside_a_path_names_one_element_of_every_message() -> None:
+    signal = Signal.parse("/scout_status.actuator_states[1].rpm+actuator_states[2].rpm")
+    assert signal.fields() == ("actuator_states[].rpm[1]", "actuator_states[].rpm[2]")
+
+
+@pytest.mark.parametrize(
+    ("unit", "raw", "value", "made"),
+    [("rpm", 60.0, 6.283185, "rad/s"), ("mm/s", 250.0, 0.25, "m/s"), ("deg", 90.0, 1.570796, "rad")],
+)
+def test_units_are_converted(unit: str, raw: float, value: float, made: str) -> None:
+    scale, offset, si = convert_unit(unit, {}, where="/wheels")
+    assert scale * (raw - offset) == pytest.approx(value)
+    assert si == made
+
+
+def test_a_platform_knows_its_own_units() -> None:
+    car = find_preset("f1tenth")
+    assert car is not None
+    scale, offset, made = convert_unit("servo", car.units, where="/commands/servo/position")
+    assert scale * (0.5304 - 1.2135 * 0.2 - offset) == pytest.approx(0.2)
+    assert made == "rad"
+
+
+def test_a_unit_that_nobody_knows_is_asked_about() -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        convert_unit("ticks", {}, where="/left/tick")
+    assert caught.value.code == "unit_unknown"
+    assert "per_turn" in str(caught.value)
+    assert "\n" not in str(caught.value)

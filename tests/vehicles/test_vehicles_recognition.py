@@ -1,0 +1,140 @@
+"""The vehicle that a log tells: robot descriptions, words of names, message types."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipeline.logs import ChannelInfo
+from pipeline.simulate import PLATFORMS
+from pipeline.vehicles import (
+    Recognized,
+    find_alike,
+    find_preset,
+    list_contradictions,
+    read_description,
+    recognize_vehicle,
+)
+
+BURGER = """<?xml version="1.0"?><robot name="turtlebot3_burger">
+<link name="base_footprint"/><link name="base_link"/>
+<joint name="base_joint" type="fixed"><parent link="base_footprint"/><child link="base_link"/>
+ <origin xyz="0 0 0.010" rpy="0 0 0"/></joint>
+<joint name="wheel_left_joint" type="continuous"><parent link="base_link"/><child link="wheel_left_link"/>
+ <origin xyz="0.0 0.08 0.023" rpy="-1.57 0 0"/><axis xyz="0 0 1"/></joint>
+<link name="wheel_left_link">{shape}</link>
+<joint name="wheel_right_joint" type="continuous"><parent link="base_link"/><child link="wheel_right_link"/>
+ <origin xyz="0.0 -0.080 0.023" rpy="-1.57 0 0"/><axis xyz="0 0 1"/></joint>
+<link name="wheel_right_link">{shape}</link>
+<joint name="caster_back_joint" type="continuous"><parent link="base_link"/><child link="caster"/>
+ <origin xyz="-0.08 0.05 -0.004" rpy="-1.57 0 0"/><axis xyz="0 0 1"/></joint>
+<link name="caster"><collision><geometry><sphere radius="0.005"/></geometry></collision></link></robot>"""
+CYLINDER = '<collision><geometry><cylinder length="0.018" radius="0.033"/></geometry></collision>'
+MESH = '<visual><geometry><mesh filename="package://a/left_tire.stl"/></geometry></visual>'
+
+
+def recognize(
+    *topics: str, types: str = "geometry_msgs/msg/Twist", metadata: dict[str, dict[str, str]] | None = None
+) -> Recognized | None:
+    channels = [ChannelInfo(i, topic, types, "ros2msg", "cdr", 5, {}) for i, topic in enumerate(topics)]
+    return recognize_vehicle(channels, metadata or {}, None)
+
+
+@pytest.mark.parametrize("shape", [CYLINDER, MESH], ids=["a cylinder", "a mesh, over the footprint"])
+def test_wheels_of_a_description_give_radius_and_track(shape: str) -> None:
+    found = read_description(BURGER.format(shape=shape))
+    assert found is not None
+    assert (found.name, found.kind) == ("turtlebot3_burger", "differential")
+    assert found.wheel_radius_m == pytest.approx(0.033, abs=1e-3)
+    assert found.track_width_m == pytest.approx(0.16, abs=1e-3)
+    assert found.wheels == ("wheel_left_joint", "wheel_right_joint")
+
+
+def test_a_car_is_told_by_its_steering_joints() -> None:
+    platform = PLATFORMS["ackermann_steering_controller"]
+    (text,) = [one.fields["data"] for one in platform.topics if one.topic == "/robot_description"]
+    found = read_description(str(text))
+    assert found is not None
+    assert found.kind == "ackermann"
+    assert found.wheelbase_m == pytest.approx(platform.vehicle.wheelbase_m)
+    assert found.track_width_m == pytest.approx(platform.vehicle.track_width_m)
+    assert found.wheel_radius_m == pytest.approx(platform.vehicle.wheel_radius_m)
+    assert found.base_to_rear_axle_m == 0.0
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "no xml",
+        "<robot/>",
+        '<!DOCTYPE r [<!ENTITY a "b">]><robot name="&a;"/>',
+        BURGER.format(shape=CYLINDER).replace('xyz="0.0 0.08 0.023"', 'xyz="nan x 1"'),
+        BURGER.format(shape=CYLINDER).replace(
+            '<parent link="base_link"/>', '<parent link="wheel_left_link"/>'
+        ),
+    ],
+    ids=["empty", "text", "no wheels", "entities", "a place that is none", "a circle of links"],
+)
+def test_a_text_that_describes_no_wheels_is_no_description(text: str) -> None:
+    assert read_description(text) is None
+
+
+@pytest.mark.parametrize(
+    ("topic", "vehicle"),
+    [
+        ("/a200_0042/platform/cmd_vel", "husky_a200"),
+        ("/j100_0001/cmd_vel", "jackal"),
+        ("/panther/cmd_vel", "panther"),
+    ],
+)
+def test_a_namespace_tells_the_platform(topic: str, vehicle: str) -> None:
+    found = recognize(topic)
+    assert found is not None
+    assert (found.vehicle.id, found.source) == (vehicle, "namespace")
+
+
+def test_message_types_and_hosts_tell_the_platform() -> None:
+    by_type = recognize("/wheel_vels", types="irobot_create_msgs/msg/WheelVels")
+    by_host = recognize("/cmd_vel", metadata={"recorder": {"hostname": "cpr-w200-0012"}})
+    assert by_type is not None
+    assert by_host is not None
+    assert (by_type.vehicle.id, by_type.source) == ("turtlebot4", "message_types")
+    assert (by_host.vehicle.id, by_host.source) == ("warthog", "namespace")
+
+
+@pytest.mark.parametrize("topic", ["/cmd_vel", "/scouting/cmd_vel", "/lynxes/odom", "/nav/husk"])
+def test_other_words_tell_nothing(topic: str) -> None:
+    assert recognize(topic) is None
+
+
+def test_a_description_of_no_platform_gives_its_own_geometry() -> None:
+    described = read_description(BURGER.format(shape=CYLINDER).replace("turtlebot3_burger", "my_robot"))
+    found = recognize_vehicle([], {}, described)
+    assert found is not None
+    assert (found.vehicle.id, found.source) == ("my_robot", "robot_description")
+    assert found.vehicle.track_width_m == pytest.approx(0.16, abs=1e-3)
+
+
+def test_where_description_and_preset_differ_both_are_said() -> None:
+    wide = BURGER.format(shape=CYLINDER).replace("0.0 0.08 0.023", "0.0 0.18 0.023")
+    found = recognize_vehicle([], {}, read_description(wide))
+    assert found is not None
+    assert found.vehicle.id == "turtlebot3_burger"
+    (note,) = found.notes
+    assert "0.26" in note
+    assert "0.16" in note
+
+
+def test_a_fitted_geometry_is_compared_with_the_platforms() -> None:
+    alike = find_alike(0.0331, 0.286)
+    assert alike is not None
+    assert alike.id == "turtlebot3_waffle"
+    assert find_alike(0.5, 0.1) is None
+
+
+def test_another_vehicle_than_the_logs_is_contradicted() -> None:
+    husky, jackal = find_preset("husky"), find_preset("jackal")
+    assert husky is not None
+    assert jackal is not None
+    assert [text for text in list_contradictions(husky, jackal) if "wheel_radius_m" in text]
+    assert list_contradictions(husky, husky) == []
