@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-batch bench-export bench-reader bench-real bench-workbench browser check clean compare damage damage-results damage-season format fuzz inspect lock map platforms samples \
+.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season format fuzz inspect lock map platforms samples \
 	serve test test-long trend
 
 help: ## print this list
@@ -111,6 +111,12 @@ bench-workbench: $(VENV)/.ready-dev ## answers of the workbench on a 10-minute l
 
 bench-reader: $(VENV)/.ready-dev ## reading a 1 GB log: ours, its peers, and the bound
 	$(BIN)/python benchmarks/reader.py
+
+bench-bags: $(VENV)/.ready-dev ## reading bags of ROS 1 and ROS 2 beside the same messages as MCAP
+	$(BIN)/python benchmarks/bags.py $$ARGS
+
+bench-writer: $(VENV)/.ready-dev ## serializing messages: ours beside mcap-ros2-support
+	$(BIN)/python benchmarks/writer.py
 
 damage-season: $(VENV)/.ready-dev ## what becomes of each kind of odd entry in a season of logs
 	$(BIN)/python tests/batch/damage_season.py

@@ -70,18 +70,21 @@ def fit_with_scipy(problem: Problem, model: Model) -> float:
     from scipy.optimize import least_squares  # noqa: PLC0415 - the peer's
 
     fitted = fit_model(problem, model)
-    free = list(fitted.free)
-    start = problem.start_state(model)
+    # Command and wheels are two problems; the peer is given the one of the drivetrain.
+    part, fit = problem.parts[-1], fitted.fits[-1]
+    free = list(fit.free)
+    start = problem.start_state(model.effects)
     for number in free:
-        typical = number.parameter.typical if number.parameter else 0.0
-        start = start.set(number, float(typical))
+        start = start.set(
+            number, model.effect(number.effect).parameter(number.name).typical if number.effect else 0.0
+        )
     low, high = np.array([number.bounds for number in free]).T
 
     def residuals(values: np.ndarray) -> np.ndarray:
         state = start
         for number, value in zip(free, values.tolist(), strict=True):
             state = state.set(number, value)
-        return fitted.weights.normalise(problem.find_residuals(state), problem).ravel()
+        return (part.find_residuals(state) / fit.weights.scale).ravel()
 
     begin = np.clip([start.get(number) for number in free], low + 1e-9, high - 1e-9)
     return float(least_squares(residuals, begin, bounds=(low, high), loss="huber", f_scale=3.0).cost)

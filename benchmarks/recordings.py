@@ -24,12 +24,17 @@ LOGS = Path(__file__).parents[2] / "shared" / "logs"
 
 
 def describe_values(reached: Reached) -> str:
-    timing = reached.fitted.state.timing[0]
+    timing, late = reached.fitted.state.timing[0], reached.problem.runs[0].alignment.heading_delay_s
     parts = [
         f"{effect.id} " + " ".join(f"{name}={value:.3g}" for name, value in effect.values.items())
         for effect in reached.fitted.model.effects
     ]
-    return "; ".join((*parts, f"poses {timing.pose_delay_s:.2f} s late, wheels {timing.wheel_delay_s:.2f} s"))
+    return "; ".join(
+        (
+            *parts,
+            f"poses {late:.2f} s late, wheels {timing.wheel_delay_s:.2f} s",
+        )
+    )
 
 
 def print_row(name: str, values: tuple[float, ...]) -> None:

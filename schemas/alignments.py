@@ -12,7 +12,7 @@ class Alignments(Table):
     """One row a run."""
 
     NAME: ClassVar[str] = "alignments"
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     hold_time = fields.number("s", "the controller stops this long after its last command", nullable=True)
     command_scale = fields.number("1", "by which the recorded command was multiplied")
@@ -29,7 +29,7 @@ class Alignments(Table):
     )
     heading_delay = fields.number(
         "s",
-        "how late the reported heading is against the gyro, beside the latencies of single poses",
+        "how late the reported heading was against the gyro: part of every latency of the poses",
         nullable=True,
     )
     heading_delay_error = fields.number("s", "standard error of that delay", nullable=True)

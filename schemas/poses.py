@@ -31,7 +31,7 @@ class Poses(Table):
     q_z = fields.number("1", "quaternion of base_link", frame="map")
     q_w = fields.number("1", "quaternion of base_link", frame="map")
     latency = fields.number(
-        "s", "how much older than other poses this one is: it belongs to t - latency", frame="log clock"
+        "s", "how late this pose is against the gyro: it belongs to t - latency", frame="log clock"
     )
     outlier = fields.flag("the localization is at fault here: left out of medians and of comparisons")
     held = fields.flag("repeats the pose before it: an old estimate sampled again")

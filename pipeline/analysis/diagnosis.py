@@ -80,7 +80,7 @@ def _diagnose(work: Work) -> dict[str, JSON]:
         {"sha256": work.sha256, "path": str(subject.path)},
     )
     try:
-        diagnosis = diagnose_runs([recording], work.vehicle, inputs=work.options.inputs)
+        diagnosis = diagnose_runs([recording], work.vehicle, inputs=work.options.inputs, tell=work.progress)
     except SlipError as error:
         # A log too poor to diagnose has its slip all the same.
         finding = {"id": error.code, "severity": "warning", "text": str(error), "where": "diagnosis"}

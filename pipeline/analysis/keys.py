@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from pipeline.analysis.subject import Subject
 
-VERSIONS: Mapping[str, int] = {"extract": 4, "align": 1, "velocity": 2, "slip": 3, "aggregate": 1}
+VERSIONS: Mapping[str, int] = {"extract": 4, "align": 2, "velocity": 3, "slip": 3, "aggregate": 1}
 EXTRACTED = ("commands", "wheels", "poses", "imu")
 TABLES: Mapping[str, tuple[str, ...]] = {
     "extract": EXTRACTED,

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 from pipeline.core.version import PACKAGE, read_version
+from pipeline.logs import ROS1_BAG, SQLITE_BAG
 from pipeline.stages.extract import list_wanted
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 _Packages = Mapping[str, tuple[str, ...]]
 _ALWAYS = ("numpy", "scipy", "polars", "pyarrow")
+_CONTAINER: _Packages = {"": ("mcap",), ROS1_BAG: ("rosbags", "lz4"), SQLITE_BAG: ("rosbags", "apsw")}
 _COMPRESSION: _Packages = {"zstd": ("zstandard",), "lz4": ("pyarrow",)}
 _ENCODING: _Packages = {"protobuf": ("mcap", "mcap-protobuf-support")}
 # How much of the error can be explained at all is found by boosted trees, wherever there is a ladder.
@@ -42,7 +44,8 @@ def _list_readers(subject: Subject) -> set[str]:
     types = {channel.topic: channel.type_name for channel in index.channels}
     wanted = {one.topic for one in list_wanted(subject.sources, types)}
     encodings = {channel.message_encoding for channel in index.channels if channel.topic in wanted}
-    used = [_COMPRESSION.get(name, ()) for name in index.compressions]
+    used = [_CONTAINER.get(name, ()) for name in index.containers]
+    used += [_COMPRESSION.get(name, ()) for name in index.compressions]
     used += [_ENCODING.get(name, ()) for name in encodings]
     return {name for names in used for name in names}
 

@@ -18,7 +18,7 @@ from pipeline.analysis.options import INPUTS
 from pipeline.analysis.subject import describe_subject, name_run
 from pipeline.analysis.work import stored_contexts
 from pipeline.core.errors import SlipError
-from pipeline.logs import hash_log
+from pipeline.logs import hash_log, list_files
 from pipeline.store import JSON, LogIdentities, Manifest, Store
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def _find_stored(path: Path, store: Store) -> Manifest | None:
     """The complete results of a log's content; None where there are none."""
     sha256 = LogIdentities(store).lookup(path)
     if sha256 is None:
-        size = sum(part.stat().st_size for part in (path.glob("*.mcap") if path.is_dir() else [path]))
+        size = sum(part.stat().st_size for part in (list_files(path) if path.is_dir() else [path]))
         # Hashing reads the whole log: only for one that may be known.
         if all(_log_of(manifest).get("bytes") != size for manifest in store.survey().manifests):
             return None

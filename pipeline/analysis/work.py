@@ -224,7 +224,7 @@ class Work:
             "sign": -1 if fit.signed_scale < 0.0 else 1,
             "scale": round(abs(fit.signed_scale), 6),
             "bias_radps": round(fit.bias, 6),
-            "pose_delay_s": round(fit.yaw_delay_s, 4),
+            "pose_delay_s": round(made.alignment.heading_delay_s, 4),
             "residual": round(fit.residual, 4),
         }  # fmt: skip
         return StageOutcome(made.findings, {"gyro": gyro})

@@ -15,6 +15,8 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, TypeVar
 
+from pipeline.logs import SUFFIXES
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
@@ -158,7 +160,7 @@ class Looker:
             kind, leads_to = told
             if kind in kinds:
                 kinds[kind][entry.name] = leads_to
-            elif entry.name.endswith(".mcap"):
+            elif entry.name.endswith(SUFFIXES):
                 self.skip(path, kind)
         return number, Folder(place, kinds["folder"], kinds["file"])
 

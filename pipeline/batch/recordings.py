@@ -14,14 +14,12 @@ from typing import TYPE_CHECKING
 
 from pipeline.batch.errors import BatchError
 from pipeline.batch.folders import Folder, Looker, Skipped
-from pipeline.logs import RemotePath
+from pipeline.logs import SUFFIXES, RemotePath, is_finished, list_files
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-SUFFIX = ".mcap"
 LISTING = "metadata.yaml"
-_MAGIC = b"\x89MCAP0\r\n"
 _GLOB = re.compile(r"[*?\[]")
 
 PATIENCE_S = 30.0
@@ -50,8 +48,8 @@ def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: floa
     """Find the recordings that are meant.
 
     Args:
-        targets: an MCAP file; a folder, searched to its depths; a glob such as ``2026/**/*.mcap``; or
-            ``@list.txt``, a text file with one of these a line (``#`` begins a comment).
+        targets: an MCAP file or a bag; a folder, searched to its depths; a glob such as ``2026/**/*.mcap``;
+            or ``@list.txt``, a text file with one of these a line (``#`` begins a comment).
         settle_s: a recording without a proper end that changed within this time is still being written [s];
             one that changed in the future is, if it grows between two looks.
         patience_s: longest time for one look at a file or folder [s].
@@ -126,12 +124,12 @@ def _find_match(match: Path, looker: Looker) -> Iterator[Path]:
     if looker.ask(match, match.is_dir):
         for folder in looker.walk(match):
             yield from _list_recordings(folder)
-    elif match.suffix == SUFFIX and looker.ask(match, match.is_file):
+    elif match.suffix in SUFFIXES and looker.ask(match, match.is_file):
         yield looker.ask(match, lambda: _parent_recording(match) or match) or match
 
 
 def _list_recordings(folder: Folder) -> Iterator[Path]:
-    logs = [name for name in folder.files if name.endswith(SUFFIX)]
+    logs = [name for name in folder.files if name.endswith(SUFFIXES)]
     parts = set(list_parts(folder.path, logs, is_listed=LISTING in folder.files))
     if parts:
         yield folder.path
@@ -146,10 +144,12 @@ def list_parts(folder: Path, names: Iterable[str], *, is_listed: bool) -> list[s
         names: names of the logs in it.
         is_listed: whether a ``metadata.yaml`` makes the folder a recording.
     """
+    # A bag of ROS 1 is a recording of its own wherever it stands.
+    parts = [name for name in names if not name.endswith(".bag")]
     if is_listed:
-        return list(names)
-    pattern = re.compile(re.escape(folder.name) + r"_\d+\.mcap")
-    return [name for name in names if pattern.fullmatch(name)]
+        return parts
+    pattern = re.compile(re.escape(folder.name) + r"_\d+\.\w+")
+    return [name for name in parts if pattern.fullmatch(name)]
 
 
 def _find_remote(target: RemotePath) -> Iterator[Path]:
@@ -169,7 +169,7 @@ def _find_remote(target: RemotePath) -> Iterator[Path]:
         objects = [found for found in objects if fnmatch.fnmatchcase(str(found), str(target))]
     listed = {found.parent for found in objects if found.name == LISTING}
     for found in objects:
-        if found.suffix == SUFFIX:
+        if found.suffix in SUFFIXES:
             folder = found.parent
             is_part = bool(list_parts(folder, [found.name], is_listed=folder in listed))
             yield folder if is_part else found
@@ -210,7 +210,7 @@ def _tell_age(path: Path, settle_s: float) -> float | None:
             return None
         # The recorder of a split recording writes the listing last of all.
         unlisted = path.is_dir() and not (path / LISTING).is_file()
-        if unlisted or not all(_ends_well(file) for file in files):
+        if unlisted or not all(is_finished(file) for file in files):
             return age_s
     return None
 
@@ -222,13 +222,4 @@ def _measure(path: Path) -> int:
 
 
 def _list_files(path: Path) -> list[Path]:
-    return sorted(file for file in path.glob(f"*{SUFFIX}") if file.is_file()) if path.is_dir() else [path]
-
-
-def _ends_well(file: Path) -> bool:
-    with file.open("rb") as stream:
-        size = stream.seek(0, os.SEEK_END)
-        if size < 2 * len(_MAGIC):
-            return False
-        stream.seek(size - len(_MAGIC))
-        return stream.read() == _MAGIC
+    return [file for file in list_files(path) if file.is_file()] if path.is_dir() else [path]

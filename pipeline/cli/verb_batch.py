@@ -142,7 +142,7 @@ def describe_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     """The closing table: how many logs came out how, and of those that need a look, why."""
     lines = [f"{word:<14}{outcome.counts[state]:>6}" for state, word in _WORDS]
     if is_search and not outcome.lines:
-        lines.append("no recording was found; they are files that end in .mcap")
+        lines.append("no recording was found; they are files that end in .mcap, .db3 or .bag")
     for state, word in (("growing", "being written"), ("left", "not begun"), ("skipped", "left out")):
         count = sum(line.state == state for line in outcome.lines)
         lines += [f"{word:<14}{count:>6}"] if count else []

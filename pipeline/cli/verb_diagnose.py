@@ -49,6 +49,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     ] = None,
     apply: Annotated[Path | None, Parameter(help="write the proposed model to this file")] = None,
     memory: str | None = None,
+    budget: str | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -57,11 +58,16 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     Args:
         trust_code: trust the Python that the model file names, now and later.
         memory: most memory, for example 2GB (default: 80 % of the machine's).
+        budget: CPU time that a search may take, for example 60s (default: that for 10 minutes of driving);
+            after it the best answer so far is given.
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
     options = build_options(choices)
+    from pipeline.diagnosis.budget import parse_budget  # noqa: PLC0415 - heavy
+
     known = None if model is None else open_model(model, trust_code=trust_code)
+    budget_s = None if budget is None else parse_budget(budget)
     diagnoses: list[Diagnosis] = []
     at_work = [logs[0]]
     chosen: dict[str, dict[str, object]] = {}
@@ -77,7 +83,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
             at_work[0] = recordings[0].path
             try:
                 agreed = vehicle if known is None else _agree(known, vehicle, recordings, vehicle_of)
-                diagnoses.append(_judge(recordings, agreed, options, known, quiet=quiet or json))
+                diagnoses.append(_judge(recordings, agreed, options, known, budget_s, quiet=quiet or json))
             except SlipError as error:
                 print_error(error)
                 errors.append(describe_error(recordings[0].path, error))
@@ -150,6 +156,7 @@ def _judge(
     vehicle: Vehicle,
     options: Options,
     known: ModelFile | None,
+    budget_s: float | None,
     *,
     quiet: bool,
 ) -> Diagnosis:
@@ -163,6 +170,8 @@ def _judge(
             vehicle,
             inputs=options.inputs,
             model=None if known is None else known.model,
+            budget_s=budget_s,
+            tell=progress,
         )
 
 

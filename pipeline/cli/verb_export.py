@@ -86,12 +86,12 @@ def export(
 def _find_named(manifest: Manifest) -> tuple[Model | None, str | None]:
     """The model that the run's diagnosis named, and what it is fed with; None where there is none."""
     from pipeline.analysis.diagnosis import DIAGNOSIS  # noqa: PLC0415 - heavy
-    from pipeline.report.diagnosed import name_model  # noqa: PLC0415 - heavy
-    from pipeline.report.motion_run import load_vehicle  # noqa: PLC0415 - heavy
+    from pipeline.report.diagnosed import read_model_text  # noqa: PLC0415 - heavy
 
     if DIAGNOSIS not in manifest.files:
         return None, None
     diagnosis = decoder.loads(manifest.path(DIAGNOSIS).read_text(encoding="utf-8"))
     named_on = diagnosis.get("input")
     usable = named_on if named_on in {"command", "measured"} else None
-    return name_model(diagnosis, load_vehicle(manifest)), usable
+    file = read_model_text(diagnosis)
+    return (None if file is None else file.model), usable

@@ -119,13 +119,16 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
 
 
 def add(  # noqa: D417 - the shared options document themselves
-    model: Path, /, *effects: str, spoken: Spoken
+    model: Path, /, *effects: str, spoken: Spoken, anyway: bool = False
 ) -> int:
     """Add effects to a model, fit it, and show the ladder before and after.
+
+    Effects with which an error over 2 s rises on data not seen are not taken: the file stays as it was.
 
     Args:
         model: the model file.
         effects: ids of effects, as `slip effects` lists them.
+        anyway: take them though an error rises.
     """
     from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
 
@@ -133,7 +136,7 @@ def add(  # noqa: D417 - the shared options document themselves
     changed = file.model
     for name in effects:
         changed = changed + find_effect(name, file.own)()
-    return _change(model, file, replace(file, model=changed), spoken)
+    return _change(model, file, replace(file, model=changed), spoken, keep_if_rises=not anyway)
 
 
 def drop(  # noqa: D417 - the shared options document themselves
@@ -244,9 +247,19 @@ def export(  # noqa: D417 - the options document themselves
 
 
 def _change(
-    path: Path, before: ModelFile, after: ModelFile, spoken: On, *, predict: Sequence[str] = ()
+    path: Path,
+    before: ModelFile,
+    after: ModelFile,
+    spoken: On,
+    *,
+    predict: Sequence[str] = (),
+    keep_if_rises: bool = False,
 ) -> int:
-    """Judge a model before and after a change, fit it, write its file, and print."""
+    """Judge a model before and after a change, fit it, write its file, and print.
+
+    Raises:
+        MotionError: ``error_rises``, with ``keep_if_rises``: the file stays as it is.
+    """
     from pipeline.identification.inputs import choose_input  # noqa: PLC0415 - heavy
     from pipeline.identification.judgement import judge_model, note_fit  # noqa: PLC0415
     from pipeline.identification.problem import Problem  # noqa: PLC0415
@@ -264,6 +277,8 @@ def _change(
     new_one = old
     if after.model.effects != before.model.effects:
         new_one = judge_model(problem, after.model, per_run=after.per_run)
+    if keep_if_rises:
+        _require_no_rise(path, old, new_one)
     written = note_fit(after, new_one)
     write_model(written, path)
     terrains = [run.terrain for run in runs]
@@ -278,6 +293,21 @@ def _change(
         print_lines(lines)
         _warn(warnings)
     return CLEAN
+
+
+def _require_no_rise(path: Path, old: Judgement, new_one: Judgement) -> None:
+    from pipeline.identification.describe import describe_rises  # noqa: PLC0415 - heavy
+    from pipeline.runs.errors import MotionError  # noqa: PLC0415
+
+    rises = describe_rises(old.whole.errors, new_one.whole.errors)
+    if rises:
+        added = [name for name in new_one.whole.effects if name not in old.whole.effects]
+        raise MotionError(
+            "error_rises",
+            f"with {', '.join(added)} {' and '.join(rises)} on data not seen: the model is as it was",
+            where=str(path),
+            hint="Take something else, or give --anyway",
+        )
 
 
 def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFile, list[MotionRun]]:
@@ -342,7 +372,7 @@ def _as_json(
         "timing": [
             {
                 "run": comparison.run.name,
-                "pose_delay_s": timing.pose_delay_s,
+                "pose_delay_s": comparison.run.alignment.heading_delay_s,
                 "wheel_delay_s": timing.wheel_delay_s,
                 "latency_spread_s": comparison.run.alignment.latency_spread_s,
                 "outlier_s": comparison.run.alignment.outlier_s,

@@ -6,6 +6,9 @@ Each room derives one class of its own.
 
 from __future__ import annotations
 
+_READABLE = 300
+_LONGEST = 1000
+
 
 class SlipError(Exception):
     """Something the user can mend.
@@ -20,7 +23,8 @@ class SlipError(Exception):
     def __init__(self, code: str, what: str, *, where: str = "", hint: str) -> None:
         super().__init__(what)
         self.code = code
-        self.what = what
+        # What a file says is repeated in errors, and files may say anything at any length.
+        self.what = shorten(what, _LONGEST)
         self.where = where
         self.hint = hint
 
@@ -32,6 +36,11 @@ class SlipError(Exception):
     def __reduce__(self) -> tuple[object, ...]:
         """Keep every part when the error crosses a process boundary."""
         return _rebuild, (type(self), self.code, self.what, self.where, self.hint)
+
+
+def shorten(text: str, most: int = _READABLE) -> str:
+    """The beginning of what a text of any length says."""
+    return text if len(text) <= most else f"{text[:most]}..."
 
 
 def _rebuild(kind: type[SlipError], code: str, what: str, where: str, hint: str) -> SlipError:

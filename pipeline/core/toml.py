@@ -11,13 +11,14 @@ import re
 import tomllib
 from typing import TYPE_CHECKING
 
+from pipeline.core.errors import shorten
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 LONGEST = 2_000_000
 DEEPEST = 16
 _LARGEST = 2**63
-_READABLE = 300
 _LINE = re.compile(r"\(at line (\d+)")
 _PART = r"""(?:[\w-]++|"[^"\n]*"|'[^'\n]*')[ \t]*"""
 _LONG_KEY = re.compile(rf"(?<![\w-])(?:{_PART}\.[ \t]*){{{DEEPEST}}}")
@@ -37,11 +38,6 @@ class TomlError(Exception):
         self.what = shorten(what)
         self.line = line
         self.key = key
-
-
-def shorten(text: str) -> str:
-    """The beginning of what a text of any length says."""
-    return text if len(text) <= _READABLE else f"{text[:_READABLE]}..."
 
 
 def parse_toml(text: str) -> dict[str, object]:

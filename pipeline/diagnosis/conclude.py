@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pipeline.diagnosis import leftover
+from pipeline.diagnosis import residual_structure
 from pipeline.diagnosis.diagnosis import Named, RunDiagnosis
+from pipeline.diagnosis.error_regions import map_errors, pick_regions
 from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.naming_rules import join_classes, list_equivalents
-from pipeline.diagnosis.own_way import list_values, measure_values, read_gyro_clock, rescale_values
 from pipeline.diagnosis.plausibility import find_implausible
-from pipeline.diagnosis.rating import rate_effects
 from pipeline.diagnosis.unexplained import find_places
-from pipeline.diagnosis.where import map_errors, pick_regions
+from pipeline.diagnosis.values import list_values, read_clock
 from pipeline.identification import Input
 from pipeline.identification.describe import errors_as_json, ladder_as_json
-from pipeline.identification.judgement import note_fit
+from pipeline.identification.judgement import judge_model, note_fit
 from pipeline.identification.ladder import compare_losses
-from pipeline.models import ModelFile, find_effect
+from pipeline.identification.parts import BodyPart
+from pipeline.models import Model, ModelFile, find_effect
 from pipeline.models.effect import Late, find_late
 from pipeline.runs import MotionError
 from pipeline.runs.windows import WINDOW_S
@@ -30,14 +32,18 @@ from pipeline.runs.windows import WINDOW_S
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.diagnosis.budget import Budget
+    from pipeline.diagnosis.context import Context
     from pipeline.diagnosis.diagnose import Explored
     from pipeline.diagnosis.diagnosis import Json
-    from pipeline.diagnosis.ground import Ground
     from pipeline.diagnosis.naming_rules import Clocks
-    from pipeline.diagnosis.problem import Problem
     from pipeline.diagnosis.subject import Recording
     from pipeline.identification.judgement import Judgement
-    from pipeline.models import Effect, Timing
+    from pipeline.identification.parts import Part
+    from pipeline.identification.state import State
+    from pipeline.models import Effect
+
+Floats = NDArray[np.float64]
 
 _DRAWS = 400
 _WORTH = 0.01
@@ -57,41 +63,35 @@ def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -
     )
 
 
-def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: Clocks) -> RunDiagnosis:
+def summarize(context: Context, source: Input, ways: Sequence[Explored], clocks: Clocks) -> RunDiagnosis:
     """What is common to the runs that were judged together."""
     body = ways[0]
     undecided = [item for way in ways for item in way.undecided if not is_term(item.candidates[0])]
     undecided += clocks.undecided
     open_ids = {item.candidates[0] for item in undecided}
     found = _gather(ways, clocks)
-    known = frozenset().union(*(way.search.arena.kept for way in ways))
-    timing = body.search.final.state.timing
+    known = frozenset().union(*(way.search.selection.kept for way in ways))
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
     inputs = tuple(dict.fromkeys((source, Input(body.search.way))))
-    judgements = _rate_ways(ground, inputs, [*found, *terms], timing)
+    judgements = _judge_ways(context, inputs, [*found, *terms], open_ids)
     idle = [e for e in _find_idle(found, ways, judgements.get(source.value)) if e.id not in known]
     if idle:
         found = [effect for effect in found if effect not in idle]
         # From measured wheels the drivetrain's effects were not in it.
-        judgements |= _rate_ways(ground, [source], [*found, *terms], timing)
+        judgements |= _judge_ways(context, [source], [*found, *terms], open_ids)
     judgement = judgements.get(source.value)
-    unexplained = leftover.describe(ways)
+    unexplained = residual_structure.describe(ways)
     described = tuple(
-        _describe(effect, ground, ways, judgements, open_ids)
+        _describe(effect, context, ways, judgement)
         for effect in _order(found, judgement)
         if not effect.searched_as & open_ids and effect.id not in known
     )
     named = tuple(effect for effect in described if _doubt(effect) is None)
-    named = leftover.mark_tentative(_mark_idle(named, judgements), ways, unexplained)
-    problem: Problem = body.search.arena.problem
-    start = body.search.start
-    comparisons = ground.compare(source)
-    residual = start.fitted.residual
-    if source.value != body.search.way:
-        problem = ground.pose_body(source)
-        residual = problem.find_residuals(start.state)
-    places = np.concatenate([find_places(comparison) for comparison in comparisons])
-    regions = map_errors(problem, residual, places)
+    named = residual_structure.mark_tentative(_mark_idle(named, judgements), ways, unexplained)
+    part, start = context.problem.whole, body.search.start
+    residual = part.find_residuals(start.state)
+    places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
+    regions = map_errors(part, residual, places)
     hidden = {name for item in undecided for name in item.candidates} | {effect.id for effect in found}
     hidden |= set().union(*(effect.searched_as for effect in found))
     unobservable = {u.id: u for way in ways for u in way.unobservable if u.id not in hidden}
@@ -100,30 +100,33 @@ def summarize(ground: Ground, source: Input, ways: Sequence[Explored], clocks: C
     return RunDiagnosis(
         run="",
         input=source.value,
-        joint=tuple(run.name for run in ground.runs),
+        joint=tuple(run.name for run in context.runs),
         effects=named,
         undecided=tuple(undecided),
         unobservable=tuple(unobservable.values()),
         unexplained=unexplained,
-        findings=(*_note_doubts(described), *(_note_idle(effect) for effect in idle)),
+        findings=(
+            *_note_cut(body.search.selection.budget),
+            *_note_doubts(described),
+            *(_note_idle(effect) for effect in idle),
+        ),
         ladder=() if judgement is None else tuple(_rungs(judgement)),
         noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
         explained_share=math.nan if last is None else last,
         regions=tuple(regions),
-        where=tuple(pick_regions(regions, residual, body.search.arena.noise[: residual.shape[0]])),
+        where=tuple(pick_regions(regions, residual, part.noise)),
         timing={"runs": cast("Json", list(clocks.timing))},
         by_way=_describe_ways(ways, source, judgements.get("measured")),
-        consistency=_compare_ways(named, judgement) if len(ways) > 1 else {},
-        disturbance=leftover.describe_disturbance(body, unexplained),
+        disturbance=residual_structure.describe_disturbance(body, unexplained),
         proposal=None if judgement is None else note_fit(ModelFile(judgement.fitted.model), judgement),
     )
 
 
-def of_run(common: RunDiagnosis, recording: Recording, number: int, ground: Ground) -> RunDiagnosis:
+def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Context) -> RunDiagnosis:
     """The common diagnosis with one run's own name, findings and delays."""
     findings = list(common.findings)
     findings += [cast("Mapping[str, Json]", f) for f in recording.list_findings()]
-    findings += _note_brevity(ground, common)
+    findings += _note_brevity(context, common)
     runs = cast("Sequence[Mapping[str, Json]]", common.timing["runs"])
     return replace(common, run=recording.name, findings=tuple(findings), timing=runs[number])
 
@@ -143,12 +146,12 @@ def _note_doubts(described: Sequence[Named]) -> list[Mapping[str, Json]]:
     ]
 
 
-def _note_brevity(ground: Ground, common: RunDiagnosis) -> list[Mapping[str, Json]]:
+def _note_brevity(context: Context, common: RunDiagnosis) -> list[Mapping[str, Json]]:
     """A word where there was less driving than names can be trusted on."""
     least, words = _LEAST_DRIVING_S[common.input]
     driven = sum(
         float(np.minimum(np.diff(comparison.windows.times[:, 0], append=np.inf), WINDOW_S).sum())
-        for comparison in ground.compare(Input(common.input))
+        for comparison in context.problem.comparisons
     )
     if driven >= least:
         return []
@@ -157,6 +160,17 @@ def _note_brevity(ground: Ground, common: RunDiagnosis) -> list[Mapping[str, Jso
         "with turns and speeds of both signs"
     )
     return [{"id": "little_driving", "text": text, "where": "diagnosis", "severity": "warning"}]
+
+
+def _note_cut(budget: Budget) -> list[Mapping[str, Json]]:
+    """A word where the search was ended before it had come to its own end."""
+    if not budget.was_cut:
+        return []
+    text = (
+        f"the search was cut after {budget.seconds:g} s of CPU: this is the best answer so far, and other "
+        f"explanations of it were not all tried (--budget {2.0 * budget.seconds:g}s lets it go on)"
+    )
+    return [{"id": "search_cut", "text": text, "where": "diagnosis", "severity": "warning"}]
 
 
 def _note_idle(effect: Effect) -> Mapping[str, Json]:
@@ -177,45 +191,54 @@ def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
     return sorted(joined, key=lambda effect: (effect.place, effect.rank, effect.id))
 
 
-def _rate_ways(
-    ground: Ground, inputs: Sequence[Input], effects: Sequence[Effect], timing: Sequence[Timing]
+def _judge_ways(
+    context: Context, inputs: Sequence[Input], effects: Sequence[Effect], open_ids: set[str]
 ) -> dict[str, Judgement]:
-    """The model judged from each input to the body."""
+    """The model of these effects judged from each input to the body.
+
+    What was put right when the recordings were aligned is no part of it, nor is what is one explanation of
+    several for the numbers of others: they are told as if it were not there.
+    """
+    kept = [
+        effect
+        for effect in effects
+        if not _was_aligned(effect, context)
+        and not (effect.id in open_ids and any(other.depends_on(effect) for other in effects))
+    ]
     found = {}
     for source in inputs:
-        try:
-            found[source.value] = rate_effects(ground, source, effects, timing)
-        except MotionError:
-            continue
+        problem = context.problem if source is context.problem.source else context.problem.behind_wheels
+        with contextlib.suppress(MotionError):
+            found[source.value] = judge_model(problem, Model(context.vehicle, tuple(kept)))
     return found
+
+
+def _was_aligned(effect: Effect, context: Context) -> bool:
+    """Whether an effect says what the gyro had put right before any model was fitted."""
+    return effect.late is Late.POSES and context.has_gyro
 
 
 def _describe(
     effect: Effect,
-    ground: Ground,
+    context: Context,
     ways: Sequence[Explored],
-    judgements: Mapping[str, Judgement],
-    open_ids: set[str],
+    judgement: Judgement | None,
 ) -> Named:
     way = _way_of(effect, ways)
     gain, selected = _measure_gain(effect, way)
-    judgement = judgements.get(way.search.way)
-    if effect.late is Late.POSES and ground.has_gyro:
-        values = read_gyro_clock(effect, [delay for delay in ground.yaw_delays if delay is not None])
+    if _was_aligned(effect, context):
+        values = read_clock(effect, context.runs)
     elif judgement is not None and effect.id in judgement.fitted.model:
         values = list_values(judgement.fitted.model.effect(effect.id), judgement.estimates)
-        # What is one explanation of several is left out of the numbers of the others.
-        for other in judgement.fitted.model.keep(open_ids):
-            values = rescale_values(values, effect.scale_without(other))
     else:
-        values = measure_values(effect, way.search)
+        values = list_values(effect, None)
     return Named(
         id=effect.id,
         parameters=values,
         gain=gain,
-        equivalent_to=list_equivalents(effect, ground),
+        equivalent_to=list_equivalents(effect, context),
         confused_with=effect.confused_with,
-        corrected=effect.late in _CLOCKS and ground.has_gyro,
+        corrected=_was_aligned(effect, context),
         way=way.search.way,
         selected=selected,
     )
@@ -280,25 +303,26 @@ def _way_of(effect: Effect, ways: Sequence[Explored]) -> Explored:
 
 def _measure_gain(effect: Effect, way: Explored) -> tuple[float, float]:
     """Relative rise of the held-out loss without an effect, and how often that is worth a name."""
-    arena, final = way.search.arena, way.search.final
+    selection, final = way.search.selection, way.search.final
     names = effect.searched_as & set(final.ids)
     clock = find_late(final.state.effects, Late.POSES)
     if effect.late in _CLOCKS and not names and clock is not None:
         names = frozenset({clock.id})
-    if effect.late is Late.POSES and not names:
-        state = replace(
-            final.state, timing=tuple(replace(one, pose_delay_s=0.0) for one in final.state.timing)
-        )
-        without = arena.enter(state)
-    else:
-        without = arena.drop(final, names)
-    metric, unit = arena.metric, arena.problem.unit
-    before = np.bincount(unit, metric.cost(without.held))
-    after = np.bincount(unit, metric.cost(final.held))
+    held = selection.drop(final, names).held if names else _delay_poses(selection.part, final.state)
+    before = np.bincount(selection.part.unit, selection.weights.cost(held))
+    after = np.bincount(selection.part.unit, selection.weights.cost(final.held))
     gain = float(before.sum()) / max(float(after.sum()), 1e-12) - 1.0
     draws = np.random.default_rng(0).integers(0, before.size, (_DRAWS, before.size))
     falls = 1.0 - after[draws].sum(axis=1) / np.maximum(before[draws].sum(axis=1), 1e-12)
     return gain, float(np.mean(falls >= _WORTH))
+
+
+def _delay_poses(part: Part, state: State) -> Floats:
+    """Residuals of poses that stand where they were stamped, before they were aligned."""
+    if not isinstance(part, BodyPart):
+        return part.find_residuals(state)
+    delays = [comparison.run.alignment.heading_delay_s for comparison in part.comparisons]
+    return np.concatenate([part.shift_clock(state, run, -late) for run, late in enumerate(delays)])
 
 
 def _rungs(judgement: Judgement) -> list[Mapping[str, Json]]:
@@ -336,21 +360,3 @@ def _describe_ways(ways: Sequence[Explored], source: Input, measured: Judgement 
         ],
     }
     return described
-
-
-def _compare_ways(named: Sequence[Named], judgement: Judgement | None) -> dict[str, Json]:
-    """Values found on an effect's own way against those of the whole way from command to body."""
-    compared: dict[str, Json] = {}
-    by_id = {effect.id: effect for effect in named}
-    for item in () if judgement is None else judgement.estimates.items:
-        effect = by_id.get(item.free.effect)
-        value = None if effect is None else effect.parameters.get(item.free.name)
-        if value is None or not math.isfinite(item.standard_error):
-            continue
-        span = max(3.0 * item.standard_error, 0.05 * abs(item.value))
-        compared[item.free.label] = {
-            "on_its_way": round(value.value, 6),
-            "command_to_body": round(item.value, 6),
-            "agrees": abs(value.value - item.value) <= span,
-        }
-    return compared

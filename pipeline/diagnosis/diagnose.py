@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.diagnosis import conclude
+from pipeline.diagnosis.budget import Budget, usual_budget
+from pipeline.diagnosis.context import prepare
 from pipeline.diagnosis.diagnosis import Diagnosis, RunDiagnosis
-from pipeline.diagnosis.errors import DiagnosisError
 from pipeline.diagnosis.excitation import find_unobservable
-from pipeline.diagnosis.ground import prepare
 from pipeline.diagnosis.naming import Search, search_body, search_wheels
 from pipeline.diagnosis.naming_rules import Clocks, read_clocks
 from pipeline.diagnosis.subject import FATAL, load_recording
@@ -26,10 +26,10 @@ from pipeline.diagnosis.unexplained import (
 from pipeline.identification import Input, choose_input
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
+    from pipeline.diagnosis.context import Context
     from pipeline.diagnosis.excitation import Unobservable
-    from pipeline.diagnosis.ground import Ground
     from pipeline.diagnosis.subject import Recording
     from pipeline.diagnosis.undecided import Undecided
     from pipeline.identification import InputChoice
@@ -60,6 +60,8 @@ def diagnose_runs(
     *,
     inputs: Sequence[str] = ("command", "measured"),
     model: Model | None = None,
+    budget_s: float | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Say which physical effects are missing from the model of one run, or of several of one vehicle jointly.
 
@@ -69,6 +71,8 @@ def diagnose_runs(
         inputs: `command`, `measured` or both; with both, the command leads and the wheels serve to tell the
             drivetrain from the ground.
         model: what is known already; what is missing beyond it is said. The ideal model when None.
+        budget_s: CPU time that the search may take [s]; by default a minute for ten minutes of driving.
+        tell: told what was found so far.
 
     Returns:
         One diagnosis a run; runs that were judged together share their effects.
@@ -81,73 +85,67 @@ def diagnose_runs(
     if fatal:
         return Diagnosis(tuple(conclude.refuse(recording, leading, recordings) for recording in recordings))
     runs = [load_recording(recording, vehicle) for recording in recordings]
-    vehicle = runs[0].correct_vehicle(vehicle)
-    ground = prepare(runs, vehicle)
     known = () if model is None else model.effects
-    chosen = choose_input(ground.runs, inputs[0] if len(inputs) == 1 else None, known)
-    leading = chosen.source.value
-    if not ground.compare(chosen.source):
-        other = "measured" if leading == "command" else "command"
-        raise DiagnosisError(
-            "no_input",
-            f"there is no {'command' if leading == 'command' else 'measured wheel'} to diagnose from",
-            where=", ".join(run.name for run in ground.runs),
-            hint=f"Try --input {other}.",
-        )
-    ways, clocks = _explore(ground, leading, known)
-    return _conclude(recordings, ground, chosen, ways, clocks)
+    chosen = choose_input(runs, inputs[0] if len(inputs) == 1 else None, known)
+    context = prepare(runs, vehicle, chosen.source)
+    driven = sum(run.duration_s for run in runs)
+    budget = Budget(usual_budget(driven) if budget_s is None else budget_s, tell)
+    ways, clocks = _explore(context, chosen.source, known, budget)
+    return _conclude(recordings, context, chosen, ways, clocks)
 
 
-def _explore(ground: Ground, leading: str, known: Sequence[Effect]) -> tuple[list[Explored], Clocks]:
+def _explore(
+    context: Context, source: Input, known: Sequence[Effect], budget: Budget
+) -> tuple[list[Explored], Clocks]:
     """All ways that the recording opens: the ground alone and the drivetrain alone, or both at once."""
-    if leading == "measured" or ground.measured:
-        body = _explore_body(ground, Input.MEASURED, known)
+    if source is Input.MEASURED or context.has_encoders:
+        body = _explore_body(context, Input.MEASURED, known, budget)
         ways = [body]
-        if leading == "command":
-            ways.append(_explore_wheels(ground, known, body.search))
+        if source is Input.COMMAND:
+            ways.append(_explore_wheels(context, known, body.search, budget))
     else:
-        body = _explore_body(ground, Input.COMMAND, known)
+        body = _explore_body(context, Input.COMMAND, known, budget)
         ways = [body]
-    return ways, read_clocks(ground, body.search)
+    return ways, read_clocks(context, body.search)
 
 
-def _explore_body(ground: Ground, source: Input, known: Sequence[Effect]) -> Explored:
-    found = search_body(ground, source, known)
-    comparisons = ground.compare(source)
+def _explore_body(context: Context, source: Input, known: Sequence[Effect], budget: Budget) -> Explored:
+    found = search_body(context, source, known, budget)
+    comparisons = found.selection.part.comparisons
     places = np.concatenate([find_places(comparison) for comparison in comparisons])
-    final = search_formula(found.arena, found.start, found.final, places)
+    final = search_formula(found.selection, found.start, found.final, places)
     features, _ = describe_windows(comparisons)
-    explainable = boost_residuals(found.arena, final, features)
+    explainable = boost_residuals(found.selection, final, features)
     found = replace(found, final=final)
     return Explored(
         found,
-        tuple(find_undecided(found.arena, final)),
-        tuple(find_unobservable(found.arena, final)),
+        tuple(find_undecided(found.selection, final)),
+        tuple(find_unobservable(found.selection, final)),
         explainable,
     )
 
 
-def _explore_wheels(ground: Ground, known: Sequence[Effect], body: Search) -> Explored:
-    found = search_wheels(ground, known, body)
+def _explore_wheels(context: Context, known: Sequence[Effect], body: Search, budget: Budget) -> Explored:
+    found = search_wheels(context, known, body, budget)
     return Explored(
         found,
-        tuple(find_undecided(found.arena, found.final)),
-        tuple(find_unobservable(found.arena, found.final)),
+        tuple(find_undecided(found.selection, found.final)),
+        tuple(find_unobservable(found.selection, found.final)),
         None,
     )
 
 
 def _conclude(
     recordings: Sequence[Recording],
-    ground: Ground,
+    context: Context,
     chosen: InputChoice,
     ways: Sequence[Explored],
     clocks: Clocks,
 ) -> Diagnosis:
-    common: RunDiagnosis = conclude.summarize(ground, chosen.source, ways, clocks)
+    common: RunDiagnosis = conclude.summarize(context, chosen.source, ways, clocks)
     common = replace(common, input_reason=chosen.reason)
     return Diagnosis(
         tuple(
-            conclude.of_run(common, recording, number, ground) for number, recording in enumerate(recordings)
+            conclude.of_run(common, recording, number, context) for number, recording in enumerate(recordings)
         )
     )

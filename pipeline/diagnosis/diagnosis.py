@@ -7,16 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
-from pipeline.diagnosis.where import tabulate_regions
-from pipeline.identification.intervals import stands_at_bound
-from pipeline.models import find_effect
+from pipeline.diagnosis.error_regions import tabulate_regions
+from pipeline.models.model_text import format_model
 
 if TYPE_CHECKING:
     import polars as pl
 
+    from pipeline.diagnosis.error_regions import Region
     from pipeline.diagnosis.excitation import Unobservable
     from pipeline.diagnosis.undecided import Undecided
-    from pipeline.diagnosis.where import Region
     from pipeline.models import ModelFile
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
@@ -26,12 +25,13 @@ _DIGITS = 6
 
 @dataclass(frozen=True)
 class Value:
-    """A number with its 95 % interval; NaN where there is none."""
+    """A number with its 95 % interval, NaN where there is none, and whether it may go no further."""
 
     value: float
     low: float
     high: float
     unit: str
+    at_bound: bool = False
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Named:
         gain: relative rise of the held-out loss when it alone is dropped.
         equivalent_to: other names of the same thing.
         confused_with: what it looks like at first order.
-        corrected: whether it is a timing error that was corrected before anything else was judged.
+        corrected: whether it is a clock that was put right before any model: no effect of the written one.
         way: on which way it was found: `command`, `measured` or `wheels`.
         selected: share of resampled recordings in which it is still worth its place.
         tentative: far more structure stays in its channel than it explains; or it lowers no error on its own
@@ -66,7 +66,13 @@ class Named:
         return {
             "id": self.id,
             "parameters": {
-                name: {"value": _clean(v.value), "low": _clean(v.low), "high": _clean(v.high), "unit": v.unit}
+                name: {
+                    "value": _clean(v.value),
+                    "low": _clean(v.low),
+                    "high": _clean(v.high),
+                    "unit": v.unit,
+                    "at_bound": v.at_bound,
+                }
                 for name, v in self.parameters.items()
             },
             "gain": _clean(self.gain),
@@ -137,7 +143,6 @@ class RunDiagnosis:
         where: the few that carry most of it.
         timing: delays, and whose heading was used.
         by_way: ladders of the drivetrain and of the ground apart, where there are encoders.
-        consistency: whether the ways agree.
         disturbance: rms of what is left in x, y, w, and the part of it that lasts for seconds.
         proposal: model file with what was named, fitted; None where nothing could be judged.
     """
@@ -158,7 +163,6 @@ class RunDiagnosis:
     where: tuple[Region, ...] = ()
     timing: Mapping[str, Json] = field(default_factory=dict)
     by_way: Mapping[str, Json] = field(default_factory=dict)
-    consistency: Mapping[str, Json] = field(default_factory=dict)
     disturbance: Mapping[str, Json] = field(default_factory=dict)
     proposal: ModelFile | None = None
 
@@ -197,8 +201,8 @@ class RunDiagnosis:
             ],
             "timing": dict(self.timing),
             "by_way": dict(self.by_way),
-            "consistency": dict(self.consistency),
             "disturbance": dict(self.disturbance),
+            "model": None if self.proposal is None else format_model(self.proposal),
         }
 
 
@@ -242,7 +246,7 @@ class Diagnosis:
                 "low": _clean(value.low),
                 "high": _clean(value.high),
                 "unit": value.unit,
-                "at_bound": stands_at_bound(value.value, find_effect(effect.id)().parameter(name).bounds),
+                "at_bound": value.at_bound,
             }
             for item in self.runs
             if item.run == run

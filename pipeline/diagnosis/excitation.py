@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.diagnosis.judge import LEAST_STRETCHES, SHORT_S
-from pipeline.diagnosis.problem import number_units
+from pipeline.diagnosis.verdict import LEAST_STRETCHES, SHORT_S
+from pipeline.identification.parts import number_units
 from pipeline.models.effect import Excitation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.diagnosis.arena import Arena, Contender
-    from pipeline.diagnosis.screen import Candidate
+    from pipeline.diagnosis.selection import CandidateModel, Selection
+    from pipeline.identification.proposals import Candidate
     from pipeline.models.effect import Effect
 
 Floats = NDArray[np.float64]
@@ -51,18 +51,18 @@ class Unobservable:
     manoeuvre: str
 
 
-def find_unobservable(arena: Arena, final: Contender) -> list[Unobservable]:
+def find_unobservable(selection: Selection, final: CandidateModel) -> list[Unobservable]:
     """Candidates of which a usual size would move the prediction by less than four standard errors.
 
     Neither can be told what shows but once: an event of its own would look the same.
     """
     found = []
-    for candidate in arena.candidates:
+    for candidate in selection.candidates:
         if final.state.find(candidate.id) is not None:
             continue
-        column = _shift(arena, final, candidate)
-        alone, beside = _evidence(arena, final, column)
-        rare = _count_stretches(arena, column) < LEAST_STRETCHES
+        column = _shift(selection, final, candidate)
+        alone, beside = _evidence(selection, final, column)
+        rare = _count_stretches(selection, column) < LEAST_STRETCHES
         if beside >= _STANDARD_ERRORS and not rare:
             continue
         reason: Literal["no excitation", "collinear with what was named"] = (
@@ -80,41 +80,41 @@ def suggest_manoeuvre(*effects: Effect) -> str:
     return "; ".join(MANOEUVRES[need] for need in needs[:3])
 
 
-def _shift(arena: Arena, final: Contender, candidate: Candidate) -> Floats:
-    changed = arena.problem.find_residuals(final.state.add(candidate().make_usual(arena.largest)))
-    shift: Floats = final.fitted.residual - changed
+def _shift(selection: Selection, final: CandidateModel, candidate: Candidate) -> Floats:
+    changed = selection.part.find_residuals(final.state.add(candidate().make_usual(selection.largest)))
+    shift: Floats = final.fit.residual - changed
     return shift
 
 
-def _evidence(arena: Arena, final: Contender, shift: Floats) -> tuple[float, float]:
+def _evidence(selection: Selection, final: CandidateModel, shift: Floats) -> tuple[float, float]:
     """How many standard errors the shift is, alone and beside the model's own numbers."""
-    fitted, metric = final.fitted, arena.metric
-    factor = metric.weights(fitted.residual)
+    fit, weights = final.fit, selection.weights
+    factor = weights.factors(fit.residual)
     column = shift * factor
     beside = column
-    if fitted.slots:
-        rows = (fitted.jacobian * factor[:, :, None]).reshape(-1, len(fitted.slots))
+    if fit.free:
+        rows = (fit.jacobian * factor[:, :, None]).reshape(-1, len(fit.free))
         solution = np.linalg.lstsq(rows, column.reshape(-1), rcond=1e-8)[0]
         beside = (column.reshape(-1) - rows @ solution).reshape(column.shape)
-    rest = metric.weigh(fitted.residual)
-    noise = _inflation(rest, arena)
+    rest = weights.weigh(fit.residual)
+    noise = _inflation(rest, selection)
     return tuple(float(np.sqrt(np.sum(c**2) / noise)) for c in (column, beside))  # type: ignore[return-value]
 
 
-def _count_stretches(arena: Arena, shift: Floats) -> float:
+def _count_stretches(selection: Selection, shift: Floats) -> float:
     """Number of short stretches over which a shift of the prediction is spread."""
-    moved = ((shift / arena.metric.scale) ** 2).sum(axis=1)
-    stretch = number_units(arena.problem.run, arena.problem.times, SHORT_S)
+    moved = ((shift / selection.weights.scale) ** 2).sum(axis=1)
+    stretch = number_units(selection.part.run, selection.part.times, SHORT_S)
     action = np.bincount(stretch, moved)
     power = float(np.sum(action**2))
     return float(action.sum()) ** 2 / power if power > 0.0 else 0.0
 
 
-def _inflation(rest: Floats, arena: Arena) -> float:
+def _inflation(rest: Floats, selection: Selection) -> float:
     """Variance of weighted residuals times the number of neighbours that repeat them."""
     largest = 0.0
-    for channel in arena.problem.channels:
-        values = np.clip(rest[arena.problem.live, channel], -3.0, 3.0)
+    for channel in selection.part.channels:
+        values = np.clip(rest[selection.part.live, channel], -3.0, 3.0)
         total = float(np.mean(values**2))
         for lag in range(1, 8):
             total += 2.0 * max(float(np.mean(values[lag:] * values[:-lag])), 0.0)

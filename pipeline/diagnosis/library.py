@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.diagnosis.screen import TERM
+from pipeline.identification.proposals import TERM
 from pipeline.models.effect import ANY, Parameter, Search
 from pipeline.models.formula.formula_effect import FormulaEffect
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.diagnosis.arena import Arena, Contender
+    from pipeline.diagnosis.selection import CandidateModel, Selection
 
 Floats = NDArray[np.float64]
 
@@ -126,17 +126,19 @@ def _divide(one: str, other: str) -> str:
     return table[one, other]
 
 
-def list_waves(arena: Arena, final: Contender, places: Floats, mark: str = "") -> tuple[Term, ...]:
+def list_waves(
+    selection: Selection, final: CandidateModel, places: Floats, mark: str = ""
+) -> tuple[Term, ...]:
     """Terms that repeat along the map's axes, with the wave numbers that fit the residuals best.
 
     Args:
-        arena: where models are judged.
+        selection: where models are judged.
         final: the model so far.
         places: x, y [m] in the map at every window, shape (n, 2).
         mark: tells terms of several models apart.
     """
-    lags = arena.problem.find_ideal()[:, 0, :]
-    rest = arena.metric.weigh(final.fitted.residual)
+    lags = selection.part.find_ideal()[:, 0, :]
+    rest = selection.weights.weigh(final.fit.residual)
     found = []
     for channel, name in enumerate(CHANNELS):
         for axis, place in zip("xy", places.T, strict=True):

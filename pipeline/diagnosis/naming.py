@@ -9,17 +9,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from pipeline.diagnosis.arena import open_arena
 from pipeline.diagnosis.search import search_effects
-from pipeline.diagnosis.state import State
+from pipeline.diagnosis.selection import open_selection
 from pipeline.identification.comparison import Input
+from pipeline.identification.state import State
 from pipeline.models.effect import Place
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.diagnosis.arena import Arena, Contender
-    from pipeline.diagnosis.ground import Ground
+    from pipeline.diagnosis.budget import Budget
+    from pipeline.diagnosis.context import Context
+    from pipeline.diagnosis.selection import CandidateModel, Selection
     from pipeline.models.effect import Effect
 
 _LEAST_SHARE = 0.01
@@ -33,35 +34,37 @@ class Search:
 
     Attributes:
         way: `command` to body, `measured` wheels to body, or command to `wheels`.
-        arena: where the models were judged.
+        selection: where the models were judged.
         start: the model to start from, fitted.
         final: the model that no move improves, fitted.
     """
 
     way: Way
-    arena: Arena
-    start: Contender
-    final: Contender
+    selection: Selection
+    start: CandidateModel
+    final: CandidateModel
 
     @property
     def new(self) -> tuple[str, ...]:
         """Ids of the effects that were found."""
-        return tuple(name for name in self.final.ids if name not in self.arena.kept)
+        return tuple(name for name in self.final.ids if name not in self.selection.kept)
 
 
-def search_body(ground: Ground, source: Input, known: Sequence[Effect]) -> Search:
+def search_body(context: Context, source: Input, known: Sequence[Effect], budget: Budget) -> Search:
     """Search from an input to the body."""
     usable = [e for e in known if source is Input.COMMAND or e.place > Place.DRIVE]
-    start = State((), ground.start_timing()).add(*usable)
-    candidates = ground.list_candidates(source)
-    arena, first = open_arena(ground.pose_body(source), start, candidates, ground.evidence)
-    return Search(source.value, arena, first, search_effects(arena, first))
+    start = State((), context.timing).add(*usable)
+    candidates = context.list_candidates(source)
+    problem = context.problem.behind_wheels if source is Input.MEASURED else context.problem
+    selection, first = open_selection(problem.whole, start, candidates, context.evidence, budget)
+    return Search(source.value, selection, first, search_effects(selection, first))
 
 
-def search_wheels(ground: Ground, known: Sequence[Effect], body: Search) -> Search:
+def search_wheels(context: Context, known: Sequence[Effect], body: Search, budget: Budget) -> Search:
     """Search from command to wheels, the encoders' own delay taken from the way to the body."""
     usable = [e for e in known if e.place <= Place.DRIVE]
     start = State((), body.final.state.timing).add(*usable)
-    arena, first = open_arena(ground.pose_wheels(), start, ground.list_drivetrain(), ground.evidence)
-    arena.least_share = _LEAST_SHARE
-    return Search("wheels", arena, first, search_effects(arena, first))
+    part, candidates = context.problem.parts[1], context.list_drivetrain()
+    selection, first = open_selection(part, start, candidates, context.evidence, budget)
+    selection.least_share = _LEAST_SHARE
+    return Search("wheels", selection, first, search_effects(selection, first))

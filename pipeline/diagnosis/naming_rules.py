@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.diagnosis.context import is_late
 from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.diagnosis.undecided import Undecided
 from pipeline.models.catalogue import find_late_effect, list_effects
@@ -16,7 +17,7 @@ from pipeline.models.evidence import LEAST_DELAY_S
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.diagnosis.ground import Ground
+    from pipeline.diagnosis.context import Context
     from pipeline.diagnosis.naming import Search
     from pipeline.models.effect import Effect
 
@@ -39,35 +40,36 @@ class Clocks:
     undecided: tuple[Undecided, ...] = ()
 
 
-def read_clocks(ground: Ground, body: Search) -> Clocks:
+def read_clocks(context: Context, body: Search) -> Clocks:
     """Name clocks: with a gyro the delays of heading and position are known apart."""
     state = body.final.state
     extra = find_late(state.effects, Late.POSES)
     more = extra.delay if extra is not None else 0.0
     rows, positions, certain = [], [], []
-    for timing, yaw in zip(state.timing, ground.yaw_delays, strict=True):
-        late = timing.pose_delay_s + more
+    for timing, run in zip(state.timing, context.runs, strict=True):
+        yaw = run.alignment.heading_delay_s
+        late = yaw + more
         positions.append(late)
-        certain.append(yaw is not None and yaw.is_certain)
+        certain.append(is_late(run))
         rows.append(
             {
-                "heading": "gyro" if yaw is not None else "pose",
+                "heading": "gyro" if run.gyro_fit is not None else "pose",
                 "pose_delay_s": round(late, 4),
-                "yaw_delay_s": None if yaw is None else round(yaw.seconds, 4),
+                "yaw_delay_s": None if run.gyro_fit is None else round(yaw, 4),
                 "wheel_delay_s": round(timing.wheel_delay_s, 4) if body.way == "measured" else None,
             }
         )
     found: list[Effect] = []
     late = float(np.mean(positions))
     # A heading that is older than its position is known; the other way round it is a late position.
-    skewed = extra is not None and ground.has_gyro and more < 0.0
+    skewed = extra is not None and context.has_gyro and more < 0.0
     if skewed:
         found.append(find_late_effect(Late.HEADING).of_delay(-more))
-    least = max(LEAST_DELAY_S, _SKEWED_CLOCK if skewed else 0.0, _held_delay(ground))
-    known = extra is not None if not ground.has_gyro else all(certain)
+    least = max(LEAST_DELAY_S, _SKEWED_CLOCK if skewed else 0.0, _held_delay(context))
+    known = extra is not None if not context.has_gyro else all(certain)
     if known and abs(late) >= least:
         clock = find_late_effect(Late.POSES).of_delay(late)
-        if ground.has_gyro and not ground.largest.moves_both_ways:
+        if context.has_gyro and not context.largest.moves_both_ways:
             # The gyro dates the heading; only driving and turning at once tie the position's clock to it.
             skew = find_late_effect(Late.HEADING)()
             pair = Undecided((clock.id, skew.id), suggest_manoeuvre(clock, skew))
@@ -76,10 +78,10 @@ def read_clocks(ground: Ground, body: Search) -> Clocks:
     return Clocks(tuple(found), tuple(rows))
 
 
-def _held_delay(ground: Ground) -> float:
+def _held_delay(context: Context) -> float:
     """Half the time that a held pose may be old: no clock offset can be named below it."""
     delay = 0.0
-    for run in ground.runs:
+    for run in context.runs:
         fresh = float(np.median(np.diff(run.track.times)))
         raw = float(np.median(np.diff(run.streams))) if run.streams.size > 1 else fresh
         if fresh > (1.0 + _HELD_SHARE) * raw and fresh > 0.06:  # noqa: PLR2004 - slower than usual poses
@@ -99,6 +101,6 @@ def join_classes(effects: Sequence[Effect]) -> list[Effect]:
     return list(found.values())
 
 
-def list_equivalents(effect: Effect, ground: Ground) -> tuple[str, ...]:
+def list_equivalents(effect: Effect, context: Context) -> tuple[str, ...]:
     """Other names of the same thing, as far as this recording goes."""
-    return effect.equivalent_to if effect.is_equivalent(ground.evidence) else ()
+    return effect.equivalent_to if effect.is_equivalent(context.evidence) else ()

@@ -5,10 +5,10 @@ from __future__ import annotations
 from itertools import combinations
 from typing import TYPE_CHECKING
 
-from pipeline.diagnosis.judge import LEAST_GAIN
+from pipeline.diagnosis.verdict import LEAST_GAIN
 
 if TYPE_CHECKING:
-    from pipeline.diagnosis.arena import Arena, Contender
+    from pipeline.diagnosis.selection import CandidateModel, Selection
 
 _TRIED = 4
 _SWAPPED = 2
@@ -21,113 +21,113 @@ _MOST_WORK = 16
 _MOST_SPLIT = 3
 
 
-def search_effects(arena: Arena, start: Contender) -> Contender:
+def search_effects(selection: Selection, start: CandidateModel) -> CandidateModel:
     """Name what is missing.
 
     Args:
-        arena: where models are judged.
+        selection: where models are judged.
         start: the model to start from, fitted.
 
     Returns:
         The model that no move improves.
     """
-    current = grow(arena, start)
+    current = grow(selection, start)
     for _ in range(_ROUNDS):
-        if arena.work > _MOST_WORK:
+        if selection.is_done(_MOST_WORK):
             return current
-        moved = _swap(arena, current) or _join(arena, current) or _split(arena, current)
+        moved = _swap(selection, current) or _join(selection, current) or _split(selection, current)
         if moved is None:
             return current
-        current = grow(arena, prune(arena, arena.adapt(moved)))
+        current = grow(selection, prune(selection, selection.adapt(moved)))
     return current
 
 
-def grow(arena: Arena, current: Contender) -> Contender:
+def grow(selection: Selection, current: CandidateModel) -> CandidateModel:
     """Add effects while one is accepted, dropping what has become superfluous."""
-    while len(current.ids) < _MOST_EFFECTS:
-        added = _add(arena, current)
+    while len(current.ids) < _MOST_EFFECTS and not selection.budget.is_spent():
+        added = _add(selection, current)
         if added is None:
             return current
-        current = prune(arena, arena.adapt(added))
+        current = prune(selection, selection.adapt(added))
     return current
 
 
-def _add(arena: Arena, current: Contender) -> Contender | None:
-    for contender in arena.suggest(current, _TRIED):
-        least = price_of(contender, current)
-        if contender.score < current.score and arena.prefers(current, contender, least):
-            return contender
+def _add(selection: Selection, current: CandidateModel) -> CandidateModel | None:
+    for tested in selection.suggest(current, _TRIED):
+        least = price_of(tested, current)
+        if tested.score < current.score and selection.prefers(current, tested, least):
+            return tested
     return None
 
 
-def price_of(contender: Contender, other: Contender) -> float:
+def price_of(tested: CandidateModel, other: CandidateModel) -> float:
     """Gain that is asked of a model's additional effects: a change point fits anything a little."""
-    new = (effect for effect in contender.state.effects if effect.id not in other.ids)
+    new = (effect for effect in tested.state.effects if effect.id not in other.ids)
     return max([LEAST_GAIN, *(effect.price for effect in new)])
 
 
-def prune(arena: Arena, current: Contender) -> Contender:
+def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
     """Drop effects whose absence is not missed, the least missed first."""
     while True:
         smaller = []
         for name in current.ids:
-            if name in arena.kept:
+            if name in selection.kept:
                 continue
-            without = arena.drop(current, [name])
+            without = selection.drop(current, [name])
             needed = price_of(current, without)
-            if not arena.prefers(without, current, needed):
+            if not selection.prefers(without, current, needed):
                 smaller.append(without)
         if not smaller:
             return current
-        current = min(smaller, key=lambda contender: contender.score)
+        current = min(smaller, key=lambda tested: tested.score)
 
 
-def _free(arena: Arena, current: Contender) -> list[str]:
-    return [name for name in current.ids if name not in arena.kept]
+def _free(selection: Selection, current: CandidateModel) -> list[str]:
+    return [name for name in current.ids if name not in selection.kept]
 
 
-def _swap(arena: Arena, current: Contender) -> Contender | None:
+def _swap(selection: Selection, current: CandidateModel) -> CandidateModel | None:
     """One effect for another: better, or as good with fewer in the end."""
-    best: Contender | None = None
-    for name in _free(arena, current):
-        if arena.work > _MOST_WORK:
+    best: CandidateModel | None = None
+    for name in _free(selection, current):
+        if selection.is_done(_MOST_WORK):
             return best
-        without = arena.drop(current, [name])
-        for rival in arena.suggest(without, _SWAPPED, without=[name]):
+        without = selection.drop(current, [name])
+        for rival in selection.suggest(without, _SWAPPED, without=[name]):
             if rival.score < (1.0 - _BETTER) * current.score:
                 if best is None or rival.score < best.score:
                     best = rival
             elif rival.score < (1.0 + _TIE) * current.score:
-                pruned = prune(arena, rival)
+                pruned = prune(selection, rival)
                 fewer = len(current.ids) - len(pruned.ids)
                 if fewer > 0 and pruned.score < (1.0 + LEAST_GAIN * fewer) * current.score:
                     return pruned
     return best
 
 
-def _join(arena: Arena, current: Contender) -> Contender | None:
+def _join(selection: Selection, current: CandidateModel) -> CandidateModel | None:
     """One effect in the place of two, or of all that are slow: lags together imitate a delay."""
-    free = _free(arena, current)
+    free = _free(selection, current)
     slow = tuple(effect.id for effect in current.state.effects if effect.is_slow and effect.id in free)
     groups = [*combinations(free, 2), *([slow] if len(slow) > 2 else [])]  # noqa: PLR2004 - pairs are there
     for group in groups:
-        if arena.work > _MOST_WORK:
+        if selection.is_done(_MOST_WORK):
             return None
-        without = arena.drop(current, group)
-        for rival in arena.suggest(without, _SWAPPED, without=group):
+        without = selection.drop(current, group)
+        for rival in selection.suggest(without, _SWAPPED, without=group):
             if rival.score < (1.0 + LEAST_GAIN) * current.score:
                 return rival
     return None
 
 
-def _split(arena: Arena, current: Contender) -> Contender | None:
+def _split(selection: Selection, current: CandidateModel) -> CandidateModel | None:
     """Two effects in the place of one, where the model leaves room for them."""
-    if not arena.has_room(current) or len(current.ids) > _MOST_SPLIT or arena.work > _MOST_WORK:
+    if not selection.has_room(current) or len(current.ids) > _MOST_SPLIT or selection.is_done(_MOST_WORK):
         return None
-    for name in _free(arena, current):
-        without = arena.drop(current, [name])
-        for half in arena.suggest(without, 2, without=[name]):
-            for rival in arena.suggest(half, 2, without=[name]):
-                if rival.score < current.score and arena.prefers(current, rival):
+    for name in _free(selection, current):
+        without = selection.drop(current, [name])
+        for half in selection.suggest(without, 2, without=[name]):
+            for rival in selection.suggest(half, 2, without=[name]):
+                if rival.score < current.score and selection.prefers(current, rival):
                     return rival
     return None

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.diagnosis.excitation import suggest_manoeuvre
 
 if TYPE_CHECKING:
-    from pipeline.diagnosis.arena import Arena, Contender
+    from pipeline.diagnosis.selection import CandidateModel, Selection
     from pipeline.models.effect import Effect
 
 _LOOKED_AT = 6
@@ -35,65 +35,69 @@ class Undecided:
     separate_by: str
 
 
-def find_undecided(arena: Arena, final: Contender) -> list[Undecided]:
+def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecided]:
     """For every effect that was named, the others that would do in its place."""
     found = []
     for effect in final.state.effects:
-        if effect.id in arena.kept:
+        if effect.id in selection.kept or selection.budget.is_spent():
             continue
-        without = arena.drop(final, [effect.id])
+        without = selection.drop(final, [effect.id])
         rivals = [
             rival
-            for rival in arena.suggest(without, _LOOKED_AT, without=[effect.id])
-            if _is_as_good(arena, final, rival) and _does_the_same(arena, without, final, rival)
+            for rival in selection.suggest(without, _LOOKED_AT, without=[effect.id])
+            if _is_as_good(selection, final, rival) and _does_the_same(selection, without, final, rival)
         ]
         names = [name for rival in rivals for name in rival.ids if name not in final.ids]
-        alike = _list_alike(arena, without, final, effect)
+        alike = _list_alike(selection, without, final, effect)
         names += [name for name in alike if name not in names]
-        simple = [name for name in names if name in alike or not _is_larger(arena, name, effect)]
+        simple = [name for name in names if name in alike or not _is_larger(selection, name, effect)]
         if simple:
-            rest = [c() for c in arena.candidates if c.id in names]
+            rest = [c() for c in selection.candidates if c.id in names]
             found.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest)))
     return found
 
 
-def _list_alike(arena: Arena, without: Contender, final: Contender, effect: Effect) -> list[str]:
+def _list_alike(
+    selection: Selection, without: CandidateModel, final: CandidateModel, effect: Effect
+) -> list[str]:
     """What does as well though it has more numbers: a bend for a break, and what only one motion shows."""
-    known = {candidate.id for candidate in arena.candidates}
+    known = {candidate.id for candidate in selection.candidates}
     softer = [
-        (other.id, arena.enter(without.state.add(other)))
-        for other in effect.list_softer(arena.largest)
+        (other.id, selection.enter(without.state.add(other)))
+        for other in effect.list_softer(selection.largest)
         if other.id in known
     ]
     alike = [
         name
         for name, rival in softer
-        if _is_as_good(arena, final, rival)
-        and _does_the_same(arena, without, final, rival)
-        and arena.is_sound(rival)
+        if _is_as_good(selection, final, rival)
+        and _does_the_same(selection, without, final, rival)
+        and selection.is_sound(rival)
     ]
-    same = effect.same_in_one_motion if arena.largest.is_one_motion else ()
+    same = effect.same_in_one_motion if selection.largest.is_one_motion else ()
     return alike + [name for name in same if name in known]
 
 
-def _is_as_good(arena: Arena, final: Contender, rival: Contender) -> bool:
-    if arena.metric.loss(rival.held) < (1.0 + _AS_GOOD) * arena.metric.loss(final.held):
+def _is_as_good(selection: Selection, final: CandidateModel, rival: CandidateModel) -> bool:
+    if selection.weights.loss(rival.held) < (1.0 + _AS_GOOD) * selection.weights.loss(final.held):
         return True
-    verdict = arena.judge(rival, final)
+    verdict = selection.judge(rival, final)
     return verdict.gain < _AS_GOOD or verdict.t < _DECIDED_T or verdict.z < _DECIDED_Z
 
 
-def _does_the_same(arena: Arena, without: Contender, final: Contender, rival: Contender) -> bool:
+def _does_the_same(
+    selection: Selection, without: CandidateModel, final: CandidateModel, rival: CandidateModel
+) -> bool:
     """Whether two effects push the prediction alike: two small ones that do not are no alternatives."""
-    base = without.fitted.residual
-    one = (base - final.fitted.residual) / arena.metric.scale
-    other = (base - rival.fitted.residual) / arena.metric.scale
+    base = without.fit.residual
+    one = (base - final.fit.residual) / selection.weights.scale
+    other = (base - rival.fit.residual) / selection.weights.scale
     size = float(np.sqrt(np.sum(one**2) * np.sum(other**2)))
     return size > 0.0 and float(np.sum(one * other)) > _ALIKE * size
 
 
-def _is_larger(arena: Arena, name: str, effect: Effect) -> bool:
+def _is_larger(selection: Selection, name: str, effect: Effect) -> bool:
     """Whether an effect fits as well only by more numbers, or by holding the other as a special case."""
-    rival = next(candidate() for candidate in arena.candidates if candidate.id == name)
+    rival = next(candidate() for candidate in selection.candidates if candidate.id == name)
     numbers = sum(bool(np.isfinite(value)) for value in effect.values.values())
     return effect.id in rival.contains or len([p for p in rival.parameters if not p.instead_of]) > numbers

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.diagnosis.judge import GAP_S
 from pipeline.diagnosis.library import is_term, list_terms, list_waves
 from pipeline.diagnosis.search import prune
+from pipeline.identification.folds import find_near
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.diagnosis.arena import Arena, Contender
+    from pipeline.diagnosis.selection import CandidateModel, Selection
     from pipeline.identification.comparison import Comparison
     from pipeline.models.formula.formula_effect import FormulaEffect
 
@@ -52,11 +52,13 @@ class Explainable:
     predicted: Floats
 
 
-def search_formula(arena: Arena, start: Contender, final: Contender, places: Floats) -> Contender:
+def search_formula(
+    selection: Selection, start: CandidateModel, final: CandidateModel, places: Floats
+) -> CandidateModel:
     """Try formulas where the catalogue has nothing, or where it only imitates one.
 
     Args:
-        arena: where the catalogue's effects were judged.
+        selection: where the catalogue's effects were judged.
         start: the model that the search began with.
         final: the best model of them.
         places: x, y [m] in the map at every window, shape (n, 2).
@@ -64,13 +66,13 @@ def search_formula(arena: Arena, start: Contender, final: Contender, places: Flo
     Returns:
         The model with up to three terms, and without effects that only stood for them.
     """
-    waves = (*list_waves(arena, final, places), *list_waves(arena, start, places, "_first"))
+    waves = (*list_waves(selection, final, places), *list_waves(selection, start, places, "_first"))
     terms = (*list_terms(), *waves)
-    wide = arena.widen((*arena.candidates, *terms))
-    narrow = {effect.id for effect in arena.candidates}
+    wide = selection.widen((*selection.candidates, *terms))
+    narrow = {effect.id for effect in selection.candidates}
     current = final
     for _ in range(_MOST_TERMS + 1):
-        if sum(is_term(name) for name in current.ids) >= _MOST_TERMS or wide.work > _MOST_WORK:
+        if sum(is_term(name) for name in current.ids) >= _MOST_TERMS or wide.is_done(_MOST_WORK):
             return current
         moved = _replace(wide, current, narrow) or _add(wide, current, narrow)
         if moved is None:
@@ -79,58 +81,58 @@ def search_formula(arena: Arena, start: Contender, final: Contender, places: Flo
     return current
 
 
-def _add(arena: Arena, current: Contender, narrow: set[str]) -> Contender | None:
-    for rival in arena.suggest(current, _TRIED, without=narrow):
-        verdict = arena.judge(current, rival)
+def _add(selection: Selection, current: CandidateModel, narrow: set[str]) -> CandidateModel | None:
+    for rival in selection.suggest(current, _TRIED, without=narrow):
+        verdict = selection.judge(current, rival)
         if verdict.gain >= _LEAST_GAIN and verdict.t >= _LEAST_T and verdict.z >= _LEAST_Z:
             return rival
     return None
 
 
-def _replace(arena: Arena, current: Contender, narrow: set[str]) -> Contender | None:
+def _replace(selection: Selection, current: CandidateModel, narrow: set[str]) -> CandidateModel | None:
     """A term in the place of one effect or two that only imitate it."""
-    free = [name for name in current.ids if name not in arena.kept and not is_term(name)]
+    free = [name for name in current.ids if name not in selection.kept and not is_term(name)]
     pairs = combinations(free, 2) if len(free) <= _MOST_PAIRED else ()
     for names in (*((name,) for name in free), *pairs):
-        if arena.work > _MOST_WORK:
+        if selection.is_done(_MOST_WORK):
             return None
-        without = arena.drop(current, names)
-        for rival in arena.suggest(without, _TRIED, without={*narrow, *names}):
+        without = selection.drop(current, names)
+        for rival in selection.suggest(without, _TRIED, without={*narrow, *names}):
             bonus = _BETTER if len(names) == 1 else 0.0
             if rival.score < (1.0 - bonus) * current.score:
                 return rival
     return None
 
 
-def collect_terms(contender: Contender) -> list[FormulaEffect]:
+def collect_terms(tested: CandidateModel) -> list[FormulaEffect]:
     """The terms of a model."""
-    return [cast("FormulaEffect", e) for e in contender.state.effects if is_term(e.id)]
+    return [cast("FormulaEffect", e) for e in tested.state.effects if is_term(e.id)]
 
 
-def boost_residuals(arena: Arena, final: Contender, features: Floats) -> Explainable:
+def boost_residuals(selection: Selection, final: CandidateModel, features: Floats) -> Explainable:
     """Predict a model's residuals from all that was recorded, stretch by stretch unseen.
 
     Args:
-        arena: where the model was judged.
+        selection: where the model was judged.
         final: the model.
         features: what was recorded, at every window, shape (n, f).
     """
     from sklearn.ensemble import HistGradientBoostingRegressor  # noqa: PLC0415 - heavy
     from threadpoolctl import threadpool_limits  # noqa: PLC0415 - heavy
 
-    problem = arena.problem
-    rest = np.clip(arena.metric.weigh(final.held), -6.0, 6.0)
-    middle = problem.times.mean(axis=1)
-    stretch = np.unique(
-        problem.run * 1_000_000 + (middle // _STRETCH_S).astype(np.int64), return_inverse=True
-    )[1]
+    part = selection.part
+    rest = np.clip(selection.weights.weigh(final.held), -6.0, 6.0)
+    middle = part.times.mean(axis=1)
+    stretch = np.unique(part.run * 1_000_000 + (middle // _STRETCH_S).astype(np.int64), return_inverse=True)[
+        1
+    ]
     predicted = np.zeros(rest.shape)
     for fold in range(_FOLDS):
         test = stretch % _FOLDS == fold
-        train = ~test & ~_is_near(problem.run, problem.times, test)
+        train = ~test & ~find_near(part, part, test)
         if not test.any() or train.sum() < 50:  # noqa: PLR2004 - too few to learn from
             continue
-        for channel in problem.channels:
+        for channel in part.channels:
             model = HistGradientBoostingRegressor(
                 max_iter=_TREES, learning_rate=0.1, max_leaf_nodes=10, min_samples_leaf=25,
                 l2_regularization=5.0, early_stopping=False, random_state=0,
@@ -139,7 +141,7 @@ def boost_residuals(arena: Arena, final: Contender, features: Floats) -> Explain
             with threadpool_limits(limits=1, user_api="openmp"):
                 model.fit(features[train], rest[train, channel])
                 predicted[test, channel] = model.predict(features[test])
-    live = problem.live
+    live = part.live
     before = (rest[live] ** 2).mean(axis=0)
     after = ((rest - predicted)[live] ** 2).mean(axis=0)
     shares = 1.0 - after / np.maximum(before, 1e-12)
@@ -149,17 +151,6 @@ def boost_residuals(arena: Arena, final: Contender, features: Floats) -> Explain
 def is_explainable(explainable: Explainable) -> bool:
     """Whether enough of any channel is predictable to be called structure."""
     return bool((explainable.shares > _EXPLAINABLE).any())
-
-
-def _is_near(run: NDArray[np.int64], times: Floats, test: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    near = np.zeros(test.size, dtype=bool)
-    for number in np.unique(run).tolist():
-        rows = run == number
-        starts, ends = np.sort(times[rows & test, 0]), np.sort(times[rows & test, 1])
-        later = np.searchsorted(starts, times[rows, 1] + GAP_S)
-        earlier = np.searchsorted(ends, times[rows, 0] - GAP_S)
-        near[rows] = later > earlier
-    return near
 
 
 def describe_windows(comparisons: Sequence[Comparison]) -> tuple[Floats, tuple[str, ...]]:
@@ -175,7 +166,7 @@ def describe_windows(comparisons: Sequence[Comparison]) -> tuple[Floats, tuple[s
 def _describe(comparison: Comparison) -> tuple[Floats, tuple[str, ...]]:
     from pipeline.models.forward import Timing  # noqa: PLC0415 - only here
 
-    around, cells = comparison.surroundings, comparison.cells
+    around, cells = comparison.context, comparison.cells
     velocity = comparison.predict_velocity((), Timing())
     at = comparison.windows.times.mean(axis=1)
     columns: dict[str, Floats] = {}

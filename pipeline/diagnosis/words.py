@@ -111,7 +111,7 @@ def _value(name: str, value: Value) -> str:
     text = f"{name} = {value.value:.3g}{unit}"
     if math.isfinite(value.low):
         text += f" [{value.low:.3g}, {value.high:.3g}]"
-    return text
+    return f"{text} (at its bound)" if value.at_bound else text
 
 
 def _list_falls(diagnosis: RunDiagnosis) -> dict[str, str]:

@@ -10,10 +10,11 @@ from pipeline.identification.inputs import InputChoice, choose_input
 from pipeline.identification.intervals import Estimate, Estimates, estimate_intervals
 from pipeline.identification.ladder import Ladder, Rung, climb
 from pipeline.identification.predict import Prediction, predict, predict_at, predict_at_from, predict_from
-from pipeline.identification.problem import Free, Problem, State
-from pipeline.identification.robust import Weights
+from pipeline.identification.problem import Problem
 from pipeline.identification.scoring import Errors, HeldOut, hold_out, score
+from pipeline.identification.state import Free, State
 from pipeline.identification.transfer import Transfer, carry_over
+from pipeline.identification.weights import Weights
 
 __all__ = [
     "Comparison",

@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Late, ReportEffect
-from pipeline.models.forward import Forward, Timing, replace_surroundings
+from pipeline.models.forward import Forward, Timing, replace_context
 from pipeline.runs.errors import MotionError
-from pipeline.runs.grid import make_cells
+from pipeline.runs.grid import lay_grid
 from pipeline.runs.heading import HeadingSource, choose_heading
-from pipeline.runs.signals import Resets, Signal, Surroundings
+from pipeline.runs.signals import Resets, RunContext, Signal
 from pipeline.runs.windows import WINDOW_S, find_lead, gather_nodes, join_horizons, join_windows
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from pipeline.models.effect import Effect
-    from pipeline.runs.grid import Cells
+    from pipeline.runs.grid import Grid
     from pipeline.runs.recording import MotionRun
     from pipeline.runs.signals import Velocity
     from pipeline.vehicles import Vehicle
@@ -31,7 +31,10 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Complex = NDArray[np.complex128]
 
-CELL_RATE_HZ = 200.0
+# Cell means of held commands are exact: finer cells change residuals in the sixth digit.
+_RATE_HZ = 50.0
+_COARSE_HZ = 25.0
+_MOST_CELLS = 20_000
 _SETTLE_S = 0.6
 _LEAST_S = 0.3
 
@@ -44,7 +47,7 @@ class Input(enum.Enum):
 
 
 @dataclass(frozen=True)
-class Reach:
+class HorizonErrors:
     """Errors of predictions at each row of the horizons, shape (n,).
 
     Attributes:
@@ -97,7 +100,7 @@ class Comparison:
         source: Input,
         *,
         heading: HeadingSource = HeadingSource.AUTO,
-        rate_hz: float = CELL_RATE_HZ,
+        rate_hz: float | None = None,
     ) -> None:
         series = run.commands if source is Input.COMMAND else run.wheels
         if series is None:
@@ -112,7 +115,7 @@ class Comparison:
         vehicle = run.correct_vehicle(vehicle)
         self.run = run
         self.source = source
-        self.cells = make_cells(run, rate_hz)
+        self.cells = lay_grid(run, choose_rate([run]) if rate_hz is None else rate_hz)
         self.heading = choose_heading(run, self.cells, heading)
         self.nodes = gather_nodes(run.track, self.cells)
         if self.nodes.times.size == 0:
@@ -122,7 +125,7 @@ class Comparison:
                 where=run.name,
                 hint="Mend [[interval]], or take all with --interval all.",
             )
-        lead = find_lead(run, self.usual_delay)
+        lead = find_lead(run, run.alignment.heading_delay_s)
         self.windows = join_windows(run, self.cells, self.nodes, lead)
         self.horizons = join_horizons(run, self.cells, self.nodes, lead)
         self._pose_times = run.track.times[self.nodes.poses]
@@ -132,7 +135,7 @@ class Comparison:
         self._measured: dict[float, Measured] = {}
         base = self._look_around(vehicle)
         self._forward = Forward(series, self.cells, base, encoders=run.wheels, has_gyro=self.has_gyro)
-        self._reaching = replace_surroundings(self._forward, self._look_from_horizons(base))
+        self._reaching = replace_context(self._forward, self._look_from_horizons(base))
 
     @property
     def has_gyro(self) -> bool:
@@ -140,19 +143,14 @@ class Comparison:
         return self.heading.gyro is not None
 
     @property
-    def surroundings(self) -> Surroundings:
+    def context(self) -> RunContext:
         """What effects may know of the run."""
         return self._forward.around
 
     @property
-    def usual_delay(self) -> float:
-        """How late the poses are as far as it is known before any fit [s]: against the gyro."""
-        return self.heading.gyro.yaw_delay_s if self.heading.gyro is not None else 0.0
-
-    @property
     def turning(self) -> Floats:
         """Measured yaw rate over every window [rad/s], shape (n,)."""
-        heading = self._node_headings(self.usual_delay)
+        heading = self._node_headings(0.0)
         turned: Floats = heading[self.windows.end] - heading[self.windows.start]
         return turned / self.windows.span_s
 
@@ -185,17 +183,22 @@ class Comparison:
         if timing.wheel_delay_s <= 0.0:
             return timing
         hidden = sum(effect.delay for effect in effects if effect.late is Late.BODY)
-        most = max(self.usual_delay, 0.0)
+        most = max(self.run.alignment.heading_delay_s, 0.0)
         return replace(timing, wheel_delay_s=min(timing.wheel_delay_s + hidden, most))
 
-    def find_residuals(self, effects: Sequence[Effect], timing: Timing) -> Floats:
+    def find_residuals(self, effects: Sequence[Effect], timing: Timing, late_s: float = 0.0) -> Floats:
         """Measured less predicted displacement of every window, over its length.
+
+        Args:
+            effects: of the model, with their values.
+            timing: of the run.
+            late_s: how much later the poses are than they are taken for [s].
 
         Returns:
             x, y [m/s] in the frame of the measured heading half-way, and w [rad/s], shape (n, 3).
         """
         velocity = self.predict_velocity(effects, timing)
-        delay = timing.pose_delay_s + self._find_delay(effects)
+        delay = late_s + self._find_delay(effects)
         seen = self._measure(delay)
         along = (velocity.x + 1j * velocity.y) * self._frame(delay)
         travelled = self._at_nodes(self.cells.sum_up(along), seen.place)
@@ -208,14 +211,21 @@ class Comparison:
         rest /= self.windows.span_s[:, None]
         return rest
 
-    def find_reach(self, effects: Sequence[Effect], timing: Timing) -> Reach:
+    def find_horizon_errors(
+        self, effects: Sequence[Effect], timing: Timing, late_s: float = 0.0
+    ) -> HorizonErrors:
         """Errors of two-second predictions from a measured state, integrating the model's own yaw.
 
         A prediction begins with the measured pose, the wheel speeds of the encoders where there are any, and
         the body velocity of the half second before: what a planner knows at that moment.
+
+        Args:
+            effects: of the model, with their values.
+            timing: of the run.
+            late_s: how much later the poses are than they are taken for [s].
         """
         velocity = self._run(self._reaching, effects, timing)
-        delay = timing.pose_delay_s + self._find_delay(effects)
+        delay = late_s + self._find_delay(effects)
         place = self._find_place(delay)
         edges = self.cells.sum_up(velocity.w)
         own = np.exp(0.5j * (edges[1:] + edges[:-1]))
@@ -227,12 +237,12 @@ class Comparison:
         predicted = self._path[origin] + turn * (travelled[node] - travelled[origin])
         yaw = (heading[node] - heading[origin]) - (turned[node] - turned[origin])
         wrapped = np.abs(np.angle(np.exp(1j * yaw)))
-        return Reach(np.abs(predicted - self._path[node]), wrapped, np.abs(yaw))
+        return HorizonErrors(np.abs(predicted - self._path[node]), wrapped, np.abs(yaw))
 
-    def list_starts(self, timing: Timing) -> tuple[Floats, Floats]:
+    def list_starts(self) -> tuple[Floats, Floats]:
         """Where predictions begin: stamps [s], shape (k,), and poses (x, y [m], yaw [rad]), shape (k, 3)."""
         origin = np.unique(self.horizons.origin)
-        heading = self._node_headings(timing.pose_delay_s)[origin]
+        heading = self._node_headings(0.0)[origin]
         path = self._path[origin]
         return self.nodes.times[origin], np.column_stack((path.real, path.imag, heading))
 
@@ -285,15 +295,14 @@ class Comparison:
             times, offset = self.run.track.times, self.heading.offset
             if self.heading.gyro is not None:
                 middle = 0.5 * (self.heading.edges[1:] + self.heading.edges[:-1])
-                late = self.heading.gyro.yaw_delay_s
-                heading = middle + np.interp(self.cells.times + late, times, offset)
+                heading = middle + np.interp(self.cells.times, times, offset)
             else:
                 heading = np.interp(self.cells.times + delay, times, offset)
             _forget(self._frames)
             self._frames[key] = np.exp(1j * heading)
         return self._frames[key]
 
-    def _look_around(self, vehicle: Vehicle) -> Surroundings:
+    def _look_around(self, vehicle: Vehicle) -> RunContext:
         cells, track = self.cells, self.run.track
         at = cells.times
         first, last = self._first_moments()
@@ -302,7 +311,7 @@ class Comparison:
         known = (self._locate_nodes(last), velocity)
         unknown = np.full((cells.first.size, 2), np.nan)
         spans = Resets(cells.span, cells.first, cells.first, unknown)
-        return Surroundings(
+        return RunContext(
             vehicle=vehicle,
             times=at,
             step_s=cells.step_s,
@@ -314,11 +323,11 @@ class Comparison:
             place=np.column_stack([np.interp(at, track.times, column) for column in track.place.T]),
         )
 
-    def _look_from_horizons(self, base: Surroundings) -> Surroundings:
+    def _look_from_horizons(self, base: RunContext) -> RunContext:
         """The run with states that begin anew at every horizon, with what is known by then."""
         cells, nodes = self.cells, self.nodes
         origin = np.unique(self.horizons.origin)
-        begin = cells.locate_edges(nodes.times[origin] - self.usual_delay).astype(np.int64)
+        begin = cells.locate_edges(nodes.times[origin]).astype(np.int64)
         begin = np.minimum(begin, cells.times.size - 1)
         before = np.searchsorted(nodes.times, nodes.times[origin] - WINDOW_S - 0.01)
         first = np.unique(np.concatenate((cells.first, begin)))
@@ -345,8 +354,7 @@ class Comparison:
     def _measure_velocity(self, first: Integers, last: Integers) -> tuple[Integers, Floats]:
         """Body velocity between pairs of nodes: cells in their middle, and (v_x, v_y, v_w) or NaN."""
         cells, nodes = self.cells, self.nodes
-        delay = self.usual_delay
-        heading = self._node_headings(delay)
+        heading = self._node_headings(0.0)
         top = nodes.times.size - 1
         one, two = np.clip(first, 0, top), np.clip(last, 0, top)
         span = nodes.times[two] - nodes.times[one]
@@ -357,16 +365,21 @@ class Comparison:
         moved = (self._path[two] - self._path[one]) * np.exp(-0.5j * (heading[one] + heading[two])) / span
         velocity = np.column_stack((moved.real, moved.imag, (heading[two] - heading[one]) / span))
         velocity[~good] = np.nan
-        middle = 0.5 * (nodes.times[one] + nodes.times[two]) - delay
+        middle = 0.5 * (nodes.times[one] + nodes.times[two])
         return np.minimum(cells.locate_edges(middle).astype(np.int64), cells.times.size - 1), velocity
 
     def _locate_nodes(self, nodes: Integers) -> Integers:
         """Cells in which nodes were reached."""
-        at = self.nodes.times[np.clip(nodes, 0, self.nodes.times.size - 1)] - self.usual_delay
+        at = self.nodes.times[np.clip(nodes, 0, self.nodes.times.size - 1)]
         return np.minimum(self.cells.locate_edges(at).astype(np.int64), self.cells.times.size - 1)
 
 
-def _reset_body(cells: Cells, first: Integers, known: tuple[Integers, Floats]) -> Resets:
+def choose_rate(runs: Iterable[MotionRun]) -> float:
+    """Cells per second that runs are modelled on [Hz]."""
+    return _COARSE_HZ if sum(run.duration_s for run in runs) * _RATE_HZ > _MOST_CELLS else _RATE_HZ
+
+
+def _reset_body(cells: Grid, first: Integers, known: tuple[Integers, Floats]) -> Resets:
     """Resets of the body's state: at the cells given where a velocity is known, else at the first cell."""
     at, velocity = known
     good = np.isfinite(velocity).all(axis=1)

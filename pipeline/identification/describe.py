@@ -89,7 +89,7 @@ def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str
             "value": _round(item.value),
             "low": _round(item.low),
             "high": _round(item.high),
-            "unit": item.free.parameter.unit if item.free.parameter else "s",
+            "unit": item.free.unit,
             "fitted": True,
             "at_bound": item.at_bound,
             "observable": item.observable,
@@ -142,10 +142,14 @@ def describe_step(before: Rung, after: Rung) -> list[str]:
 
 
 def _describe_rises(below: Errors, errors: Errors, done: str) -> list[str]:
+    return [f"  ! {text}: {done} because asked for" for text in describe_rises(below, errors)]
+
+
+def describe_rises(below: Errors, errors: Errors) -> list[str]:
+    """Errors over 2 s that are higher than before, each in words."""
     names = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
     return [
-        f"  ! {names[key][0]} error rises {getattr(below, key):.4f} -> {getattr(errors, key):.4f} "
-        f"{names[key][1]}: {done} because asked for"
+        f"{names[key][0]} error rises {getattr(below, key):.4f} -> {getattr(errors, key):.4f} {names[key][1]}"
         for key in list_rises(below, errors)
     ]
 

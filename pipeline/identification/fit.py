@@ -1,56 +1,92 @@
-"""Fitting: robust least squares over all free numbers at once, after a search for good starts."""
+"""Fitting: robust least squares over all free numbers at once (Levenberg-Marquardt), part by part."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.identification.problem import Free, Problem, State, needs_search
-from pipeline.identification.robust import Weights, estimate_scales, measure_loss, solve_step, weigh_system
-from pipeline.identification.starts import find_starts, refine_grid
+from pipeline.identification.proposals import propose
+from pipeline.identification.weights import make_weights
+from pipeline.models.model import Model
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.models.model import Model
+    from pipeline.identification.parts import Part
+    from pipeline.identification.problem import Problem
+    from pipeline.identification.state import Free, State
+    from pipeline.identification.weights import Weights
+    from pipeline.models.effect import Effect, Parameter
 
 Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
-_MOST_ITERATIONS = 25
-_CONVERGED = 1e-6
+_ITERATIONS = 20
+_ENOUGH = 2e-5
 _NEWS = 0.02
+_GRID_ROUNDS = 4
+_STIFFEST = 30.0
+_REWEIGHTED = 3
+_SAME_SCALE = 0.01
+_SETTLED = 1e-9
+_SETTLED_ROUNDS = 8
+_SAME_NUMBER = 2e-4
 
 
 @dataclass(frozen=True)
-class Fitted:
-    """A fitted state and what is needed to judge it.
+class PartFit:
+    """A state whose numbers are the best for one part of the way.
 
     Attributes:
-        state: model, per-run values and delays.
-        free: the numbers that were fitted.
-        weights: of the residuals.
-        residuals: of all windows, shape (n, 3).
-        jacobian: change of the residuals with each number, shape (n, 3, p).
-        loss: mean robust loss over windows and channels.
-        used: windows that took part, shape (n,).
+        state: the state.
+        free: its free numbers that act on this part.
+        residual: its residuals, shape (n, 3).
+        jacobian: change of the prediction with each free number, shape (n, 3, p).
+        weights: what a residual costs.
+        loss: mean cost under these weights.
     """
 
     state: State
     free: tuple[Free, ...]
-    weights: Weights
-    residuals: Floats
+    residual: Floats
     jacobian: Floats
+    weights: Weights
     loss: float
-    used: Flags = field(repr=False)
+
+    @property
+    def smooth(self) -> list[int]:
+        """Places of the free numbers that derivatives find."""
+        return [place for place, number in enumerate(self.free) if number.is_smooth]
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A model fitted to runs.
+
+    Attributes:
+        problem: the runs.
+        state: model, per-run values and delays.
+        fits: the fit of each part of the way.
+        residuals: of the whole way, shape (n, 3).
+    """
+
+    problem: Problem = field(repr=False)
+    state: State
+    fits: tuple[PartFit, ...] = field(repr=False)
+    residuals: Floats = field(repr=False)
 
     @property
     def model(self) -> Model:
-        """The fitted model."""
-        return self.state.model
+        """The fitted model, of the effects that act on the input."""
+        return Model(self.problem.vehicle, self.state.effects)
+
+    @property
+    def free(self) -> tuple[Free, ...]:
+        """All numbers that were fitted."""
+        return tuple(number for fit in self.fits for number in fit.free)
 
 
 def fit_model(
@@ -58,96 +94,222 @@ def fit_model(
     model: Model,
     *,
     per_run: Sequence[str] = (),
-    start: State | None = None,
-    used: Flags | None = None,
-    weights: Weights | None = None,
+    start: Fitted | None = None,
+    exact: bool = False,
 ) -> Fitted:
     """Fit a model's free parameters and the recording's delays.
+
+    Where wheels were measured beside the command, effects of the drivetrain are fitted from the command to
+    the wheels and those of the ground from the wheels to the body: what one part leaves unexplained is not
+    pressed into the numbers of the other.
 
     Args:
         problem: the runs.
         model: effects at neutral values are searched from several starts; others start where they are.
         per_run: labels ``effect.name`` or ids whose values belong to each run alone.
-        start: state to start from, without a search, in place of the model's own values.
-        used: windows to fit, all by default.
-        weights: scales to use; by default they are found along the way.
+        start: a fit of nearly the same model, of which parts that have not changed are taken over.
+        exact: go on until nothing moves any more, so that the same model ends at the same numbers whatever
+            it was started from; without, until the loss stands still, which is enough to compare models.
 
     Returns:
         The fit; a number at its bound says that the data ask for more.
     """
-    used = np.ones(problem.run_of.size, dtype=bool) if used is None else used
-    free = problem.list_free(model, per_run)
-    given = weights
-    if start is None:
-        state = find_starts(problem, model, free, used)
-    else:
-        state = State(model, start.own, start.timing)
-    residuals = problem.find_residuals(state)
-    weights = given or estimate_scales(problem, residuals, used)
-    smooth = tuple(number for number in free if not needs_search(number))
-    jacobian = problem.differentiate(state, smooth, residuals)
-    for _ in range(3 if given is None else 1):
-        state, residuals, jacobian = _descend(problem, smooth, weights, used, (state, residuals, jacobian))
-        if len(smooth) < len(free):
-            state = refine_grid(problem, state, free, weights, used)
-            residuals = problem.find_residuals(state)
-            jacobian = problem.differentiate(state, smooth, residuals)
-            state, residuals, jacobian = _descend(
-                problem, smooth, weights, used, (state, residuals, jacobian)
-            )
-        if given is None:
-            before, weights = weights, estimate_scales(problem, residuals, used)
-            if np.allclose(before.scale, weights.scale, rtol=0.01):
-                break
-    if len(smooth) < len(free):
-        jacobian = problem.differentiate(state, free, residuals)
-    loss = measure_loss(problem, residuals, weights, used)
-    return Fitted(state, free, weights, residuals, jacobian, loss, used)
+    state = problem.start_state(() if start is None else start.state)
+    effects = problem.active_effects(model)
+    fits: list[PartFit] = []
+    for place, part in enumerate(problem.parts):
+        mine = replace(state, effects=()).add(*(effect for effect in effects if part.owns(effect)))
+        known = None if start is None else start.fits[place]
+        if known is not None and (known.state.effects, known.state.timing) == (mine.effects, mine.timing):
+            fit = known
+        else:
+            fit = _fit_part(problem, part, mine, per_run)
+        if exact:
+            fit = _settle(part, fit, per_run)
+        fits.append(fit)
+        state = replace(fit.state, effects=state.effects).add(*fit.state.effects)
+    return Fitted(problem, state, tuple(fits), problem.find_residuals(state))
+
+
+def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]) -> PartFit:
+    """The best values for a part of the way: effects that have none yet are put in one after the other."""
+    fresh = [effect for effect in state.effects if effect.is_neutral and effect.fixed != _names(effect)]
+    state = state.drop([effect.id for effect in fresh])
+    fit = fit_part(part, make_weights(part.find_residuals(state), part), state, per_run=per_run)
+    for effect in fresh:
+        found = propose(part, fit, [Unset(effect)], problem.largest, {})
+        begun = found[0].state if found else fit.state
+        started = begun.find(effect.id)
+        # What a proposal leaves as it is may be fitted here.
+        begun = begun.add(effect if started is None else effect.change(**started.values))
+        fit = fit_part(part, fit.weights, begun, per_run=per_run)
+    for _ in range(_REWEIGHTED):
+        weights = make_weights(fit.residual, part)
+        if np.allclose(weights.scale, fit.weights.scale, rtol=_SAME_SCALE):
+            break
+        fit = fit_part(part, weights, fit.state, per_run=per_run)
+    return fit
+
+
+def _settle(part: Part, fit: PartFit, per_run: Sequence[str]) -> PartFit:
+    """The fit after which neither numbers nor weights move."""
+    for _ in range(_SETTLED_ROUNDS):
+        before = np.array([fit.state.get(number) for number in fit.free])
+        weights = make_weights(fit.residual, part)
+        fit = fit_part(part, weights, fit.state, per_run=per_run, enough=_SETTLED)
+        after = np.array([fit.state.get(number) for number in fit.free])
+        if np.allclose(before, after, rtol=_SAME_NUMBER, atol=1e-6):
+            break
+    return fit
+
+
+def _names(effect: Effect) -> frozenset[str]:
+    return frozenset(parameter.name for parameter in effect.parameters)
+
+
+@dataclass(frozen=True)
+class Unset:
+    """An effect of which a fit has yet to find the values, as a candidate: what is fixed stays."""
+
+    effect: Effect
+
+    @property
+    def id(self) -> str:
+        """Of the effect."""
+        return self.effect.id
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Its numbers that may change."""
+        return tuple(p for p in self.effect.parameters if p.name not in self.effect.fixed)
+
+    def __call__(self, **values: float) -> Effect:
+        """The effect with these values."""
+        return self.effect.change(**values)
+
+
+def fit_part(
+    part: Part,
+    weights: Weights,
+    state: State,
+    iterations: int = _ITERATIONS,
+    *,
+    per_run: Sequence[str] = (),
+    enough: float = _ENOUGH,
+) -> PartFit:
+    """Fit all free numbers of a state to one part of the way, grids included.
+
+    Args:
+        part: of the way.
+        weights: what a residual costs.
+        state: to start from.
+        iterations: most of them.
+        per_run: as in `fit_model`.
+        enough: relative fall of the loss at which the fit ends.
+    """
+    free = state.list_free(part.delays, per_run)
+    fit = _descend(part, weights, state, free, (iterations, enough))
+    for number in free:
+        moved = None if number.is_smooth else _walk_grid(part, fit, number)
+        if moved is not None:
+            fit = _descend(part, weights, moved, free, (iterations, enough))
+    return fit
+
+
+def solve_step(
+    jacobian: Floats, residual: Floats, weights: Weights, damping: float = 0.0, hold: Floats | float = 0.0
+) -> tuple[Floats, Floats]:
+    """One weighted least squares step.
+
+    Args:
+        jacobian: change of the prediction with each number, shape (n, 3, p).
+        residual: shape (n, 3).
+        weights: cost of residuals.
+        damping: Levenberg-Marquardt damping relative to the diagonal.
+        hold: information that speaks for staying where each number is, shape (p,).
+
+    Returns:
+        The step, shape (p,), and the normal matrix, shape (p, p).
+    """
+    factor = weights.factors(residual)
+    rows = (jacobian * factor[:, :, None]).reshape(-1, jacobian.shape[2])
+    target = (residual * factor).reshape(-1)
+    normal = np.asarray(rows.T @ rows, dtype=np.float64)
+    size = np.diag(normal) + 1e-12
+    stiff = normal + np.diag(size * (damping + 1e-9) + hold)
+    step = np.asarray(np.linalg.solve(stiff, rows.T @ target), dtype=np.float64)
+    return step, normal
 
 
 def _descend(
-    problem: Problem,
-    free: Sequence[Free],
-    weights: Weights,
-    used: Flags,
-    at: tuple[State, Floats, Floats],
-) -> tuple[State, Floats, Floats]:
-    """Levenberg-Marquardt until the loss no longer falls."""
-    state, residuals, jacobian = at
-    if not free:
-        return at
-    bounds = np.array([number.bounds for number in free])
-    loss = measure_loss(problem, residuals, weights, used)
+    part: Part, weights: Weights, state: State, free: tuple[Free, ...], until: tuple[int, float]
+) -> PartFit:
+    iterations, enough = until
+    residual = part.find_residuals(state)
+    loss = weights.loss(residual)
+    smooth = [place for place, number in enumerate(free) if number.is_smooth]
+    jacobian = part.differentiate(state, residual, free)
+    if not smooth:
+        return PartFit(state, free, residual, jacobian, weights, loss)
     damping, is_fresh = 1e-4, True
-    for _ in range(_MOST_ITERATIONS):
-        normal, gradient = weigh_system(problem, residuals, jacobian, weights, used)
-        values = np.array([state.get(number) for number in free])
-        fell = 0.0
-        while damping < 1e6:  # noqa: PLR2004 - beyond it no step is left
-            step = solve_step(normal, gradient, values, bounds, damping)
-            moved = _move(state, free, values + step)
-            trial = problem.find_residuals(moved)
-            new = measure_loss(problem, trial, weights, used)
-            if new < loss:
-                fell = (loss - new) / loss
-                state, residuals, loss = moved, trial, new
-                damping = max(damping / 10.0, 1e-7)
-                break
-            if not is_fresh:
-                break
-            if np.abs(step / np.maximum(np.abs(values), 1e-2)).max(initial=0.0) < 1e-5:  # noqa: PLR2004
-                return state, residuals, jacobian
-            damping *= 10.0
-        if is_fresh and fell < _CONVERGED:
+    for _ in range(iterations):
+        moving = [place for place in smooth if not _pushes_out(state, free[place], jacobian, residual, place)]
+        if not moving:
             break
+        step, _ = solve_step(jacobian[:, :, moving], residual, weights, damping)
+        # What the step promises, were the model linear: where that is nothing, the fit is done.
+        promised = weights.loss(residual - jacobian[:, :, moving] @ step)
+        if (loss - promised) / max(loss, 1e-12) < 0.5 * enough:
+            break
+        trial = state.move([free[place] for place in moving], step.tolist())
+        after = part.find_residuals(trial)
+        reached = weights.loss(after)
+        if reached > loss:
+            if not is_fresh:
+                jacobian, is_fresh = part.differentiate(state, residual, free), True
+                continue
+            if damping > _STIFFEST:
+                break
+            damping = max(damping * 20.0, 1e-2)
+            continue
+        fall = (loss - reached) / max(loss, 1e-12)
+        state, residual, loss = trial, after, reached
+        damping = max(damping / 8.0, 1e-8)
         # After a small step the derivatives still serve: new ones cost a prediction for each number.
-        is_fresh = not _CONVERGED <= fell < _NEWS
+        is_fresh = fall > _NEWS
         if is_fresh:
-            jacobian = problem.differentiate(state, free, residuals)
-    return state, residuals, jacobian
+            jacobian = part.differentiate(state, residual, free)
+        if fall < enough:
+            break
+    return PartFit(state, free, residual, jacobian, weights, loss)
 
 
-def _move(state: State, free: Sequence[Free], values: Floats) -> State:
-    for number, value in zip(free, values.tolist(), strict=True):
-        state = state.set(number, value)
-    return state
+def _pushes_out(state: State, number: Free, jacobian: Floats, residual: Floats, place: int) -> bool:
+    """Whether a number stands at its bound and wants to go beyond."""
+    value, (low, high) = state.get(number), number.bounds
+    if low < value < high:
+        return False
+    pull = float(np.sum(jacobian[:, :, place] * residual))
+    return (value <= low and pull < 0.0) or (value >= high and pull > 0.0)
+
+
+def _walk_grid(part: Part, fit: PartFit, number: Free) -> State | None:
+    """Shrinking grid around a number, the others following linearly; None where it is best already."""
+    others, weights = fit.smooth, fit.weights
+    value = fit.state.get(number)
+    # A moment has no size that its neighbourhood could be a share of.
+    width = 8.0 * number.step if math.isnan(fit.state.neutral_of(number)) else 0.5 * abs(value)
+    best, best_loss = value, fit.loss
+    for _ in range(_GRID_ROUNDS):
+        for at in (best - width, best - 0.5 * width, best + 0.5 * width, best + width):
+            if not number.bounds[0] <= at <= number.bounds[1]:
+                continue
+            residual = part.find_residuals(fit.state.set(number, at))
+            if others:
+                step, _ = solve_step(fit.jacobian[:, :, others], residual, weights)
+                residual = residual - fit.jacobian[:, :, others] @ step
+            loss = weights.loss(residual)
+            if loss < best_loss:
+                best, best_loss = at, loss
+        width /= 3.0
+    return None if best == value else fit.state.set(number, best)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.identification.persistence import split_residuals
-from pipeline.identification.scoring import HeldOut, assign_folds, list_training, measure_errors
+from pipeline.identification.scoring import HeldOut, measure_errors
 from pipeline.models.forward import Timing
 
 if TYPE_CHECKING:
@@ -90,11 +90,10 @@ def _take_lower(
 def _remove_predictable(problem: Problem, residuals: Floats, known: Flags) -> Floats:
     """Residuals without what a regression on the inputs predicts of them, where that makes them smaller."""
     features = np.concatenate([describe_inputs(comparison) for comparison in problem.comparisons])
-    fold = assign_folds(problem)
     left = residuals.copy()
     best = np.sqrt(np.mean(residuals[known] ** 2, axis=0))
-    for ridge in _RIDGES:
-        rest = residuals - _predict_held_out(problem, features, residuals, known, (fold, ridge))
+    for predicted in _predict_held_out(problem, features, residuals, known):
+        rest = residuals - predicted
         size = np.sqrt(np.mean(rest[known] ** 2, axis=0))
         better = size < best
         left[:, better], best[better] = rest[:, better], size[better]
@@ -104,15 +103,15 @@ def _remove_predictable(problem: Problem, residuals: Floats, known: Flags) -> Fl
 def _measure_speed(comparison: Comparison) -> Floats:
     """Forward speed of the input at the middle of every window [m/s], shape (n,)."""
     velocity = comparison.predict_velocity((), Timing())
-    middle = comparison.windows.times.mean(axis=1) - comparison.usual_delay
-    return np.asarray(np.interp(middle, comparison.surroundings.times, velocity.x), dtype=np.float64)
+    middle = comparison.windows.times.mean(axis=1)
+    return np.asarray(np.interp(middle, comparison.context.times, velocity.x), dtype=np.float64)
 
 
 def describe_inputs(comparison: Comparison) -> Floats:
     """Functions of the input at the middle of every window, shape (n, features)."""
-    around = comparison.surroundings
+    around = comparison.context
     velocity = comparison.predict_velocity((), Timing())
-    middle = comparison.windows.times.mean(axis=1) - comparison.usual_delay
+    middle = comparison.windows.times.mean(axis=1)
     along, around_w = _average(velocity.x, around.step_s), _average(velocity.w, around.step_s)
 
     def look(signal: Floats, late: float) -> Floats:
@@ -152,29 +151,28 @@ def _average(signal: Floats, step_s: float) -> Floats:
     return mean
 
 
-def _predict_held_out(
-    problem: Problem,
-    features: Floats,
-    residuals: Floats,
-    known: Flags,
-    how: tuple[NDArray[np.int64], float],
-) -> Floats:
-    """Residuals as predicted from the inputs by regressions that had not seen their blocks."""
-    fold, ridge = how
-    predicted = np.zeros(residuals.shape)
+def _predict_held_out(problem: Problem, features: Floats, residuals: Floats, known: Flags) -> Floats:
+    """Residuals as predicted from the inputs by regressions that had not seen their stretches.
+
+    Returns:
+        shape (ridges, n, 3).
+    """
+    predicted = np.zeros((len(_RIDGES), *residuals.shape))
     spread = 1.4826 * np.median(np.abs(residuals[known]), axis=0) + 1e-12
     target = np.clip(residuals, -_CLIP * 3.0 * spread, _CLIP * 3.0 * spread)
-    for number in range(int(fold.max()) + 1):
-        tested = (fold[problem.block_of] == number) & known
-        rows = list_training(problem, tested) & known
+    for fold in problem.folds:
+        tested, rows = fold.test & known, fold.train & known
         if not tested.any() or rows.sum() < 2 * features.shape[1]:
             continue
         centre = features[rows].mean(axis=0)
         scale = features[rows].std(axis=0)
         scale[scale == 0.0] = 1.0
         design = (features[rows] - centre) / scale
-        normal = design.T @ design / design.shape[0] + ridge * np.eye(design.shape[1])
+        normal = design.T @ design / design.shape[0]
         mean = target[rows].mean(axis=0)
-        weights = np.linalg.solve(normal, design.T @ (target[rows] - mean) / design.shape[0])
-        predicted[tested] = mean + (features[tested] - centre) / scale @ weights
+        pull = design.T @ (target[rows] - mean) / design.shape[0]
+        looked_at = (features[tested] - centre) / scale
+        for number, ridge in enumerate(_RIDGES):
+            weights = np.linalg.solve(normal + ridge * np.eye(normal.shape[0]), pull)
+            predicted[number, tested] = mean + looked_at @ weights
     return predicted

@@ -8,19 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.identification.problem import Free, needs_search
-from pipeline.identification.robust import weigh_system
-from pipeline.models.effect import Late, find_late
-
 if TYPE_CHECKING:
-    from pipeline.identification.fit import Fitted
+    from pipeline.identification.fit import Fitted, PartFit
+    from pipeline.identification.parts import Part
     from pipeline.identification.problem import Problem
+    from pipeline.identification.state import Free
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _DRAWS = 1000
 _HUBER = 3.0
+_GAUSSIAN = 1.4826
 _SHORTEST_BLOCK_S = 6.0
 _TAUS = 5.0
 _DELAY_STEP = 5e-3
@@ -86,14 +85,26 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
         problem: the runs.
         fitted: a converged fit.
     """
+    made = [
+        _estimate_part(part, fit) for part, fit in zip(problem.parts, fitted.fits, strict=True) if fit.free
+    ]
+    if not made:
+        return NOTHING
+    sizes = [len(one.items) for one in made]
+    correlation = np.zeros((sum(sizes), sum(sizes)))
+    for one, end, size in zip(made, np.cumsum(sizes).tolist(), sizes, strict=True):
+        correlation[end - size : end, end - size : end] = one.correlation
+    items = tuple(item for one in made for item in one.items)
+    return Estimates(items, correlation, min(one.blocks for one in made))
+
+
+def _estimate_part(part: Part, fit: PartFit) -> Estimates:
     from scipy.stats import t as student  # noqa: PLC0415 - heavy
 
-    count = len(fitted.free)
-    if count == 0:
-        return NOTHING
-    block = join_blocks(problem, fitted)
+    count = len(fit.free)
+    block = join_blocks(part, fit)
     pieces = int(block.max()) + 1
-    normals, gradients = _sum_blocks(problem, fitted, block, pieces)
+    normals, gradients = _sum_blocks(fit, block, pieces)
     total = normals.sum(axis=0)
     size = np.sqrt(np.maximum(np.diag(total), 0.0))
     observable = size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)
@@ -108,13 +119,11 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
         correlation[np.ix_(rows, rows)] = spread / deviation
     freedom = max(pieces - rows.size, 2)
     wide = float(student.ppf(0.975, freedom)) * np.sqrt(pieces / max(pieces - rows.size, 1))
-    errors[rows] = np.hypot(errors[rows], _carry_delays(problem, fitted, total, rows, size))
+    errors[rows] = np.hypot(errors[rows], _carry_clocks(part, fit, total, rows, size))
     items = []
-    for index, number in enumerate(fitted.free):
-        value = fitted.state.get(number)
-        half = wide * float(errors[index])
-        if needs_search(number):
-            half = _widen(problem, fitted, number)
+    for index, number in enumerate(fit.free):
+        value = fit.state.get(number)
+        half = wide * float(errors[index]) if number.is_smooth else _widen(part, fit, number)
         items.append(
             Estimate(
                 number,
@@ -136,61 +145,57 @@ def stands_at_bound(value: float, bounds: tuple[float, float]) -> bool:
     return not low + margin < value < high - margin
 
 
-def _carry_delays(problem: Problem, fitted: Fitted, total: Floats, rows: Integers, size: Floats) -> Floats:
-    """Standard errors that come from not knowing the delay of the poses exactly, shape (rows,)."""
+def _carry_clocks(part: Part, fit: PartFit, total: Floats, rows: Integers, size: Floats) -> Floats:
+    """Standard errors that come from not knowing the clocks exactly, shape (rows,)."""
     carried = np.zeros(rows.size)
-    if problem.given_timing is not None or rows.size == 0:
+    if rows.size == 0:
         return carried
     scaled = total[np.ix_(rows, rows)] / np.outer(size[rows], size[rows]) + 1e-9 * np.eye(rows.size)
-    for run, comparison in enumerate(problem.comparisons):
-        gyro = comparison.heading.gyro
-        if gyro is None or find_late(fitted.model, Late.POSES) is not None:
+    factor = fit.weights.factors(fit.residual)
+    for run, error in enumerate(part.list_clock_errors().tolist()):
+        if error == 0.0:
             continue
-        delay = Free("", "pose_delay_s", run, (-1.0, 1.0), _DELAY_STEP)
-        column = problem.differentiate(fitted.state, [delay], fitted.residuals)
-        jacobian = np.concatenate((fitted.jacobian, column), axis=2)
-        normal, _ = weigh_system(problem, fitted.residuals, jacobian, fitted.weights, fitted.used)
-        shift = np.linalg.solve(scaled, normal[rows, -1] / size[rows]) / size[rows]
-        carried = np.hypot(carried, np.abs(shift) * gyro.delay_error_s)
+        mine = part.run == run
+        late = (part.shift_clock(fit.state, run, _DELAY_STEP) - fit.residual[mine]) / _DELAY_STEP
+        pull = np.einsum("ncp,nc->p", fit.jacobian[mine] * factor[mine][:, :, None], late * factor[mine])
+        shift = np.linalg.solve(scaled, pull[rows] / size[rows]) / size[rows]
+        carried = np.hypot(carried, np.abs(shift) * error)
     return carried
 
 
-def _widen(problem: Problem, fitted: Fitted, number: Free) -> float:
+def _widen(part: Part, fit: PartFit, number: Free) -> float:
     """Half-width for a number that is not smooth: where the loss has risen by what chance would allow.
 
     The likelihood ratio, divided by how often a residual repeats itself.
     """
-    value, (low, high) = fitted.state.get(number), number.bounds
-    base = _sum_losses(problem, fitted, fitted.residuals)
-    stride = float(np.median(np.diff(problem.times.mean(axis=1))))
-    repeats = max(integrate_correlation(problem, fitted) / max(stride, 1e-3), 1.0)
+    value, (low, high) = fit.state.get(number), number.bounds
+    base = _sum_losses(fit, fit.residual)
+    stride = float(np.median(np.diff(part.times.mean(axis=1))))
+    repeats = max(integrate_correlation(part, fit) / max(stride, 1e-3), 1.0)
     ends = []
     for side in (-1.0, 1.0):
         width = number.step / 16.0
         while width < 64.0 * number.step:
-            moved = fitted.state.set(number, float(np.clip(value + side * width, low, high)))
-            if _sum_losses(problem, fitted, problem.find_residuals(moved)) - base > _RISEN * repeats:
+            moved = fit.state.set(number, float(np.clip(value + side * width, low, high)))
+            if _sum_losses(fit, part.find_residuals(moved)) - base > _RISEN * repeats:
                 break
             width *= 1.5
         ends.append(width)
     return max(ends)
 
 
-def _sum_losses(problem: Problem, fitted: Fitted, residuals: Floats) -> float:
-    size = np.abs(fitted.weights.normalise(residuals, problem))[fitted.used]
-    return float(np.where(size <= _HUBER, 0.5 * size**2, _HUBER * (size - 0.5 * _HUBER)).sum())
+def _sum_losses(fit: PartFit, residual: Floats) -> float:
+    return 0.5 * float(fit.weights.cost(residual).sum())
 
 
-def join_blocks(problem: Problem, fitted: Fitted) -> Integers:
+def join_blocks(part: Part, fit: PartFit) -> Integers:
     """Number of the bootstrap block of every window: command steps, joined where they are too short."""
-    length = max(_SHORTEST_BLOCK_S, _TAUS * integrate_correlation(problem, fitted))
-    joined = np.empty(problem.block_of.size, dtype=np.int64)
+    length = max(_SHORTEST_BLOCK_S, _TAUS * integrate_correlation(part, fit))
+    joined = np.empty(part.block.size, dtype=np.int64)
     number = -1
     begin, last_run, last_block = -np.inf, -1, -1
-    middle = problem.times.mean(axis=1)
-    for index, (run, block) in enumerate(
-        zip(problem.run_of.tolist(), problem.block_of.tolist(), strict=True)
-    ):
+    middle = part.times.mean(axis=1)
+    for index, (run, block) in enumerate(zip(part.run.tolist(), part.block.tolist(), strict=True)):
         if run != last_run or (block != last_block and middle[index] - begin >= length - 1.0):
             number += 1
             begin = middle[index]
@@ -199,15 +204,17 @@ def join_blocks(problem: Problem, fitted: Fitted) -> Integers:
     return joined
 
 
-def integrate_correlation(problem: Problem, fitted: Fitted) -> float:
-    """Integrated autocorrelation time [s] of the residuals: the longest of the three channels."""
-    normal = np.clip(fitted.weights.normalise(fitted.residuals, problem), -_HUBER, _HUBER)
-    middle = problem.times.mean(axis=1)
+def integrate_correlation(part: Part, fit: PartFit) -> float:
+    """Integrated autocorrelation time [s] of the residuals: the longest of the channels."""
+    spread = np.median(np.abs(fit.residual), axis=0) * _GAUSSIAN
+    normal = fit.residual / np.maximum(spread, 1e-12)
+    normal = np.clip(normal, -_HUBER, _HUBER)
+    middle = part.times.mean(axis=1)
     step = float(np.median(np.diff(middle)))
-    near = (np.diff(middle) < 2.0 * step) & (np.diff(problem.run_of) == 0)
+    near = (np.diff(middle) < 2.0 * step) & (np.diff(part.run) == 0)
     label = np.concatenate(([0], np.cumsum(~near)))
     longest = 0.0
-    for channel in normal.T:
+    for channel in normal.T[list(part.channels)]:
         centred = channel - channel.mean()
         power = float(np.mean(centred**2))
         if power <= 0.0:
@@ -225,19 +232,14 @@ def integrate_correlation(problem: Problem, fitted: Fitted) -> float:
     return longest
 
 
-def _sum_blocks(problem: Problem, fitted: Fitted, block: Integers, pieces: int) -> tuple[Floats, Floats]:
+def _sum_blocks(fit: PartFit, block: Integers, pieces: int) -> tuple[Floats, Floats]:
     """Normal matrix and gradient of every block."""
-    used = fitted.used
-    normal = fitted.weights.normalise(fitted.residuals, problem)[used]
-    size = np.abs(normal)
-    robust = np.sqrt(np.where(size <= _HUBER, 1.0, _HUBER / np.maximum(size, _HUBER)))
-    columns = fitted.jacobian[used] * (robust / fitted.weights.scale[problem.run_of[used]])[:, :, None]
-    products = np.einsum("ncp,ncq->npq", columns, columns)
-    pulls = np.einsum("ncp,nc->np", columns, normal * robust)
-    normals = np.zeros((pieces, *products.shape[1:]))
-    gradients = np.zeros((pieces, pulls.shape[1]))
-    np.add.at(normals, block[used], products)
-    np.add.at(gradients, block[used], pulls)
+    factor = fit.weights.factors(fit.residual)
+    columns = fit.jacobian * factor[:, :, None]
+    normals = np.zeros((pieces, columns.shape[2], columns.shape[2]))
+    gradients = np.zeros((pieces, columns.shape[2]))
+    np.add.at(normals, block, np.einsum("ncp,ncq->npq", columns, columns))
+    np.add.at(gradients, block, np.einsum("ncp,nc->np", columns, fit.residual * factor))
     return normals, gradients
 
 
@@ -252,5 +254,5 @@ def _draw(normals: Floats, gradients: Floats, rows: Integers, size: Floats, piec
     pull = pull - pull.mean(axis=0)
     matrices = np.einsum("dk,kpq->dpq", counts, small) + 1e-9 * np.eye(rows.size)
     sums = counts @ pull
-    steps: Floats = -np.linalg.solve(matrices, sums[:, :, None])[:, :, 0] / scale
+    steps: Floats = np.linalg.solve(matrices, sums[:, :, None])[:, :, 0] / scale
     return steps

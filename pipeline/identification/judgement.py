@@ -56,12 +56,15 @@ def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) 
     ladder = climb(problem, model, per_run=per_run)
     top = ladder.rungs[-1]
     wanted = {effect.id for effect in problem.active_effects(model)}
-    if wanted == set(top.effects):
-        fitted, held_out = top.fitted, top.held_out
-    else:
-        fitted = fit_model(problem, model.keep(wanted), per_run=per_run)
-        held_out = hold_out(problem, fitted)
+    is_top = wanted == set(top.effects)
+    begin = top.fitted.model if is_top else model.keep(wanted)
+    start = top.fitted if is_top else None
+    fitted = fit_model(problem, begin, per_run=per_run, start=start, exact=True)
+    held_out = hold_out(problem, fitted)
     whole = Rung(fitted, held_out)
+    if is_top:
+        top = whole
+        ladder = replace(ladder, rungs=(*ladder.rungs[:-1], whole))
     best = whole if compare_losses(held_out, top.held_out) < 1.0 else top
     floor = hold_below(estimate_floor(problem, best.held_out), top.errors)
     return Judgement(problem, ladder, whole, estimate_intervals(problem, fitted), floor)
@@ -92,7 +95,7 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
                 "run": comparison.run.name,
                 "sha256": comparison.run.sha256,
                 "terrain": comparison.run.terrain,
-                "pose_delay_s": timing.pose_delay_s,
+                "pose_delay_s": comparison.run.alignment.heading_delay_s,
                 "wheel_delay_s": timing.wheel_delay_s,
             }
             for comparison, timing in zip(problem.comparisons, judgement.fitted.state.timing, strict=True)

@@ -61,37 +61,52 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
     """Build the ladder of a model's effects, the most useful first.
 
     At each rung every remaining effect is tried on top of those below; the one that lowers the loss most is
-    taken if it lowers the held-out loss too, and the error over 2 s does not rise: else the next best one is.
-    Effects that do neither are left out and named.
+    taken if it lowers the held-out loss too. Neither error over 2 s rises from rung to rung: effects that
+    lower them only together are one rung. Effects that do not help are left out and named.
 
     Args:
         problem: the runs.
         model: whose effects may be taken, with their values as starts.
         per_run: as in `fit_model`.
     """
-    base = model.ideal
-    fitted = fit_model(problem, base)
+    fitted = fit_model(problem, model.ideal, exact=True)
     rungs = [Rung(fitted, hold_out(problem, fitted))]
-    rest = [effect.id for effect in problem.active_effects(model)]
-    hoped = dict.fromkeys(rest, inf)
-    while rest:
-        waiting = dict(hoped)
-        while waiting:
-            name, candidate = _take_best(problem, model, fitted, waiting, per_run)
-            hoped.update(waiting)
-            held_out = hold_out(problem, candidate)
-            if compare_losses(held_out, rungs[-1].held_out) >= 1.0:
-                return Ladder(tuple(rungs), tuple(rest))
-            if "t_mrmse_m" not in list_rises(rungs[-1].errors, held_out.pooled):
-                break
-            del waiting[name]
-        else:
+    hoped = dict.fromkeys((effect.id for effect in problem.active_effects(model)), inf)
+    last = rungs[0]
+    while hoped:
+        taken = _take_next(problem, model, last, rungs[-1], hoped, per_run)
+        if taken is None:
             break
-        fitted = candidate
-        rungs.append(Rung(candidate, held_out))
-        rest.remove(name)
+        name, last = taken
         del hoped[name]
-    return Ladder(tuple(rungs), tuple(rest))
+        if not list_rises(rungs[-1].errors, last.errors):
+            rungs.append(last)
+    # What was taken since the last rung has not made up for the error that it raised.
+    left = tuple(effect.id for effect in problem.active_effects(model) if effect.id not in rungs[-1].effects)
+    return Ladder(tuple(rungs), left)
+
+
+def _take_next(
+    problem: Problem,
+    model: Model,
+    last: Rung,
+    shown: Rung,
+    hoped: dict[str, float],
+    per_run: Sequence[str],
+) -> tuple[str, Rung] | None:
+    """The most useful effect that raises no error; else the most useful one; None where none helps."""
+    waiting, first = dict(hoped), None
+    while waiting:
+        name, fitted = _take_best(problem, model, last.fitted, waiting, per_run)
+        hoped.update(waiting)
+        rung = Rung(fitted, hold_out(problem, fitted))
+        if compare_losses(rung.held_out, last.held_out) >= 1.0:
+            break
+        first = first or (name, rung)
+        if not list_rises(shown.errors, rung.errors):
+            return name, rung
+        del waiting[name]
+    return first
 
 
 def _take_best(
@@ -111,7 +126,7 @@ def _take_best(
     for name in sorted(hoped, key=lambda one: -hoped[one]):
         if best is not None and best[0] >= hoped[name]:
             break
-        candidate = fit_model(problem, fitted.model + model.effect(name), per_run=per_run)
+        candidate = fit_model(problem, fitted.model + model.effect(name), per_run=per_run, start=fitted)
         hoped[name] = below - _scale_free(candidate)
         if best is None or hoped[name] > best[0]:
             best = hoped[name], name, candidate
@@ -123,7 +138,12 @@ def _take_best(
 def list_rises(below: Errors, errors: Errors) -> tuple[str, ...]:
     """Errors over 2 s that are larger than one step below: `t_mrmse_m`, `r_mrmse_rad`; never unknown ones."""
     names = ("t_mrmse_m", "r_mrmse_rad")
-    return tuple(name for name in names if getattr(errors, name) > getattr(below, name) * (1.0 + _NOTHING))
+    return tuple(name for name in names if is_risen(getattr(below, name), getattr(errors, name)))
+
+
+def is_risen(before: float, after: float) -> bool:
+    """Whether an error is higher than it was, beyond rounding; never an unknown one."""
+    return after > before * (1.0 + _NOTHING)
 
 
 def compare_losses(new: HeldOut, old: HeldOut) -> float:

@@ -60,17 +60,16 @@ def predict(
         model: with its values.
         run: whose commands or wheels are followed, and from whose poses predictions begin.
         source: what the model is fed with.
-        timing: delays of the recording; by default those that the gyro shows.
+        timing: delays of the recording; none by default.
         heading: whose heading predictions begin with.
         horizon_s: length of a prediction.
-        rate_hz: grid of the result; the model itself runs at 200 Hz.
+        rate_hz: grid of the result; the model itself runs at `choose_rate`.
 
     Raises:
         MotionError: the run lacks the input.
     """
     comparison = Comparison(run, model.vehicle, source, heading=heading)
-    timing = timing or Timing(comparison.usual_delay)
-    return predict_from(comparison, model.effects, timing, horizon_s=horizon_s, rate_hz=rate_hz)
+    return predict_from(comparison, model.effects, timing or Timing(), horizon_s=horizon_s, rate_hz=rate_hz)
 
 
 def predict_from(
@@ -88,18 +87,18 @@ def predict_from(
         effects: of the model, with their values.
         timing: delays of the recording.
         horizon_s: length of a prediction.
-        rate_hz: grid of the result; the model itself runs at 200 Hz.
+        rate_hz: grid of the result; the model itself runs at `choose_rate`.
     """
     velocity = comparison.predict_velocity(effects, timing)
     cells = comparison.cells
     every = max(round(1.0 / (rate_hz * cells.step_s)), 1)
     kept = slice(every // 2, None, every)
-    start_times, start = comparison.list_starts(timing)
+    start_times, start = comparison.list_starts()
     turned = cells.sum_up(velocity.w)
     own = np.exp(0.5j * (turned[1:] + turned[:-1]))
     travelled = cells.sum_up((velocity.x + 1j * velocity.y) * own)
     since = np.arange(0.0, horizon_s + 0.5 / rate_hz, 1.0 / rate_hz)
-    at = cells.locate_edges((start_times[:, None] + since).ravel() - timing.pose_delay_s)
+    at = cells.locate_edges((start_times[:, None] + since).ravel())
     index = np.arange(turned.size, dtype=np.float64)
     yaw = np.interp(at, index, turned).reshape(start_times.size, since.size)
     path = np.interp(at, index, travelled.real) + 1j * np.interp(at, index, travelled.imag)
@@ -133,8 +132,8 @@ def predict_at(
         model: with its values.
         run: whose commands or wheels are followed.
         source: what the model is fed with.
-        at: stamps of poses [s], shape (n,).
-        timing: delays of the recording; by default those that the gyro shows.
+        at: times of aligned poses [s], shape (n,).
+        timing: delays of the recording; none by default.
 
     Returns:
         (v_x [m/s], v_y [m/s], v_w [rad/s]) as the localization would report them, NaN in holes of the
@@ -144,7 +143,7 @@ def predict_at(
         MotionError: the run lacks the input.
     """
     comparison = Comparison(run, model.vehicle, source)
-    return predict_at_from(comparison, model.effects, timing or Timing(comparison.usual_delay), at)
+    return predict_at_from(comparison, model.effects, timing or Timing(), at)
 
 
 def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: Timing, at: Floats) -> Floats:
@@ -154,12 +153,11 @@ def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: T
         comparison: the run and its input.
         effects: of the model, with their values.
         timing: delays of the recording.
-        at: stamps of poses [s], shape (n,).
+        at: times of aligned poses [s], shape (n,).
     """
     velocity = comparison.predict_velocity(effects, timing)
     cells = comparison.cells
-    moment = at - timing.pose_delay_s
-    columns = [np.interp(moment, cells.times, values) for values in (velocity.x, velocity.y, velocity.w)]
+    columns = [np.interp(at, cells.times, values) for values in (velocity.x, velocity.y, velocity.w)]
     found = np.column_stack(columns)
-    found[cells.find_span(moment) < 0] = np.nan
+    found[cells.find_span(at) < 0] = np.nan
     return found

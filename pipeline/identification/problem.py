@@ -1,109 +1,41 @@
-"""A fitting problem: one or several runs, one input, and which numbers are free."""
+"""A fitting problem: runs made ready for one input; models are fitted to it and judged on it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.identification.comparison import Comparison, Input
-from pipeline.identification.encoders import measure_wheel_delay
-from pipeline.models.effect import Late, Place, Search, find_late
+from pipeline.identification.comparison import Comparison, Input, choose_rate
+from pipeline.identification.folds import Fold, find_near, make_folds
+from pipeline.identification.parts import BodyPart, Part, WheelPart
+from pipeline.identification.state import State
+from pipeline.models.effect import Place
+from pipeline.models.evidence import Largest
 from pipeline.models.forward import Timing
 from pipeline.runs.errors import MotionError
 from pipeline.runs.heading import HeadingSource
+from pipeline.runs.signals import name_inputs
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
-    from pipeline.models.effect import Effect, Parameter
+    from pipeline.identification.state import DelayName
+    from pipeline.models.effect import Effect
     from pipeline.models.model import Model
     from pipeline.runs.recording import MotionRun
     from pipeline.vehicles import Vehicle
 
 Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
-_DELAY_BOUNDS = (-0.7, 0.9)
-_DELAY_STEP = 5e-3
 _FEWEST_WINDOWS = 20
 
 
-@dataclass(frozen=True)
-class Free:
-    """A number that is fitted.
-
-    Attributes:
-        effect: id of the effect; empty for a delay of the recording.
-        name: of the parameter or of the delay.
-        run: number of the run it belongs to; None where all runs share it.
-        bounds: smallest and largest value.
-        step: for numerical derivatives.
-        parameter: its declaration; None for a delay.
-    """
-
-    effect: str
-    name: str
-    run: int | None
-    bounds: tuple[float, float]
-    step: float
-    parameter: Parameter | None = None
-
-    @property
-    def label(self) -> str:
-        """``effect.name``, or ``timing.name``."""
-        return f"{self.effect or 'timing'}.{self.name}"
-
-
-@dataclass(frozen=True)
-class State:
-    """A model with its values, run by run.
-
-    Attributes:
-        model: with the shared values.
-        own: values that belong to one run: by run number, then ``(effect, name)``.
-        timing: delays of each run.
-    """
-
-    model: Model
-    own: Mapping[int, Mapping[tuple[str, str], float]]
-    timing: tuple[Timing, ...]
-
-    def effects_of(self, run: int) -> tuple[Effect, ...]:
-        """The effects as they act in one run."""
-        if run not in self.own:
-            return self.model.effects
-        model = self.model
-        for (effect, name), value in self.own[run].items():
-            model = model.change(effect, **{name: value})
-        return model.effects
-
-    def get(self, free: Free) -> float:
-        """Value of a free number."""
-        if not free.effect:
-            return float(getattr(self.timing[free.run or 0], free.name))
-        if free.run is not None and (free.effect, free.name) in self.own.get(free.run, {}):
-            return self.own[free.run][free.effect, free.name]
-        return self.model.effect(free.effect).values[free.name]
-
-    def set(self, free: Free, value: float) -> State:
-        """The state with another value of a free number, brought inside its bounds."""
-        # A step that ends on a bound may miss it by a rounding error.
-        value = min(max(value, free.bounds[0]), free.bounds[1])
-        if not free.effect:
-            timing = list(self.timing)
-            timing[free.run or 0] = replace(timing[free.run or 0], **{free.name: value})
-            return replace(self, timing=tuple(timing))
-        if free.run is not None:
-            own = {**self.own.get(free.run, {}), (free.effect, free.name): value}
-            return replace(self, own={**self.own, free.run: own})
-        return replace(self, model=self.model.change(free.effect, **{free.name: value}))
-
-
 class Problem:
-    """Runs made ready for one input; models are fitted to it and judged on it.
+    """Runs made ready for one input.
 
     Building one is the expensive part; asking it about many models is cheap.
 
@@ -112,9 +44,13 @@ class Problem:
         vehicle: geometry.
         source: what models are fed with.
         heading: whose heading is used.
-        estimate_timing: delays of the recording are fitted along with every model (as far as they can be told
-            from physics); else they are ``timing``.
-        timing: delays of each run to start from, or to keep.
+
+    Attributes:
+        comparisons: the runs fed with the input.
+        whole: the whole way from the input to the body, on which errors are measured.
+        parts: on which numbers are fitted: the whole way, or with measured wheels beside the command the way
+            from the wheels to the body and that from the command to the wheels.
+        largest: what was asked for.
 
     Raises:
         MotionError: a run lacks the input, or has too little that can be compared.
@@ -127,61 +63,91 @@ class Problem:
         source: Input,
         *,
         heading: HeadingSource = HeadingSource.AUTO,
-        timing: Sequence[Timing] | None = None,
-        rate_hz: float | None = None,
     ) -> None:
-        more = {} if rate_hz is None else {"rate_hz": rate_hz}
+        self.runs = tuple(runs)
         self.vehicle = runs[0].correct_vehicle(vehicle)
         self.source = source
-        self.comparisons = tuple(Comparison(run, vehicle, source, heading=heading, **more) for run in runs)
-        self.given_timing = None if timing is None else tuple(timing)
-        # From commands, states begin with what the encoders say: their delay must be known beforehand.
-        late = source is Input.COMMAND and timing is None
-        self._late_wheels = tuple(
-            measure_wheel_delay(run, vehicle) if late and comparison.has_gyro else 0.0
-            for run, comparison in zip(runs, self.comparisons, strict=True)
-        )
-        counts = []
-        for comparison in self.comparisons:
-            counts.append(comparison.windows.start.size)
-            if counts[-1] < _FEWEST_WINDOWS:
+        self.heading = heading
+        self.comparisons = self._compare(source)
+        counts = [comparison.windows.start.size for comparison in self.comparisons]
+        for run, count in zip(self.runs, counts, strict=True):
+            if count < _FEWEST_WINDOWS:
                 raise MotionError(
                     "too_short",
-                    f"the run has {counts[-1]} stretches of half a second with live commands and good poses; "
+                    f"the run has {count} stretches of half a second with live commands and good poses; "
                     f"{_FEWEST_WINDOWS} are needed",
-                    where=comparison.run.name,
+                    where=run.name,
                     hint="Drive longer, or check the intervals and the pose topic with `slip inspect`.",
                 )
-        self.run_of = np.repeat(np.arange(len(counts)), counts)
-        shift = np.concatenate(([0], np.cumsum([int(c.windows.block.max()) + 1 for c in self.comparisons])))
-        self._block_shift = shift
-        blocks = [c.windows.block + shift[i] for i, c in enumerate(self.comparisons)]
-        self.block_of: Integers = np.concatenate(blocks)
-        self.times: Floats = np.concatenate([c.windows.times for c in self.comparisons])
+        self.largest = measure_largest(self.runs, self.vehicle)
+        gyro = all(comparison.has_gyro for comparison in self.comparisons)
+        # The gyro dates the poses; what is left between them and the wheels is the encoders' delay.
+        delays: tuple[DelayName, ...] = ("wheel_delay_s",) if gyro else ()
+        if source is Input.MEASURED:
+            self.whole = BodyPart(self.comparisons, delays, whole=False)
+            self.parts: tuple[Part, ...] = (self.whole,)
+        elif any(run.wheels is None for run in self.runs):
+            self.whole = BodyPart(self.comparisons)
+            self.parts = (self.whole,)
+        else:
+            measured = self._compare(Input.MEASURED)
+            self.whole = BodyPart(self.comparisons)
+            self.parts = (
+                BodyPart(measured, delays, whole=False),
+                WheelPart(self.comparisons, measured, speed=self.largest.speed, turn=self.largest.turn),
+            )
+
+    def _compare(self, source: Input) -> tuple[Comparison, ...]:
+        rate = choose_rate(self.runs)
+        return tuple(
+            Comparison(run, self.vehicle, source, heading=self.heading, rate_hz=rate) for run in self.runs
+        )
+
+    @cached_property
+    def behind_wheels(self) -> Problem:
+        """The same runs fed with their measured wheels; what is ready is shared."""
+        if self.source is Input.MEASURED:
+            return self
+        found = Problem.__new__(Problem)
+        body = self.parts[0]
+        if not isinstance(body, BodyPart) or body is self.whole:
+            raise MotionError(
+                "no_measured",
+                "the run has no measured wheels to feed a model with",
+                where=", ".join(self.names),
+                hint="Choose the other input.",
+            )
+        found.runs, found.vehicle, found.heading = self.runs, self.vehicle, self.heading
+        found.source, found.largest = Input.MEASURED, self.largest
+        found.comparisons, found.whole, found.parts = body.comparisons, body, (body,)
+        return found
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the runs."""
-        return tuple(comparison.run.name for comparison in self.comparisons)
+        return tuple(run.name for run in self.runs)
 
-    def horizon_blocks(self, run: int) -> Integers:
-        """Block of every row of a run's horizons, numbered as `block_of`."""
-        shifted: Integers = self.comparisons[run].horizons.block + self._block_shift[run]
-        return shifted
+    @cached_property
+    def folds(self) -> tuple[Fold, ...]:
+        """Windows of the whole way that are held out in turn."""
+        return make_folds(self.whole)
 
-    def start_state(self, model: Model) -> State:
-        """A model before fitting: delays as given, or as the gyro shows them."""
-        if self.given_timing is not None:
-            return State(model, {}, self.given_timing)
-        known = find_late(model, Late.POSES) is None
-        timing = tuple(
-            Timing(
-                pose_delay_s=c.heading.gyro.yaw_delay_s if c.heading.gyro is not None and known else 0.0,
-                wheel_delay_s=late,
+    @cached_property
+    def training(self) -> tuple[tuple[Flags, ...], ...]:
+        """By fold and part: windows that may be fitted when those of the fold are judged."""
+        return tuple(
+            tuple(
+                fold.train if part is self.whole else ~find_near(part, self.whole, fold.test)
+                for part in self.parts
             )
-            for c, late in zip(self.comparisons, self._late_wheels, strict=True)
+            for fold in self.folds
         )
-        return State(model, {}, timing)
+
+    def start_state(self, known: State | Sequence[Effect] = ()) -> State:
+        """A state to start from: of a fit, or without any delay."""
+        if isinstance(known, State):
+            return known
+        return State(tuple(known), (Timing(),) * len(self.runs))
 
     def active_effects(self, model: Model) -> tuple[Effect, ...]:
         """Effects that can act on this input."""
@@ -189,67 +155,26 @@ class Problem:
             return model.effects
         return tuple(e for e in model.effects if e.place > Place.DRIVE)
 
-    def list_free(self, model: Model, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
-        """The numbers a fit may change.
-
-        Args:
-            model: with its fixed parameters.
-            per_run: labels ``effect.name``, or ids of effects, whose values belong to each run alone.
-        """
-        found: list[Free] = []
-        for effect in self.active_effects(model):
-            for parameter in effect.parameters:
-                if parameter.name in effect.fixed or not effect.is_used(parameter):
-                    continue
-                alone = f"{effect.id}.{parameter.name}" in per_run or effect.id in per_run
-                places: Sequence[int | None] = range(len(self.comparisons)) if alone else [None]
-                found += [
-                    Free(effect.id, parameter.name, run, parameter.bounds, parameter.step, parameter)
-                    for run in places
-                ]
-        return (*found, *self._free_delays(model))
-
-    def _free_delays(self, model: Model) -> list[Free]:
-        """Delays that this input and heading can tell from physics.
-
-        With a gyro the delay of the poses is known from their heading and is no free number: a position that
-        is later than its own heading, or a body that is later than its wheels, are effects (see `Late`).
-        """
-        if self.given_timing is not None:
-            return []
-        found = []
-        for run, comparison in enumerate(self.comparisons):
-            measured = self.source is Input.MEASURED
-            if measured and not comparison.has_gyro and find_late(model, Late.POSES) is None:
-                found.append(Free("", "pose_delay_s", run, _DELAY_BOUNDS, _DELAY_STEP))
-            if comparison.has_gyro and measured:
-                found.append(Free("", "wheel_delay_s", run, _DELAY_BOUNDS, _DELAY_STEP))
-        return found
-
     def find_residuals(self, state: State) -> Floats:
-        """Residuals of all windows of all runs, shape (n, 3): x, y [m/s], w [rad/s]."""
-        return np.concatenate([self.find_run_residuals(state, run) for run in range(len(self.comparisons))])
+        """Residuals of the whole way, all windows of all runs, shape (n, 3): x, y [m/s], w [rad/s]."""
+        return self.whole.find_residuals(state)
 
     def find_run_residuals(self, state: State, run: int) -> Floats:
         """Residuals of one run's windows."""
-        return self.comparisons[run].find_residuals(state.effects_of(run), state.timing[run])
-
-    def differentiate(self, state: State, free: Sequence[Free], base: Floats) -> Floats:
-        """Change of the residuals with every free number, by differences; shape (n, 3, p)."""
-        columns = np.zeros((*base.shape, len(free)))
-        for index, number in enumerate(free):
-            value, (low, high) = state.get(number), number.bounds
-            step = number.step if value + number.step <= high else -number.step
-            del low
-            moved = state.set(number, value + step)
-            if number.run is None:
-                columns[:, :, index] = (self.find_residuals(moved) - base) / step
-            else:
-                rows = self.run_of == number.run
-                columns[rows, :, index] = (self.find_run_residuals(moved, number.run) - base[rows]) / step
-        return columns
+        return self.whole.find_run_residuals(state, run)
 
 
-def needs_search(free: Free) -> bool:
-    """Whether a number is found on a grid only."""
-    return free.parameter is not None and free.parameter.search is Search.GRID
+def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
+    """What was asked for in runs, of the command where there is one."""
+    speed = turn = wheel = difference = 0.0
+    for run in runs:
+        series = run.commands or run.wheels
+        if series is None:
+            continue
+        forward, _, around = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
+        speed, turn = max(speed, float(np.abs(forward).max())), max(turn, float(np.abs(around).max()))
+        wheel = max(wheel, float(np.abs(series.left).max()), float(np.abs(series.right).max()))
+        difference = max(difference, float(np.abs(series.right - series.left).max()))
+    places = np.concatenate([run.track.place[run.track.active, 0] for run in runs])
+    tenths = np.quantile(places, np.linspace(0.0, 1.0, 11)) if places.size else np.zeros(11)
+    return Largest(speed, turn, wheel, max(difference, 1e-6), max(run.duration_s for run in runs), tenths)

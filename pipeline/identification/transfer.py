@@ -59,8 +59,8 @@ def carry_over(
     for run in runs:
         problem = Problem([run], model.vehicle, source)
         carried = hold_out(problem, fit_model(problem, frozen))
-        own = hold_out(problem, fit_model(problem, model))
-        ideal = hold_out(problem, fit_model(problem, model.ideal))
+        own = hold_out(problem, fit_model(problem, model, exact=True))
+        ideal = hold_out(problem, fit_model(problem, model.ideal, exact=True))
         ratios = np.array(carried.pooled.ratios(own.pooled)[:3])
         ratio = float(np.exp(np.mean(np.log(ratios))))
         found.append(

@@ -14,9 +14,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from concurrent.futures import Executor, Future
 
+    from mcap.records import Channel, Schema
+
     from pipeline.logs.index import ChannelInfo, Part
     from pipeline.logs.messages import Messages
-    from pipeline.logs.records import ChannelRecord, SchemaRecord
     from pipeline.logs.source import ByteSource
 
 _NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be seen"
@@ -104,7 +105,7 @@ class Coverage:
 
 def find_contradictions(part: Part, messages: Messages) -> list[Loss]:
     """Schemas and channels that a chunk describes otherwise than the rest of the file does."""
-    pairs: list[tuple[SchemaRecord | ChannelRecord, SchemaRecord | ChannelRecord]] = [
+    pairs: list[tuple[Schema | Channel, Schema | Channel]] = [
         *((part.schemas.get(schema.id, schema), schema) for schema in messages.schemas),
         *((part.channels.get(channel.id, channel), channel) for channel in messages.channels),
     ]

@@ -19,10 +19,14 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from pipeline.logs.records import ChannelRecord, SchemaRecord
+    from mcap.records import Channel, Schema
+
     from pipeline.logs.scan import Catalog
     from pipeline.logs.spans import Span
 
+
+SUFFIXES: Final = (".mcap", ".db3", ".bag")
+"""Of the files that recordings are made of."""
 
 _LONGEST_SHOWN: Final = 100
 _MAX_LISTING: Final = 4 << 20
@@ -66,16 +70,18 @@ class Part:
         data_end: where the data section ends, None when unknown.
         data_crc: checksum of the data section, 0 when there is none.
         version: of an object on a store, None for a file.
+        container: what kind of file it is where it is no MCAP (see ``bags``).
     """
 
     path: Path
     spans: tuple[Span, ...]
-    channels: Mapping[int, ChannelRecord]
-    schemas: Mapping[int, SchemaRecord]
+    channels: Mapping[int, Channel]
+    schemas: Mapping[int, Schema]
     numbers: Mapping[int, int]
     data_end: int | None = None
     data_crc: int = 0
     version: str | None = None
+    container: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +130,11 @@ class LogIndex:
         return (self.end_ns - self.start_ns) * 1e-9
 
     @property
+    def containers(self) -> frozenset[str]:
+        """What kinds of file its parts are: empty for MCAP, else the name of a kind of bag."""
+        return frozenset(part.container for part in self.parts)
+
+    @property
     def complete(self) -> bool:
         """Whether nothing is known to be lost."""
         return not self.losses
@@ -154,8 +165,8 @@ def open_log(path: str | os.PathLike[str]) -> LogIndex:
     """Find out what a recording holds.
 
     Args:
-        path: an MCAP file or object (``s3://bucket/key``), or the folder of a recording split over several
-            (with or without the ``metadata.yaml`` of rosbag2).
+        path: an MCAP file or object (``s3://bucket/key``), a bag of ROS 1 or an SQLite file of rosbag2, or
+            the folder of a recording split over several (with or without the ``metadata.yaml`` of rosbag2).
 
     Raises:
         LogError: ``log_not_found``, ``log_empty``, ``not_mcap``, ``not_a_recording``, ``log_unreadable``.
@@ -195,7 +206,8 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
     if not path.is_dir():
         return [path], []
     listing = path / "metadata.yaml"
-    here = sorted(path.glob("*.mcap"), key=_split_number)
+    every = list_files(path)
+    here = [file for file in every if file.suffix == every[0].suffix]
     if listing.is_file():
         if listing.stat().st_size > _MAX_LISTING:
             raise LogError(
@@ -205,7 +217,7 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
                 hint="Put it back from where it was recorded, or remove it: the files are then found by name",
             )
         listed = [
-            name for name in _listed_files(listing.read_text("utf-8", "replace")) if name.endswith(".mcap")
+            name for name in _listed_files(listing.read_text("utf-8", "replace")) if name.endswith(SUFFIXES)
         ]
         named = {name: _find_listed(path, name) for name in listed}
         found = [file for file in named.values() if file is not None] or here
@@ -218,15 +230,20 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
     stems = {re.sub(r"_\d+$", "", file.stem) for file in here}
     if here and len(stems) == 1:
         return here, []
-    what, hint = "the folder holds no MCAP recording", "Give one .mcap file or one rosbag2 folder"
+    what, hint = "the folder holds no recording", "Give one .mcap, .db3 or .bag file, or one rosbag2 folder"
     if here:
         what = "the folder holds several recordings"
-    elif any(path.glob("*.mcap.zstd")):
+    elif any(path.glob("*.zstd")):
         what, hint = (
             "the recording's files are compressed as a whole",
-            "Unpack them: zstd -d --rm *.mcap.zstd",
+            "Unpack them: zstd -d --rm *.zstd",
         )
     raise LogError("not_a_recording", what, where=str(path), hint=hint)
+
+
+def list_files(folder: Path) -> list[Path]:
+    """Every file in a folder that may be one of a recording: MCAP first, by name and number."""
+    return [file for end in SUFFIXES for file in sorted(folder.glob(f"*{end}"), key=_split_number)]
 
 
 def _find_listed(folder: Path, name: str) -> Path | None:
@@ -300,6 +317,7 @@ def _merge(path: Path, catalogs: Sequence[tuple[Path, int, Catalog]], losses: Se
                 numbers,
                 catalog.data_end,
                 catalog.data_crc,
+                container=catalog.container,
             )
         )
     every = [catalog for _, _, catalog in catalogs]

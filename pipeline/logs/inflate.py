@@ -67,8 +67,28 @@ def check_size(stored: int, compression: str, size: int) -> None:
         raise InflateError(f"the compression {compression[:20]!r} is not known")
     if size > MAX_CHUNK or size > stored * _MAX_RATIO[compression] + 1024:
         raise InflateError(f"{stored} bytes cannot hold {size}")
-    if size > max(_PLAUSIBLE, stored * _PLAUSIBLE_RATIO):
+    if size > largest_plausible(stored):
         raise InflateError(f"{stored} bytes say they hold {size}, as no recording does")
+
+
+def largest_plausible(stored: int) -> int:
+    """Most bytes that so many stored ones inflate to in any recording."""
+    return min(MAX_CHUNK, max(_PLAUSIBLE, stored * _PLAUSIBLE_RATIO))
+
+
+def inflate_message(stored: bytes) -> Buffer:
+    """The content of a message that was compressed alone, as rosbag2 can; of others the bytes themselves.
+
+    Raises:
+        InflateError: as ``inflate``.
+    """
+    if not stored.startswith(zstandard.FRAME_HEADER):
+        return stored
+    try:
+        size = zstandard.frame_content_size(stored)
+    except zstandard.ZstdError as error:
+        raise InflateError(str(error)) from None
+    return inflate(stored, "zstd", max(size, 0))
 
 
 def inflate_into(stored: Buffer, compression: str, target: memoryview) -> None:

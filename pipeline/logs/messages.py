@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from mcap.records import Channel, Schema
 
 from pipeline.logs import records as rec
 from pipeline.logs.resync import find_record
@@ -69,8 +70,8 @@ class Messages:
     channel: NDArray[np.uint16]
     log_time: Ints
     publish_time: Ints
-    schemas: list[rec.SchemaRecord] = field(default_factory=list)
-    channels: list[rec.ChannelRecord] = field(default_factory=list)
+    schemas: list[Schema] = field(default_factory=list)
+    channels: list[Channel] = field(default_factory=list)
     damage: list[tuple[int, int]] = field(default_factory=list)
     walked: bool = False
 
@@ -78,8 +79,8 @@ class Messages:
 @dataclass(slots=True)
 class _Found:
     offsets: list[int] = field(default_factory=list)
-    schemas: list[rec.SchemaRecord] = field(default_factory=list)
-    channels: list[rec.ChannelRecord] = field(default_factory=list)
+    schemas: list[Schema] = field(default_factory=list)
+    channels: list[Channel] = field(default_factory=list)
     damage: list[tuple[int, int]] = field(default_factory=list)
 
 
@@ -175,14 +176,15 @@ def _walk(chunk: Buffer, start: int, end: int, found: _Found) -> None:
 
 def _take_side_record(opcode: int, body: Buffer, found: _Found) -> bool:
     try:
-        if opcode == rec.SCHEMA:
-            found.schemas.append(rec.parse_schema(body))
-        elif opcode == rec.CHANNEL:
-            found.channels.append(rec.parse_channel(body))
-        else:
-            return opcode >= FIRST_PRIVATE
+        record = rec.parse_record(opcode, body)
     except rec.RecordError:
         return False
+    if isinstance(record, Schema):
+        found.schemas.append(record)
+    elif isinstance(record, Channel):
+        found.channels.append(record)
+    else:
+        return opcode >= FIRST_PRIVATE
     return True
 
 

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import os
+import struct
 from dataclasses import dataclass, replace
 from functools import cache
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
 
 from pipeline.logs import records as rec
+from pipeline.logs.bags import (
+    LONGEST_HEAD,
+    LONGEST_MAGIC,
+    catalog_bag,
+    is_whole,
+    is_written_to,
+    tell_container,
+)
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import checksum
 from pipeline.logs.loading import checksum_holds, load_spans
@@ -16,8 +28,11 @@ from pipeline.logs.scan import Catalog, Scanner
 from pipeline.logs.spans import Loaded, Span, SpanKind, StoredAs
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pipeline.logs.source import ByteSource
 
+_FOOTER: Final = struct.Struct("<QQI")
 _MAX_SUMMARY: Final = 1 << 29
 
 
@@ -32,8 +47,8 @@ class _DamagedSummaryError(_NoSummaryError):
 @dataclass(frozen=True, slots=True)
 class _Summary:
     start: int
-    statistics: rec.StatisticsRecord
-    chunks: list[rec.ChunkIndexRecord]
+    statistics: Statistics
+    chunks: list[ChunkIndex]
     side_records: set[tuple[int, int, str]]
 
 
@@ -45,10 +60,14 @@ def catalog_file(source: ByteSource, *, threads: int = 1) -> Catalog:
         threads: how many chunks are inflated at once where the summary is missing.
 
     Raises:
-        LogError: ``not_mcap``.
+        LogError: ``not_mcap``; of a bag, ``log_unreadable``.
     """
+    head = source.read_at(0, LONGEST_MAGIC)
+    container = tell_container(head)
+    if container:
+        return catalog_bag(source, container)
     catalog = Catalog()
-    start = _check_magic(source, catalog)
+    start = _check_magic(head[: len(rec.MAGIC)], source, catalog)
     ends_well = source.read_at(max(0, source.size - len(rec.MAGIC)), len(rec.MAGIC)) == rec.MAGIC
     stop = source.size - len(rec.MAGIC) if ends_well and source.size >= 2 * len(rec.MAGIC) else source.size
     try:
@@ -70,8 +89,22 @@ def catalog_file(source: ByteSource, *, threads: int = 1) -> Catalog:
     return catalog
 
 
-def _check_magic(source: ByteSource, catalog: Catalog) -> int:
-    head = source.read_at(0, len(rec.MAGIC))
+def is_finished(path: Path) -> bool:
+    """Whether a recorder has put an end to a file, as far as its first and last bytes tell.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(LONGEST_HEAD)
+        size = stream.seek(0, os.SEEK_END)
+        if tell_container(head):
+            return is_whole(head, size) and not is_written_to(path)
+        stream.seek(max(0, size - len(rec.MAGIC)))
+        return size >= 2 * len(rec.MAGIC) and stream.read() == rec.MAGIC
+
+
+def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> int:
     if head == rec.MAGIC:
         return len(rec.MAGIC)
     alike = sum(a == b for a, b in zip(head, rec.MAGIC, strict=False))
@@ -85,9 +118,9 @@ def _check_magic(source: ByteSource, catalog: Catalog) -> int:
     if alike < len(rec.MAGIC) - 2:
         raise LogError(
             "not_mcap",
-            "the file does not begin as MCAP does",
+            "the file begins neither as MCAP does nor as a bag of ROS 1 or ROS 2",
             where=source.name,
-            hint="Give an .mcap file, or convert the recording (`ros2 bag convert`, `mcap convert`)",
+            hint="Give an .mcap, .bag or .db3 file, or convert the recording (`ros2 bag convert`)",
         )
     catalog.losses.append(Loss("damaged_record", "the file's first 8 bytes are damaged", bytes=8))
     return len(rec.MAGIC)
@@ -101,8 +134,7 @@ def _read_summary(source: ByteSource, catalog: Catalog) -> _Summary:
     opcode, length = rec.HEAD.unpack_from(tail, 0)
     if opcode != rec.FOOTER or length != rec.LEAST_BODY[rec.FOOTER]:
         raise _DamagedSummaryError("the footer is damaged")
-    parser = rec.Parser(tail[rec.HEAD_SIZE :])
-    start, _offsets, crc = parser.number(8), parser.number(8), parser.number(4)
+    start, _offsets, crc = _FOOTER.unpack_from(tail, rec.HEAD_SIZE)
     footer_at = source.size - rec.FOOTER_SIZE - len(rec.MAGIC)
     if start == 0:
         raise _NoSummaryError("there is no summary")
@@ -120,17 +152,17 @@ def _read_summary(source: ByteSource, catalog: Catalog) -> _Summary:
     return summary
 
 
-def _compare_chunks(source: ByteSource, chunks: list[rec.ChunkIndexRecord]) -> None:
+def _compare_chunks(source: ByteSource, chunks: list[ChunkIndex]) -> None:
     """Look whether chunks stand where a summary without checksum says."""
     for chunk in chunks:
-        head = source.read_at(chunk.offset, rec.HEAD_SIZE)
-        if head != rec.HEAD.pack(rec.CHUNK, chunk.length - rec.HEAD_SIZE):
+        head = source.read_at(chunk.chunk_start_offset, rec.HEAD_SIZE)
+        if head != rec.HEAD.pack(rec.CHUNK, chunk.chunk_length - rec.HEAD_SIZE):
             raise _DamagedSummaryError("the summary disagrees with the chunks")
 
 
 def _parse_summary(body: bytes, start: int, catalog: Catalog) -> _Summary:
-    statistics: rec.StatisticsRecord | None = None
-    chunks: list[rec.ChunkIndexRecord] = []
+    statistics: Statistics | None = None
+    chunks: list[ChunkIndex] = []
     listed: set[tuple[int, int, str]] = set()
     place = 0
     view = memoryview(body)
@@ -143,51 +175,47 @@ def _parse_summary(body: bytes, start: int, catalog: Catalog) -> _Summary:
             raise rec.RecordError("a record is cut")
         record = view[place : place + length]
         place += length
-        if opcode == rec.SCHEMA:
-            schema = rec.parse_schema(record)
-            catalog.schemas[schema.id] = schema
-        elif opcode == rec.CHANNEL:
-            channel = rec.parse_channel(record)
-            catalog.channels[channel.id] = channel
-        elif opcode == rec.STATISTICS:
-            statistics = rec.parse_statistics(record)
-        elif opcode == rec.CHUNK_INDEX:
-            chunks.append(rec.parse_chunk_index(record))
-        elif opcode in {rec.ATTACHMENT_INDEX, rec.METADATA_INDEX}:
-            listed.add(rec.parse_side_index(opcode, record))
+        parsed = rec.parse_record(opcode, record)
+        if isinstance(parsed, Schema):
+            catalog.schemas[parsed.id] = parsed
+        elif isinstance(parsed, Channel):
+            catalog.channels[parsed.id] = parsed
+        elif isinstance(parsed, Statistics):
+            statistics = parsed
+        elif isinstance(parsed, ChunkIndex):
+            chunks.append(parsed)
+        elif isinstance(parsed, AttachmentIndex | MetadataIndex):
+            listed.add((parsed.offset, parsed.length, parsed.name))
     if statistics is None:
         raise _NoSummaryError("the summary has no statistics")
     _check_summary(statistics, chunks, start, catalog)
     return _Summary(start, statistics, chunks, listed)
 
 
-def _check_summary(
-    statistics: rec.StatisticsRecord, chunks: list[rec.ChunkIndexRecord], start: int, catalog: Catalog
-) -> None:
+def _check_summary(statistics: Statistics, chunks: list[ChunkIndex], start: int, catalog: Catalog) -> None:
     if len(chunks) != statistics.chunk_count:
         raise _NoSummaryError("the summary does not list its chunks")
-    if sum(statistics.message_counts.values()) != statistics.message_count:
+    if sum(statistics.channel_message_counts.values()) != statistics.message_count:
         raise _NoSummaryError("the summary does not count its messages by channel")
-    if any(number not in catalog.channels for number in statistics.message_counts):
+    if any(number not in catalog.channels for number in statistics.channel_message_counts):
         raise _NoSummaryError("the summary does not list its channels")
     if any(c.schema_id and c.schema_id not in catalog.schemas for c in catalog.channels.values()):
         raise _NoSummaryError("the summary does not list its schemas")
     end = len(rec.MAGIC)
-    for chunk in sorted(chunks, key=lambda each: each.offset):
-        if chunk.offset < end or chunk.length < rec.LEAST_BODY[rec.CHUNK]:
+    for chunk in sorted(chunks, key=attrgetter("chunk_start_offset")):
+        if chunk.chunk_start_offset < end or chunk.chunk_length < rec.LEAST_BODY[rec.CHUNK]:
             raise _DamagedSummaryError("the summary places its chunks one over the other")
-        end = chunk.offset + chunk.length + chunk.index_length
+        end = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
         catalog.compressions.add(chunk.compression)
-        known = frozenset(chunk.index_offsets) or None
         catalog.spans.append(
             Span(
                 SpanKind.CHUNK,
-                chunk.offset,
-                chunk.length,
-                chunk.index_length,
-                chunk.start_ns,
-                chunk.end_ns,
-                known,
+                chunk.chunk_start_offset,
+                chunk.chunk_length,
+                chunk.message_index_length,
+                chunk.message_start_time,
+                chunk.message_end_time,
+                frozenset(chunk.message_index_offsets) or None,
                 StoredAs(chunk.compression, chunk.compressed_size, chunk.uncompressed_size),
                 chunk.uncompressed_size,
             )
@@ -221,15 +249,15 @@ def _compare_side_records(catalog: Catalog, summary: _Summary) -> None:
 
 def _take_statistics(source: ByteSource, catalog: Catalog, summary: _Summary, threads: int) -> None:
     statistics = summary.statistics
-    unlisted = {chunk.offset for chunk in summary.chunks}
+    unlisted = {chunk.chunk_start_offset for chunk in summary.chunks}
     extra = [s for s in catalog.spans if s.kind is not SpanKind.LOOSE and s.offset not in unlisted]
     if extra:
         catalog.notes.append(f"{len(extra)} chunks that the summary does not list were found")
         _examine(source, catalog, threads)
         return
-    catalog.counts = dict(statistics.message_counts)
+    catalog.counts = dict(statistics.channel_message_counts)
     if statistics.message_count:
-        catalog.start_ns, catalog.end_ns = statistics.start_ns, statistics.end_ns
+        catalog.start_ns, catalog.end_ns = statistics.message_start_time, statistics.message_end_time
 
 
 def _rebuild(source: ByteSource, catalog: Catalog, start: int, stop: int, threads: int) -> None:
@@ -244,8 +272,8 @@ def _examine(source: ByteSource, catalog: Catalog, threads: int) -> None:
     """
     catalog.counts = {}
     examined: list[Span] = []
-    schemas: dict[int, rec.SchemaRecord] = {}
-    channels: dict[int, rec.ChannelRecord] = {}
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
 
     @cache
     def file_holds() -> bool:

@@ -98,6 +98,14 @@ def gather_payloads(chunk: Buffer, messages: Messages, numbers: Iterable[int]) -
     }
 
 
+def join_payloads(log_time: list[int], payloads: list[Buffer]) -> Payloads:
+    """Messages of one channel that came one by one; recorded when they were published [ns]."""
+    time = np.array(log_time, dtype=np.int64)
+    size = np.array([len(payload) for payload in payloads], dtype=np.int64)
+    data = np.frombuffer(b"".join(payloads) or bytes(1), dtype=np.uint8)
+    return Payloads(time, time, _group_by_size(data, np.cumsum(size) - size, size))
+
+
 def _group_by_size(data: NDArray[np.uint8], start: Ints, size: Ints) -> list[Group]:
     first = int(size[0])
     if size.min() == size.max():

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from pipeline.logs.bags import read_bag
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer
 from pipeline.logs.codecs import decoder_for
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pipeline.logs.bags import BagMessages
     from pipeline.logs.codecs import Recipe
     from pipeline.logs.columns import Column
     from pipeline.logs.index import ChannelInfo, Part
@@ -257,6 +259,8 @@ def _read_part(
     source: ByteSource, part: Part, wanted: set[int], threads: int, section: DataSection
 ) -> Iterator[_Gathered]:
     own = {number for number, merged in part.numbers.items() if merged in wanted}
+    if part.container:
+        return (_gather_bag(part, messages) for messages in read_bag(part.path, part.container, own))
 
     def gather(span: Span, loaded: Loaded) -> _Gathered:
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)
@@ -268,6 +272,13 @@ def _read_part(
 
     spans = _spans_with(part, own)
     return load_spans(source, spans, gather, threads=threads, wanted=own, file_holds=section.holds)
+
+
+def _gather_bag(part: Part, messages: BagMessages) -> _Gathered:
+    merged = {part.numbers[number]: each for number, each in messages.payloads.items()}
+    # Nothing in a bag is covered by a checksum.
+    stretch = int(bool(merged))
+    return _Gathered(merged, messages.losses, stretch, stretch, index_damaged=False)
 
 
 def _spans_with(part: Part, own: set[int]) -> list[Span]:

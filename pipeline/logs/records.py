@@ -1,4 +1,4 @@
-"""The records of an MCAP file: opcodes and parsers that trust no length.
+"""The records of an MCAP file: opcodes, and mcap's own records read from bodies whose lengths nobody trusts.
 
 Layout after the MCAP specification, version 0x30: a record is an opcode (u8), a length (u64) and the body.
 """
@@ -6,10 +6,23 @@ Layout after the MCAP specification, version 0x30: a record is an opcode (u8), a
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass
+from io import BytesIO
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.records import (
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -58,6 +71,16 @@ LEAST_BODY: Final[Mapping[int, int]] = {
 }
 """Fewest bytes of the body of every kind of record."""
 
+_KINDS: Final[Mapping[int, Any]] = {
+    HEADER: Header,
+    SCHEMA: Schema,
+    CHANNEL: Channel,
+    CHUNK_INDEX: ChunkIndex,
+    ATTACHMENT_INDEX: AttachmentIndex,
+    STATISTICS: Statistics,
+    METADATA: Metadata,
+    METADATA_INDEX: MetadataIndex,
+}
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _INDEX_HEAD: Final = struct.Struct("<HI")
 _ENTRY_SIZE: Final = 16
@@ -65,27 +88,6 @@ _ENTRY_SIZE: Final = 16
 
 class RecordError(ValueError):
     """A record whose body does not hold what its opcode promises."""
-
-
-@dataclass(frozen=True, slots=True)
-class SchemaRecord:
-    """A schema: number, type name, encoding, definition."""
-
-    id: int
-    name: str
-    encoding: str
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class ChannelRecord:
-    """A channel: number, schema number, topic, encoding of its messages, metadata."""
-
-    id: int
-    schema_id: int
-    topic: str
-    message_encoding: str
-    metadata: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,100 +106,55 @@ class ChunkHead:
     body: int
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkIndexRecord:
-    """What the summary says of a chunk."""
-
-    start_ns: int
-    end_ns: int
-    offset: int
-    length: int
-    index_offsets: Mapping[int, int]
-    index_length: int
-    compression: str
-    compressed_size: int
-    uncompressed_size: int
-
-
-@dataclass(frozen=True, slots=True)
-class StatisticsRecord:
-    """Counts over the whole file."""
-
-    message_count: int
-    chunk_count: int
-    attachment_count: int
-    metadata_count: int
-    start_ns: int
-    end_ns: int
-    message_counts: Mapping[int, int] = field(default_factory=dict)
-
-
-class Parser:
-    """Reads the fields of one record's body in order.
-
-    Raises:
-        RecordError: from every method, when the body ends too early.
-    """
+class _Body(ReadDataStream):
+    """One record's body; where mcap takes what is there, this refuses what is too short."""
 
     def __init__(self, body: Buffer) -> None:
-        self.body = memoryview(body)
-        self.place = 0
+        super().__init__(BytesIO(body))
+        self._left = len(body)
 
-    def take(self, size: int) -> memoryview:
-        """The next ``size`` bytes."""
-        if size > len(self.body) - self.place:
+    def read(self, length: int) -> bytes:
+        """The next bytes.
+
+        Raises:
+            RecordError: the body ends before.
+        """
+        if length > self._left:
             raise RecordError("a length points beyond the end of its record")
-        self.place += size
-        return self.body[self.place - size : self.place]
+        self._left -= length
+        return super().read(length)
 
-    def number(self, size: int) -> int:
-        """The next unsigned little-endian number of ``size`` bytes."""
-        return int.from_bytes(self.take(size), "little")
+    def read_prefixed_string(self) -> str:
+        """The next string (u32 length, UTF-8).
 
-    def text(self) -> str:
-        """The next string (u32 length, UTF-8)."""
+        Raises:
+            RecordError: it is none.
+        """
         try:
-            return str(self.take(self.number(4)), "utf-8")
+            return super().read_prefixed_string()
         except UnicodeDecodeError:
             raise RecordError("a string is no UTF-8") from None
 
-    def texts(self) -> dict[str, str]:
-        """The next map of strings."""
-        below = Parser(self.take(self.number(4)))
-        found: dict[str, str] = {}
-        while below.place < len(below.body):
-            key = below.text()
-            found[key] = below.text()
-        return found
 
-    def counts(self, size: int) -> dict[int, int]:
-        """The next map from u16 to numbers of ``size`` bytes."""
-        below = Parser(self.take(self.number(4)))
-        found: dict[int, int] = {}
-        while below.place < len(below.body):
-            key = below.number(2)
-            found[key] = below.number(size)
-        return found
+def parse_record(opcode: int, body: Buffer) -> McapRecord | None:
+    """The record of a kind that says what a file holds; None for other kinds.
+
+    Raises:
+        RecordError: the body does not hold what the opcode promises.
+    """
+    kind = _KINDS.get(opcode)
+    return None if kind is None else cast("McapRecord", kind.read(_Body(body)))
 
 
-def parse_header(body: Buffer) -> tuple[str, str]:
-    """Profile and library."""
-    parser = Parser(body)
-    return parser.text(), parser.text()
+def parse_attachment_name(body: Buffer) -> str:
+    """Name of an attachment, from the first bytes of its record's body.
 
-
-def parse_schema(body: Buffer) -> SchemaRecord:
-    """A schema record."""
-    parser = Parser(body)
-    number, name, encoding = parser.number(2), parser.text(), parser.text()
-    return SchemaRecord(number, name, encoding, bytes(parser.take(parser.number(4))))
-
-
-def parse_channel(body: Buffer) -> ChannelRecord:
-    """A channel record."""
-    parser = Parser(body)
-    number, schema_id = parser.number(2), parser.number(2)
-    return ChannelRecord(number, schema_id, parser.text(), parser.text(), parser.texts())
+    Raises:
+        RecordError: they do not hold it.
+    """
+    stream = _Body(body)
+    stream.read(16)
+    return stream.read_prefixed_string()
 
 
 def parse_chunk_head(body: Buffer, body_size: int) -> ChunkHead:
@@ -232,45 +189,3 @@ def parse_message_index(body: Buffer) -> tuple[int, NDArray[np.uint64]]:
         raise RecordError("a message index says it is longer than its record")
     count = size // _ENTRY_SIZE * 2
     return channel, np.frombuffer(body, dtype="<u8", count=count, offset=_INDEX_HEAD.size).reshape(-1, 2)
-
-
-def parse_chunk_index(body: Buffer) -> ChunkIndexRecord:
-    """A chunk index record."""
-    parser = Parser(body)
-    start, end, offset, length = (parser.number(8) for _ in range(4))
-    offsets, index_length, compression = parser.counts(8), parser.number(8), parser.text()
-    return ChunkIndexRecord(
-        start, end, offset, length, offsets, index_length, compression, parser.number(8), parser.number(8)
-    )
-
-
-def parse_side_index(opcode: int, body: Buffer) -> tuple[int, int, str]:
-    """Where the summary says that a metadata record or an attachment stands, its length, and its name."""
-    parser = Parser(body)
-    place, length = parser.number(8), parser.number(8)
-    if opcode == ATTACHMENT_INDEX:
-        parser.take(24)
-    return place, length, parser.text()
-
-
-def parse_statistics(body: Buffer) -> StatisticsRecord:
-    """The statistics record."""
-    parser = Parser(body)
-    messages = parser.number(8)
-    parser.take(2)
-    _channels, attachments, metadata, chunks = (parser.number(4) for _ in range(4))
-    start, end = parser.number(8), parser.number(8)
-    return StatisticsRecord(messages, chunks, attachments, metadata, start, end, parser.counts(8))
-
-
-def parse_metadata(body: Buffer) -> tuple[str, dict[str, str]]:
-    """Name and entries of a metadata record."""
-    parser = Parser(body)
-    return parser.text(), parser.texts()
-
-
-def parse_attachment_name(body: Buffer) -> str:
-    """Name of an attachment, from the first bytes of its record's body."""
-    parser = Parser(body)
-    parser.take(16)
-    return parser.text()

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from mcap.records import Channel, Header, Metadata, Schema
 
 from pipeline.logs import records as rec
 from pipeline.logs.errors import Loss
@@ -28,14 +29,16 @@ _MAX_SIDE_RECORD: Final = 1 << 26
 class Catalog:
     """What is known of a file.
 
-    ``metadata`` and ``attachments`` keep the order of the file, ``side_records`` are their places, lengths
-    and names; ``counts`` are messages by channel number.
+    ``container`` is what kind of file it is, empty for MCAP. ``metadata`` and ``attachments`` keep the order
+    of the file, ``side_records`` are their places, lengths and names; ``counts`` are messages by channel
+    number.
     """
 
+    container: str = ""
     profile: str = ""
     library: str = ""
-    schemas: dict[int, rec.SchemaRecord] = field(default_factory=dict)
-    channels: dict[int, rec.ChannelRecord] = field(default_factory=dict)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
     spans: list[Span] = field(default_factory=list)
     compressions: set[str] = field(default_factory=set)
     metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
@@ -50,22 +53,18 @@ class Catalog:
     footer_seen: bool = False
     side_records: set[tuple[int, int, str]] = field(default_factory=set)
 
-    def note_contradiction(
-        self, one: rec.SchemaRecord | rec.ChannelRecord, other: rec.SchemaRecord | rec.ChannelRecord
-    ) -> None:
+    def note_contradiction(self, one: Schema | Channel, other: Schema | Channel) -> None:
         """Note a schema or channel that the file holds twice, where the two differ."""
         loss = describe_contradiction(one, other)
         if loss is not None and loss not in self.losses:
             self.losses.append(loss)
 
 
-def describe_contradiction(
-    one: rec.SchemaRecord | rec.ChannelRecord, other: rec.SchemaRecord | rec.ChannelRecord
-) -> Loss | None:
+def describe_contradiction(one: Schema | Channel, other: Schema | Channel) -> Loss | None:
     """What two records of one number say differently; None where they agree."""
     if one == other:
         return None
-    if isinstance(one, rec.ChannelRecord) and isinstance(other, rec.ChannelRecord):
+    if isinstance(one, Channel) and isinstance(other, Channel):
         # Recorders may add to a channel's own notes, which nothing is decoded by.
         if replace(one, metadata={}) == replace(other, metadata={}):
             return None
@@ -172,18 +171,16 @@ class Scanner:
 
     def _note_small(self, opcode: int, place: int, body: memoryview) -> None:
         catalog = self._catalog
-        if opcode == rec.SCHEMA:
-            schema = rec.parse_schema(body)
-            catalog.note_contradiction(catalog.schemas.setdefault(schema.id, schema), schema)
-        elif opcode == rec.CHANNEL:
-            channel = rec.parse_channel(body)
-            catalog.note_contradiction(catalog.channels.setdefault(channel.id, channel), channel)
-        elif opcode == rec.METADATA:
-            record = rec.parse_metadata(body)
-            catalog.metadata.append(record)
-            catalog.side_records.add((place, rec.HEAD_SIZE + len(body), record[0]))
-        elif opcode == rec.HEADER:
-            catalog.profile, catalog.library = rec.parse_header(body)
+        record = rec.parse_record(opcode, body)
+        if isinstance(record, Schema):
+            catalog.note_contradiction(catalog.schemas.setdefault(record.id, record), record)
+        elif isinstance(record, Channel):
+            catalog.note_contradiction(catalog.channels.setdefault(record.id, record), record)
+        elif isinstance(record, Metadata):
+            catalog.metadata.append((record.name, record.metadata))
+            catalog.side_records.add((place, rec.HEAD_SIZE + len(body), record.name))
+        elif isinstance(record, Header):
+            catalog.profile, catalog.library = record.profile, record.library
         elif opcode == rec.DATA_END:
             catalog.data_crc = int.from_bytes(body[:4], "little")
         elif opcode == rec.FOOTER:

@@ -3,30 +3,16 @@
 from __future__ import annotations
 
 import os
-import zlib
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Final
+from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
 
 import numpy as np
+from mcap.writer import CompressionType, Writer
 
-from pipeline.logs import records as rec
 from pipeline.logs.definitions import definition_text
 from pipeline.logs.encode import encode_rows
 from pipeline.logs.errors import LogError
-from pipeline.logs.messages import MESSAGE_HEAD, MESSAGE_OVERHEAD
-from pipeline.logs.pack import (
-    ChunkSummary,
-    pack_channel,
-    pack_chunk,
-    pack_metadata,
-    pack_record,
-    pack_schema,
-    pack_summary,
-    pack_text,
-)
 from pipeline.logs.schema import leaf_paths, parse_msg
-from pipeline.logs.spool import Spool
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -41,23 +27,32 @@ if TYPE_CHECKING:
     Ints = NDArray[np.int64]
 
 LIBRARY: Final = "slip-pipeline"
-COMPRESSIONS: Final = ("", "lz4", "zstd")
+COMPRESSIONS: Final = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
 _SECOND: Final = 1_000_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class _Type:
-    number: int
+class _Type(NamedTuple):
+    schema_id: int
     structure: Structure
-    record: bytes
 
 
-@dataclass(slots=True)
-class _Channel:
-    number: int
-    kind: _Type
-    record: bytes
-    messages: int = 0
+class _Rows(NamedTuple):
+    """Serialized messages of one length of one channel: times [ns] and numbers (n,), payloads (n, length)."""
+
+    channel: int
+    log_time: Ints
+    publish_time: Ints
+    sequence: Ints
+    payloads: NDArray[np.uint8]
+
+    def select(self, chosen: NDArray[np.bool_]) -> _Rows:
+        return _Rows(
+            self.channel,
+            self.log_time[chosen],
+            self.publish_time[chosen],
+            self.sequence[chosen],
+            self.payloads[chosen],
+        )
 
 
 class LogWriter:
@@ -85,17 +80,10 @@ class LogWriter:
             )
         self._path = Path(path)
         self._draft = self._path.with_name(f".{self._path.name}.{os.getpid()}.part")
-        self._chunk_size = chunk_size
-        self._compression = compression
         self._types: dict[str, _Type] = {}
-        self._channels: dict[tuple[str, str], _Channel] = {}
-        self._crc = 0
-        self._has_begun = False
-        self._metadata: list[tuple[str, Mapping[str, str]]] = []
-        self._places: list[tuple[int, int, str]] = []
-        self._chunks: list[ChunkSummary] = []
-        self._written: set[bytes] = set()
-        self._spool = Spool(self._path)
+        self._channels: dict[tuple[str, str], int] = {}
+        self._sequences: dict[int, int] = {}
+        self._waiting: list[_Rows] = []
         try:
             self._file: BinaryIO = self._draft.open("wb")
         except OSError as error:
@@ -105,10 +93,17 @@ class LogWriter:
                 where=str(path),
                 hint="Choose another folder or check its permissions",
             ) from None
+        self._mcap = Writer(
+            self._file,
+            chunk_size=chunk_size,
+            compression=COMPRESSIONS[compression],
+            enable_data_crcs=True,
+        )
+        self._mcap.start(profile="ros2", library=LIBRARY)
 
     def metadata(self, name: str, record: Mapping[str, str]) -> None:
         """Add a metadata record."""
-        self._metadata.append((name, dict(record)))
+        self._mcap.add_metadata(name, dict(record))
 
     def write_columns(
         self,
@@ -156,16 +151,10 @@ class LogWriter:
         if header_time is not None:
             given = {**_stamp_fields(kind.structure, np.asarray(header_time, dtype=np.int64), topic), **given}
         channel = self._channel(topic, kind)
-        first, channel.messages = channel.messages, channel.messages + log.size
+        first = self._sequences[channel]
+        self._sequences[channel] += log.size
         for rows, payloads in encode_rows(kind.structure, log.size, given, where=topic):
-            records = np.empty((rows.size, MESSAGE_OVERHEAD + payloads.shape[1]), dtype=np.uint8)
-            head = np.empty(rows.size, dtype=MESSAGE_HEAD)
-            head["opcode"], head["length"] = rec.MESSAGE, records.shape[1] - rec.HEAD_SIZE
-            head["channel"], head["sequence"] = channel.number, first + rows
-            head["log_time"], head["publish_time"] = log[rows], publish[rows]
-            records[:, :MESSAGE_OVERHEAD] = head.view(np.uint8).reshape(rows.size, -1)
-            records[:, MESSAGE_OVERHEAD:] = payloads
-            self._spool.add(records, channel.number, log[rows])
+            self._waiting.append(_Rows(channel, log[rows], publish[rows], first + rows, payloads))
 
     def write_before(self, log_time: int) -> None:
         """Write what was logged before a time, so that memory holds only what comes later.
@@ -176,59 +165,41 @@ class LogWriter:
         Args:
             log_time: [ns].
         """
-        self._begin()
-        self._write_chunks(log_time)
+        waiting = self._waiting
+        self._write([rows.select(rows.log_time < log_time) for rows in waiting])
+        later = [rows.select(rows.log_time >= log_time) for rows in waiting]
+        self._waiting = [rows for rows in later if rows.log_time.size]
 
     def close(self) -> None:
         """Write everything and put the file in its place."""
-        self._begin()
-        self._write_chunks(None)
-        kinds = [kind.record for kind in self._types.values()]
-        channels = [channel.record for channel in self._channels.values()]
-        for record in [*kinds, *channels]:
-            self._put(b"" if record in self._written else record)
-        self._put_metadata()
-        self._put(pack_record(rec.DATA_END, self._crc.to_bytes(4, "little")))
-        self._put(pack_summary(self._file.tell(), kinds, channels, self._chunks, self._places))
-        self._put(rec.MAGIC)
+        self._write(self._waiting)
+        self._waiting = []
+        self._mcap.finish()  # type: ignore[no-untyped-call]
         self._file.flush()
         os.fsync(self._file.fileno())
         self._file.close()
-        self._spool.close()
         self._draft.replace(self._path)
 
-    def _begin(self) -> None:
-        if self._has_begun:
-            return
-        self._has_begun = True
-        self._put(rec.MAGIC)
-        self._put(pack_record(rec.HEADER, pack_text("ros2") + pack_text(LIBRARY)))
-        self._put_metadata()
-
-    def _put_metadata(self) -> None:
-        for name, entries in self._metadata:
-            packed = pack_metadata(name, entries)
-            self._places.append((self._file.tell(), len(packed), name))
-            self._put(packed)
-        self._metadata = []
-
-    def _write_chunks(self, before: int | None) -> None:
-        by_number = {channel.number: channel for channel in self._channels.values()}
-        for batch in self._spool.batches(self._chunk_size, before):
-            side = b""
-            for number in np.unique(batch.channel).tolist():
-                for record in (by_number[number].kind.record, by_number[number].record):
-                    side += b"" if record in self._written else record
-                    self._written.add(record)
-            packed, indexes, summary = pack_chunk(batch, side, self._compression)
-            self._chunks.append(replace(summary, offset=self._file.tell()))
-            self._put(packed)
-            self._put(indexes)
+    def _write(self, waiting: list[_Rows]) -> None:
+        empty = np.empty(0, dtype=np.int64)
+        log = np.concatenate([empty, *(rows.log_time for rows in waiting)])
+        owner = np.concatenate([empty, *(np.full(rows.log_time.size, n) for n, rows in enumerate(waiting))])
+        inside = np.concatenate([empty, *(np.arange(rows.log_time.size) for rows in waiting)])
+        # Of one time, what was given first comes first.
+        order = np.argsort(log, kind="stable")
+        for number, row in zip(owner[order].tolist(), inside[order].tolist(), strict=True):
+            rows = waiting[number]
+            self._mcap.add_message(
+                rows.channel,
+                int(rows.log_time[row]),
+                rows.payloads[row].tobytes(),
+                int(rows.publish_time[row]),
+                int(rows.sequence[row]),
+            )
 
     def discard(self) -> None:
         """Leave no trace."""
         self._file.close()
-        self._spool.close()
         self._draft.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
@@ -246,10 +217,6 @@ class LogWriter:
             self.discard()
             raise
 
-    def _put(self, packed: bytes) -> None:
-        self._crc = zlib.crc32(packed, self._crc)
-        self._file.write(packed)
-
     def _type(self, name: str, definition: str | None) -> _Type:
         known = self._types.get(name)
         if known is not None:
@@ -262,16 +229,15 @@ class LogWriter:
                 where=str(self._path),
                 hint="Give `definition`, or use one of the standard types",
             )
-        number = len(self._types) + 1
-        record = pack_schema(number, name, "ros2msg", text.encode())
-        self._types[name] = _Type(number, parse_msg(name, text), record)
+        number = self._mcap.register_schema(name, "ros2msg", text.encode())
+        self._types[name] = _Type(number, parse_msg(name, text))
         return self._types[name]
 
-    def _channel(self, topic: str, kind: _Type) -> _Channel:
+    def _channel(self, topic: str, kind: _Type) -> int:
         key = (topic, kind.structure.name)
         if key not in self._channels:
-            number = len(self._channels) + 1
-            self._channels[key] = _Channel(number, kind, pack_channel(number, kind.number, topic, "cdr"))
+            channel = self._mcap.register_channel(topic, "cdr", kind.schema_id)
+            self._channels[key], self._sequences[channel] = channel, 0
         return self._channels[key]
 
 

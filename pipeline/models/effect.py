@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from pipeline.models.evidence import Evidence, Largest, Relative
-    from pipeline.runs.signals import Commands, Floats, Rolling, Surroundings, Velocity, Wheels
+    from pipeline.runs.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
 
 INF = math.inf
 NAN = math.nan
@@ -278,10 +278,10 @@ class Effect(ABC):
         del largest
         return ()
 
-    def scale_without(self, other: Effect) -> float:
-        """What its numbers are to be multiplied with where another effect is left out of the same motion."""
+    def depends_on(self, other: Effect) -> bool:
+        """Whether one motion shows only the ratio of its number to that of another effect."""
         del other
-        return 1.0
+        return False
 
     def is_used(self, parameter: Parameter) -> bool:
         """Whether a parameter takes part: of two that stand for each other only the one that is given."""
@@ -382,7 +382,7 @@ class CommandEffect(Effect):
     place = Place.COMMAND
 
     @abstractmethod
-    def change_commands(self, commands: Commands, around: Surroundings) -> Commands:
+    def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """What the drive is told in place of these commands."""
 
 
@@ -392,7 +392,7 @@ class DriveEffect(Effect):
     place = Place.DRIVE
 
     @abstractmethod
-    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """What the wheels do in place of this."""
 
 
@@ -402,7 +402,7 @@ class KinematicEffect(Effect):
     place = Place.KINEMATICS
 
     @abstractmethod
-    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """The body velocity before the ground, in place of this."""
 
 
@@ -412,7 +412,7 @@ class BodyEffect(Effect):
     place = Place.BODY
 
     @abstractmethod
-    def move_body(self, rolling: Rolling, around: Surroundings) -> Velocity:
+    def move_body(self, rolling: Rolling, around: RunContext) -> Velocity:
         """Velocity of the body before ground effects are added."""
 
 
@@ -425,7 +425,7 @@ class AddedEffect(Effect):
     place = Place.GROUND
 
     @abstractmethod
-    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Velocity:
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
         """Add the effect to ``total``.
 
         Args:
@@ -440,7 +440,7 @@ class LinearEffect(AddedEffect):
     """Adds parameter times column."""
 
     @abstractmethod
-    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """What one unit of each parameter adds to v_x, v_y, v_w.
 
         Args:
@@ -449,7 +449,7 @@ class LinearEffect(AddedEffect):
             around: the run.
         """
 
-    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Velocity:
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
         """Add all columns, each times its parameter."""
         for name, (x, y, w) in self.columns(rolling, velocity, around).items():
             value = self.values[name]
@@ -465,14 +465,14 @@ class ReportEffect(Effect):
     place = Place.LOCALIZATION
 
     @abstractmethod
-    def report(self, velocity: Velocity, around: Surroundings) -> Velocity:
+    def report(self, velocity: Velocity, around: RunContext) -> Velocity:
         """Velocity as the reported poses show it."""
 
     def delay_s(self) -> float:
         """How late the reported position is stamped beyond its heading, or beyond what is known [s]."""
         return 0.0
 
-    def report_gyro(self, velocity: Velocity, around: Surroundings) -> Velocity:
+    def report_gyro(self, velocity: Velocity, around: RunContext) -> Velocity:
         """As `report`, where the heading is a gyro's and not the poses' own."""
         return self.report(velocity, around)
 

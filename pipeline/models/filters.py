@@ -38,21 +38,21 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
     fade = step_s / tau
     known = np.where(np.isfinite(start), start, signal[resets.at])
     if np.array_equal(resets.at, resets.first):
-        _add_fading(before, known - before[resets.at], resets.at, resets, fade)
+        _add_fading(before, known - before[resets.at], resets.number, resets.since_set, fade)
     else:
-        _add_fading(before, signal[resets.first] - before[resets.first], resets.first, resets, fade)
-        _add_fading(before, known - before[resets.at], resets.at, resets, fade)
+        missing = signal[resets.first] - before[resets.first]
+        _add_fading(before, missing, resets.number, resets.since_first, fade)
+        _add_fading(before, known - before[resets.at], resets.number, resets.since_set, fade)
     lagged: Signal = signal + (before - signal) * (tau / step_s * (1.0 - decay))
     return lagged
 
 
-def _add_fading(state: Signal, missing: Signal, at: Integers, resets: Resets, fade: float) -> None:
+def _add_fading(state: Signal, missing: Signal, number: Integers, since: Integers, fade: float) -> None:
     """Add what is missing at each reset to the state; it fades until the next reset comes."""
-    ends = np.append(resets.first[1:], state.size)
-    count = np.clip(ends - at, 0, int(_FORGOTTEN / fade) + 1)
-    since = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
-    table = np.exp(-fade * np.arange(int(count.max(initial=1))))
-    state[np.repeat(at, count) + since] += np.repeat(missing, count) * table[since]
+    forgotten = int(_FORGOTTEN / fade) + 1
+    # The last entry is that of cells before the state was set, too: their place is -1.
+    table = np.append(np.exp(-fade * np.arange(forgotten)), 0.0)
+    state += missing[number] * table[np.minimum(since, forgotten)]
 
 
 def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, start: Floats) -> Floats:

@@ -20,12 +20,12 @@ from pipeline.models.effect import (
     ReportEffect,
 )
 from pipeline.runs.grid import MeasuredDrive, begin_spans, hold_on_cells
-from pipeline.runs.signals import Rolling, Surroundings, Velocity, Wheels, roll_ideally
+from pipeline.runs.signals import Rolling, RunContext, Velocity, Wheels, roll_ideally
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from pipeline.runs.grid import Cells
+    from pipeline.runs.grid import Grid
     from pipeline.runs.recording import DriveSeries
 
 Result = TypeVar("Result")
@@ -40,11 +40,9 @@ class Timing:
     """Delays that are no physics, per run.
 
     Attributes:
-        pose_delay_s: how late the reported poses are against the gyro's clock, or the input's without one.
         wheel_delay_s: how late measured wheels are.
     """
 
-    pose_delay_s: float = 0.0
     wheel_delay_s: float = 0.0
 
 
@@ -62,8 +60,8 @@ class Forward:
     def __init__(
         self,
         series: DriveSeries,
-        cells: Cells,
-        around: Surroundings,
+        cells: Grid,
+        around: RunContext,
         *,
         encoders: DriveSeries | None,
         has_gyro: bool,
@@ -78,7 +76,7 @@ class Forward:
         # A derivative by each number in turn: the state it starts from must outlast the turns.
         self._most = _REMEMBERED_OF_SHORT if cells.times.size < _SHORT else _REMEMBERED
         self._kept: dict[Place, OrderedDict[object, object]] = {place: OrderedDict() for place in Place}
-        self._known: OrderedDict[float, Surroundings] = OrderedDict()
+        self._known: OrderedDict[float, RunContext] = OrderedDict()
 
     def run_commands(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
         """Body velocity as reported, of commands."""
@@ -98,7 +96,7 @@ class Forward:
         )
         return self._move(wheels, key, effects)
 
-    def _start_wheels(self, delay_s: float) -> Surroundings:
+    def _start_wheels(self, delay_s: float) -> RunContext:
         """The run with wheel speeds as the encoders had them where states begin."""
         if self._encoders is None:
             return self.around
@@ -134,7 +132,7 @@ class Forward:
         return hold_on_cells(commands, self.cells)
 
     def _drive(
-        self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect], around: Surroundings
+        self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect], around: RunContext
     ) -> tuple[Wheels, tuple[object, ...]]:
         """Wheels at the drivetrain's end, and their key; kept after each effect: the next may vary alone."""
         for effect in effects:
@@ -183,7 +181,7 @@ class Forward:
         return Velocity(rolling.v0, np.zeros_like(rolling.v0), rolling.w0)
 
 
-def replace_surroundings(forward: Forward, around: Surroundings) -> Forward:
+def replace_context(forward: Forward, around: RunContext) -> Forward:
     """The same input in other surroundings."""
     return Forward(
         forward.series, forward.cells, around, encoders=forward.encoders, has_gyro=forward.has_gyro

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.core.toml import TomlError, parse_toml, require_finite, shorten
+from pipeline.core.errors import shorten
+from pipeline.core.toml import TomlError, parse_toml, require_finite
 from pipeline.models.catalogue import find_effect, run_effects
 from pipeline.models.formula.formula_effect import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.model import Model
@@ -63,6 +64,15 @@ class ModelFile:
     code: tuple[str, ...] = field(default=(), compare=False)
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+
+    def find_wheel_delay(self, run: str) -> float:
+        """How late the encoders of a run were in the last fit [s]; zero where it was not fitted on it."""
+        runs = self.fit.get("runs")
+        for entry in runs if isinstance(runs, list) else []:
+            late = entry.get("wheel_delay_s") if isinstance(entry, dict) and entry.get("run") == run else None
+            if isinstance(late, float):
+                return late
+        return 0.0
 
 
 def read_model(path: Path) -> ModelFile:

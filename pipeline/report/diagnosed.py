@@ -1,13 +1,15 @@
-"""The model that a diagnosis named, on its run, for figures."""
+"""The model that a diagnosis wrote, on its run, for figures."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.identification import Problem, choose_input, fit_model
-from pipeline.models import Model, find_effect
+from pipeline.identification import Problem, State, choose_input
+from pipeline.models import Timing
+from pipeline.models.model_file import parse_model
 from pipeline.report.motion_view import MotionStage, MotionView
-from pipeline.report.run import mapping_in, number_in, objects_in
+from pipeline.report.run import mapping_in, objects_in
 from pipeline.runs import MotionError, load_run
 
 if TYPE_CHECKING:
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-    from pipeline.models import Effect
+    from pipeline.models import ModelFile
     from pipeline.vehicles import Vehicle
 
 
@@ -35,42 +37,31 @@ def view_diagnosis(
     Returns:
         Rows to draw; None where nothing was named, or the run is too poor for a model.
     """
-    model = name_model(diagnosis, vehicle)
-    if model is None or "poses" not in tables:
+    file = read_model_text(diagnosis)
+    if file is None or not file.model.effects or "poses" not in tables:
         return None
     asked = diagnosis.get("input")
     try:
         run = load_run(tables, vehicle, name=str(diagnosis.get("run", "")))
-        problem = Problem(
-            [run], vehicle, choose_input([run], asked if isinstance(asked, str) else None).source
-        )
-        state = fit_model(problem, model).state
+        source = choose_input([run], asked if isinstance(asked, str) else None).source
+        problem = Problem([run], vehicle, source)
     except MotionError:
         # A log that is too poor for a model has its slip all the same.
         return None
+    state = State(file.model.effects, (Timing(file.find_wheel_delay(run.name)),))
     places = tables["velocities"].select("t", "x", "y").sort("t") if "velocities" in tables else None
     floor = mapping_in(diagnosis, "noise_floor")
     return MotionStage(problem, places).view(state, objects_in(diagnosis, "ladder"), floor or None)
 
 
-def name_model(diagnosis: Mapping[str, object], vehicle: Vehicle) -> Model | None:
-    """The model that a diagnosis names, with its values; None where it names nothing.
+def read_model_text(diagnosis: Mapping[str, object]) -> ModelFile | None:
+    """The model file that a diagnosis wrote; None where it wrote none that can be read.
 
     Args:
         diagnosis: the JSON object of one run of ``slip diagnose --json``.
-        vehicle: geometry.
     """
-    made = [_make_effect(entry) for entry in objects_in(diagnosis, "effects")]
-    effects = tuple(effect for effect in made if effect is not None and vehicle.kind in effect.kinds)
-    return Model(vehicle, effects) if effects else None
-
-
-def _make_effect(entry: Mapping[str, object]) -> Effect | None:
-    """An effect with the values of the diagnosis; None for one that no longer exists or cannot be so."""
-    found = mapping_in(entry, "parameters")
-    values = {name: number_in(mapping_in(found, name), "value") for name in found}
+    text = diagnosis.get("model")
     try:
-        made = find_effect(str(entry.get("id", "")))()
-        return made.change(**{name: value for name, value in values.items() if value is not None})
+        return parse_model(text, Path("diagnosis.toml")) if isinstance(text, str) else None
     except MotionError:
         return None

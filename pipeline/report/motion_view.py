@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.identification import Fitted, Problem, State
-    from pipeline.identification.comparison import Reach
+    from pipeline.identification.comparison import HorizonErrors
 
 Floats = NDArray[np.float64]
 
@@ -91,15 +91,15 @@ class MotionStage:
         return fit_model(self.problem, Model(self.problem.vehicle))
 
     @cached_property
-    def _ideal_reach(self) -> Reach:
-        return self._comparison.find_reach((), self.ideal.state.timing[0])
+    def _ideal_reach(self) -> HorizonErrors:
+        return self._comparison.find_horizon_errors((), self.ideal.state.timing[0])
 
     @cached_property
     def _signals(self) -> dict[str, Floats]:
         comparison = self._comparison
-        cells, around = comparison.cells, comparison.surroundings
+        cells, around = comparison.cells, comparison.context
         velocity = comparison.predict_velocity((), Timing())
-        times, span = comparison.windows.times - comparison.usual_delay, comparison.windows.span_s
+        times, span = comparison.windows.times, comparison.windows.span_s
         edges = cells.locate_edges(times.ravel())
         index = np.arange(cells.times.size + 1, dtype=np.float64)
         middle = times.mean(axis=1)
@@ -133,7 +133,7 @@ class MotionStage:
             floor: the noise floor as JSON.
         """
         comparison = self._comparison
-        rows = self.problem.run_of == 0
+        rows = self.problem.whole.run == 0
         ideal, model = self.ideal.residuals[rows], self.problem.find_run_residuals(state, 0)
         effects, timing = state.effects_of(0), state.timing[0]
         residuals = pl.DataFrame(
@@ -146,12 +146,12 @@ class MotionStage:
         )
         return MotionView(
             input=self.problem.source.value,
-            effects=state.model.ids,
+            effects=state.ids,
             ladder=ladder,
             floor=floor,
             residuals=residuals,
             velocity=self._draw_velocity(state),
-            reach=self._gather_reach(comparison.find_reach(effects, timing)),
+            reach=self._gather_reach(comparison.find_horizon_errors(effects, timing)),
             arcs=self._draw_arcs(state),
         )
 
@@ -163,13 +163,13 @@ class MotionStage:
         columns = {f"v_{name}": getattr(velocity, name)[kept] for name in COMPONENTS}
         return pl.DataFrame(
             {
-                "t": cells.times[kept] + state.timing[0].pose_delay_s,
+                "t": cells.times[kept],
                 "piece": cells.span[kept].astype(np.int32),
                 **columns,
             }
         )
 
-    def _gather_reach(self, reach: Reach) -> pl.DataFrame:
+    def _gather_reach(self, reach: HorizonErrors) -> pl.DataFrame:
         horizons, ideal = self._comparison.horizons, self._ideal_reach
         count = np.maximum(np.bincount(horizons.number), 1)
 

@@ -22,7 +22,7 @@ _BEFORE = 1.0
 
 
 @dataclass(frozen=True)
-class Cells:
+class Grid:
     """Cells of all spans, one after the other.
 
     Attributes:
@@ -62,7 +62,7 @@ class Cells:
         return self.first[span] + inside / self.step_s
 
 
-def make_cells(run: MotionRun, rate_hz: float) -> Cells:
+def lay_grid(run: MotionRun, rate_hz: float) -> Grid:
     """Cut a run at the holes of its recording and lay cells over what remains.
 
     Args:
@@ -82,7 +82,7 @@ def make_cells(run: MotionRun, rate_hz: float) -> Cells:
     first = np.concatenate(([0], np.cumsum(counts)[:-1]))
     span = np.repeat(np.arange(starts.size), counts)
     times = starts[span] + (np.arange(span.size) - first[span] + 0.5) * step
-    return Cells(step, times, span, first, starts, starts + counts * step)
+    return Grid(step, times, span, first, starts, starts + counts * step)
 
 
 class MeasuredDrive:
@@ -116,7 +116,7 @@ class MeasuredDrive:
         )
 
 
-def begin_spans(series: DriveSeries, cells: Cells, measured: Floats) -> Commands:
+def begin_spans(series: DriveSeries, cells: Grid, measured: Floats) -> Commands:
     """Commands with a first value for every span: what the wheels did there, or the span's first command.
 
     Args:
@@ -144,7 +144,7 @@ def begin_spans(series: DriveSeries, cells: Cells, measured: Floats) -> Commands
     return Commands(times[order], *columns)
 
 
-def hold_on_cells(commands: Commands, cells: Cells) -> Wheels:
+def hold_on_cells(commands: Commands, cells: Grid) -> Wheels:
     """Cell means of held commands, exact wherever a stamp falls inside a cell."""
     times = commands.times
     edges = np.concatenate((cells.times - 0.5 * cells.step_s, cells.ends))

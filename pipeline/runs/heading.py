@@ -18,7 +18,7 @@ from pipeline.core import timegrid
 from pipeline.runs.recording import GyroFit
 
 if TYPE_CHECKING:
-    from pipeline.runs.grid import Cells
+    from pipeline.runs.grid import Grid
     from pipeline.runs.recording import MotionRun, Track
 
 Floats = NDArray[np.float64]
@@ -62,7 +62,7 @@ class Heading:
     offset: Floats
 
 
-def choose_heading(run: MotionRun, cells: Cells, source: HeadingSource) -> Heading:
+def choose_heading(run: MotionRun, cells: Grid, source: HeadingSource) -> Heading:
     """The gyro's heading where it agrees with the poses, else the poses' own."""
     track = run.track
     fit = run.gyro_fit if source is HeadingSource.AUTO else None
@@ -71,7 +71,7 @@ def choose_heading(run: MotionRun, cells: Cells, source: HeadingSource) -> Headi
     times, rate = run.gyro
     on_cells = fit.signed_scale * np.interp(cells.times, times, rate) + fit.bias
     edges = cells.sum_up(on_cells)
-    seen = np.interp(cells.locate_edges(track.times - fit.yaw_delay_s), np.arange(edges.size), edges)
+    seen = np.interp(cells.locate_edges(track.times), np.arange(edges.size), edges)
     difference = track.heading - seen
     good = ~mark_barred(run, track.times)
     offset = align_heading(track, difference, good, cells.find_span(track.times))

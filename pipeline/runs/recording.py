@@ -83,7 +83,7 @@ class GyroFit:
     Attributes:
         signed_scale: negative where the gyro turns the other way.
         bias: [rad/s].
-        yaw_delay_s: how late the reported heading is against the gyro.
+        yaw_delay_s: how late the heading of the track is against the gyro: none once a recording is aligned.
         delay_error_s: standard error of that delay, from stretches of ten seconds.
         residual: robust spread of what is left over that of the turning itself.
     """
@@ -109,6 +109,7 @@ class Alignment:
         command_scale: by which the recorded command was multiplied.
         track_multiplier: by which the controller multiplies the track width.
         gyro: how the gyro fits the poses; None without a good one.
+        heading_delay_s: how late the reported heading was against the gyro: taken off the poses.
         latency_spread_s: standard deviation of the latencies that were taken off the poses.
         outlier_s: time in which the localization goes where the wheels did not, beside bad stretches.
         recorded_moduli: median slip modulus with L = 1 m by input before anything was put right [m/s].
@@ -118,6 +119,7 @@ class Alignment:
     command_scale: float = 1.0
     track_multiplier: float = 1.0
     gyro: GyroFit | None = None
+    heading_delay_s: float = 0.0
     latency_spread_s: float = 0.0
     outlier_s: float = 0.0
     recorded_moduli: Mapping[str, float | None] = field(default_factory=dict)
@@ -239,7 +241,7 @@ def read_alignment(table: pl.DataFrame) -> Alignment:
         gyro = GyroFit(
             row["gyro_scale"],
             row["gyro_bias"],
-            row["heading_delay"],
+            0.0,
             row["heading_delay_error"],
             row["gyro_residual"],
         )
@@ -248,6 +250,7 @@ def read_alignment(table: pl.DataFrame) -> Alignment:
         row["command_scale"],
         row["track_multiplier"],
         gyro,
+        row["heading_delay"] or 0.0,
         row["latency_spread"],
         row["outlier_time"],
         {name: row[f"recorded_modulus_{name}"] for name in _INPUTS},
@@ -267,7 +270,7 @@ def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
             "track_multiplier": [alignment.track_multiplier],
             "gyro_scale": [fit.signed_scale if fit and known else None],
             "gyro_bias": [fit.bias if fit and known else None],
-            "heading_delay": [fit.yaw_delay_s if fit and known else None],
+            "heading_delay": [alignment.heading_delay_s if fit and known else None],
             "heading_delay_error": [fit.delay_error_s if fit and known else None],
             "gyro_residual": [fit.residual if fit and known else None],
             "latency_spread": [alignment.latency_spread_s],

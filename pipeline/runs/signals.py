@@ -8,6 +8,7 @@ are grouped in spans; between spans the recording had a hole.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
@@ -129,9 +130,21 @@ class Resets:
     at: Integers
     start: Floats
 
+    @cached_property
+    def since_first(self) -> Integers:
+        """How many cells after its reset each cell comes, shape (n,)."""
+        since: Integers = np.arange(self.number.size) - self.first[self.number]
+        return since
+
+    @cached_property
+    def since_set(self) -> Integers:
+        """How many cells after the state was set each cell comes, -1 before, shape (n,)."""
+        since: Integers = np.maximum(np.arange(self.number.size) - self.at[self.number], -1)
+        return since
+
 
 @dataclass(frozen=True)
-class Surroundings:
+class RunContext:
     """What an effect may know of a run beside the signal it acts on.
 
     Attributes:
@@ -165,7 +178,7 @@ class Surroundings:
 _LEAST_RIM_SPEED = 0.01
 
 
-def find_turning(wheels: Wheels, around: Surroundings) -> Floats:
+def find_turning(wheels: Wheels, around: RunContext) -> Floats:
     """One where the wheels turn, zero where they stand, shape (n,)."""
     rim = around.vehicle.wheel_radius_m * np.maximum(np.abs(wheels.left), np.abs(wheels.right))
     return (rim > _LEAST_RIM_SPEED).astype(np.float64)
@@ -177,14 +190,14 @@ def name_inputs(drive: Drive, vehicle: Vehicle) -> dict[str, Floats]:
     return {"left": drive.left, "right": drive.right, "speed": speed, "steering": drive.steering}
 
 
-def roll_ideally(wheels: Wheels, around: Surroundings) -> Rolling:
+def roll_ideally(wheels: Wheels, around: RunContext) -> Rolling:
     """Ideal velocity of the drivetrain's output, without sideways motion."""
     vehicle = around.vehicle
     forward, _, turning = vehicle.kinematics.forward(name_inputs(wheels, vehicle), vehicle)
     return Rolling(forward, turning, wheels)
 
 
-def earlier_in_span(around: Surroundings, late: float) -> Flags:
+def earlier_in_span(around: RunContext, late: float) -> Flags:
     """Whether the time ``late`` seconds before each cell lies in the same span (after it, when negative)."""
     spans = around.spans
     last = np.append(spans.first[1:], around.times.size) - 1

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.runs.heading import has_barred
 
 if TYPE_CHECKING:
-    from pipeline.runs.grid import Cells
+    from pipeline.runs.grid import Grid
     from pipeline.runs.recording import MotionRun, Track
     from pipeline.runs.signals import Signal
 
@@ -95,7 +95,7 @@ class Horizons:
     times: Floats
 
 
-def gather_nodes(track: Track, cells: Cells) -> Nodes:
+def gather_nodes(track: Track, cells: Grid) -> Nodes:
     """Gather poses: means over 0.13 s every quarter of a second, or single poses where they are rare."""
     span = cells.find_span(track.times)
     cut = (np.diff(track.segment) != 0) | (np.diff(span) != 0)
@@ -120,7 +120,7 @@ def gather_nodes(track: Track, cells: Cells) -> Nodes:
     return Nodes(poses, first, count, times, piece[poses][first])
 
 
-def number_blocks(run: MotionRun, cells: Cells) -> Floats:
+def number_blocks(run: MotionRun, cells: Grid) -> Floats:
     """Starts of blocks [s]: command steps, short ones joined, long ones divided; and spans."""
     hard = cells.starts
     soft = run.step_starts
@@ -150,7 +150,7 @@ def find_lead(run: MotionRun, delay_s: float) -> float:
     return _LEAD_S if run.wheels is None else max(delay_s, 0.0) + _LEAST_LEAD_S
 
 
-def join_windows(run: MotionRun, cells: Cells, nodes: Nodes, lead_s: float) -> Windows:
+def join_windows(run: MotionRun, cells: Grid, nodes: Nodes, lead_s: float) -> Windows:
     """All windows of half a second, a quarter of a second apart where poses are dense."""
     start = np.arange(nodes.times.size)
     at = np.searchsorted(nodes.times, nodes.times + WINDOW_S)
@@ -170,7 +170,7 @@ def join_windows(run: MotionRun, cells: Cells, nodes: Nodes, lead_s: float) -> W
     return Windows(start, end, times[:, 1] - times[:, 0], block, times)
 
 
-def join_horizons(run: MotionRun, cells: Cells, nodes: Nodes, lead_s: float) -> Horizons:
+def join_horizons(run: MotionRun, cells: Grid, nodes: Nodes, lead_s: float) -> Horizons:
     """Predictions of two seconds, one after the other."""
     reach = nodes.times + HORIZON_S
     last = np.searchsorted(nodes.times, reach + 0.13, side="right") - 1
@@ -195,7 +195,7 @@ def join_horizons(run: MotionRun, cells: Cells, nodes: Nodes, lead_s: float) -> 
 
 
 def _is_clean(
-    run: MotionRun, cells: Cells, nodes: Nodes, ends: tuple[Integers, Integers], lead_s: float
+    run: MotionRun, cells: Grid, nodes: Nodes, ends: tuple[Integers, Integers], lead_s: float
 ) -> Flags:
     """Whether a stretch stays in one piece, clear of what is barred and of its span's first moments."""
     start, end = ends

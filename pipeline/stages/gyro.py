@@ -13,7 +13,7 @@ from pipeline.stages.finding import Finding
 if TYPE_CHECKING:
     import polars as pl
 
-    from pipeline.runs.recording import GyroFit
+    from pipeline.runs.recording import Alignment, GyroFit
 
 Floats = NDArray[np.float64]
 
@@ -55,13 +55,14 @@ def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -
     return corrected
 
 
-def describe_gyro(fit: GyroFit | None, turning: Floats) -> list[Finding]:
+def describe_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
     """What is said of the gyro.
 
     Args:
-        fit: how it fits the poses; None where it does not.
+        alignment: with how it fits the poses, if it does.
         turning: yaw rate of the poses [rad/s], shape (n,).
     """
+    fit = alignment.gyro
     if fit is None:
         if float(np.std(turning)) < _LEAST_TURNING:
             text = "the vehicle turned too little to check the gyro against the poses: it was not used"
@@ -82,8 +83,9 @@ def describe_gyro(fit: GyroFit | None, turning: Floats) -> list[Finding]:
     if abs(fit.bias) > _BIAS_FORGIVEN:
         text = f"the gyro has a bias of {-fit.bias:.4f} rad/s against the poses: it was taken off"
         findings.append(Finding("imu_bias", "info", text, where="imu", value=-fit.bias))
-    if abs(fit.yaw_delay_s) > _LATE:
-        late = "late" if fit.yaw_delay_s > 0.0 else "early"
-        text = f"the poses are {abs(fit.yaw_delay_s) * 1e3:.0f} ms {late} against the gyro"
-        findings.append(Finding("pose_delay", "info", text, where="pose", value=fit.yaw_delay_s))
+    delay = alignment.heading_delay_s
+    if abs(delay) > _LATE:
+        late = "late" if delay > 0.0 else "early"
+        text = f"the poses are {abs(delay) * 1e3:.0f} ms {late} against the gyro: put right"
+        findings.append(Finding("pose_delay", "info", text, where="pose", value=delay))
     return findings

@@ -119,14 +119,17 @@ def _differentiate_segment(piece: pl.DataFrame, settings: VelocitySection) -> pl
     """Velocities of one segment; None when it is too short."""
     times = piece["t"].to_numpy()
     fresh = segments.select_fresh_poses(times, piece["held"].to_numpy())
-    aligned = times - piece["latency"].to_numpy() if "latency" in piece.columns else times
+    aligned = times
+    if "latency" in piece.columns:
+        aligned = np.maximum.accumulate(times - piece["latency"].to_numpy())
     # Latencies leave the order as it is, up to rounding.
-    fresh = fresh[np.diff(np.maximum.accumulate(aligned[fresh]), prepend=-np.inf) > 0.0]
+    fresh = fresh[np.diff(aligned[fresh], prepend=-np.inf) > 0.0]
     if fresh.size < 2:  # noqa: PLR2004 - one pose has no velocity
         return None
     kept = aligned[fresh]
     # The grid spans the whole segment, repeats included: a vehicle may stand at its end.
-    if times[-1] - times[0] < _SHORTEST_SPAN:
+    first, last = max(float(aligned[0]), 0.0), float(aligned[-1])
+    if last - first < _SHORTEST_SPAN:
         return None
     position = piece.select("x", "y", "z").to_numpy()[fresh]
     quaternion = piece.select("q_x", "q_y", "q_z", "q_w").to_numpy()[fresh]
@@ -134,7 +137,7 @@ def _differentiate_segment(piece: pl.DataFrame, settings: VelocitySection) -> pl
     odometer = np.concatenate(
         (np.zeros((1, 3)), np.cumsum(np.column_stack((move[:, :2], turn[:, 2])), axis=0))
     )
-    grid = timegrid.make_grid(times[0], times[-1], settings.rate_hz)
+    grid = timegrid.make_grid(first, last, settings.rate_hz)
     inside = np.clip(grid, kept[0], kept[-1])
     velocity = timegrid.differentiate_locally(inside, kept, odometer, settings.window_s)
     at, attitude = rigid.interpolate_poses(inside, kept, position, quaternion)
@@ -151,6 +154,6 @@ def _differentiate_segment(piece: pl.DataFrame, settings: VelocitySection) -> pl
             "pitch": pitch,
             "yaw": rigid.unwrap_yaw(yaw),
             **{name: velocity[:, i] for i, name in enumerate(("v_x", "v_y", "v_w"))},
-            "outlier": outlier[timegrid.nearest_indices(grid, times)],
+            "outlier": outlier[timegrid.nearest_indices(grid, aligned)],
         }
     )

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from stat import S_ISDIR
 from typing import TYPE_CHECKING
 
+from pipeline.logs import list_files
 from pipeline.store.manifest import hash_bytes
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def see_log(path: Path) -> LogSighting:
             seen_ns=seen_ns,
         )
     # A part may change without its folder noticing.
-    parts = {part.name: part.stat() for part in path.glob("*.mcap")}
+    parts = {part.name: part.stat() for part in list_files(path)}
     told = [[name, part.st_size, part.st_mtime_ns, part.st_ino] for name, part in sorted(parts.items())]
     return LogSighting(
         path=str(path.resolve()),

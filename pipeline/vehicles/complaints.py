@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.core.toml import shorten
+from pipeline.core.errors import shorten
 from pipeline.vehicles.configuration import Configuration
 from pipeline.vehicles.errors import ConfigurationError
 from pipeline.vehicles.presets import find_preset, list_presets

@@ -18,11 +18,11 @@ from pipeline.vehicles import list_presets
 from pipeline.web.answers import answer, make_handlers
 from pipeline.web.errors import WorkbenchError
 from pipeline.web.guard import LOOPBACK, Guard
-from pipeline.web.hall import Hall
 from pipeline.web.limits import Limits
 from pipeline.web.places import Places
 from pipeline.web.requests import read_ask
 from pipeline.web.runs import find_run, list_runs
+from pipeline.web.sessions import Sessions
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
@@ -61,7 +61,7 @@ class Web:
         hall: what is asked.
     """
 
-    def __init__(self, hall: Hall) -> None:
+    def __init__(self, hall: Sessions) -> None:
         self._hall = hall
 
     def routes(self) -> list[Route]:
@@ -185,7 +185,7 @@ def build_app(
         work: what the worker process does with a task; importable by its name there.
     """
     places = Places(results)
-    hall = Hall(results, limits or Limits(), diagnosis=diagnosis, places=places, work=work)
+    hall = Sessions(results, limits or Limits(), diagnosis=diagnosis, places=places, work=work)
 
     @asynccontextmanager
     async def live(_: Starlette) -> AsyncIterator[None]:

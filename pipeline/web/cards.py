@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from pipeline.models import Effect, Parameter
     from pipeline.models.model_file import ModelFile
     from pipeline.vehicles import Vehicle
-    from pipeline.web.desk import Desk
+    from pipeline.web.session import Session
 
 _STEPS = 200
 _LATEST = 12
 
 
-def show_desk(desk: Desk, file: ModelFile) -> dict[str, object]:
+def show_session(desk: Session, file: ModelFile) -> dict[str, object]:
     """The state of a desk as JSON.
 
     Args:
@@ -92,7 +92,7 @@ def describe_shortly(effect: Effect | type[Effect]) -> str:
 
 def _show_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> dict[str, object]:
     value = effect.values[parameter.name]
-    low, high = find_reach(parameter, value)
+    low, high = find_range(parameter, value)
     interval = file.intervals.get(f"{effect.id}.{parameter.name}")
     return {
         "name": parameter.name,
@@ -108,7 +108,7 @@ def _show_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> di
     }
 
 
-def find_reach(parameter: Parameter, value: float) -> tuple[float, float]:
+def find_range(parameter: Parameter, value: float) -> tuple[float, float]:
     """Ends of a slider: the neutral value, the usual size and the present one inside, within the bounds."""
     neutral = parameter.neutral if math.isfinite(parameter.neutral) else value
     usual = abs(parameter.typical - neutral) or 1.0

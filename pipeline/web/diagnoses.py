@@ -9,8 +9,8 @@ from pipeline.analysis.diagnosis import DIAGNOSIS, read_recording
 from pipeline.analysis.options import INPUTS
 from pipeline.store.files import make_folder, replace_file
 from pipeline.store.names import encode_run
-from pipeline.web.desk import FOLDER
 from pipeline.web.runs import read_json
+from pipeline.web.session import FOLDER
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -50,7 +50,8 @@ export class Pane {
       this.show();
       return true;
     } catch (error) {
-      toast(error.message);
+      if (error.code === "error_rises") toast(error.message, "Take it anyway", () => this.act(action, { ...more, anyway: true }));
+      else toast(error.message);
       return false;
     } finally {
       this.busy(false);
@@ -321,11 +322,11 @@ export class Pane {
   named(diagnosis, there) {
     if (!diagnosis)
       return h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", onclick: () => this.diagnose() }, "Diagnose"));
-    const effects = (diagnosis.effects ?? []).filter((entry) => !there.has(entry.id)).sort((a, b) => (b.gain ?? 0) - (a.gain ?? 0));
+    const effects = (diagnosis.effects ?? []).filter((entry) => !there.has(entry.id) && !entry.corrected).sort((a, b) => (b.gain ?? 0) - (a.gain ?? 0));
     const told = effects.map((entry) => h("li", { class: "first", data: { effect: entry.id }, bar: 1 },
       h("div", {}, h("b", {}, entry.id), h("span", { class: "quiet" }, `named by the diagnosis${Number.isFinite(entry.gain) ? `: without it the loss is ${say(entry.gain + 1)} times as high` : ""}${(entry.equivalent_to ?? []).length ? `; same as ${entry.equivalent_to.join(", ")}` : ""}`)),
       h("button", { type: "button", class: "add", "aria-label": `add ${entry.id}, named by the diagnosis`, onclick: () => this.add(entry.id) }, "Add")));
-    const all = effects.length > 1 && h("button", { type: "button", class: "add-all", onclick: () => this.addAll(effects.map((entry) => entry.id)) }, `Add all ${effects.length}`);
+    const all = effects.length > 1 && h("button", { type: "button", class: "add-all", onclick: () => this.addAll() }, `Add all ${effects.length}`);
     const undecided = (diagnosis.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. ${entry.separate_by ?? ""}`));
     const rest = diagnosis.unexplained ? [h("p", { class: "quiet" }, `Not explained yet: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}`)] : [];
     return h("div", { class: "named" }, told.length ? h("ul", { class: "proposals" }, told) : null, all, undecided, rest);
@@ -351,12 +352,9 @@ export class Pane {
     if (this.state?.desk.effects.some((entry) => entry.id === effect)) this.tryAll();
   }
 
-  // One after the other: each is a step that can be undone, and a step of the staircase.
-  async addAll(effects) {
-    for (const effect of effects) {
-      await this.act("add", { effect });
-      if (!this.state?.desk.effects.some((entry) => entry.id === effect)) return;
-    }
+  // The joint fit of the diagnosis, as one step that can be undone.
+  async addAll() {
+    await this.act("add_named");
     this.tryAll();
   }
 

@@ -14,9 +14,17 @@ export const h = (tag, props = {}, ...children) => {
   return node;
 };
 
-export const toast = (text) => {
+export const toast = (text, word, action) => {
   const place = document.getElementById("toast");
-  place.textContent = text;
+  place.replaceChildren(text);
+  if (action)
+    place.append(
+      " ",
+      h("button", { type: "button", class: "anyway", onclick: () => {
+        place.hidden = true;
+        action();
+      } }, word),
+    );
   place.hidden = false;
   clearTimeout(toast.timer);
   toast.timer = setTimeout(() => (place.hidden = true), 9000);

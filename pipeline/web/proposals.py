@@ -6,11 +6,11 @@ import threading
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from pipeline.core.errors import SlipError
+from pipeline.diagnosis.verdict import compare
 from pipeline.identification import fit_model, hold_out
 from pipeline.identification.ladder import compare_losses
+from pipeline.identification.weights import make_weights
 from pipeline.models import list_effects
 from pipeline.runs import MotionError
 from pipeline.web.cards import describe_shortly
@@ -19,13 +19,11 @@ from pipeline.web.errors import evaluating
 if TYPE_CHECKING:
     from pipeline.identification import HeldOut, Problem
     from pipeline.models import Model
-    from pipeline.web.bench import Stand
+    from pipeline.web.run_cache import PreparedRun
 
 _WORTH = 0.99
-_SURE = 2.5
 _EACH_NUMBER = 1.02
 _MOST_KEPT = 40
-_CLIP = 6.0
 
 
 @dataclass
@@ -64,21 +62,21 @@ class Trials:
         self._known: dict[tuple[object, ...], Trial] = {}
         self._lock = threading.Lock()
 
-    def find(self, stand: Stand, model: Model) -> Trial | None:
+    def find(self, prepared: PreparedRun, model: Model) -> Trial | None:
         """The trial of a model, if there is one that was not stopped before its end."""
         with self._lock:
-            trial = self._known.get(_key(stand, model))
+            trial = self._known.get(_key(prepared, model))
         return None if trial is None or trial.is_broken else trial
 
-    def begin(self, stand: Stand, model: Model, owner: str) -> Trial:
+    def begin(self, prepared: PreparedRun, model: Model, owner: str) -> Trial:
         """Try every effect on top of a model, in the background; what its owner had begun before ends.
 
         Args:
-            stand: the run.
+            prepared: the run.
             model: as it stands.
             owner: who asks: one trial each.
         """
-        key = _key(stand, model)
+        key = _key(prepared, model)
         with self._lock:
             known = self._known.get(key)
             if known is not None and not known.is_broken:
@@ -90,31 +88,31 @@ class Trials:
             kinds = [
                 effect
                 for effect in list_effects()
-                if stand.vehicle.kind in effect.kinds and effect.id not in model
+                if prepared.vehicle.kind in effect.kinds and effect.id not in model
             ]
             trial = Trial(owner, len(kinds))
             self._known[key] = trial
         names = [effect.id for effect in kinds]
-        threading.Thread(target=_try_all, args=(stand, model, names, trial), daemon=True).start()
+        threading.Thread(target=_try_all, args=(prepared, model, names, trial), daemon=True).start()
         return trial
 
 
-def _key(stand: Stand, model: Model) -> tuple[object, ...]:
-    manifest = stand.manifest
-    return (manifest.run, manifest.key, stand.problem.source.value, model.effects)
+def _key(prepared: PreparedRun, model: Model) -> tuple[object, ...]:
+    manifest = prepared.manifest
+    return (manifest.run, manifest.key, prepared.problem.source.value, model.effects)
 
 
-def _try_all(stand: Stand, model: Model, names: list[str], trial: Trial) -> None:
+def _try_all(prepared: PreparedRun, model: Model, names: list[str], trial: Trial) -> None:
     try:
-        with evaluating(stand.manifest.run):
-            _try_each(stand, model, names, trial)
+        with evaluating(prepared.manifest.run):
+            _try_each(prepared, model, names, trial)
     except SlipError:
         # On top of a model that cannot be fitted nothing can be tried.
         trial.tried = trial.total
 
 
-def _try_each(stand: Stand, model: Model, names: list[str], trial: Trial) -> None:
-    problem = stand.coarse_problem()
+def _try_each(prepared: PreparedRun, model: Model, names: list[str], trial: Trial) -> None:
+    problem = prepared.second_problem()
     base: HeldOut = hold_out(problem, fit_model(problem, model))
     kinds = {effect.id: effect for effect in list_effects()}
     for name in names:
@@ -152,12 +150,6 @@ def _reaches_further(base: HeldOut, new: HeldOut) -> bool:
 
 
 def _is_sure(problem: Problem, base: HeldOut, new: HeldOut) -> bool:
-    """Whether the loss falls in most blocks, not by luck in a few: t over blocks of command steps."""
-    known = np.isfinite(base.residuals).all(axis=1) & np.isfinite(new.residuals).all(axis=1)
-    sizes = [base.weights.normalise(side.residuals, problem)[known] for side in (base, new)]
-    before, after = (np.minimum(size**2, _CLIP**2).mean(axis=1) for size in sizes)
-    block = problem.block_of[known]
-    count = np.bincount(block)
-    gain = np.bincount(block, before - after)[count > 0] / count[count > 0]
-    error = float(gain.std(ddof=1)) / np.sqrt(gain.size) if gain.size > 1 else np.inf
-    return bool(gain.mean() > _SURE * error)
+    """Whether the loss falls beyond doubt, not by luck in a few stretches."""
+    weights = make_weights(base.residuals, problem.whole)
+    return compare(problem.whole, weights, base.residuals, new.residuals).accepts()

@@ -24,7 +24,8 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         run: name of the run.
         slot: `a`, or `b` for the desk beside it.
         input: what the model is fed with; None for the usual one.
-        action: what to do.
+        action: what to do; `add_named` puts in the model that the diagnosis wrote, fitted as one.
+        anyway: take an effect though it raises an error.
         effect: id of the effect it concerns.
         parameter: name of the parameter it concerns.
         value: new value.
@@ -37,6 +38,7 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     action: Literal[
         "open",
         "add",
+        "add_named",
         "drop",
         "switch",
         "set",
@@ -48,6 +50,7 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         "redo",
         "try",
     ] = "open"
+    anyway: bool = False
     effect: str = ""
     parameter: str = ""
     value: float = 0.0

@@ -17,7 +17,7 @@ from pipeline.analysis.options import Options
 from pipeline.simulate import simulate_case
 
 ROOT = Path(__file__).parents[2]
-BASE = {"python", "slip-pipeline", "numpy", "scipy", "polars", "pyarrow"}
+BASE = {"python", "slip-pipeline", "mcap", "numpy", "scipy", "polars", "pyarrow"}
 DECLARED = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
 
 

@@ -12,8 +12,7 @@ import pytest
 
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.options import Options
-from pipeline.diagnosis import Diagnosis, Recording, Value, diagnose_runs
-from pipeline.diagnosis.own_way import rescale_values
+from pipeline.diagnosis import Diagnosis, Recording, diagnose_runs
 from pipeline.diagnosis.plausibility import find_implausible, is_nameable
 from pipeline.diagnosis.words import describe, list_lines
 from pipeline.models import Model, find_effect, read_model
@@ -97,12 +96,6 @@ def test_the_regions_say_where_it_fails(skidding: Diagnosis) -> None:
     assert skidding.tabulate_where(skidding.runs[0].run).height > 20
 
 
-def test_drivetrain_and_ground_agree_with_the_whole_way(skidding: Diagnosis) -> None:
-    consistency = skidding.runs[0].consistency
-    assert set(consistency) == {"drive_lag.tau", "effective_track.k"}
-    assert all(item["agrees"] for item in consistency.values())  # type: ignore[index, call-overload]
-
-
 def test_the_screen_names_each_effect_and_the_fall(skidding: Diagnosis) -> None:
     text = describe(skidding)
     assert "effective_track" in text
@@ -159,9 +152,8 @@ def test_an_old_heading_is_found_against_the_gyro_and_rated_with_the_position_as
     (named,) = run.effects
     assert named.id == "heading_skew"
     assert named.parameters["d"].value == pytest.approx(0.1, abs=0.02)
-    ideal, last = run.ladder[0], run.ladder[-1]
-    for error in ("t_mrmse_m", "r_mrmse_rad"):
-        assert last[error] < 0.9 * ideal[error]  # type: ignore[operator]
+    # The heading that is compared is the gyro's: what falls is the error of the position.
+    assert run.ladder[-1]["t_mrmse_m"] < 0.9 * run.ladder[0]["t_mrmse_m"]  # type: ignore[operator]
 
 
 def test_driven_straight_only_turning_is_said_to_be_unobservable(tmp_path: Path) -> None:
@@ -319,12 +311,10 @@ def test_what_no_vehicle_does_is_said() -> None:
     assert find_implausible(find_effect("yaw_drift")(c=0.1)) is None
 
 
-def test_a_track_is_told_for_the_nominal_radius_where_the_radius_is_undecided() -> None:
-    track = {"k": Value(1.65, 1.6, 1.7, "1")}
-    scale = find_effect("effective_track")(k=1.65).scale_without(find_effect("wheel_radius")(k=0.95))
-    told = rescale_values(track, scale)["k"]
-    assert told.value == pytest.approx(1.65 / 0.95)
-    assert (told.low, told.high) == pytest.approx((1.6 / 0.95, 1.7 / 0.95))
+def test_a_track_depends_on_the_radius_and_on_nothing_else() -> None:
+    track = find_effect("effective_track")(k=1.65)
+    assert track.depends_on(find_effect("wheel_radius")(k=0.95))
+    assert not track.depends_on(find_effect("drive_lag")(tau=0.3))
 
 
 def test_an_effect_out_of_bounds_is_an_error_of_the_model() -> None:

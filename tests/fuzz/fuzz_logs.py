@@ -20,9 +20,10 @@ import warnings
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT)]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "logs")]
 
 import numpy as np  # noqa: E402 - the repository is put on the path first
+from bag_files import BagWriter, write_bag, write_db3  # noqa: E402
 from mcap.writer import CompressionType, IndexType, Writer  # noqa: E402
 
 from pipeline.logs import (  # noqa: E402
@@ -107,6 +108,10 @@ def write_seeds(folder: Path) -> list[bytes]:
                 writer2.add_message(channels[number % 4], time_ns, bodies[number % 4], time_ns)
             writer2.finish()
         seeds.append(path.read_bytes())
+    bags = Path(tempfile.mkdtemp(dir=folder))
+    forms = (None, *BagWriter.CompressionFormat)
+    seeds += [write_bag(bags / f"{form}.bag", form).read_bytes() for form in forms]
+    seeds += [file.read_bytes() for file in write_db3(bags / "run").glob("*.db3")]
     return seeds
 
 

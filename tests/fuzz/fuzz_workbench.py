@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import http.client
 import json
+import os
 import random
 import shutil
 import socket
@@ -183,10 +184,19 @@ def intrude(client: Client, rng: random.Random, _: bytes) -> None:
 def damage(client: Client, rng: random.Random, _: bytes) -> None:
     """Flip bytes in the state of a desk or in a summary, as a stranger's results may hold them."""
     results = client.server.results
-    kept = sorted([*(results / "workbench").rglob("*.json"), *(results / "runs").rglob("summary.json")])
+    # The server adds and deletes folders meanwhile: `os.walk` passes over those that are gone.
+    names = [Path(folder, name) for folder, _, files in os.walk(results) for name in files]
+    kept = sorted(
+        path
+        for path in names
+        if path.name == "summary.json" or ("workbench" in path.parts and path.suffix == ".json")
+    )
     if kept:
         path = rng.choice(kept)
-        content = bytearray(path.read_bytes())
+        try:
+            content = bytearray(path.read_bytes())
+        except FileNotFoundError:
+            return
         for _ in range(rng.randrange(1, 6) if content else 0):
             content[rng.randrange(len(content))] = rng.randrange(256)
         if rng.random() < 0.2:

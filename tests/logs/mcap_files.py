@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.logs import (
     LogData,
+    LogError,
     LogWriter,
     Ragged,
     RaggedStrings,
@@ -121,6 +123,33 @@ def read_small(path: Path) -> tuple[LogData, Truth]:
     return data, found
 
 
+Channel = tuple[str, str, str, bytes, str, list[bytes]]
+"""Topic, type, encoding of the schema, schema, encoding of the messages, payloads."""
+
+CHUNK = 6
+CODES = {"log_empty", "not_mcap"}
+
+
+def chunk_places(content: bytes) -> list[tuple[int, int]]:
+    """Where every chunk of a whole file starts and ends."""
+    starts = record_starts(content)
+    return [(a, b) for a, b in pairwise(starts) if content[a] == CHUNK]
+
+
+def read_damaged(path: Path, content: bytes, truth: Truth) -> tuple[Truth, list[str]]:
+    """What comes out of damaged bytes; everything of it must be true."""
+    path.write_bytes(content)
+    try:
+        data, found = read_small(path)
+    except LogError as error:
+        if error.code not in CODES:
+            raise
+        return {}, [error.code]
+    wrong = {key: value for key, value in found.items() if truth.get(key) != value}
+    assert not wrong
+    return found, [loss.kind for loss in data.losses]
+
+
 def value_of(fields: Mapping[str, Any], row: int) -> object:
     """One message in the form of the truth."""
     data = fields.get("data")
@@ -213,3 +242,32 @@ def assert_column_equals(column: Any, expected: list[Any]) -> None:
     else:
         values = np.array([list(v) if isinstance(v, bytes) else v for v in expected])
         assert np.array_equal(column, values.reshape(column.shape), equal_nan=True)
+
+
+def write_channels(
+    path: Path, channels: list[Channel], *, times: list[int] | None = None, **options: Any
+) -> None:
+    """Channels as (topic, type, schema encoding, schema, message encoding, payloads)."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start(profile="ros2", library="test")
+        for topic, kind, schema_encoding, schema, encoding, encoded in channels:
+            schema_id = writer.register_schema(kind, schema_encoding, schema) if kind else 0
+            channel = writer.register_channel(topic, encoding, schema_id)
+            for number, payload in enumerate(encoded):
+                time = times[number] if times else START + number
+                writer.add_message(channel, time, payload, time, number)
+        writer.finish()
+
+
+def read_one(path: Path, topic: str, *fields: str) -> Any:
+    """The columns of a topic of one channel, nothing lost."""
+    data = read_topics(path, [Wanted(topic, fields or None)])
+    assert not data.losses
+    (columns,) = data.of(topic)
+    return columns
+
+
+def text_of(kind: str) -> bytes:
+    """The definition of a bundled type."""
+    return (definition_text(kind) or "").encode()

@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 from mcap.exceptions import McapError
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
-from mcap_files import SHARED, assert_equals_official, payloads
+from mcap_files import SHARED, assert_equals_official, payloads, write_channels
 from mcap_ros2 import _dynamic
 from mcap_ros2._cdr import CdrWriter, EncapsulationKind
-from test_logs_formats import write_channels
 
 from pipeline.logs import (
     LogError,

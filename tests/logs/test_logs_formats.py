@@ -1,11 +1,8 @@
 """Everything that is legal, and much that is not but met in the field, is read as it was meant."""
 
-# ruff: noqa: ANN401 - columns and messages come in many shapes
 from __future__ import annotations
 
 import io
-import json
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +14,13 @@ from mcap_files import (
     JOINTS,
     START,
     TEXT,
+    Channel,
     payloads,
+    read_one,
     read_small,
     small_truth,
+    text_of,
+    write_channels,
     write_official,
     write_small,
 )
@@ -29,16 +30,13 @@ from pipeline.logs import (
     LogWriter,
     Ragged,
     RaggedStrings,
-    Strings,
     TransformBuffer,
     Wanted,
-    definition_text,
     hash_log,
     open_log,
     read_topics,
 )
 
-Channel = tuple[str, str, str, bytes, str, list[bytes]]
 IDL = """================================================================================
 IDL: demo_msgs/msg/Status
 module demo_msgs {
@@ -75,33 +73,6 @@ MSG: std_msgs/Header
 builtin_interfaces/Time stamp
 string frame_id
 """
-
-
-def write_channels(
-    path: Path, channels: list[Channel], *, times: list[int] | None = None, **options: Any
-) -> None:
-    """Channels as (topic, type, schema encoding, schema, message encoding, payloads)."""
-    with path.open("wb") as stream:
-        writer = Writer(stream, **options)
-        writer.start(profile="ros2", library="test")
-        for topic, kind, schema_encoding, schema, encoding, encoded in channels:
-            schema_id = writer.register_schema(kind, schema_encoding, schema) if kind else 0
-            channel = writer.register_channel(topic, encoding, schema_id)
-            for number, payload in enumerate(encoded):
-                time = times[number] if times else START + number
-                writer.add_message(channel, time, payload, time, number)
-        writer.finish()
-
-
-def read_one(path: Path, topic: str, *fields: str) -> Any:
-    data = read_topics(path, [Wanted(topic, fields or None)])
-    assert not data.losses
-    (columns,) = data.of(topic)
-    return columns
-
-
-def text_of(kind: str) -> bytes:
-    return (definition_text(kind) or "").encode()
 
 
 def test_two_channels_on_one_topic_stay_apart(tmp_path: Path) -> None:
@@ -147,69 +118,6 @@ def test_one_name_with_two_definitions_is_decoded_by_each(tmp_path: Path) -> Non
     for topic in ("/a", "/b"):
         fields = read_one(path, topic).fields
         assert (fields["x"][0], fields["y"][0]) == (1.0, 2.0)
-
-
-def big_endian_joints() -> bytes:
-    body = struct.pack(">iI", 5, 6) + struct.pack(">I", 4) + b"abc\0"
-    body += struct.pack(">I", 1) + struct.pack(">I", 3) + b"xy\0"
-    body += b"\0" + struct.pack(">I", 1)
-    body += b"\0" * (-len(body) % 8) + struct.pack(">d", 1.5)
-    body += struct.pack(">I", 2) + b"\0" * 4 + struct.pack(">2d", 2.5, -3.5) + struct.pack(">I", 0)
-    return b"\x00\x00\x00\x00" + body
-
-
-def test_big_endian_messages_are_read_among_little_endian_ones(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    little = payloads(JOINTS, 1, {"name": ["xy"], "velocity": np.array([[7.0]])})
-    write_channels(path, [("/j", JOINTS, "ros2msg", text_of(JOINTS), "cdr", [big_endian_joints(), *little])])
-    columns = read_one(path, "/j")
-    assert columns.fields["velocity"].row(0).tolist() == [2.5, -3.5]
-    assert columns.fields["velocity"].row(1).tolist() == [7.0]
-    assert columns.fields["name"].row(0) == ["xy"]
-    assert columns.fields["header.frame_id"].to_list() == ["abc", ""]
-    assert columns.header_time.tolist() == [5_000_000_006, 0]
-
-
-def test_plain_xcdr2_is_aligned_to_four_and_counts_bytes_of_sequences(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    text = "uint8 flag\nfloat64 value\nstring[] names\nfloat64[] list\n"
-    names = struct.pack("<I", 2) + struct.pack("<I", 2) + b"a\0" + b"\0\0" + struct.pack("<I", 2) + b"b\0"
-    body = b"\x01\0\0\0" + struct.pack("<d", 2.25) + struct.pack("<I", len(names)) + names
-    body += b"\0" * (-len(body) % 4) + struct.pack("<I", 1) + struct.pack("<d", -4.0)
-    write_channels(
-        path, [("/x", "demo/msg/X", "ros2msg", text.encode(), "cdr", [b"\x00\x07\x00\x00" + body])]
-    )
-    fields = read_one(path, "/x").fields
-    assert fields["value"].tolist() == [2.25]
-    assert fields["names"].row(0) == ["a", "b"]
-    assert fields["list"].row(0).tolist() == [-4.0]
-
-
-@pytest.mark.parametrize(("kind", "name"), [(0x03, "PL_CDR_LE"), (0x09, "D_CDR2_LE"), (0x0B, "PL_CDR2_LE")])
-def test_other_encapsulations_are_named_never_decoded_as_plain(tmp_path: Path, kind: int, name: str) -> None:
-    path = tmp_path / "log.mcap"
-    good = payloads(FLOAT, 3, {"data": np.array([1.0, 2.0, 3.0])})
-    odd = bytes([0, kind]) + good[1][2:]
-    write_channels(path, [("/x", FLOAT, "ros2msg", text_of(FLOAT), "cdr", [good[0], odd, good[2]])])
-    data = read_topics(path, [Wanted("/x")])
-    assert data.of("/x")[0].fields["data"].tolist() == [1.0, 3.0]
-    (loss,) = data.losses
-    assert loss.kind == "unsupported_encoding"
-    assert name in loss.text
-    assert (loss.start_ns, loss.end_ns) == (START + 1, START + 1)
-
-
-def test_payloads_that_do_not_fit_their_type_are_lost_and_counted(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    good = payloads(JOINTS, 2, {"name": ["a"], "velocity": np.array([[1.0], [2.0]])})
-    too_long = bytearray(good[0])
-    struct.pack_into("<I", too_long, 12, 1 << 31)
-    bad = [b"", b"\0", good[0][:30], bytes(too_long), b"\xff\xff\0\0" + good[0][4:]]
-    write_channels(path, [("/j", JOINTS, "ros2msg", text_of(JOINTS), "cdr", [good[0], *bad, good[1]])])
-    data = read_topics(path, [Wanted("/j", ("velocity[0]",))])
-    assert data.of("/j")[0].fields["velocity[0]"].tolist() == [1.0, 2.0]
-    assert {loss.kind for loss in data.losses} == {"undecodable"}
-    assert sum(int(loss.text.split()[0]) for loss in data.losses) == len(bad)
 
 
 def test_idl_schemas_mean_the_same_as_msg(tmp_path: Path) -> None:
@@ -380,62 +288,6 @@ def test_a_folder_of_several_recordings_is_refused(tmp_path: Path) -> None:
     assert caught.value.code == "not_a_recording"
 
 
-def test_json_messages_are_columns(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    messages = [
-        {"speed": 1.5, "mode": "calib", "wheels": [1, 2], "pose": {"x": 3}, "points": [{"x": 1}, {"x": 2}]},
-        {"speed": 2.5, "mode": "idle", "wheels": [], "pose": {"x": 4}, "points": []},
-    ]
-    encoded = [json.dumps(message).encode() for message in messages]
-    write_channels(path, [("/j", "Status", "jsonschema", b"{}", "json", [*encoded, b"{broken"])])
-    data = read_topics(path, [Wanted("/j")])
-    fields: Any = data.of("/j")[0].fields
-    assert fields["speed"].tolist() == [1.5, 2.5]
-    assert isinstance(fields["mode"], Strings)
-    assert fields["wheels"].row(0).tolist() == [1, 2]
-    assert fields["points[].x"].row(0).tolist() == [1, 2]
-    assert fields["pose.x"].tolist() == [3, 4]
-    assert [loss.kind for loss in data.losses] == ["undecodable"]
-    only = read_topics(path, [Wanted("/j", ("wheels[1]",))]).of("/j")[0].fields
-    assert np.array_equal(only["wheels[1]"], [2.0, np.nan], equal_nan=True)
-
-
-def test_protobuf_messages_are_columns(tmp_path: Path) -> None:
-    timestamp = pytest.importorskip("google.protobuf.timestamp_pb2", reason="protobuf is not installed")
-    support = pytest.importorskip("mcap_protobuf.writer", reason="mcap-protobuf-support is not installed")
-    path = tmp_path / "log.mcap"
-    with path.open("wb") as stream, support.Writer(stream) as writer:
-        for row in range(3):
-            message = timestamp.Timestamp(seconds=row, nanos=row * 2)
-            writer.write_message("/p", message, START + row, START + row)
-    fields = read_one(path, "/p").fields
-    assert fields["seconds"].tolist() == [0, 1, 2]
-    assert fields["nanos"].tolist() == [0, 2, 4]
-
-
-def test_ros1_messages_are_columns(tmp_path: Path) -> None:
-    pytest.importorskip("mcap_ros1", reason="mcap-ros1-support is not installed")
-    from mcap.reader import make_reader  # noqa: PLC0415 - optional
-    from mcap_ros1.decoder import DecoderFactory  # noqa: PLC0415 - optional
-
-    path = tmp_path / "log.mcap"
-    text = "Header header\nfloat64[] velocity\nstring[] name\nint8 level\n" + "=" * 80
-    text += "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
-    body = struct.pack("<III", 7, 5, 6) + struct.pack("<I", 3) + b"map" + struct.pack("<I2d", 2, 1.5, 2.5)
-    body += struct.pack("<I", 1) + struct.pack("<I", 2) + b"ab" + b"\xff"
-    write_channels(path, [("/r", "demo/Joints", "ros1msg", text.encode(), "ros1", [body])])
-    columns = read_one(path, "/r")
-    with path.open("rb") as stream:
-        ((_, _, _, official),) = make_reader(
-            stream, decoder_factories=[DecoderFactory()]
-        ).iter_decoded_messages()
-    assert columns.fields["velocity"].row(0).tolist() == list(official.velocity)
-    assert columns.fields["name"].row(0) == official.name
-    assert columns.fields["header.frame_id"].to_list() == [official.header.frame_id]
-    assert columns.fields["level"].tolist() == [official.level] == [-1]
-    assert columns.header_time.tolist() == [5_000_000_006]
-
-
 def test_fields_are_chosen_by_path(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     write_small(path, rows=5)
@@ -489,18 +341,3 @@ def test_the_index_tells_what_a_log_holds(tmp_path: Path) -> None:
     assert {channel.type_name for channel in index.channels} == {FLOAT, JOINTS, TEXT}
     assert isinstance(read_topics(path, [Wanted("/joints")]).topics[0].fields["name"], RaggedStrings)
     assert io.BytesIO(path.read_bytes()).read(5) == b"\x89MCAP"
-
-
-def test_absurd_stamps_and_numbers_in_json_warn_nobody(tmp_path: Path) -> None:
-    """Tests turn every warning of numpy into an error."""
-    path = tmp_path / "log.mcap"
-    seconds = ["1e308", "NaN", "-Infinity", "1" * 400, "-9223372036854775808", "5"]
-    encoded = [
-        f'{{"header": {{"stamp": {{"sec": {text}, "nanosec": {text}}}}}, "x": {text}}}'.encode()
-        for text in seconds
-    ]
-    write_channels(path, [("/json", "T", "jsonschema", b"{}", "json", encoded)])
-    columns = read_one(path, "/json")
-    assert columns.header_time is None
-    assert columns.fields["x"][3] == np.inf
-    assert columns.fields["x"][5] == 5.0

@@ -10,9 +10,11 @@ import numpy as np
 
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.options import Options
-from pipeline.identification import Fitted, Input, Problem, fit_model, hold_out, score
-from pipeline.identification.scoring import assign_folds, list_training, refit
-from pipeline.models import Model, Timing, find_effect
+from pipeline.core.timegrid import nearest_indices
+from pipeline.identification import Fitted, Input, Problem, fit_model, hold_out
+from pipeline.identification.folds import refit
+from pipeline.identification.scoring import measure_errors
+from pipeline.models import Model, find_effect
 from pipeline.runs import MotionRun, load_run
 from pipeline.store import Store
 from pipeline.vehicles import Vehicle
@@ -148,15 +150,15 @@ def make_model(vehicle: Vehicle, effects: tuple[str, ...]) -> Model:
 
 def measure(run: MotionRun, vehicle: Vehicle, source: Input, effects: tuple[str, ...]) -> Reached:
     problem = Problem([run], vehicle, source)
-    ideal = fit_model(problem, Model(vehicle))
-    as_recorded = Problem([run], vehicle, source, timing=[Timing()])
-    before = score(as_recorded, as_recorded.start_state(Model(vehicle)), ideal.weights).pooled
+    late = -run.alignment.heading_delay_s
+    comparison, ideal = problem.comparisons[0], problem.start_state()
+    recorded = comparison.find_horizon_errors((), ideal.timing[0], late)
+    before = measure_errors(problem.whole.shift_clock(ideal, 0, late), recorded.position, recorded.yaw)
     fitted = fit_model(problem, make_model(vehicle, effects))
     after = hold_out(problem, fitted).pooled
-    turned = as_recorded.comparisons[0].find_reach((), Timing()).turned
     return Reached(
         ratios=after.ratios(before),
-        turned=float(np.sqrt(np.mean(_hold_out_turning(problem, fitted) ** 2) / np.mean(turned**2))),
+        turned=float(np.sqrt(np.mean(_hold_out_turning(problem, fitted) ** 2) / np.mean(recorded.turned**2))),
         fitted=fitted,
         problem=problem,
         t_before_m=before.t_mrmse_m,
@@ -166,11 +168,12 @@ def measure(run: MotionRun, vehicle: Vehicle, source: Input, effects: tuple[str,
 
 
 def _hold_out_turning(problem: Problem, fitted: Fitted) -> np.ndarray:
-    comparison, fold = problem.comparisons[0], assign_folds(problem)
+    comparison, middle = problem.comparisons[0], problem.whole.times.mean(axis=1)
     turned = np.full(comparison.horizons.number.size, np.nan)
-    at = fold[np.minimum(problem.horizon_blocks(0), fold.size - 1)]
-    for number in range(int(fold.max()) + 1):
-        state = refit(problem, fitted, list_training(problem, fold[problem.block_of] == number))
-        reach = comparison.find_reach(state.effects_of(0), state.timing[0])
-        turned[at == number] = reach.turned[at == number]
+    for fold, training in zip(problem.folds, problem.training, strict=True):
+        state = fitted.state
+        for part, fit, rows in zip(problem.parts, fitted.fits, training, strict=True):
+            state = state.take_over(refit(part, fit, rows), fit.free)
+        told = fold.test[nearest_indices(comparison.horizons.times.mean(axis=1), middle)]
+        turned[told] = comparison.find_horizon_errors(state.effects_of(0), state.timing[0]).turned[told]
     return turned[np.isfinite(turned)]

@@ -15,10 +15,10 @@ from motion_runs import simulate, vehicle_of
 from pipeline.identification import Input, Problem, estimate_intervals, fit_model
 from pipeline.identification.comparison import Comparison
 from pipeline.models import Effect, LinearEffect, Model, Place, Timing, list_effects
-from pipeline.models.effect import KinematicEffect
+from pipeline.models.effect import KinematicEffect, Late
 from pipeline.models.formula import parse_expression, parse_unit
 from pipeline.runs.signals import Rolling, Velocity, Wheels, find_turning
-from pipeline.simulate import VEHICLES, Program
+from pipeline.simulate import VEHICLES, Encoders, Program
 from pipeline.simulate import list_effects as list_simulated
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ WRITTEN = [e for e in EFFECTS if issubclass(e, LinearEffect | KinematicEffect) a
 @pytest.mark.parametrize("effect", WRITTEN, ids=ids(tuple(WRITTEN)))
 def test_the_formula_of_the_page_is_that_of_the_code(effect: type[Effect]) -> None:
     comparison = comparison_of(effect.kinds[0])
-    around = comparison.surroundings
+    around = comparison.context
     generator = np.random.default_rng(3)
     size = around.times.size
     wheels = Wheels(
@@ -178,6 +178,9 @@ def test_a_parameter_put_into_simulated_data_comes_back(effect: type[Effect]) ->
         from pipeline.simulate import Ground  # noqa: PLC0415 - one effect needs it
 
         more["ground"] = Ground(pitch_rad=0.14)
+    if effect.late is Late.POSES:
+        # A gyro tells how late poses are before any model is fitted; slow encoders know when only by halves.
+        more |= {"imu": None, "encoders": Encoders(rate_hz=50.0)}
     run = simulate({effect.id: truth}, duration_s=150.0, **more)
     source = Input.COMMAND if effect.id in DRIVETRAIN else Input.MEASURED
     problem = Problem([run], vehicle_of(KIND_OF[effect.kinds[0]]), source)

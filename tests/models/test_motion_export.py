@@ -182,7 +182,7 @@ def test_every_effect_moves_alike_at_any_of_its_values(name: str, runs: Mapping[
             continue
         assert run.commands is not None
         model = Model(vehicle_of("husky_a200" if vehicle == "differential" else "ackermann_car"))
-        comparison = Comparison(run, model.vehicle, Input.COMMAND)
+        comparison = Comparison(run, model.vehicle, Input.COMMAND, rate_hz=200.0)
         series = run.commands
         columns = [series.times, series.left, series.right, series.steering]
         rows = list(zip(*(column.tolist() for column in columns), strict=True))

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.models.filters import lag_signal, limit_rate
-from pipeline.runs.grid import Cells, hold_on_cells
+from pipeline.runs.grid import Grid, hold_on_cells
 from pipeline.runs.signals import Commands, Resets
 
 STEP = 0.005
@@ -75,7 +75,7 @@ def test_held_commands_keep_their_area_wherever_their_stamps_fall(gaps: list[flo
     times = np.concatenate(([-1.0], np.cumsum(gaps)))
     values = np.random.default_rng(seed).uniform(-3.0, 3.0, times.size)
     size = int(np.ceil((times[-1] + 0.1) / STEP))
-    cells = Cells(
+    cells = Grid(
         STEP,
         (np.arange(size) + 0.5) * STEP,
         np.zeros(size, dtype=np.int64),

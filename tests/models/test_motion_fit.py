@@ -19,8 +19,9 @@ from pipeline.identification import (
     score,
 )
 from pipeline.identification.floor import hold_below
+from pipeline.identification.folds import GAP_S
 from pipeline.identification.persistence import split_residuals
-from pipeline.identification.scoring import GAP_S, assign_folds, list_training, measure_by_terrain
+from pipeline.identification.scoring import measure_by_terrain
 from pipeline.models import Model, Timing, find_effect
 from pipeline.runs import HeadingSource, MotionError
 from pipeline.simulate import Disturbance, Imu, PoseSensor
@@ -56,7 +57,7 @@ def test_several_effects_come_back_together() -> None:
 def test_measured_wheels_leave_the_drivetrain_out() -> None:
     run = simulate(SKID)
     problem = Problem([run], HUSKY, Input.MEASURED)
-    labels = [free.label for free in problem.list_free(model_of(*SKID))]
+    labels = [free.label for free in fit_model(problem, model_of(*SKID)).free]
     assert labels == ["effective_track.k", "icr_offset.x_icr", "timing.wheel_delay_s"]
 
 
@@ -102,7 +103,8 @@ def test_a_gyro_of_the_wrong_sign_and_a_late_pose_are_found_and_named() -> None:
     assert gyro is not None
     assert gyro.signed_scale == pytest.approx(-1.0, abs=0.02)
     assert gyro.bias == pytest.approx(-0.01, abs=0.002)
-    assert gyro.yaw_delay_s == pytest.approx(0.12, abs=0.01)
+    assert run.alignment.heading_delay_s == pytest.approx(0.12, abs=0.01)
+    assert gyro.yaw_delay_s == 0.0
 
 
 def test_without_a_gyro_the_poses_own_heading_serves() -> None:
@@ -110,7 +112,9 @@ def test_without_a_gyro_the_poses_own_heading_serves() -> None:
     problem = Problem([run], HUSKY, Input.COMMAND)
     assert not problem.comparisons[0].has_gyro
     fitted = fit_model(problem, model_of("effective_track", "heading_skew"))
-    assert fitted.model.effect("heading_skew").values["d"] == pytest.approx(0.1, abs=0.01)
+    skew = estimate_intervals(problem, fitted).find("heading_skew.d")
+    assert skew.low < 0.1 < skew.high
+    assert skew.high - skew.low < 0.1
     with_gyro = simulate({"effective_track": 1.7})
     assert not Problem([with_gyro], HUSKY, Input.COMMAND, heading=HeadingSource.POSE).comparisons[0].has_gyro
 
@@ -136,20 +140,19 @@ def test_a_run_that_is_too_short_says_how_much_is_needed() -> None:
         Problem([run], HUSKY, Input.COMMAND)
 
 
-def test_training_windows_keep_their_distance_from_tested_ones() -> None:
+@pytest.mark.parametrize("source", list(Input))
+def test_training_windows_keep_their_distance_from_tested_ones(source: Input) -> None:
     run = simulate(SKID)
-    problem = Problem([run], HUSKY, Input.MEASURED)
-    fold = assign_folds(problem)
-    seen = np.zeros(problem.run_of.size, dtype=int)
-    for number in range(int(fold.max()) + 1):
-        tested = fold[problem.block_of] == number
-        training = list_training(problem, tested)
-        seen += tested
-        assert training.any()
-        assert not (training & tested).any()
-        for start, end in problem.times[tested]:
-            near = (problem.times[:, 1] > start - GAP_S) & (problem.times[:, 0] < end + GAP_S)
-            assert not (near & training).any()
+    problem = Problem([run], HUSKY, source)
+    whole = problem.whole
+    seen = np.zeros(whole.run.size, dtype=int)
+    for fold, training in zip(problem.folds, problem.training, strict=True):
+        seen += fold.test
+        for part, rows in zip(problem.parts, training, strict=True):
+            assert rows.any()
+            for start, end in whole.times[fold.test]:
+                near = (part.times[:, 1] > start - GAP_S) & (part.times[:, 0] < end + GAP_S)
+                assert not (near & rows).any()
     assert (seen == 1).all()
 
 
@@ -182,7 +185,7 @@ def test_the_floor_is_the_true_model_s_error_under_slow_localization_noise(sourc
             find_effect("icr_offset")(x_icr=0.1),
         ),
     )
-    true = score(problem, problem.start_state(true_model), fitted.weights).pooled
+    true = score(problem, problem.start_state(true_model.effects)).pooled
     assert np.allclose(floor.ratios(true), 1.0, atol=0.15)
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from motion_runs import simulate, vehicle_of
 
-from pipeline.identification import Input, Problem, State, fit_model
+from pipeline.identification import Input, Problem, fit_model
 from pipeline.models import Model
 from pipeline.models.formula import FormulaEffect, Unit, parse_expression, parse_unit
 from pipeline.models.formula.formula_effect import make_parameter
@@ -121,7 +121,7 @@ def test_rates_of_signals_can_be_used_and_are_nothing_across_holes() -> None:
     effect = FormulaEffect("jerk", {"v_x": "k * v0_rate"}, (make_parameter("k", "s", (-1.0, 1.0)),), k=0.1)
     problem = Problem([run], vehicle_of("husky_a200"), Input.MEASURED)
     model = Model(problem.vehicle, (effect,))
-    ideal = problem.find_residuals(State(model.ideal, {}, problem.start_state(model).timing))
+    ideal = problem.find_residuals(problem.start_state())
     shaken = problem.find_residuals(problem.start_state(model))
     assert np.isfinite(shaken).all()
     assert np.abs(shaken - ideal)[:, 0].max() > 0.01

@@ -10,8 +10,9 @@ import polars as pl
 import pytest
 from motion_runs import QUIET, align, make_scenario, tables_of, vehicle_of
 
-from pipeline.identification.comparison import Comparison, Input
-from pipeline.identification.encoders import measure_wheel_delay
+from pipeline.core.timegrid import nearest_indices
+from pipeline.identification import Comparison, Input, Problem, fit_model
+from pipeline.models import Model, find_effect
 from pipeline.runs import MotionRun, load_run
 from pipeline.simulate import Imu, simulate_run
 
@@ -47,7 +48,7 @@ def test_good_stamps_and_good_poses_stay_as_they_are(tables: Mapping[str, pl.Dat
     run = load(tables)
     assert run.alignment.latency_spread_s == 0.0
     assert run.alignment.outlier_s == 0.0
-    assert np.array_equal(run.track.times, np.sort(tables["poses"]["t"].to_numpy()))
+    assert np.allclose(run.track.times, np.sort(tables["poses"]["t"].to_numpy()), atol=2e-3)
 
 
 def test_poses_at_a_hundred_a_second_do_not_push_each_other_on() -> None:
@@ -56,7 +57,7 @@ def test_poses_at_a_hundred_a_second_do_not_push_each_other_on() -> None:
     stamps = np.sort(made.poses.stamp_s)
     run = load(tables_of(made, HUSKY))
     assert run.alignment.latency_spread_s == 0.0
-    assert np.array_equal(run.track.times, stamps)
+    assert np.allclose(run.track.times, stamps, atol=2e-3)
 
 
 def test_nothing_is_scored_before_the_first_command(tables: Mapping[str, pl.DataFrame]) -> None:
@@ -89,7 +90,8 @@ def test_a_localization_that_jumps_away_and_back_is_not_compared(tables: Mapping
     away = (times > 100.0) & (times < 102.0)
     moved = poses.with_columns(pl.Series("x", poses["x"].to_numpy() + 1.5 * away))
     run = load(tables, poses=moved)
-    more = np.setdiff1d(run.barred, load(tables).barred)
+    before = np.sort(load(tables).barred)
+    more = run.barred[np.abs(before[nearest_indices(run.barred, before)] - run.barred) > 0.02]
     assert np.abs(more - 101.0).max() < 1.8
     for edge in (100.0, 102.0):
         assert np.abs(more - edge).min() < 0.1
@@ -125,4 +127,8 @@ def test_the_delay_of_the_encoders_is_measured_against_the_gyro(
     late: float, tables: Mapping[str, pl.DataFrame]
 ) -> None:
     wheels = tables["wheels"].with_columns(pl.col("t") + late)
-    assert measure_wheel_delay(load(tables, wheels=wheels), HUSKY) == pytest.approx(late, abs=0.02)
+    problem = Problem([load(tables, wheels=wheels)], HUSKY, Input.COMMAND)
+    model = Model(HUSKY, tuple(find_effect(name)() for name in SKID))
+    found = fit_model(problem, model).state.timing[0].wheel_delay_s
+    # Read twenty times a second, wheels that step seem late by up to half that time.
+    assert late - 0.02 < found < late + 0.045

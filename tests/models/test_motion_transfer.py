@@ -70,7 +70,7 @@ def test_the_exported_function_moves_like_the_model_with_every_effect(kind: str)
     more = {} if kind == "differential" else {"vehicle": VEHICLES["car"], "program": Program(speed_scale=0.5)}
     run = simulate({}, duration_s=40.0, encoders=None, pose=QUIET, disturbance=Disturbance(), **more)
     assert run.commands is not None
-    comparison = Comparison(run, model.vehicle, Input.COMMAND)
+    comparison = Comparison(run, model.vehicle, Input.COMMAND, rate_hz=200.0)
     expected = comparison.predict_velocity(model.effects, Timing())
     series = run.commands
     columns = [series.times, series.left, series.right, series.steering]

@@ -19,8 +19,8 @@ from pipeline.models.model_text import format_model
 from pipeline.models.trust import distrust, list_trusted, trust
 from pipeline.runs import MotionError
 from pipeline.simulate import simulate_case
-from pipeline.web.cards import show_desk
-from pipeline.web.desk import Desk, DeskFile, Step
+from pipeline.web.cards import show_session
+from pipeline.web.session import Session, SessionFile, Step
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -214,13 +214,13 @@ def test_trust_is_said_once_listed_and_taken_back(
 
 
 def test_a_model_out_of_a_results_folder_runs_nothing_in_the_workbench_and_says_so(model: Path) -> None:
-    file = DeskFile(model.parent, "run")
+    file = SessionFile(model.parent, "run")
     file.model_path.parent.mkdir(parents=True)
     shutil.copy(model.parent / "own.py", file.model_path.parent)
     ladder: list[dict[str, object]] = [{"t_mrmse_m": 0.1, "r_mrmse_rad": 0.1}]
     step = Step(said="opened", model=MODEL, order=["effective_track", "tilt"], ladder=ladder)
-    desk = Desk(run="run", key="k", input="command", steps=[step], at=0)
-    shown = show_desk(desk, file.parse(step.model))
+    desk = Session(run="run", key="k", input="command", steps=[step], at=0)
+    shown = show_session(desk, file.parse(step.model))
     assert not has_run(model)
     assert "left out: tilt" in str(shown["warnings"])
     assert [card["id"] for card in shown["effects"]] == ["effective_track"]  # type: ignore[attr-defined]

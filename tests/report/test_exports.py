@@ -11,7 +11,6 @@ import xml.etree.ElementTree as ET
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -23,7 +22,6 @@ from rosbags.highlevel import AnyReader
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.options import Options
 from pipeline.logs import LogWriter
-from pipeline.logs.spool import Spool
 from pipeline.models import Model, find_effect
 from pipeline.report import ReportError
 from pipeline.report.exports import (
@@ -38,9 +36,6 @@ from pipeline.report.motion_run import load_vehicle
 from pipeline.runs import MotionError
 from pipeline.simulate import simulate_case
 from pipeline.store import Store, StoreError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 ROOT = Path(__file__).parents[2]
 
@@ -168,13 +163,13 @@ def test_a_long_run_is_exported_in_stretches_that_nobody_sees(
     source: ExportSource, derived: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     largest = []
-    added = Spool.add
+    write_before = LogWriter.write_before
 
-    def add(self: Spool, records: NDArray[np.uint8], channel: int, log_time: NDArray[np.int64]) -> None:
-        added(self, records, channel, log_time)
-        largest.append(self._size)
+    def measure(self: LogWriter, log_time: int) -> None:
+        largest.append(sum(rows.payloads.nbytes for rows in self._waiting))
+        write_before(self, log_time)
 
-    monkeypatch.setattr(Spool, "add", add)
+    monkeypatch.setattr(LogWriter, "write_before", measure)
     monkeypatch.setattr(derived_module, "LogWriter", partial(LogWriter, chunk_size=20_000))
     cut = write_derived_log(replace(source, stretch_rows=100), tmp_path / "cut.mcap")
     assert len(replace(source, stretch_rows=100).stretches) > 6

@@ -8,8 +8,9 @@ import pytest
 from report_synthesis import make_report
 
 from pipeline.identification import Input, Problem, State, predict
-from pipeline.models import Model, Timing, find_effect
-from pipeline.report.diagnosed import name_model
+from pipeline.models import Model, ModelFile, Timing, find_effect
+from pipeline.models.model_text import format_model
+from pipeline.report.diagnosed import read_model_text
 from pipeline.report.figures.autocorrelation import correlate
 from pipeline.report.figures.ladder import list_rungs
 from pipeline.report.figures.residuals import choose_signal
@@ -84,13 +85,13 @@ def test_the_staircase_names_what_each_rung_adds() -> None:
     assert rows["ladder_ceiling"]["label"].to_list() == ["ceiling 1.06 m"]
 
 
-def test_a_diagnosis_becomes_the_model_it_names() -> None:
-    entry = {"id": "effective_track", "parameters": {"k": {"value": 1.79, "unit": "1"}}}
-    model = name_model({"effects": [entry, {"id": "no_longer_known", "parameters": {}}]}, vehicle())
-    assert model is not None
-    assert model.ids == ("effective_track",)
-    assert model.effect("effective_track").values["k"] == 1.79
-    assert name_model({"effects": []}, vehicle()) is None
+def test_the_model_that_is_drawn_is_the_one_that_was_written() -> None:
+    model = Model(vehicle(), (find_effect("effective_track")(k=1.79),))
+    file = read_model_text({"model": format_model(ModelFile(model))})
+    assert file is not None
+    assert file.model == model
+    for damaged in (None, 7, "", "[[effect", "[[effect]]\nid = 'no_longer_known'"):
+        assert read_model_text({"model": damaged}) is None
 
 
 def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFactory) -> None:
@@ -105,15 +106,14 @@ def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFa
     }
     run = load_run(tables, vehicle(), name="run")
     model = Model(vehicle(), (find_effect("effective_track")(k=1.7),))
-    timing = Timing(0.02, 0.0)
     places = manifest.read("velocities").select("t", "x", "y")
     view = MotionStage(Problem([run], vehicle(), Input.COMMAND), places).view(
-        State(model, {}, (timing,)), (), None
+        State(model.effects, (Timing(),)), (), None
     )
-    made = predict(model, run, Input.COMMAND, timing=timing)
+    made = predict(model, run, Input.COMMAND)
 
     shown = view.velocity.sort("t")
-    expected = np.interp(shown["t"], made.times + timing.pose_delay_s, made.velocity[:, 2])
+    expected = np.interp(shown["t"], made.times, made.velocity[:, 2])
     assert np.allclose(shown["v_w"], expected, atol=1e-9)
     starts = view.arcs.group_by("piece", maintain_order=True).first()
     for axis in "xy":

@@ -229,7 +229,7 @@ def test_trap_6_without_turning_the_gyro_cannot_be_checked(drive: TakeThrough) -
 def test_trap_15_how_late_the_poses_are_against_the_gyro_is_told(drive: TakeThrough, late: float) -> None:
     taken = drive(replace(FIELD, effects={"drive_lag": 0.3, "clock_offset": late}))
     assert taken.aligned.alignment.gyro is not None
-    assert taken.aligned.alignment.gyro.yaw_delay_s == pytest.approx(late, abs=0.02)
+    assert taken.aligned.alignment.heading_delay_s == pytest.approx(late, abs=0.02)
     assert ("pose_delay" in taken.ids()) == (abs(late) > 0.05)
 
 

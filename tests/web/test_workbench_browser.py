@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import tempfile
 import webbrowser
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
-from workbench_server import RUN, TOKEN, Workbench
+from workbench_server import RUN, TOKEN, TRACK, Workbench
 
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.options import Options
@@ -198,22 +199,39 @@ def test_a_stretch_that_is_brushed_shows_on_the_map_and_in_command_space(
     look_for_trouble(chrome)
 
 
-def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, workbench: Workbench) -> None:
-    manifest = Store(workbench.results).manifest(RUN)
-    assert manifest is not None
-    effects = [{"id": "drive_lag", "gain": 0.1}, {"id": "effective_track", "gain": 9.0}]
-    path = workbench.results / "workbench" / "diagnoses" / f"{RUN}.json"
-    path.parent.mkdir(parents=True)
-    path.write_text(json.dumps({"key": manifest.key, "diagnosis": {"effects": effects}}))
+def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, tmp_path: Path) -> None:
+    log = tmp_path / "field" / "late.mcap"
+    simulate_case(None, {"effective_track": TRACK, "drive_lag": 0.3}, out=log, seed=4, duration_s=90.0)
+    husky = {"vehicle": {"preset": "husky_a200"}}
+    analyze_log(log, Options(out=tmp_path / "out", report=False, diagnosis=True, overrides=husky))
+    with closing(Workbench(tmp_path / "out")) as workbench:
+        chrome.size(LAPTOP, 900)
+        chrome.open(workbench.address)
+        chrome.wait(SHOWN)
+        named = "[...document.querySelectorAll('.named li')].map((entry) => entry.dataset.effect)"
+        assert set(chrome.run(named)) == {"effective_track", "drive_lag"}
+        chrome.click(".add-all")
+        chrome.wait("document.querySelectorAll('.card').length === 2")
+        chrome.wait("document.querySelectorAll('[data-figure=ladder] .mark-rect path').length === 3")
+        chrome.wait("document.querySelector('.said').textContent === '+ all 2 that were named'")
+        look_for_trouble(chrome)
+
+
+def test_what_raises_an_error_is_not_taken_unless_it_is_said_again(
+    chrome: Chrome, workbench: Workbench
+) -> None:
     chrome.size(LAPTOP, 900)
     chrome.open(workbench.address)
     chrome.wait(SHOWN)
-    named = "[...document.querySelectorAll('.named li')].map((entry) => entry.dataset.effect)"
-    assert chrome.run(named) == ["effective_track", "drive_lag"]
-    chrome.click(".add-all")
-    chrome.wait("document.querySelectorAll('.card').length === 2")
-    chrome.wait("document.querySelectorAll('[data-figure=ladder] .mark-rect path').length === 3")
-    look_for_trouble(chrome)
+    chrome.run("document.querySelector('select.catalogue').value = 'wheel_radius'")
+    chrome.run("document.querySelector('select.catalogue').dispatchEvent(new Event('change'))")
+    chrome.wait("document.getElementById('toast').textContent.includes('it was not taken')")
+    assert chrome.run("document.querySelectorAll('.card').length") == 0
+    chrome.click("#toast .anyway")
+    chrome.wait("document.querySelectorAll('.card').length === 1")
+    chrome.wait("document.querySelector('.said').textContent === '+ wheel_radius'")
+    errors = [text for text in chrome.errors if "422" not in text]
+    assert errors == []
 
 
 def test_a_run_stands_beside_those_that_its_report_does(chrome: Chrome, workbench: Workbench) -> None:

@@ -13,11 +13,11 @@ from workbench_server import RUN, TRACK, Workbench
 from pipeline.models import read_model
 from pipeline.simulate import simulate_case
 
-Desk = dict[str, dict[str, float]]
+Session = dict[str, dict[str, float]]
 
 
 def errors(answer: dict[str, object], key: str = "errors") -> dict[str, float]:
-    return cast("Desk", answer["desk"])[key]
+    return cast("Session", answer["desk"])[key]
 
 
 def effects(answer: dict[str, object]) -> list[dict[str, object]]:
@@ -69,7 +69,7 @@ def test_a_preview_shows_rows_and_keeps_nothing(workbench: Workbench) -> None:
     shown = workbench.desk(RUN, "preview", effect="effective_track", parameter="k", value=1.1)
 
     assert errors(shown)["r"] > errors(added)["r"]
-    assert {"arcs", "model_w", "reach", "residual_w", "ladder"} <= set(cast("Desk", shown["rows"]))
+    assert {"arcs", "model_w", "reach", "residual_w", "ladder"} <= set(cast("Session", shown["rows"]))
     assert (workbench.results / "workbench/desks/a/field/hidden.json").read_bytes() == before
 
 
@@ -114,7 +114,7 @@ def test_a_damaged_desk_is_begun_anew(workbench: Workbench, content: bytes) -> N
 
 def test_two_desks_of_a_run_do_not_touch_each_other(workbench: Workbench) -> None:
     workbench.desk(RUN, "add", effect="effective_track")
-    other = workbench.desk(RUN, "add", effect="wheel_radius", slot="b")
+    other = workbench.desk(RUN, "add", effect="wheel_radius", anyway=True, slot="b")
     assert [effect["id"] for effect in effects(other)] == ["wheel_radius"]
     assert [effect["id"] for effect in effects(workbench.desk(RUN))] == ["effective_track"]
 
@@ -290,7 +290,7 @@ def test_whatever_formula_is_written_the_desk_stays_usable(
         assert error["hint"]
         assert len(error["message"]) < 1000
     assert shared_workbench.desk(RUN)["desk"]["effects"] == before["effects"]  # type: ignore[index]
-    assert errors(shared_workbench.desk(RUN)) == cast("Desk", before)["errors"]
+    assert errors(shared_workbench.desk(RUN)) == cast("Session", before)["errors"]
 
 
 @pytest.mark.parametrize(

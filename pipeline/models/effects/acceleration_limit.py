@@ -17,7 +17,7 @@ from pipeline.models.filters import limit_rate
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence, Largest
-    from pipeline.runs.signals import Surroundings, Wheels
+    from pipeline.runs.signals import RunContext, Wheels
 
 # A limit that the largest wheel speed is reached under in less shows in no pose.
 _LEAST_RAMP_S = 0.08
@@ -44,7 +44,7 @@ class AccelerationLimit(DriveEffect):
     needs = (Excitation.CHANGES, Excitation.LARGE)
     confused_with = ("drive_lag", "body_inertia")
 
-    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
         limit, resets, step = self.values["limit"], around.wheels, around.step_s
         return replace(

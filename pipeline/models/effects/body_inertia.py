@@ -20,7 +20,7 @@ from pipeline.runs.signals import Velocity
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Rolling, Surroundings
+    from pipeline.runs.signals import Rolling, RunContext
 
 
 class BodyInertia(BodyEffect):
@@ -48,7 +48,7 @@ class BodyInertia(BodyEffect):
     equivalent_when = "never turning, or only turning on the spot"
     late = Late.BODY
 
-    def move_body(self, rolling: Rolling, around: Surroundings) -> Velocity:
+    def move_body(self, rolling: Rolling, around: RunContext) -> Velocity:
         """See the formula above."""
         tau, resets, step = self.values["tau"], around.body, around.step_s
         if tau <= 0.0:

@@ -17,7 +17,7 @@ from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter, Se
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Commands, Surroundings
+    from pipeline.runs.signals import Commands, RunContext
 
 
 class BodySpeedLimit(CommandEffect):
@@ -42,7 +42,7 @@ class BodySpeedLimit(CommandEffect):
     needs = (Excitation.LARGE, Excitation.SPEED_SPREAD)
     confused_with = ("wheel_speed_limit", "speed_slip")
 
-    def change_commands(self, commands: Commands, around: Surroundings) -> Commands:
+    def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""
         limit = self.values["limit"]
         radius = around.vehicle.wheel_radius_m

@@ -21,7 +21,7 @@ from pipeline.models.effects.turn_droop import TurnDroop
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
     from pipeline.models.evidence import Evidence, Largest
-    from pipeline.runs.signals import Commands, Surroundings
+    from pipeline.runs.signals import Commands, RunContext
 
 
 class BodyTurnLimit(CommandEffect):
@@ -46,7 +46,7 @@ class BodyTurnLimit(CommandEffect):
     needs = (Excitation.LARGE, Excitation.TURNING)
     confused_with = ("wheel_speed_limit", "turn_droop")
 
-    def change_commands(self, commands: Commands, around: Surroundings) -> Commands:
+    def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""
         limit, vehicle = self.values["limit"], around.vehicle
         if vehicle.kind == "ackermann":

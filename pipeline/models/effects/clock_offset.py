@@ -17,7 +17,7 @@ from pipeline.models.evidence import LEAST_DELAY_S
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Surroundings, Velocity
+    from pipeline.runs.signals import RunContext, Velocity
 
 
 class ClockOffset(ReportEffect):
@@ -46,7 +46,7 @@ class ClockOffset(ReportEffect):
     equivalent_when = "the input is the command and there are neither encoders, gyro nor another clock"
     late = Late.POSES
 
-    def report(self, velocity: Velocity, around: Surroundings) -> Velocity:
+    def report(self, velocity: Velocity, around: RunContext) -> Velocity:
         """See the formula above."""
         del around
         return velocity

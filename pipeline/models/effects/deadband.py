@@ -17,7 +17,7 @@ from pipeline.models.effect import CommandEffect, Excitation, Parameter, Search
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence, Largest
-    from pipeline.runs.signals import Commands, Surroundings
+    from pipeline.runs.signals import Commands, RunContext
 
 # Of the largest speed: less is passed through in one step of a command.
 _LEAST_SHARE = 0.02
@@ -44,7 +44,7 @@ class Deadband(CommandEffect):
     needs = (Excitation.SMALL,)
     confused_with = ("turn_droop",)
 
-    def change_commands(self, commands: Commands, around: Surroundings) -> Commands:
+    def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""
         least = self.values["d"] / around.vehicle.wheel_radius_m
         left = np.where(np.abs(commands.left) < least, 0.0, commands.left)

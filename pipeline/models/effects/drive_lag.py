@@ -17,7 +17,7 @@ from pipeline.models.filters import lag_signal
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Surroundings, Wheels
+    from pipeline.runs.signals import RunContext, Wheels
 
 
 class DriveLag(DriveEffect):
@@ -46,7 +46,7 @@ class DriveLag(DriveEffect):
     equivalent_when = "never turning, or only turning on the spot"
     same_in_one_motion = ("turn_lag",)
 
-    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
         tau, resets, step = self.values["tau"], around.wheels, around.step_s
         return replace(

@@ -24,7 +24,7 @@ from pipeline.models.effects.wheel_radius import WheelRadius
 
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
-    from pipeline.runs.signals import Rolling, Surroundings
+    from pipeline.runs.signals import Rolling, RunContext
 
 
 class EffectiveTrack(KinematicEffect):
@@ -48,11 +48,11 @@ class EffectiveTrack(KinematicEffect):
     needs = (Excitation.TURNING,)
     confused_with = ("wheel_radius", "terrain_change")
 
-    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
         del around
         return rolling.scale(1.0, 1.0 / self.values["k"])
 
-    def scale_without(self, other: Effect) -> float:
+    def depends_on(self, other: Effect) -> bool:
         """The yaw rate is that of the ratio k_radius / k_track: for nominal wheels the track is that wide."""
-        return 1.0 / other.values["k"] if isinstance(other, WheelRadius) else 1.0
+        return isinstance(other, WheelRadius)

@@ -21,7 +21,7 @@ from pipeline.runs.signals import earlier_in_span
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Surroundings, Velocity
+    from pipeline.runs.signals import RunContext, Velocity
 
 
 class HeadingSkew(ReportEffect):
@@ -48,7 +48,7 @@ class HeadingSkew(ReportEffect):
     confused_with = ("lateral_skid", "body_inertia", "icr_offset")
     late = Late.HEADING
 
-    def report(self, velocity: Velocity, around: Surroundings) -> Velocity:
+    def report(self, velocity: Velocity, around: RunContext) -> Velocity:
         """See the formula above."""
         late = self.values["d"]
         if late == 0.0:
@@ -68,7 +68,7 @@ class HeadingSkew(ReportEffect):
             w=rate,
         )
 
-    def report_gyro(self, velocity: Velocity, around: Surroundings) -> Velocity:
+    def report_gyro(self, velocity: Velocity, around: RunContext) -> Velocity:
         """The gyro's heading has no skew: nothing but the delay of the position is left."""
         del around
         return velocity

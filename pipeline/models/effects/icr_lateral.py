@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+    from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class IcrLateral(LinearEffect):
@@ -42,7 +42,7 @@ class IcrLateral(LinearEffect):
     equivalent_to = ("lever_arm",)
     equivalent_when = "always: a pose of a point l_y = -y_icr to the left moves alike"
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         del rolling, around
         return {"y_icr": (velocity.w, 0.0, 0.0)}

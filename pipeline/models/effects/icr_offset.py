@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+    from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class IcrOffset(LinearEffect):
@@ -43,7 +43,7 @@ class IcrOffset(LinearEffect):
     equivalent_to = ("lever_arm",)
     equivalent_when = "always: a pose of a point l_x = -x_icr ahead moves alike"
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         del rolling, around
         return {"x_icr": (0.0, -velocity.w, 0.0)}

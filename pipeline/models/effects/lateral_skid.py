@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+    from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class LateralSkid(LinearEffect):
@@ -42,7 +42,7 @@ class LateralSkid(LinearEffect):
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("icr_offset", "body_inertia", "heading_skew", "drive_lag")
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         del velocity, around
         return {"c": (0.0, -rolling.v0 * rolling.w0, 0.0)}

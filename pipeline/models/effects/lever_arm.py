@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+    from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class LeverArm(LinearEffect):
@@ -36,7 +36,7 @@ class LeverArm(LinearEffect):
     equivalent_when = "always: a centre of rotation at (-l_x, -l_y) moves alike"
     parts = (Part("l_x", "icr_offset", "x_icr", -1.0), Part("l_y", "icr_lateral", "y_icr", -1.0))
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         del rolling, around
         return {"l_x": (0.0, velocity.w, 0.0), "l_y": (-velocity.w, 0.0, 0.0)}

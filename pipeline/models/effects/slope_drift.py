@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+    from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class SlopeDrift(LinearEffect):
@@ -43,7 +43,7 @@ class SlopeDrift(LinearEffect):
     needs = (Excitation.SLOPE,)
     confused_with = ("lateral_drift",)
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         del velocity
         turning = find_turning(rolling.wheels, around)

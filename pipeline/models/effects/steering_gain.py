@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from pipeline.models.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter, Plausible
 
 if TYPE_CHECKING:
-    from pipeline.runs.signals import Surroundings, Wheels
+    from pipeline.runs.signals import RunContext, Wheels
 
 
 class SteeringGain(DriveEffect):
@@ -39,7 +39,7 @@ class SteeringGain(DriveEffect):
     needs = (Excitation.STEERING,)
     confused_with = ("understeer",)
 
-    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
         del around
         return replace(wheels, steering=self.values["g"] * wheels.steering)

@@ -16,7 +16,7 @@ from pipeline.models.effect import ACKERMANN, STAMPS, DriveEffect, Excitation, L
 from pipeline.models.filters import lag_signal
 
 if TYPE_CHECKING:
-    from pipeline.runs.signals import Surroundings, Wheels
+    from pipeline.runs.signals import RunContext, Wheels
 
 
 class SteeringLag(DriveEffect):
@@ -42,7 +42,7 @@ class SteeringLag(DriveEffect):
     needs = (Excitation.CHANGES, Excitation.STEERING)
     confused_with = ("transport_delay",)
 
-    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
         spans = around.spans
         lagged = lag_signal(wheels.steering, self.values["tau"], around.step_s, spans, spans.start[:, 0])

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from pipeline.models.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter
 
 if TYPE_CHECKING:
-    from pipeline.runs.signals import Surroundings, Wheels
+    from pipeline.runs.signals import RunContext, Wheels
 
 
 class SteeringOffset(DriveEffect):
@@ -38,7 +38,7 @@ class SteeringOffset(DriveEffect):
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("yaw_drift",)
 
-    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
         del around
         return replace(wheels, steering=wheels.steering + self.values["o"])

@@ -28,7 +28,7 @@ from pipeline.models.effect import (
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Rolling, Surroundings
+    from pipeline.runs.signals import Rolling, RunContext
 
 _LEAST = Least(0.03, DATA_SHEET)
 _PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")
@@ -78,7 +78,7 @@ class TerrainChange(KinematicEffect):
     # A change point fits anything a little.
     price = 0.05
 
-    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
         at_x, at_s = self.values["at_x"], self.values["at_s"]
         if math.isfinite(at_x):

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from pipeline.models.effect import DATA_SHEET, Excitation, KinematicEffect, Least, Parameter, Plausible
 
 if TYPE_CHECKING:
-    from pipeline.runs.signals import Rolling, Surroundings
+    from pipeline.runs.signals import Rolling, RunContext
 
 
 class TimeDrift(KinematicEffect):
@@ -37,7 +37,7 @@ class TimeDrift(KinematicEffect):
     needs = (Excitation.LONG,)
     confused_with = ("terrain_change", "wheel_radius")
 
-    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
         fade = 1.0 - self.values["k"] * around.times / around.duration_s
         return rolling.scale(fade, fade)

@@ -18,7 +18,7 @@ from pipeline.models.evidence import LEAST_DELAY_S
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Commands, Surroundings
+    from pipeline.runs.signals import Commands, RunContext
 
 
 class TransportDelay(CommandEffect):
@@ -46,7 +46,7 @@ class TransportDelay(CommandEffect):
     equivalent_to = ("clock_offset",)
     equivalent_when = "the input is the command and there are neither encoders, gyro nor another clock"
 
-    def change_commands(self, commands: Commands, around: Surroundings) -> Commands:
+    def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""
         del around
         return replace(commands, times=commands.times + self.values["d"])

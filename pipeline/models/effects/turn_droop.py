@@ -29,7 +29,7 @@ from pipeline.models.effect import (
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence, Largest
-    from pipeline.runs.signals import Surroundings, Wheels
+    from pipeline.runs.signals import RunContext, Wheels
 
 # Of the largest difference that was asked for: a lower threshold makes a wider track, a higher one nothing.
 _THRESHOLDS = (0.1, 0.99)
@@ -71,7 +71,7 @@ class TurnDroop(DriveEffect):
     confused_with = ("effective_track", "wheel_speed_limit", "body_turn_limit")
     contains = ("effective_track",)
 
-    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
         del around
         gain = self.values["gain"]

@@ -21,7 +21,7 @@ from pipeline.models.filters import lag_signal
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
     from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Surroundings, Wheels
+    from pipeline.runs.signals import RunContext, Wheels
 
 _PLAUSIBLE = Plausible(0.0, 3.0, "wider than the 0.1 to 1.6 s of Husky and Warthog")
 # Closer together, as a share of the slower one or in seconds, both time constants are one.
@@ -66,7 +66,7 @@ class TurnLag(DriveEffect):
     same_in_one_motion = ("drive_lag",)
     contains = ("drive_lag",)
 
-    def drive_wheels(self, wheels: Wheels, around: Surroundings) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
         slow, fast = self.values["tau_diff"], self.values["tau_mean"]
         if slow <= 0.0 and fast <= 0.0:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+    from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class TurningResistance(LinearEffect):
@@ -41,7 +41,7 @@ class TurningResistance(LinearEffect):
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("speed_slip", "wheel_radius")
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         del velocity, around
         return {"k": (-rolling.v0 * np.abs(rolling.w0), 0.0, 0.0)}

@@ -17,7 +17,7 @@ import numpy as np
 from pipeline.models.effect import ACKERMANN, Excitation, KinematicEffect, Parameter, Plausible
 
 if TYPE_CHECKING:
-    from pipeline.runs.signals import Rolling, Surroundings
+    from pipeline.runs.signals import Rolling, RunContext
 
 
 class Understeer(KinematicEffect):
@@ -40,7 +40,7 @@ class Understeer(KinematicEffect):
     needs = (Excitation.SPEED_SPREAD, Excitation.STEERING)
     confused_with = ("steering_gain",)
 
-    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
         wheelbase = around.vehicle.wheelbase_m or 1.0
         reach = np.maximum(1.0 + self.values["K"] / wheelbase * rolling.v0**2, 0.05)

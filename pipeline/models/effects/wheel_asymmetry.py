@@ -23,7 +23,7 @@ from pipeline.models.effect import (
 )
 
 if TYPE_CHECKING:
-    from pipeline.runs.signals import Rolling, Surroundings
+    from pipeline.runs.signals import Rolling, RunContext
 
 
 class WheelAsymmetry(KinematicEffect):
@@ -47,7 +47,7 @@ class WheelAsymmetry(KinematicEffect):
     needs = (Excitation.BOTH_SIGNS, Excitation.SPEED_SPREAD)
     confused_with = ("yaw_drift", "lever_arm", "icr_lateral")
 
-    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
         uneven, track = self.values["e"], around.track_m
         return replace(

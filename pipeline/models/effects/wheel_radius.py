@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from pipeline.models.effect import DATA_SHEET, Excitation, KinematicEffect, Least, Parameter, Plausible
 
 if TYPE_CHECKING:
-    from pipeline.runs.signals import Rolling, Surroundings
+    from pipeline.runs.signals import Rolling, RunContext
 
 
 class WheelRadius(KinematicEffect):
@@ -37,7 +37,7 @@ class WheelRadius(KinematicEffect):
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("speed_slip", "effective_track")
 
-    def roll(self, rolling: Rolling, around: Surroundings) -> Rolling:
+    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
         del around
         return rolling.scale(self.values["k"], self.values["k"])

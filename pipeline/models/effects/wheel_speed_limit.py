@@ -17,7 +17,7 @@ from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter, Se
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Commands, Surroundings
+    from pipeline.runs.signals import Commands, RunContext
 
 
 class WheelSpeedLimit(CommandEffect):
@@ -42,7 +42,7 @@ class WheelSpeedLimit(CommandEffect):
     needs = (Excitation.LARGE,)
     confused_with = ("body_speed_limit", "body_turn_limit")
 
-    def change_commands(self, commands: Commands, around: Surroundings) -> Commands:
+    def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""
         del around
         limit = self.values["limit"]

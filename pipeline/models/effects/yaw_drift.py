@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+    from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class YawDrift(LinearEffect):
@@ -30,7 +30,7 @@ class YawDrift(LinearEffect):
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("wheel_asymmetry", "steering_offset")
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         del velocity
         return {"c": (0.0, 0.0, find_turning(rolling.wheels, around))}

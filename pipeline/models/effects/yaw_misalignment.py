@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from pipeline.models.effect import MOUNTING, Excitation, Least, Parameter, Plausible, ReportEffect
 
 if TYPE_CHECKING:
-    from pipeline.runs.signals import Surroundings, Velocity
+    from pipeline.runs.signals import RunContext, Velocity
 
 
 class YawMisalignment(ReportEffect):
@@ -40,7 +40,7 @@ class YawMisalignment(ReportEffect):
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("lateral_drift",)
 
-    def report(self, velocity: Velocity, around: Surroundings) -> Velocity:
+    def report(self, velocity: Velocity, around: RunContext) -> Velocity:
         """See the formula above."""
         del around
         sine, cosine = math.sin(self.values["psi"]), math.cos(self.values["psi"])

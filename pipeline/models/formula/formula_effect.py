@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.models.formula.units import Unit
-    from pipeline.runs.signals import Rolling, Surroundings, Velocity
+    from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 _BASE_UNITS = {
@@ -107,7 +107,7 @@ class FormulaEffect(AddedEffect):
         lines += [f"    {channel} += {text}" for channel, text in self.formulas.items()]
         return "\n".join(lines)
 
-    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: Surroundings) -> Velocity:
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
         """Add the formulas' values."""
         del velocity
         signals = _Signals(rolling, around)
@@ -188,7 +188,7 @@ def _parse_signal_units() -> Mapping[str, Unit]:
 class _Signals:
     """Named signals of a run, made when they are asked for."""
 
-    def __init__(self, rolling: Rolling, around: Surroundings) -> None:
+    def __init__(self, rolling: Rolling, around: RunContext) -> None:
         ideal = roll_ideally(rolling.wheels, around)
         self._around = around
         self._makers: Mapping[str, Callable[[], NDArray[np.float64]]] = {

@@ -68,7 +68,6 @@ class ModelFeed:
         self._duration_s = max(
             (_find_end(source, name) for name in ("poses", "commands", "wheels")), default=0.0
         )
-        self._delay: float | None = None
         self._refused: MotionError | None = None
         self._has_answered = False
 
@@ -91,10 +90,7 @@ class ModelFeed:
             self._refused = self._refused or error
             return None
         self._has_answered = True
-        # One delay for the whole run: where little turns, the gyro does not show it.
-        if self._delay is None and comparison.has_gyro:
-            self._delay = comparison.usual_delay
-        timing = Timing(comparison.usual_delay if self._delay is None else self._delay)
+        timing = Timing()
         velocity = predict_at_from(comparison, self._model.effects, timing, at)
         made = _predict_within(comparison, self._model.effects, timing, low, high)
         return Stretch(velocity, made)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import altair as alt
 import polars as pl
 
+from pipeline.identification.ladder import is_risen
 from pipeline.report import theme
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
 from pipeline.report.run import INPUT_WORDS, mapping_in, number_in, objects_in
@@ -94,10 +95,11 @@ def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
         before = effects
         if size is None:
             continue
+        rises = _describe_rises(rungs[max(number - 1, 0)], rung)
         rows.append(
             {
                 "rung": number,
-                "step": "ideal" if number == 0 else "+ " + ", ".join(added),
+                "step": "ideal" if number == 0 else "+ " + ", ".join(added) + rises,
                 "t": size,
                 "told": f"{say_number(size)} m \u00b7 {say_number(number_in(rung, 'r_mrmse_rad'))} rad",
                 "series": "model" if effects else "ideal",
@@ -109,6 +111,16 @@ def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
         "ladder_ceiling": _list_bound("ceiling", highest),
         "ladder_floor": _list_bound("floor", number_in(floor, "t_mrmse_m")),
     }
+
+
+def _describe_rises(below: Mapping[str, object], rung: Mapping[str, object]) -> str:
+    """What must not pass for progress: which error is higher than one rung below."""
+    risen = []
+    for key, word in (("t_mrmse_m", "position"), ("r_mrmse_rad", "heading")):
+        old, new = number_in(below, key), number_in(rung, key)
+        if old is not None and new is not None and is_risen(old, new):
+            risen.append(word)
+    return f" ({' and '.join(risen)} error rises)" if risen else ""
 
 
 def _list_bound(word: str, size: float | None) -> pl.DataFrame:

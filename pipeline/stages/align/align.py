@@ -104,7 +104,7 @@ def align_tables(
     poses, alignment = _align_poses(corrected, aligned_vehicle, alignment, grid, where)
     imu = tables.get("imu")
     if imu is not None and not imu.is_empty():
-        findings += describe_gyro(alignment.gyro, velocities["v_w"].to_numpy())
+        findings += describe_gyro(alignment, velocities["v_w"].to_numpy())
     findings += _describe_poses(alignment)
     made = {**corrected, "poses": poses, "alignments": tabulate_alignment(alignment)}
     return Aligned(made, alignment, aligned_vehicle, tuple(findings))
@@ -189,7 +189,8 @@ def _align_poses(
         # A log that is too poor for a model has its slip all the same.
         return _correct_poses(poses, latency, outlier), alignment
     if not grid.is_localization:
-        return _correct_poses(poses, latency, outlier), _with_gyro(run).alignment
+        # Integrated wheels have no clock of their own.
+        return _correct_poses(poses, latency, outlier), _take_off_delay(_with_gyro(run).alignment, 0.0)
     raw = run.track.times
     own, spread = estimate_latency(run)
     run = replace(run, track=replace(run.track, times=raw - own))
@@ -199,15 +200,25 @@ def _align_poses(
         near = np.abs(at_fault[timegrid.nearest_indices(times, at_fault)] - times) <= _BESIDE * SAMPLE_S
         outlier |= near
         run = _with_gyro(replace(run, barred=np.union1d(run.barred, at_fault)))
+    late = run.gyro_fit.yaw_delay_s if run.gyro_fit is not None else 0.0
     for segment in np.unique(run.track.segment).tolist():
         rows, known = poses["segment"].to_numpy() == segment, run.track.segment == segment
-        latency[rows] = np.interp(times[rows], raw[known], own[known])
-    alignment = replace(run.alignment, latency_spread_s=spread, outlier_s=float(at_fault.size * SAMPLE_S))
+        latency[rows] = late + np.interp(times[rows], raw[known], own[known])
+    alignment = _take_off_delay(run.alignment, late)
+    alignment = replace(alignment, latency_spread_s=spread, outlier_s=float(at_fault.size * SAMPLE_S))
     return _correct_poses(poses, latency, outlier), alignment
 
 
 def _correct_poses(poses: pl.DataFrame, latency: Floats, outlier: Flags) -> pl.DataFrame:
     return poses.with_columns(pl.Series("latency", latency), pl.Series("outlier", outlier))
+
+
+def _take_off_delay(alignment: Alignment, late: float) -> Alignment:
+    """The alignment of poses that stand at the gyro's clock."""
+    gyro = alignment.gyro
+    return replace(
+        alignment, gyro=None if gyro is None else replace(gyro, yaw_delay_s=0.0), heading_delay_s=late
+    )
 
 
 def _with_gyro(run: MotionRun) -> MotionRun:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from pipeline.diagnosis.problem import Problem
+    from pipeline.identification.parts import Part
 
 Floats = NDArray[np.float64]
 
@@ -20,7 +20,7 @@ _RIDGE = 1e-6
 
 
 @dataclass(frozen=True)
-class Metric:
+class Weights:
     """Weights of residuals.
 
     Attributes:
@@ -38,7 +38,7 @@ class Metric:
         shrunk: Floats = scaled * np.sqrt(self.clip / np.maximum(size, self.clip))
         return shrunk
 
-    def weights(self, residual: Floats) -> Floats:
+    def factors(self, residual: Floats) -> Floats:
         """Factors that turn rows of a Jacobian into those of `weigh`, shape (n, 3)."""
         size = np.abs(residual / self.scale)
         factors: Floats = np.sqrt(self.clip / np.maximum(size, self.clip)) / self.scale
@@ -56,57 +56,56 @@ class Metric:
         return float(self.cost(residual).mean())
 
 
-def measure_spread(residual: Floats, problem: Problem) -> Floats:
+def measure_spread(residual: Floats, part: Part) -> Floats:
     """Robust spread of each run and channel while it drives, laid out like the residuals, shape (n, 3).
 
     It is never far below the clipped rms: where a vehicle mostly drives straight, the median of the yaw
     residual says nothing about turning.
     """
     spread = np.full(residual.shape, np.inf)
-    for number in np.unique(problem.run).tolist():
-        rows = problem.run == number
-        live = rows & problem.live
-        for channel in problem.channels:
+    for number in np.unique(part.run).tolist():
+        rows = part.run == number
+        live = rows & part.live
+        for channel in part.channels:
             size = np.abs(residual[live if live.any() else rows, channel])
-            middle = max(_GAUSSIAN * float(np.median(size)), float(problem.least[channel]))
+            middle = max(_GAUSSIAN * float(np.median(size)), float(part.least[channel]))
             clipped = float(np.sqrt(np.mean(np.minimum(size, _CLIP * middle) ** 2)))
             spread[rows, channel] = max(middle, _SHARE_OF_RMS * clipped)
     return spread
 
 
-def make_metric(residual: Floats, noise: Floats, problem: Problem) -> Metric:
-    """Metric at a model: spreads at most those that a saturated fit leaves, clipped at six of its own.
+def make_weights(residual: Floats, part: Part) -> Weights:
+    """Weights at a model: spreads at most those that a saturated fit leaves, clipped at six of its own.
 
     Args:
         residual: of the model, shape (n, 3).
-        noise: spread that a saturated fit leaves, shape (n, 3).
-        problem: whose residuals they are.
+        part: whose residuals they are.
     """
-    own = measure_spread(residual, problem)
-    scale = np.minimum(own, noise)
+    own = measure_spread(residual, part)
+    scale = np.minimum(own, part.noise)
     with np.errstate(invalid="ignore"):
         clip = np.where(np.isfinite(scale), _CLIP * own / scale, 1.0)
-    return Metric(scale, clip)
+    return Weights(scale, clip)
 
 
-def saturate(problem: Problem, residual: Floats) -> Floats:
+def measure_noise(part: Part, residual: Floats) -> Floats:
     """Spread that remains when nearly anything linear in the input's past may act, shape (n, 3).
 
     Args:
-        problem: what is explained.
+        part: what is explained.
         residual: of the ideal model, or of the model to start from.
     """
-    design = _make_features(problem)
+    design = _make_features(part)
     rest = np.array(residual)
-    for number in np.unique(problem.run).tolist():
-        rows = problem.run == number
+    for number in np.unique(part.run).tolist():
+        rows = part.run == number
         columns = design[rows]
         columns = columns[:, columns.std(axis=0) > 0.0]
         size = np.sqrt((columns**2).mean(axis=0))
         columns = np.column_stack((columns / size, np.ones(columns.shape[0])))
-        for channel in problem.channels:
+        for channel in part.channels:
             rest[rows, channel] = _fit_robustly(columns, residual[rows, channel])
-    return measure_spread(rest, problem)
+    return measure_spread(rest, part)
 
 
 def _fit_robustly(columns: Floats, values: Floats) -> Floats:
@@ -123,8 +122,8 @@ def _fit_robustly(columns: Floats, values: Floats) -> Floats:
     return widened
 
 
-def _make_features(problem: Problem) -> Floats:
-    lags = problem.find_ideal()
+def _make_features(part: Part) -> Floats:
+    lags = part.find_ideal()
     forward, turning = lags[:, :, 0], lags[:, :, 1]
     products = forward * turning
     now = [

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 _MOST_RUNS = 6
 _MOST_FITS = 60
-_COARSE_RATE_HZ = 50.0
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class Judged:
 
 
 @dataclass
-class Stand:
+class PreparedRun:
     """One run and input, ready; one thread at a time.
 
     Attributes:
@@ -63,7 +62,7 @@ class Stand:
     stage: MotionStage
     lock: threading.RLock = field(default_factory=threading.RLock)
     _fits: OrderedDict[object, Judged] = field(default_factory=OrderedDict)
-    _coarse: Problem | None = None
+    _second: Problem | None = None
 
     def judge(self, model: Model) -> Judged:
         """Fit a model and score it on data that the fit has not seen; remembered.
@@ -73,7 +72,7 @@ class Stand:
         key = model.effects
         with self.lock:
             if key not in self._fits:
-                fitted = fit_model(self.problem, model)
+                fitted = fit_model(self.problem, model, exact=True)
                 held_out = hold_out(self.problem, fitted)
                 floor = estimate_floor(self.problem, held_out)
                 items = estimate_intervals(self.problem, fitted).items if model.effects else ()
@@ -87,17 +86,17 @@ class Stand:
     def judge_quickly(self, model: Model) -> Errors:
         """Held-out errors of a fitted model, without floor and intervals."""
         with self.lock:
-            return hold_out(self.problem, fit_model(self.problem, model)).pooled
+            return hold_out(self.problem, fit_model(self.problem, model, exact=not model.effects)).pooled
 
     def score(self, model: Model, timing: Sequence[float]) -> Errors:
         """Errors of a model as it stands, nothing fitted."""
         with self.lock:
-            return score(self.problem, self.state(model, timing), self.stage.ideal.weights).pooled
+            return score(self.problem, self.state(model, timing)).pooled
 
     def state(self, model: Model, timing: Sequence[float]) -> State:
         """A model with the recording's delays."""
-        pose, wheel = timing
-        return State(model, {}, (Timing(pose, wheel),))
+        _, wheel = timing
+        return State(model.effects, (Timing(wheel),))
 
     def view(
         self,
@@ -110,19 +109,19 @@ class Stand:
         with self.lock:
             return self.stage.view(self.state(model, timing), ladder, floor)
 
-    def coarse_problem(self) -> Problem:
-        """The run on a coarser grid, for trying many effects beside the work in front."""
+    def second_problem(self) -> Problem:
+        """The run made ready once more, for trying many effects beside the work in front."""
         with self.lock:
-            if self._coarse is None:
-                self._coarse = Problem([self.run], self.vehicle, self.problem.source, rate_hz=_COARSE_RATE_HZ)
-            return self._coarse
+            if self._second is None:
+                self._second = Problem([self.run], self.vehicle, self.problem.source)
+            return self._second
 
 
-class Bench:
+class RunCache:
     """The runs that were opened last."""
 
     def __init__(self) -> None:
-        self._stands: OrderedDict[tuple[str, str, str], Stand] = OrderedDict()
+        self._prepared: OrderedDict[tuple[str, str, str], PreparedRun] = OrderedDict()
         self._runs: OrderedDict[tuple[str, str], tuple[Vehicle, MotionRun]] = OrderedDict()
         self._lock = threading.Lock()
         self._making: dict[tuple[str, str, str], threading.Lock] = {}
@@ -148,7 +147,7 @@ class Bench:
         found += [Input.MEASURED] if run.wheels is not None else []
         return [source.value for source in found]
 
-    def stand(self, manifest: Manifest, source: str | None) -> Stand:
+    def prepared(self, manifest: Manifest, source: str | None) -> PreparedRun:
         """A run ready for an input; made where it is not there yet.
 
         Raises:
@@ -161,19 +160,19 @@ class Bench:
             making = self._making.setdefault(key, threading.Lock())
         with making:
             with self._lock:
-                if key in self._stands:
-                    self._stands.move_to_end(key)
-                    return self._stands[key]
+                if key in self._prepared:
+                    self._prepared.move_to_end(key)
+                    return self._prepared[key]
             problem = Problem([run], vehicle, chosen)
             places = None
             if "velocities" in manifest.tables:
                 places = manifest.read("velocities").select(pl.col("t", "x", "y")).sort("t")
-            stand = Stand(manifest, vehicle, run, problem, MotionStage(problem, places))
+            prepared = PreparedRun(manifest, vehicle, run, problem, MotionStage(problem, places))
             with self._lock:
-                self._stands[key] = stand
-                while len(self._stands) > _MOST_RUNS:
-                    self._stands.popitem(last=False)
-            return stand
+                self._prepared[key] = prepared
+                while len(self._prepared) > _MOST_RUNS:
+                    self._prepared.popitem(last=False)
+            return prepared
 
 
 def rung_as_json(effects: Sequence[str], errors: Errors) -> dict[str, object]:

@@ -35,7 +35,7 @@ FIGURES = (
 _LIVE = (list_rungs, list_arcs, list_reach, list_residuals, list_autocorrelations, list_responses, model_rows)
 
 
-class Album:
+class FigureCache:
     """The tables of one run, read once, and the figures of any model of it.
 
     Args:

@@ -51,7 +51,7 @@ class Step(msgspec.Struct, frozen=True, kw_only=True):
     by_hand: bool = False
 
 
-class Desk(msgspec.Struct, frozen=True, kw_only=True):
+class Session(msgspec.Struct, frozen=True, kw_only=True):
     """All steps of a model in the making.
 
     Attributes:
@@ -83,23 +83,23 @@ class Desk(msgspec.Struct, frozen=True, kw_only=True):
             )
         return self.steps[self.at]
 
-    def push(self, step: Step) -> Desk:
+    def push(self, step: Step) -> Session:
         """The desk after another step; what had been undone is forgotten."""
         steps = [*self.steps[: self.at + 1], step][-_MOST_STEPS:]
         return msgspec.structs.replace(self, steps=steps, at=len(steps) - 1)
 
-    def drop(self, which: int) -> Desk:
+    def drop(self, which: int) -> Session:
         """The desk without one of its steps; before it where that one counted."""
         steps = [step for number, step in enumerate(self.steps) if number != which]
         return msgspec.structs.replace(self, steps=steps, at=max(self.at - (which <= self.at), 0))
 
-    def move(self, by: int) -> Desk:
+    def move(self, by: int) -> Session:
         """The desk some steps back (negative) or forward, as far as there are any."""
         return msgspec.structs.replace(self, at=min(max(self.at + by, 0), len(self.steps) - 1))
 
 
 @dataclass(frozen=True)
-class DeskFile:
+class SessionFile:
     """Where a desk is kept.
 
     Attributes:
@@ -127,14 +127,14 @@ class DeskFile:
         suffix = ".toml" if self.slot == "a" else f".{self.slot}.toml"
         return self.results / FOLDER / "models" / _with_suffix(encode_run(self.run), suffix)
 
-    def read(self) -> Desk | None:
+    def read(self) -> Session | None:
         """The desk; None when there is none that can be read."""
         try:
-            return msgspec.json.decode(self.path.read_bytes(), type=Desk)
+            return msgspec.json.decode(self.path.read_bytes(), type=Session)
         except (OSError, ValueError, msgspec.DecodeError, RecursionError):
             return None
 
-    def write(self, desk: Desk) -> None:
+    def write(self, desk: Session) -> None:
         """Keep the desk.
 
         Raises:
@@ -161,10 +161,10 @@ def format_step(model: Model, intervals: Mapping[str, tuple[float, float]]) -> s
     return format_model(ModelFile(model, intervals=intervals))
 
 
-def begin_desk(run: str, key: str, source: str, vehicle: Vehicle) -> Desk:
+def begin_session(run: str, key: str, source: str, vehicle: Vehicle) -> Session:
     """A desk with the ideal model on it, not fitted yet."""
     step = Step(said="ideal model", model=format_step(Model(vehicle), {}))
-    return Desk(run=run, key=key, input=source, steps=[step], at=0)
+    return Session(run=run, key=key, input=source, steps=[step], at=0)
 
 
 def switch_off(model: Model, off: list[str]) -> Model:

@@ -14,10 +14,9 @@ from pipeline.models.effect import Effect, Parameter, Search
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from pipeline.diagnosis.metric import Metric
-    from pipeline.diagnosis.polish import Fitted
-    from pipeline.diagnosis.problem import Problem
-    from pipeline.diagnosis.state import State
+    from pipeline.identification.fit import PartFit
+    from pipeline.identification.parts import Part
+    from pipeline.identification.state import State
     from pipeline.models.evidence import Largest
 
 Floats = NDArray[np.float64]
@@ -72,9 +71,8 @@ class Proposal:
 
 
 def propose(
-    problem: Problem,
-    metric: Metric,
-    fitted: Fitted,
+    part: Part,
+    fit: PartFit,
     candidates: Sequence[Candidate],
     largest: Largest,
     known: dict[str, list[Trial]],
@@ -82,26 +80,25 @@ def propose(
     """Candidates by promised loss, the best start of each.
 
     Args:
-        problem: what is explained.
-        metric: cost of residuals.
-        fitted: the model to add to.
+        part: of the way that is explained.
+        fit: of the model to add to.
         candidates: effects to try.
         largest: what relative starts are shares of.
         known: columns of formula terms: they hardly change with the rest of the model.
     """
     found = []
     for candidate in candidates:
-        if fitted.state.find(candidate.id) is not None:
+        if fit.state.find(candidate.id) is not None:
             continue
         best: Proposal | None = None
         if candidate.id in known:
             trials = known[candidate.id]
         else:
-            trials = list(list_trials(problem, fitted, candidate, largest))
+            trials = list(list_trials(part, fit, candidate, largest))
             if candidate.id.startswith(TERM):
                 known[candidate.id] = trials
         for trial in trials:
-            proposal = _promise(metric, fitted, trial)
+            proposal = _promise(fit, trial)
             if proposal is not None and (best is None or proposal.loss < best.loss):
                 best = proposal
         if best is not None:
@@ -109,7 +106,7 @@ def propose(
     return sorted(found, key=lambda proposal: proposal.loss)
 
 
-def list_trials(problem: Problem, fitted: Fitted, candidate: Candidate, largest: Largest) -> Iterator[Trial]:
+def list_trials(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Iterator[Trial]:
     """Every start of an effect with its columns."""
     for values in list_starts(candidate, largest):
         start = candidate(**values)
@@ -118,20 +115,20 @@ def list_trials(problem: Problem, fitted: Fitted, candidate: Candidate, largest:
             for p in start.parameters
             if p.search is Search.DIRECT and math.isfinite(p.neutral) and p.name not in start.fixed
         )
-        state = fitted.state.add(start)
+        state = fit.state.add(start)
         if not direct:
-            residual = problem.find_residuals(state)
-            shift = fitted.residual - residual
+            residual = part.find_residuals(state)
+            shift = fit.residual - residual
             yield Trial(start, (), shift[:, :, None], np.zeros_like(shift))
             continue
-        base = fitted.residual if start.is_neutral else problem.find_residuals(state)
+        base = fit.residual if start.is_neutral else part.find_residuals(state)
         columns = []
         for name in direct:
             parameter = start.parameter(name)
             changed = start.change(**{name: parameter.neutral + parameter.step})
-            after = problem.find_residuals(fitted.state.add(changed))
+            after = part.find_residuals(fit.state.add(changed))
             columns.append((base - after) / parameter.step)
-        yield Trial(start, direct, np.stack(columns, axis=2), fitted.residual - base)
+        yield Trial(start, direct, np.stack(columns, axis=2), fit.residual - base)
 
 
 def list_starts(candidate: Candidate, largest: Largest) -> list[dict[str, float]]:
@@ -171,12 +168,12 @@ def _find_traced(trial: Trial, size: Floats) -> NDArray[np.bool_]:
     return traced if traced.any() else size > _NO_TRACE
 
 
-def _promise(metric: Metric, fitted: Fitted, trial: Trial) -> Proposal | None:
+def _promise(fit: PartFit, trial: Trial) -> Proposal | None:
     """Loss after one joint step of the model's numbers and the effect's."""
-    base = fitted.residual - trial.shift
-    joint = np.concatenate((fitted.jacobian, trial.columns), axis=2)
-    own = fitted.jacobian.shape[2]
-    factor = metric.weights(fitted.residual)
+    base = fit.residual - trial.shift
+    joint = np.concatenate((fit.jacobian, trial.columns), axis=2)
+    own = fit.jacobian.shape[2]
+    factor = fit.weights.factors(fit.residual)
     rows = (joint * factor[:, :, None]).reshape(-1, joint.shape[2])
     size = np.sqrt(np.einsum("ij,ij->j", rows, rows)) + 1e-12
     if not (size[own:] > _NO_TRACE).any():
@@ -193,10 +190,10 @@ def _promise(metric: Metric, fitted: Fitted, trial: Trial) -> Proposal | None:
     normal = rows.T @ rows + 1e-7 * np.eye(rows.shape[1])
     step = np.linalg.solve(normal, rows.T @ (base * factor).reshape(-1)) / size
     after = base - joint @ step
-    state = fitted.state
-    for slot, change in zip(fitted.slots, step[:own].tolist(), strict=True):
-        if slot.search is not Search.GRID:
-            state = state.write(slot, state.read(slot) + change)
+    state = fit.state
+    for number, change in zip(fit.free, step[:own].tolist(), strict=True):
+        if number.is_smooth:
+            state = state.set(number, state.get(number) + change)
     effect = trial.effect
     if trial.names:
         for name, change in zip(trial.names, step[own:].tolist(), strict=True):
@@ -204,4 +201,4 @@ def _promise(metric: Metric, fitted: Fitted, trial: Trial) -> Proposal | None:
             effect = effect.change(**{name: min(max(effect.values[name] + change, low), high)})
     elif step[own] < _LEAST_SHARE:
         return None
-    return Proposal(state.add(effect), effect.id, metric.loss(after))
+    return Proposal(state.add(effect), effect.id, fit.weights.loss(after))

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.diagnosis.diagnosis import Unexplained
+from pipeline.diagnosis.error_regions import CHANNELS
 from pipeline.diagnosis.library import join_formula
 from pipeline.diagnosis.unexplained import collect_terms, describe_windows, is_explainable
-from pipeline.diagnosis.where import CHANNELS
 from pipeline.identification.persistence import split_residuals
 
 if TYPE_CHECKING:
@@ -44,17 +44,17 @@ def describe(ways: Sequence[Explored]) -> Unexplained | None:
     predicted from what was recorded and of motion that lasts though nothing that was recorded tells of it.
     """
     body = ways[0]
-    arena, final = body.search.arena, body.search.final
+    selection, final = body.search.selection, body.search.final
     terms = collect_terms(final)
     if terms:
-        without = arena.drop(final, [term.id for term in terms])
-        share = 1.0 - arena.metric.loss(final.held) / arena.metric.loss(without.held)
-        signal = without.fitted.residual - final.fitted.residual
+        without = selection.drop(final, [term.id for term in terms])
+        share = 1.0 - selection.weights.loss(final.held) / selection.weights.loss(without.held)
+        signal = without.fit.residual - final.fit.residual
         return _describe_signal(body, signal, share, write_formula(join_formula(terms)))
     found: list[tuple[float, Unexplained]] = []
     explainable = body.explainable
     if explainable is not None and is_explainable(explainable):
-        signal = explainable.predicted * arena.metric.scale * (explainable.shares > 0.0)
+        signal = explainable.predicted * selection.weights.scale * (explainable.shares > 0.0)
         left = _describe_signal(body, signal, 0.0, None)
         channel = CHANNELS.index(left.channel)
         left = replace(left, share=float(explainable.shares[channel]))
@@ -66,7 +66,7 @@ def describe(ways: Sequence[Explored]) -> Unexplained | None:
 
 def _describe_signal(body: Explored, signal: Floats, share: float, formula: str | None) -> Unexplained:
     """What a push of x, y, w at every window depends on most."""
-    sizes = np.sqrt(((signal / body.search.arena.metric.scale) ** 2).mean(axis=0))
+    sizes = np.sqrt(((signal / body.search.selection.weights.scale) ** 2).mean(axis=0))
     channel = int(np.argmax(sizes))
     name, table = _depend(body, signal[:, channel])
     every = tuple(CHANNELS[i] for i in np.argsort(-sizes) if sizes[i] > _PART * sizes[channel])
@@ -107,7 +107,7 @@ def _find_lasting(way: Explored) -> tuple[float, Unexplained] | None:
 
 def _measure_asked(way: Explored) -> Floats:
     """Motion that was asked for, rms of x, y, w; sideways it is measured by the way forward."""
-    ideal = way.search.arena.problem.find_ideal()[:, 0, :]
+    ideal = way.search.selection.part.find_ideal()[:, 0, :]
     forward, turning = np.sqrt((ideal**2).mean(axis=0)).tolist()
     asked: Floats = np.maximum(np.array([forward, forward, turning]), 1e-9)
     return asked
@@ -116,7 +116,7 @@ def _measure_asked(way: Explored) -> Floats:
 def _share_lasting(way: Explored) -> tuple[Floats, Floats]:
     """Of x, y, w: share of the residual's variance that lasts, and correlation over one to two seconds."""
     makeup = _split(way)
-    seen = np.isin(np.arange(3), way.search.arena.problem.channels)
+    seen = np.isin(np.arange(3), way.search.selection.part.channels)
     shares = np.array([part.lasting_share for part in makeup])
     # Random motion that is forgotten within half a second repeats itself by 0.1 over that time.
     repeats = np.array([part.correlation[1:4].mean() for part in makeup])
@@ -124,8 +124,7 @@ def _share_lasting(way: Explored) -> tuple[Floats, Floats]:
 
 
 def _split(way: Explored) -> tuple[Makeup, Makeup, Makeup]:
-    problem = way.search.arena.problem
-    return split_residuals(problem.comparisons, way.search.final.held)  # type: ignore[attr-defined]
+    return split_residuals(way.search.selection.part.comparisons, way.search.final.held)
 
 
 def _unit(channel: int) -> str:
@@ -155,18 +154,18 @@ def mark_tentative(
     if unexplained is None or not unexplained.partial:
         return named
     body = ways[0]
-    arena, final = body.search.arena, body.search.final
+    selection, final = body.search.selection, body.search.final
     terms = [term.id for term in collect_terms(final)]
-    rest = arena.drop(final, terms) if terms else final
+    rest = selection.drop(final, terms) if terms else final
     channel = CHANNELS.index(unexplained.channel)
-    stays = unexplained.share * float(((rest.held / arena.metric.scale) ** 2)[:, channel].mean())
+    stays = unexplained.share * float(((rest.held / selection.weights.scale) ** 2)[:, channel].mean())
     marked = []
     for effect in named:
         tentative = False
         if effect.id in final.ids:
-            without = arena.drop(final, [effect.id])
-            fall = ((without.held / arena.metric.scale) ** 2).mean(axis=0)
-            fall -= ((final.held / arena.metric.scale) ** 2).mean(axis=0)
+            without = selection.drop(final, [effect.id])
+            fall = ((without.held / selection.weights.scale) ** 2).mean(axis=0)
+            fall -= ((final.held / selection.weights.scale) ** 2).mean(axis=0)
             tentative = int(np.argmax(fall)) == channel and float(fall[channel]) < 0.5 * stays
         marked.append(replace(effect, tentative=effect.tentative or tentative))
     return tuple(marked)
@@ -200,9 +199,7 @@ def describe_disturbance(body: Explored, unexplained: Unexplained | None) -> dic
 
 def _depend(body: Explored, signal: Floats) -> tuple[str, list[tuple[float, float]]]:
     """The recorded signal that a push depends on most, and its mean by value."""
-    problem = body.search.arena.problem
-    comparisons = problem.comparisons  # type: ignore[attr-defined]
-    features, names = describe_windows(comparisons)
+    features, names = describe_windows(body.search.selection.part.comparisons)
     best, name, table = -1.0, names[0], [(0.0, 0.0)]
     for column, label in zip(features.T, names, strict=True):
         edges = np.unique(np.quantile(column, np.linspace(0.0, 1.0, _BINS + 1)))

@@ -8,46 +8,53 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from pipeline.identification.describe import errors_as_json
+from pipeline.identification.ladder import is_risen
 from pipeline.models import find_effect
-from pipeline.web.bench import rung_as_json
-from pipeline.web.cards import show_desk
-from pipeline.web.desk import Desk, Step, begin_desk, format_step, switch_off
+from pipeline.web.cards import show_session
 from pipeline.web.errors import WorkbenchError
+from pipeline.web.run_cache import rung_as_json
+from pipeline.web.session import Session, Step, begin_session, format_step, switch_off
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from pipeline.identification import Errors
     from pipeline.models import Effect, Model
-    from pipeline.web.bench import Judged, Stand
-    from pipeline.web.desk import DeskFile
+    from pipeline.web.run_cache import Judged, PreparedRun
+    from pipeline.web.session import SessionFile
 
     Rungs = Mapping[tuple[str, ...], dict[str, object]]
 
 
-def open_desk(file: DeskFile, stand: Stand) -> Desk:
+def open_session(file: SessionFile, prepared: PreparedRun) -> Session:
     """The desk of a run as it was left; begun anew where there is none or the results have changed.
 
     Steps that cannot be opened any more are left out.
     """
     desk = file.read()
-    source = stand.problem.source.value
-    if desk is not None and (desk.key != stand.manifest.key or desk.input != source):
+    source = prepared.problem.source.value
+    if desk is not None and (desk.key != prepared.manifest.key or desk.input != source):
         desk = None
     desk = desk.move(0) if desk is not None else None
     while desk is not None and desk.steps and not _can_open(file, desk):
         desk = desk.drop(desk.at)
     if desk is None or not desk.steps:
-        desk = begin_desk(stand.manifest.run, stand.manifest.key, source, stand.vehicle)
+        desk = begin_session(prepared.manifest.run, prepared.manifest.key, source, prepared.vehicle)
         fitted = _fit_anew(
-            stand, desk, _model_of(file, desk), desk.step.order, desk.step.said, off=desk.step.off, known={}
+            prepared,
+            desk,
+            _model_of(file, desk),
+            desk.step.order,
+            desk.step.said,
+            off=desk.step.off,
+            known={},
         )
         desk = msgspec.structs.replace(fitted, steps=[fitted.step], at=0)
         file.write(desk)
     return desk
 
 
-def move(file: DeskFile, desk: Desk, by: int) -> Desk:
+def move(file: SessionFile, desk: Session, by: int) -> Session:
     """The desk a step back (-1) or forward (1); steps that cannot be opened any more are left out."""
     while True:
         moved = desk.move(by)
@@ -56,55 +63,101 @@ def move(file: DeskFile, desk: Desk, by: int) -> Desk:
         desk = desk.drop(moved.at)
 
 
-def _can_open(file: DeskFile, desk: Desk) -> bool:
+def _can_open(file: SessionFile, desk: Session) -> bool:
     try:
-        show_desk(desk, file.parse(desk.step.model))
+        show_session(desk, file.parse(desk.step.model))
     except Exception:  # noqa: BLE001 - whatever a file holds that was written elsewhere
         return False
     return True
 
 
-def add_effect(file: DeskFile, stand: Stand, desk: Desk, effect: Effect | str) -> Desk:
-    """Put an effect on top of the model and fit all of it."""
+def add_effect(
+    file: SessionFile, prepared: PreparedRun, desk: Session, effect: Effect | str, *, anyway: bool = False
+) -> Session:
+    """Put an effect on top of the model and fit all of it.
+
+    Raises:
+        WorkbenchError: ``error_rises``, see `add_effects`.
+    """
     made = find_effect(effect)() if isinstance(effect, str) else effect
-    model = _model_of(file, desk) + made
-    order, known = [*desk.step.order, made.id], _known_rungs(desk.step)
-    return _fit_anew(stand, desk, model, order, f"+ {made.id}", off=desk.step.off, known=known)
+    return add_effects(file, prepared, desk, [made], f"+ {made.id}", anyway=anyway)
 
 
-def drop_effect(file: DeskFile, stand: Stand, desk: Desk, name: str) -> Desk:
+def add_effects(
+    file: SessionFile,
+    prepared: PreparedRun,
+    desk: Session,
+    effects: Sequence[Effect],
+    said: str,
+    *,
+    anyway: bool,
+) -> Session:
+    """Put effects on top of the model at once, and fit all of it.
+
+    Raises:
+        WorkbenchError: ``error_rises``, an error over 2 s is higher with them and nobody said to take them
+            anyway.
+    """
+    model = _model_of(file, desk)
+    for made in effects:
+        model = model + made
+    order = [*desk.step.order, *(made.id for made in effects)]
+    changed = _fit_anew(prepared, desk, model, order, said, off=desk.step.off, known=_known_rungs(desk.step))
+    rises = _describe_rises(desk.step.ladder[-1], changed.step.ladder[-1])
+    if rises and not anyway:
+        raise WorkbenchError(
+            "error_rises",
+            f"with {said.removeprefix('+ ')} {' and '.join(rises)}: it was not taken",
+            where=desk.run,
+            hint="Take something else, or take it anyway",
+        )
+    return changed
+
+
+def _describe_rises(before: Mapping[str, object], after: Mapping[str, object]) -> list[str]:
+    told = []
+    for key, (word, unit) in {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}.items():
+        old, new = before.get(key), after.get(key)
+        if isinstance(old, float) and isinstance(new, float) and is_risen(old, new):
+            told.append(f"the {word} error over 2 s rises from {old:.3g} to {new:.3g} {unit}")
+    return told
+
+
+def drop_effect(file: SessionFile, prepared: PreparedRun, desk: Session, name: str) -> Session:
     """Take an effect away and fit the rest."""
     model = _model_of(file, desk) - name
     order = [each for each in desk.step.order if each != name]
     off = [each for each in desk.step.off if each != name]
-    return _fit_anew(stand, desk, model, order, f"\u2212 {name}", off=off, known=_known_rungs(desk.step))
+    return _fit_anew(prepared, desk, model, order, f"\u2212 {name}", off=off, known=_known_rungs(desk.step))
 
 
-def fit_desk(file: DeskFile, stand: Stand, desk: Desk) -> Desk:
+def fit_session(file: SessionFile, prepared: PreparedRun, desk: Session) -> Session:
     """Fit all values that are not locked, from where they are."""
     model = _model_of(file, desk)
-    return _fit_anew(stand, desk, model, desk.step.order, "fit", off=desk.step.off, known={})
+    return _fit_anew(prepared, desk, model, desk.step.order, "fit", off=desk.step.off, known={})
 
 
-def switch_effect(file: DeskFile, stand: Stand, desk: Desk, name: str) -> Desk:
+def switch_effect(file: SessionFile, prepared: PreparedRun, desk: Session, name: str) -> Session:
     """Switch an effect off, or on again, without a fit: what it carries alone shows at once."""
     model = _model_of(file, desk)
     model.effect(name)
     off = desk.step.off
     off = [each for each in off if each != name] if name in off else [*off, name]
     said = f"{name} {'off' if name in off else 'on'}"
-    return desk.push(_score_by_hand(stand, desk.step, model, said, off))
+    return desk.push(_score_by_hand(prepared, desk.step, model, said, off))
 
 
-def set_value(file: DeskFile, stand: Stand, desk: Desk, name: str, values: Mapping[str, float]) -> Desk:
+def set_value(
+    file: SessionFile, prepared: PreparedRun, desk: Session, name: str, values: Mapping[str, float]
+) -> Session:
     """Set values of an effect by hand, without a fit."""
     model = _model_of(file, desk).change(name, **values)
     told = ", ".join(f"{key} = {value:.4g}" for key, value in values.items())
-    step = _score_by_hand(stand, desk.step, model, f"{name}: {told}", desk.step.off)
+    step = _score_by_hand(prepared, desk.step, model, f"{name}: {told}", desk.step.off)
     return desk.push(step)
 
 
-def lock_value(file: DeskFile, desk: Desk, name: str, parameter: str) -> Desk:
+def lock_value(file: SessionFile, desk: Session, name: str, parameter: str) -> Session:
     """Lock a value against fits, or unlock it."""
     parsed = file.parse(desk.step.model)
     effect = parsed.model.effect(name)
@@ -115,13 +168,13 @@ def lock_value(file: DeskFile, desk: Desk, name: str, parameter: str) -> Desk:
     return desk.push(step)
 
 
-def _model_of(file: DeskFile, desk: Desk) -> Model:
+def _model_of(file: SessionFile, desk: Session) -> Model:
     return file.parse(desk.step.model).model
 
 
-def _score_by_hand(stand: Stand, step: Step, model: Model, said: str, off: list[str]) -> Step:
-    errors = stand.score(switch_off(model, off), step.timing)
-    _require_numbers(errors, stand.manifest.run)
+def _score_by_hand(prepared: PreparedRun, step: Step, model: Model, said: str, off: list[str]) -> Step:
+    errors = prepared.score(switch_off(model, off), step.timing)
+    _require_numbers(errors, prepared.manifest.run)
     shown = [name for name in step.order if name not in off]
     ladder = [rung for rung in step.ladder if set(_effects_of(rung)) < set(shown)]
     ladder.append(rung_as_json(shown, errors))
@@ -136,12 +189,19 @@ def _effects_of(rung: Mapping[str, object]) -> list[str]:
 
 
 def _fit_anew(
-    stand: Stand, desk: Desk, model: Model, order: list[str], said: str, *, off: list[str], known: Rungs
-) -> Desk:
+    prepared: PreparedRun,
+    desk: Session,
+    model: Model,
+    order: list[str],
+    said: str,
+    *,
+    off: list[str],
+    known: Rungs,
+) -> Session:
     """Fit a model; its ladder goes up in the order in which effects were added.
 
     Args:
-        stand: the run.
+        prepared: the run.
         desk: whose step it follows.
         model: with the effects that are switched off.
         order: of its effects.
@@ -149,7 +209,7 @@ def _fit_anew(
         off: effects that are switched off.
         known: rungs that need not be fitted again.
     """
-    whole = stand.judge(switch_off(model, off))
+    whole = prepared.judge(switch_off(model, off))
     _require_numbers(whole.errors, desk.run)
     fitted = whole.fitted.model
     shown = [name for name in order if name in fitted]
@@ -157,11 +217,11 @@ def _fit_anew(
     for count in range(len(shown)):
         rung = known.get(tuple(shown[:count]))
         if rung is None:
-            rung = rung_as_json(shown[:count], stand.judge_quickly(fitted.keep(shown[:count])))
+            rung = rung_as_json(shown[:count], prepared.judge_quickly(fitted.keep(shown[:count])))
         ladder.append(rung)
     ladder.append(rung_as_json(shown, whole.errors))
     timing = whole.fitted.state.timing[0]
-    delays = (timing.pose_delay_s, timing.wheel_delay_s)
+    delays = (prepared.run.alignment.heading_delay_s, timing.wheel_delay_s)
     step = Step(
         said=said,
         model=format_step(model.swap(*fitted.effects), whole.intervals),
@@ -169,7 +229,7 @@ def _fit_anew(
         off=off,
         timing=delays,
         ladder=ladder,
-        without={name: stand.score(fitted - name, delays).t_mrmse_m for name in shown},
+        without={name: prepared.score(fitted - name, delays).t_mrmse_m for name in shown},
     )
     return msgspec.structs.replace(desk, floor=_lower_floor(desk, whole)).push(step)
 
@@ -190,7 +250,7 @@ def _known_rungs(step: Step) -> Rungs:
     return {tuple(_effects_of(rung)): rung for rung in rungs}
 
 
-def learn_floor(desk: Desk, diagnosis: Mapping[str, object] | None) -> Desk:
+def learn_floor(desk: Session, diagnosis: Mapping[str, object] | None) -> Session:
     """The desk with the floor that a diagnosis found for the same input, where it is lower."""
     found = diagnosis.get("noise_floor") if diagnosis and diagnosis.get("input") == desk.input else None
     lower = found if isinstance(found, dict) and isinstance(found.get("t_mrmse_m"), float) else None
@@ -199,7 +259,7 @@ def learn_floor(desk: Desk, diagnosis: Mapping[str, object] | None) -> Desk:
     return msgspec.structs.replace(desk, floor=lower)
 
 
-def _lower_floor(desk: Desk, judged: Judged) -> dict[str, object]:
+def _lower_floor(desk: Session, judged: Judged) -> dict[str, object]:
     """The floor can only sink: the better the model, the sharper it is."""
     found = errors_as_json(judged.floor)
     return found if _is_below(found, desk.floor) else desk.floor

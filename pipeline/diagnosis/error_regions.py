@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import polars as pl
 
-    from pipeline.diagnosis.problem import Problem
+    from pipeline.identification.parts import Part
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -53,16 +53,16 @@ class Region:
         return f"{self.text}: {self.share:.0%} of the {_WORDS[self.channel]} in {self.time_share:.0%} of time"
 
 
-def map_errors(problem: Problem, residual: Floats, places: Floats) -> list[Region]:
+def map_errors(part: Part, residual: Floats, places: Floats) -> list[Region]:
     """Every region of every kind with its part of each channel's error.
 
     Args:
-        problem: whose windows they are.
+        part: whose windows they are.
         residual: of a model, shape (n, 3).
         places: x, y [m] in the map at every window, shape (n, 2).
     """
     regions = []
-    for kind, text, rows in _list_regions(problem, places):
+    for kind, text, rows in _list_regions(part, places):
         if not rows.any():
             continue
         for channel, name in enumerate(CHANNELS):
@@ -106,15 +106,15 @@ def pick_regions(regions: list[Region], residual: Floats, noise: Floats) -> list
     return picked[: 2 * _SHOWN]
 
 
-def _list_regions(problem: Problem, places: Floats) -> list[tuple[str, str, Flags]]:
-    lags = problem.find_ideal()
+def _list_regions(part: Part, places: Floats) -> list[tuple[str, str, Flags]]:
+    lags = part.find_ideal()
     speed, turn = lags[:, 0, 0], lags[:, 0, 1]
     found = _cut_commands(speed, turn)
     changed = np.abs(lags - lags[:, :1, :]).max(axis=1) > _CHANGE * np.abs(lags).max(axis=(0, 1))
     transitory = changed.any(axis=1)
     found.append(("phase", f"within {_TRANSITORY_S:g} s of a change of command", transitory))
-    found.append(("phase", "in steady driving", ~transitory & problem.live))
-    middle = problem.times.mean(axis=1)
+    found.append(("phase", "in steady driving", ~transitory & part.live))
+    middle = part.times.mean(axis=1)
     edges = np.linspace(float(middle.min()), float(middle.max()) + 1e-6, 6)
     for low, high in pairwise(edges.tolist()):
         found.append(("time", f"from {low:.0f} to {high:.0f} s", (middle >= low) & (middle < high)))

@@ -1,7 +1,7 @@
 """Whether one model is better than another on data that neither has seen: blocked cross-validation.
 
 Residuals of field data are autocorrelated, so that textbook tests name what is not there. Here the unit is a
-stretch of ten seconds; parameters are refitted for every fold, through the Jacobian.
+stretch of ten seconds.
 """
 
 from __future__ import annotations
@@ -12,22 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.diagnosis.polish import solve_step
-from pipeline.diagnosis.problem import number_units
-from pipeline.models.effect import Search
+from pipeline.identification.parts import number_units
 
 if TYPE_CHECKING:
-    from pipeline.diagnosis.metric import Metric
-    from pipeline.diagnosis.polish import Fitted
-    from pipeline.diagnosis.problem import Problem
+    from pipeline.identification.parts import Part
+    from pipeline.identification.weights import Weights
 
 Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 
-FOLDS = 5
-_LEAST_SHARE = 0.01
-GAP_S = 1.5
 LEAST_GAIN = 0.01
 LEAST_T = 2.5
 _FEWEST_WINDOWS = 6
@@ -42,14 +35,6 @@ _RARE_T = 1.5
 _PLAIN_Z = 6.0
 LEAST_STRETCHES = 1.7
 _LAGS = 8
-
-
-@dataclass(frozen=True)
-class Fold:
-    """Windows that are fitted and windows that are judged."""
-
-    train: Flags
-    test: Flags
 
 
 @dataclass(frozen=True)
@@ -77,60 +62,25 @@ class Verdict:
         return common or rare or (self.gain >= _RARE_GAIN and self.z >= _PLAIN_Z)
 
 
-def make_folds(problem: Problem) -> tuple[Fold, ...]:
-    """Five folds of ten-second stretches, with gaps of 1.5 s between what is fitted and what is judged."""
-    folds = []
-    begin, end = problem.times[:, 0], problem.times[:, 1]
-    for number in range(FOLDS):
-        test = problem.unit % FOLDS == number
-        near = np.zeros(test.size, dtype=bool)
-        for run in np.unique(problem.run).tolist():
-            rows = problem.run == run
-            starts, ends = np.sort(begin[rows & test]), np.sort(end[rows & test])
-            later = np.searchsorted(starts, end[rows] + GAP_S)
-            earlier = np.searchsorted(ends, begin[rows] - GAP_S)
-            near[rows] = later > earlier
-        folds.append(Fold(~near, test))
-    return tuple(folds)
-
-
-def hold_out(fitted: Fitted, metric: Metric, folds: tuple[Fold, ...]) -> Floats:
-    """Residuals of every window under parameters fitted without it and its surroundings, shape (n, 3)."""
-    smooth = [place for place, slot in enumerate(fitted.slots) if slot.search is not Search.GRID]
-    held = np.array(fitted.residual)
-    if not smooth:
-        return held
-    jacobian = fitted.jacobian[:, :, smooth]
-    # What acts in a few moments may act in one fold only: the others must not send its number to the moon.
-    hold = _LEAST_SHARE * ((jacobian * metric.weights(fitted.residual)[:, :, None]) ** 2).sum(axis=(0, 1))
-    for fold in folds:
-        if not fold.test.any() or not fold.train.any():
-            continue
-        part = type(metric)(metric.scale[fold.train], metric.clip[fold.train])
-        step, _ = solve_step(jacobian[fold.train], fitted.residual[fold.train], part, hold=hold)
-        held[fold.test] = fitted.residual[fold.test] - jacobian[fold.test] @ step
-    return held
-
-
-def compare(problem: Problem, metric: Metric, before: Floats, after: Floats) -> Verdict:
-    """Judge held-out residuals of two models under one metric."""
-    old, new = metric.cost(before), metric.cost(after)
+def compare(part: Part, weights: Weights, before: Floats, after: Floats) -> Verdict:
+    """Judge held-out residuals of two models under one weights."""
+    old, new = weights.cost(before), weights.cost(after)
 
     def add_up(label: Integers, values: Floats) -> Floats:
         return np.asarray(np.bincount(label, values), dtype=np.float64)
 
-    count = np.bincount(problem.unit)
+    count = np.bincount(part.unit)
     kept = count >= min(_FEWEST_WINDOWS, int(count.max()))
-    sums_old = add_up(problem.unit, old)[kept]
-    sums_new = add_up(problem.unit, new)[kept]
+    sums_old = add_up(part.unit, old)[kept]
+    sums_new = add_up(part.unit, new)[kept]
     gain = 1.0 - float(new.sum()) / max(float(old.sum()), 1e-12)
     difference = sums_old - sums_new
     ratio = np.log(np.maximum(sums_old, 1e-9) / np.maximum(sums_new, 1e-9))
-    moved = (((before - after) / metric.scale) ** 2).sum(axis=1)
-    action = add_up(problem.unit, moved)[kept]
-    stretch = number_units(problem.run, problem.times, SHORT_S)
+    moved = (((before - after) / weights.scale) ** 2).sum(axis=1)
+    action = add_up(part.unit, moved)[kept]
+    stretch = number_units(part.run, part.times, SHORT_S)
     short = _ratio_t(add_up(stretch, old - new), add_up(stretch, moved)) * LEAST_T / _SHORT_T
-    rare = _normal_t(problem, after / metric.scale, add_up(stretch, old - new), add_up(stretch, moved))
+    rare = _normal_t(part, after / weights.scale, add_up(stretch, old - new), add_up(stretch, moved))
     return Verdict(
         gain, max(_block_t(difference), _block_t(ratio), _ratio_t(difference, action), short), rare
     )
@@ -154,14 +104,14 @@ def _ratio_t(difference: Floats, action: Floats) -> float:
     return float(difference.sum()) / spread if spread > 0.0 else 0.0
 
 
-def _normal_t(problem: Problem, rest: Floats, difference: Floats, action: Floats) -> float:
+def _normal_t(part: Part, rest: Floats, difference: Floats, action: Floats) -> float:
     """Loss taken away over its deviation if the better model's residuals were all the noise there is."""
     total = float(action.sum())
     if total <= 0.0 or total**2 / float(np.sum(action**2)) < LEAST_STRETCHES:
         return 0.0
     noise = 0.0
-    for channel in problem.channels:
-        clipped = np.clip(rest[problem.live, channel], -3.0, 3.0)
+    for channel in part.channels:
+        clipped = np.clip(rest[part.live, channel], -3.0, 3.0)
         power = float(np.mean(clipped**2))
         spread = power
         for lag in range(1, _LAGS):

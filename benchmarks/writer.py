@@ -1,0 +1,55 @@
+"""What serializing a message takes: our columns beside the message-wise encoder of mcap-ros2-support.
+
+    python benchmarks/writer.py [--rows 20000]
+
+Both serialize the same values; the exit code is 1 where their bytes differ.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from types import SimpleNamespace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mcap_ros2._dynamic import serialize_dynamic
+from mcap_ros2.decoder import generate_dynamic
+from reader_log import SMALL, START_NS, payloads_of, small_fields
+
+from pipeline.logs import definition_text
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+def measure(work: Callable[[], list[bytes]]) -> tuple[float, list[bytes]]:
+    """Processor time [s] and the payloads."""
+    before = time.process_time()
+    payloads = work()
+    return time.process_time() - before, payloads
+
+
+def main() -> int:
+    """Serialize every kind of message, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rows", type=int, default=20_000)
+    given = parser.parse_args()
+    differ = False
+    print(f"{'us a message':32s} {'ours':>8s} {'mcap-ros2-support':>18s}")
+    for kind in sorted({kind for _, kind, _ in SMALL}):
+        text = definition_text(kind) or ""
+        times = START_NS + np.arange(given.rows) * 10_000_000
+        fields = small_fields(kind, times, np.random.default_rng(1))
+        ours, payloads = measure(lambda: payloads_of(kind, text, given.rows, fields))  # noqa: B023 - called here
+        decode = generate_dynamic(kind, text)[kind]
+        messages: list[SimpleNamespace] = [decode(payload) for payload in payloads]
+        encode = serialize_dynamic(kind, text)[kind]
+        theirs, other = measure(lambda: [encode(message) for message in messages])  # noqa: B023 - called here
+        differ |= payloads != other
+        print(f"{kind:32s} {ours / given.rows * 1e6:8.2f} {theirs / given.rows * 1e6:18.2f}")
+    return int(differ)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

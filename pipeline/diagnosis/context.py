@@ -1,0 +1,140 @@
+"""What is diagnosed: the runs made ready, and the candidates that follow from their topics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from pipeline.diagnosis.errors import DiagnosisError
+from pipeline.identification.comparison import Input
+from pipeline.identification.problem import Problem
+from pipeline.models.catalogue import list_effects
+from pipeline.models.effect import Place
+from pipeline.models.evidence import LEAST_DELAY_S, Evidence
+from pipeline.models.forward import Timing
+from pipeline.runs.errors import MotionError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.identification.proposals import Candidate
+    from pipeline.models.evidence import Largest
+    from pipeline.runs.recording import MotionRun
+    from pipeline.vehicles import Vehicle
+
+_FEWEST_WINDOWS = 60
+_DRIVETRAIN = frozenset({Place.COMMAND, Place.DRIVE})
+_SURE = 4.0
+
+
+@dataclass(frozen=True)
+class Context:
+    """Runs of one vehicle, ready to be asked.
+
+    Attributes:
+        problem: the runs on the leading input.
+    """
+
+    problem: Problem
+
+    @property
+    def runs(self) -> tuple[MotionRun, ...]:
+        """The recordings."""
+        return self.problem.runs
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """Geometry."""
+        return self.problem.vehicle
+
+    @property
+    def largest(self) -> Largest:
+        """What relative starts are shares of."""
+        return self.problem.largest
+
+    @property
+    def has_encoders(self) -> bool:
+        """Whether every run has measured wheels."""
+        return all(run.wheels is not None for run in self.runs)
+
+    @property
+    def has_gyro(self) -> bool:
+        """Whether every run has a good gyro as heading and clock."""
+        return all(comparison.has_gyro for comparison in self.problem.comparisons)
+
+    @property
+    def evidence(self) -> Evidence:
+        """What the runs can show; every search looks at measured wheels where there are any."""
+        sampling = self.sampling_s if self.has_encoders else 0.0
+        return Evidence(self.largest, self.has_encoders, self.has_gyro, sampling)
+
+    @property
+    def sampling_s(self) -> float:
+        """Delay that sampled encoders may feign: a little more than half their period."""
+        periods = [float(np.median(np.diff(run.wheels.times))) for run in self.runs if run.wheels is not None]
+        return 0.6 * max(periods, default=0.0)
+
+    @property
+    def timing(self) -> tuple[Timing, ...]:
+        """Delays to start from: none, the runs are aligned."""
+        return (Timing(),) * len(self.runs)
+
+    def list_candidates(self, source: Input) -> tuple[Candidate, ...]:
+        """Effects that can be told on an input of this vehicle."""
+        hidden = _DRIVETRAIN if source is Input.MEASURED else frozenset()
+        return tuple(
+            cast("Candidate", effect)
+            for effect in list_effects()
+            if self.vehicle.kind in effect.kinds
+            and effect.place not in hidden
+            and not effect.parts
+            and effect().can_show(self.evidence)
+        )
+
+    def list_drivetrain(self) -> tuple[Candidate, ...]:
+        """Effects between command and wheels."""
+        return tuple(
+            cast("Candidate", effect)
+            for effect in list_effects()
+            if self.vehicle.kind in effect.kinds and effect.place in _DRIVETRAIN
+        )
+
+
+def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Context:
+    """Make runs ready.
+
+    Raises:
+        DiagnosisError: ``no_input``; ``too_short``, fewer than a quarter of a minute of driving can be
+            compared.
+    """
+    where = ", ".join(run.name for run in runs)
+    try:
+        problem = Problem(runs, vehicle, source)
+    except MotionError as error:
+        if error.code != f"no_{source.value}":
+            raise
+        other = Input.MEASURED if source is Input.COMMAND else Input.COMMAND
+        raise DiagnosisError(
+            "no_input",
+            f"there is no {'command' if source is Input.COMMAND else 'measured wheel'} to diagnose from",
+            where=where,
+            hint=f"Try --input {other.value}.",
+        ) from error
+    windows = problem.whole.run.size
+    if windows < _FEWEST_WINDOWS:
+        raise DiagnosisError(
+            "too_short",
+            f"only {windows} stretches of half a second have both a live input and good poses",
+            where=where,
+            hint=f"{_FEWEST_WINDOWS} are needed: drive longer, or check the poses with `slip inspect`.",
+        )
+    return Context(problem)
+
+
+def is_late(run: MotionRun) -> bool:
+    """Whether the reported heading is late or early against the gyro beyond doubt."""
+    gyro = run.gyro_fit
+    delay = abs(run.alignment.heading_delay_s)
+    return gyro is not None and delay >= LEAST_DELAY_S and delay > _SURE * gyro.delay_error_s

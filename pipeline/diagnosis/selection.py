@@ -1,0 +1,224 @@
+"""Where models compete: a part of the way, its weights and folds, and the effects that may be named."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.diagnosis.budget import Budget
+from pipeline.diagnosis.plausibility import is_nameable
+from pipeline.diagnosis.verdict import LEAST_GAIN, Verdict, compare
+from pipeline.identification.fit import PartFit, fit_part
+from pipeline.identification.folds import hold_out_part, make_folds
+from pipeline.identification.proposals import propose
+from pipeline.identification.weights import Weights, make_weights, measure_spread
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from pipeline.identification.folds import Fold
+    from pipeline.identification.parts import Part
+    from pipeline.identification.proposals import Candidate, Proposal, Trial
+    from pipeline.identification.state import State
+    from pipeline.models.evidence import Evidence, Largest
+
+Floats = NDArray[np.float64]
+
+# A number more must buy something: between models that predict alike the simpler one is named.
+_PRICE_OF_A_NUMBER = 0.004
+_FIRST_STEPS = 4
+_WORTH = 1.15
+_FLOOR = 1.1
+
+
+@dataclass(frozen=True)
+class CandidateModel:
+    """A fitted model with its held-out residuals.
+
+    Attributes:
+        fit: the model.
+        held: residuals under parameters fitted elsewhere, shape (n, 3).
+        score: held-out loss, a little more for every number.
+    """
+
+    fit: PartFit
+    held: Floats
+    score: float
+
+    @property
+    def state(self) -> State:
+        """The model's state."""
+        return self.fit.state
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Ids of its effects."""
+        return self.fit.state.ids
+
+
+@dataclass
+class Selection:
+    """A part of the way with what is needed to judge models of it.
+
+    Attributes:
+        part: of the way that is explained.
+        candidates: effects that may be named.
+        evidence: what the runs can show.
+        kept: effects that are never dropped: those of the model to start from.
+        weights: cost of residuals at the current model.
+        budget: how long the search may take.
+        work: how many times candidates were looked through.
+        least_share: share of the asked motion (rms) that an effect must account for.
+    """
+
+    part: Part
+    candidates: tuple[Candidate, ...]
+    evidence: Evidence
+    folds: tuple[Fold, ...]
+    weights: Weights
+    kept: frozenset[str] = frozenset()
+    least_share: float = 0.0
+    budget: Budget = field(default_factory=Budget)
+    _dropped: dict[tuple[str, ...], CandidateModel] = field(default_factory=dict)
+    _suggested: dict[tuple[object, ...], list[CandidateModel]] = field(default_factory=dict)
+    _proposed: dict[tuple[object, ...], list[Proposal]] = field(default_factory=dict)
+    _tried: dict[tuple[object, ...], PartFit] = field(default_factory=dict)
+    _finished: dict[tuple[object, ...], CandidateModel] = field(default_factory=dict)
+    work: int = 0
+    _columns: dict[str, list[Trial]] = field(default_factory=dict)
+
+    def widen(self, candidates: tuple[Candidate, ...]) -> Selection:
+        """The same selection with other candidates; nothing that was tried here counts there."""
+        return Selection(
+            self.part, candidates, self.evidence, self.folds, self.weights,
+            kept=self.kept, least_share=self.least_share, budget=self.budget,
+        )  # fmt: skip
+
+    def is_done(self, most: int) -> bool:
+        """Whether candidates were looked through often enough, or for too long."""
+        return self.work > most or self.budget.is_spent()
+
+    @property
+    def largest(self) -> Largest:
+        """What was asked for."""
+        return self.evidence.largest
+
+    def enter(self, state: State) -> CandidateModel:
+        """Fit a state and hold it out."""
+        return self._present(fit_part(self.part, self.weights, state))
+
+    def drop(self, current: CandidateModel, names: Iterable[str]) -> CandidateModel:
+        """A model without some of its effects, fitted anew."""
+        state = current.state.drop(names)
+        if state.ids not in self._dropped:
+            self._dropped[state.ids] = self.enter(state)
+        return self._dropped[state.ids]
+
+    def _present(self, fit: PartFit) -> CandidateModel:
+        held = hold_out_part(fit, self.folds)
+        price = 1.0 + sum(
+            effect.price + _PRICE_OF_A_NUMBER * sum(np.isfinite(value) for value in effect.values.values())
+            for effect in fit.state.effects
+        )
+        return CandidateModel(fit, held, self.weights.loss(held) * price)
+
+    def judge(self, before: CandidateModel, after: CandidateModel) -> Verdict:
+        """How much better ``after`` is."""
+        return compare(self.part, self.weights, before.held, after.held)
+
+    def prefers(self, before: CandidateModel, after: CandidateModel, least_gain: float = LEAST_GAIN) -> bool:
+        """Whether ``after`` is better beyond doubt, and by enough to matter."""
+        return self.judge(before, after).accepts(least_gain) and self._matters(before, after)
+
+    def _matters(self, before: CandidateModel, after: CandidateModel) -> bool:
+        """Whether enough of the motion is explained: encoders are so exact that all else is certain."""
+        if self.least_share == 0.0:
+            return True
+        asked = (self.part.find_ideal()[:, 0, :] ** 2).mean(axis=0)
+        fall = (before.held**2 - after.held**2).mean(axis=0)[[0, 2]]
+        return bool((fall > self.least_share**2 * asked).any())
+
+    def adapt(self, tested: CandidateModel) -> CandidateModel:
+        """Take the weights from a model's own residuals, and fit it anew."""
+        self.weights = make_weights(tested.fit.residual, self.part)
+        self._dropped.clear()
+        self._suggested.clear()
+        self._proposed.clear()
+        self._tried.clear()
+        self._finished.clear()
+        self.budget.report(self.part.way, tested.ids)
+        return self.enter(tested.state)
+
+    def suggest(self, base: CandidateModel, count: int, without: Iterable[str] = ()) -> list[CandidateModel]:
+        """The best few models with one effect more, fitted, by score."""
+        barred = frozenset(without)
+        key = (base.ids, count, barred)
+        if key in self._suggested:
+            return self._suggested[key]
+        self.work += 1
+        proposals = self._propose(base, barred)[:count]
+        # A few steps tell which of them are worth fitting to the end.
+        tried = [self._try(base.ids, proposal.state) for proposal in proposals]
+        best = min((fit.loss for fit in tried), default=0.0)
+        entered = [
+            self._finish(base.ids, fit) if fit.loss < _WORTH * best else self._present(fit) for fit in tried
+        ]
+        entered = [self._simplify(tested) for tested in entered]
+        ranked = sorted((c for c in entered if self.is_sound(c)), key=lambda c: c.score)
+        self._suggested[key] = ranked
+        return ranked
+
+    def _propose(self, base: CandidateModel, barred: frozenset[str]) -> list[Proposal]:
+        """Effects beside a model by what they promise; asked again and again for another count of them."""
+        key = (base.ids, barred)
+        if key not in self._proposed:
+            candidates = [c for c in self.candidates if c.id not in barred]
+            self._proposed[key] = propose(self.part, base.fit, candidates, self.largest, self._columns)
+        return self._proposed[key]
+
+    def _try(self, base: tuple[str, ...], state: State) -> PartFit:
+        key = (base, state.ids)
+        if key not in self._tried:
+            self._tried[key] = fit_part(self.part, self.weights, state, _FIRST_STEPS)
+        return self._tried[key]
+
+    def _finish(self, base: tuple[str, ...], fit: PartFit) -> CandidateModel:
+        key = (base, fit.state.ids)
+        if key not in self._finished:
+            self._finished[key] = self.enter(fit.state)
+        return self._finished[key]
+
+    def _simplify(self, tested: CandidateModel) -> CandidateModel:
+        """The model with a simpler effect for one that has become it beside a new effect."""
+        known = {candidate.id for candidate in self.candidates} - set(tested.ids)
+        for effect in tested.state.effects:
+            simpler = None if effect.id in self.kept else effect.collapse()
+            if simpler is None or simpler.id not in known or is_nameable(effect, self.evidence):
+                continue
+            return self.enter(tested.state.drop([effect.id]).add(simpler))
+        return tested
+
+    def has_room(self, tested: CandidateModel) -> bool:
+        """Whether a model leaves more than a saturated fit does in any channel."""
+        own = measure_spread(tested.fit.residual, self.part)[:, self.part.channels]
+        return bool((own > _FLOOR * self.part.noise[:, self.part.channels]).any())
+
+    def is_sound(self, tested: CandidateModel) -> bool:
+        """Whether every effect is large enough to be named, and no degenerate form of another."""
+        return all(
+            effect.id in self.kept or is_nameable(effect, self.evidence) for effect in tested.state.effects
+        )
+
+
+def open_selection(
+    part: Part, start: State, candidates: tuple[Candidate, ...], evidence: Evidence, budget: Budget
+) -> tuple[Selection, CandidateModel]:
+    """The selection of a part of the way, and the model to start from, fitted."""
+    weights = make_weights(part.find_residuals(start), part)
+    selection = Selection(
+        part, candidates, evidence, make_folds(part), weights, kept=frozenset(start.ids), budget=budget
+    )
+    return selection, selection.adapt(selection.enter(start))

@@ -1,0 +1,48 @@
+"""Numbers of an effect as they are said: those of the one fit, with its intervals."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.diagnosis.diagnosis import Value
+from pipeline.identification.intervals import stands_at_bound
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.identification import Estimates
+    from pipeline.models import Effect
+    from pipeline.runs import MotionRun
+
+_SURE = 1.96
+
+
+def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]:
+    """Numbers of an effect with the intervals of a fit; none where the fit could not tell."""
+    known = {} if estimates is None else {item.free.label: item for item in estimates.items}
+    values = {}
+    for parameter in effect.parameters:
+        value = effect.values[parameter.name]
+        if not math.isfinite(value):
+            continue
+        item = known.get(f"{effect.id}.{parameter.name}")
+        low, high = (math.nan, math.nan) if item is None else (item.low, item.high)
+        least, most = parameter.bounds
+        if high - low > most - least:
+            low = high = math.nan
+        at_bound = stands_at_bound(value, parameter.bounds)
+        values[parameter.name] = Value(value, low, high, parameter.unit, at_bound)
+    return values
+
+
+def read_clock(effect: Effect, runs: Sequence[MotionRun]) -> dict[str, Value]:
+    """How late poses were by the gyro's clock: no fit of the motion moves it, its error is the gyro's."""
+    (parameter,) = effect.parameters
+    value = effect.values[parameter.name]
+    errors = [run.gyro_fit.delay_error_s for run in runs if run.gyro_fit is not None]
+    half = _SURE * float(np.sqrt(np.mean(np.square(errors)) / len(errors)))
+    half = half if np.isfinite(half) else math.nan
+    return {parameter.name: Value(value, value - half, value + half, parameter.unit)}

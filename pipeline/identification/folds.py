@@ -1,0 +1,116 @@
+"""Blocked cross-validation: ten-second stretches are judged under numbers that were fitted without them.
+
+Residuals of field data are autocorrelated: stretches are whole, and gaps separate what is fitted from what is
+judged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.identification.fit import PartFit, solve_step
+from pipeline.identification.weights import Weights
+
+if TYPE_CHECKING:
+    from pipeline.identification.parts import Part
+    from pipeline.identification.state import State
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+FOLDS = 5
+GAP_S = 1.5
+_CHORD_STEPS = 3
+_LEAST_SHARE = 0.01
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Windows that are fitted and windows that are judged."""
+
+    train: Flags
+    test: Flags
+
+
+def make_folds(part: Part) -> tuple[Fold, ...]:
+    """Five folds of ten-second stretches, with gaps of 1.5 s between what is fitted and what is judged."""
+    tests = [part.unit % FOLDS == number for number in range(FOLDS)]
+    return tuple(Fold(~find_near(part, part, test), test) for test in tests)
+
+
+def find_near(part: Part, tested: Part, test: Flags) -> Flags:
+    """Windows of a part that lie within the gap of tested windows of the same runs, shape (n,).
+
+    Args:
+        part: whose windows.
+        tested: the part whose windows are judged; may be the same.
+        test: which of those are, shape (m,).
+    """
+    near = np.zeros(part.run.size, dtype=bool)
+    for run in np.unique(part.run).tolist():
+        rows, judged = part.run == run, (tested.run == run) & test
+        starts, ends = np.sort(tested.times[judged, 0]), np.sort(tested.times[judged, 1])
+        # A window is near when more tested ones have begun before its end than have ended before its start.
+        later = np.searchsorted(starts, part.times[rows, 1] + GAP_S)
+        earlier = np.searchsorted(ends, part.times[rows, 0] - GAP_S)
+        near[rows] = later > earlier
+    return near
+
+
+def hold_out_part(fit: PartFit, folds: tuple[Fold, ...]) -> Floats:
+    """Residuals of every window under numbers fitted without it and its surroundings, shape (n, 3).
+
+    To first order, through the derivatives: what a search needs many times.
+    """
+    smooth = fit.smooth
+    held = np.array(fit.residual)
+    if not smooth:
+        return held
+    jacobian, hold = fit.jacobian[:, :, smooth], _hold(fit)
+    for fold in folds:
+        if not fold.test.any() or not fold.train.any():
+            continue
+        step, _ = solve_step(
+            jacobian[fold.train], fit.residual[fold.train], _take(fit.weights, fold.train), hold=hold
+        )
+        held[fold.test] = fit.residual[fold.test] - jacobian[fold.test] @ step
+    return held
+
+
+def refit(part: Part, fit: PartFit, train: Flags) -> State:
+    """The fit repeated on some windows only, from its own solution and with its own derivatives.
+
+    Args:
+        part: that was fitted.
+        fit: fit to all windows.
+        train: windows to fit, shape (n,).
+    """
+    smooth, state, residual = fit.smooth, fit.state, fit.residual
+    if not smooth or not train.any():
+        return state
+    weights, jacobian, hold = _take(fit.weights, train), fit.jacobian[train][:, :, smooth], _hold(fit)
+    loss = weights.loss(residual[train])
+    for _ in range(_CHORD_STEPS):
+        step, _ = solve_step(jacobian, residual[train], weights, hold=hold)
+        moved = state.move([fit.free[place] for place in smooth], step.tolist())
+        trial = part.find_residuals(moved)
+        new = weights.loss(trial[train])
+        if new >= loss:
+            break
+        state, residual, loss = moved, trial, new
+    return state
+
+
+def _hold(fit: PartFit) -> Floats:
+    """Information that speaks for staying: what acts in a few moments may act in one fold only."""
+    weighted = fit.jacobian[:, :, fit.smooth] * fit.weights.factors(fit.residual)[:, :, None]
+    hold: Floats = _LEAST_SHARE * (weighted**2).sum(axis=(0, 1))
+    return hold
+
+
+def _take(weights: Weights, rows: Flags) -> Weights:
+    return Weights(weights.scale[rows], weights.clip[rows])

@@ -1,0 +1,268 @@
+"""What is fitted: residuals over windows of half a second, of one or several runs, as a function of a state.
+
+A part of the way from command to body: the whole of it, from the wheels to the body, or to the wheels.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.identification.state import State
+from pipeline.identification.weights import measure_noise
+from pipeline.models.effect import Place
+from pipeline.models.forward import Timing
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.identification.comparison import Comparison
+    from pipeline.identification.state import DelayName, Free
+    from pipeline.models.effect import Effect
+    from pipeline.runs.signals import Velocity
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+UNIT_S = 10.0
+_NO_DELAY = Timing()
+_LEAST_SPREAD = 2e-4
+_STANDING = 0.02
+# Encoders are read between commands: half a period of one is half a percent of half a second of the other.
+_LEAST_SHARE = 0.005
+
+
+class Part:
+    """Residuals over windows of half a second: x [m/s], y [m/s], w [rad/s].
+
+    Args:
+        comparisons: runs, fed with the input; their windows are compared.
+        delays: which delays of a run are free beside the effects.
+
+    Attributes:
+        run: number of the run of each window, shape (n,).
+        times: start and end of each window [s], shape (n, 2).
+        unit: number of the stretch of ten seconds of each window; no stretch spans two runs, shape (n,).
+        block: number of the command step of each window, through all runs, shape (n,).
+        channels: which of x, y, w say anything.
+        live: whether the input moves the vehicle during a window or just before, shape (n,).
+        least: spread below which a residual is rounding of stamps [m/s, m/s, rad/s], shape (3,).
+        way: from where to where, in words.
+    """
+
+    channels: tuple[int, ...] = (0, 1, 2)
+    way: str
+
+    def __init__(self, comparisons: Sequence[Comparison], delays: tuple[DelayName, ...] = ()) -> None:
+        self.comparisons = tuple(comparisons)
+        self.delays = delays
+        self.least: Floats = np.full(3, _LEAST_SPREAD)
+        windows = [c.windows for c in self.comparisons]
+        self.run = np.repeat(np.arange(len(windows)), [w.start.size for w in windows]).astype(np.int64)
+        self.times: Floats = np.concatenate([w.times for w in windows])
+        self.unit = number_units(self.run, self.times)
+        shift = np.concatenate(([0], np.cumsum([int(w.block.max(initial=-1)) + 1 for w in windows])))
+        self.block: Integers = np.concatenate([w.block + shift[i] for i, w in enumerate(windows)])
+        self.live = find_live(self.find_ideal())
+
+    def owns(self, effect: Effect) -> bool:
+        """Whether an effect acts on this part of the way."""
+        raise NotImplementedError
+
+    def find_run_residuals(self, state: State, run: int) -> Floats:
+        """Measured less predicted of one run's windows, shape (m, 3)."""
+        raise NotImplementedError
+
+    def find_residuals(self, state: State) -> Floats:
+        """Measured less predicted of all runs, shape (n, 3)."""
+        return np.concatenate([self.find_run_residuals(state, run) for run in range(len(self.comparisons))])
+
+    def find_ideal(self) -> Floats:
+        """Ideal velocity of the input (f_x, f_w) averaged over windows, now and up to 2 s earlier.
+
+        Returns:
+            shape (n, lags, 2), lags a quarter of a second apart.
+        """
+        return np.concatenate([average_lags(c, c.predict_velocity((), _NO_DELAY)) for c in self.comparisons])
+
+    def list_clock_errors(self) -> Floats:
+        """Standard error of each run's clock that is no free number of this part [s], shape (runs,)."""
+        raise NotImplementedError
+
+    def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
+        """Residuals of one run's windows if that clock were late by ``late_s`` [s], shape (m, 3)."""
+        raise NotImplementedError
+
+    @cached_property
+    def noise(self) -> Floats:
+        """Spread that remains when nearly anything linear in the input's past may act, shape (n, 3)."""
+        ideal = State((), (_NO_DELAY,) * len(self.comparisons))
+        return measure_noise(self, self.find_residuals(ideal))
+
+    def differentiate(self, state: State, residual: Floats, free: Sequence[Free]) -> Floats:
+        """Change of the prediction with each free number, shape (n, 3, p)."""
+        columns = np.zeros((*residual.shape, len(free)))
+        for place, number in enumerate(free):
+            value = state.get(number)
+            step = number.step if value + number.step <= number.bounds[1] else -number.step
+            moved = state.set(number, value + step)
+            if number.run is None:
+                columns[:, :, place] = (residual - self.find_residuals(moved)) / step
+            else:
+                rows = self.run == number.run
+                change = residual[rows] - self.find_run_residuals(moved, number.run)
+                columns[rows, :, place] = change / step
+        return columns
+
+
+class BodyPart(Part):
+    """From an input to the body's motion."""
+
+    def __init__(
+        self, comparisons: Sequence[Comparison], delays: tuple[DelayName, ...] = (), *, whole: bool = True
+    ) -> None:
+        super().__init__(comparisons, delays)
+        self.whole = whole
+        self.way = "from the command to the body" if whole else "from the wheels to the body"
+
+    def owns(self, effect: Effect) -> bool:
+        """All effects from the command on, those behind the wheels from them on."""
+        return self.whole or effect.place > Place.DRIVE
+
+    def find_run_residuals(self, state: State, run: int) -> Floats:
+        """See `Part`."""
+        return self.comparisons[run].find_residuals(state.effects_of(run), state.timing[run])
+
+    def list_clock_errors(self) -> Floats:
+        """See `Part`: of the poses against the gyro, or against encoders that read now and then."""
+        return np.array([self._find_clock_error(comparison) for comparison in self.comparisons])
+
+    def _find_clock_error(self, comparison: Comparison) -> float:
+        if comparison.heading.gyro is not None:
+            return comparison.heading.gyro.delay_error_s
+        return 0.0 if self.whole else find_sampling_error(comparison)
+
+    def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
+        """See `Part`: of poses that are later by ``late_s`` than they are taken for."""
+        return self.comparisons[run].find_residuals(state.effects_of(run), state.timing[run], late_s)
+
+
+class WheelPart(Part):
+    """From the command to the wheels: what the drivetrain does, free of the ground.
+
+    Args:
+        commanded: runs fed with commands.
+        measured: the same runs fed with measured wheels.
+        speed, turn: largest that were asked for [m/s, rad/s].
+    """
+
+    channels = (0, 2)
+    way = "from the command to the wheels"
+
+    def __init__(
+        self, commanded: Sequence[Comparison], measured: Sequence[Comparison], *, speed: float, turn: float
+    ) -> None:
+        super().__init__(commanded)
+        self.least = np.array([speed, 1.0, turn]) * _LEAST_SHARE
+        self.measured = tuple(measured)
+        self._seen: dict[tuple[int, float], Floats] = {}
+        self._spans = [locate_windows(comparison) for comparison in self.comparisons]
+
+    def owns(self, effect: Effect) -> bool:
+        """What acts on commands and in the drivetrain."""
+        return effect.place <= Place.DRIVE
+
+    def find_run_residuals(self, state: State, run: int) -> Floats:
+        """See `Part`; in terms of the ideal velocity of the wheels."""
+        comparison, late = self.comparisons[run], state.timing[run].wheel_delay_s
+        if (run, late) not in self._seen:
+            wheels = self.measured[run].predict_velocity((), state.timing[run])
+            self._seen = {key: seen for key, seen in self._seen.items() if key[0] != run}
+            self._seen[run, late] = average_windows(comparison, wheels, self._spans[run])
+        drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
+        driven = comparison.predict_velocity(drive, _NO_DELAY)
+        residual: Floats = self._seen[run, late] - average_windows(comparison, driven, self._spans[run])
+        return residual
+
+    def list_clock_errors(self) -> Floats:
+        """See `Part`: wheels that are read now and then step somewhere between two readings."""
+        return np.array([find_sampling_error(comparison) for comparison in self.comparisons])
+
+    def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
+        """See `Part`: of encoders that are later by ``late_s`` than they are taken for."""
+        timing = list(state.timing)
+        timing[run] = Timing(timing[run].wheel_delay_s + late_s)
+        return self.find_run_residuals(replace(state, timing=tuple(timing)), run)
+
+
+def find_sampling_error(comparison: Comparison) -> float:
+    """Standard deviation [s] of when wheels step that are read now and then; zero without encoders."""
+    wheels = comparison.run.wheels
+    return 0.0 if wheels is None else float(np.median(np.diff(wheels.times))) / math.sqrt(12.0)
+
+
+def number_units(run: Integers, times: Floats, length: float = UNIT_S) -> Integers:
+    """Stretches of ten seconds, or of another length, numbered through all runs."""
+    label = run * 1_000_000 + (times.mean(axis=1) // length).astype(np.int64)
+    return np.unique(label, return_inverse=True)[1].astype(np.int64)
+
+
+def find_live(ideal: Floats) -> Flags:
+    """Whether any of the ideal velocities (n, lags, 2) is more than 2 % of the largest."""
+    size = np.abs(ideal)
+    live: Flags = (size > _STANDING * size.max(axis=(0, 1))).any(axis=(1, 2))
+    return live
+
+
+@dataclass(frozen=True)
+class Spans:
+    """Where windows begin and end among the cell edges: edge before, share of the cell, and width [s]."""
+
+    first: Integers
+    into_first: Floats
+    last: Integers
+    into_last: Floats
+    width: Floats
+
+    def average(self, comparison: Comparison, signal: Floats) -> Floats:
+        """Mean of a signal on cells over every window, shape (n,)."""
+        total = comparison.cells.sum_up(signal)
+        end = total[self.last] + self.into_last * (total[self.last + 1] - total[self.last])
+        start = total[self.first] + self.into_first * (total[self.first + 1] - total[self.first])
+        means: Floats = (end - start) / self.width
+        return means
+
+
+def locate_windows(comparison: Comparison, late: float = 0.0) -> Spans:
+    """The windows of a comparison, ``late`` seconds earlier, among its cell edges."""
+    cells, times = comparison.cells, comparison.windows.times
+    start, end = cells.locate_edges(times[:, 0] - late), cells.locate_edges(times[:, 1] - late)
+    top = cells.times.size - 1
+    first, last = np.minimum(start.astype(np.int64), top), np.minimum(end.astype(np.int64), top)
+    width = np.maximum((end - start) * cells.step_s, cells.step_s)
+    return Spans(first, start - first, last, end - last, width)
+
+
+def average_windows(comparison: Comparison, velocity: Velocity, spans: Spans) -> Floats:
+    """Mean of (x, y, w) over every window, shape (n, 3)."""
+    y = velocity.y
+    return np.column_stack(
+        (
+            spans.average(comparison, velocity.x),
+            spans.average(comparison, y) if y.any() else np.zeros(spans.first.size),
+            spans.average(comparison, velocity.w),
+        )
+    )
+
+
+def average_lags(comparison: Comparison, velocity: Velocity, lags: int = 9) -> Floats:
+    """Means of (x, w) over windows now and earlier, shape (n, lags, 2)."""
+    spans = [locate_windows(comparison, 0.25 * lag) for lag in range(lags)]
+    means = [[one.average(comparison, signal) for signal in (velocity.x, velocity.w)] for one in spans]
+    return np.moveaxis(np.asarray(means), (0, 1, 2), (1, 2, 0))

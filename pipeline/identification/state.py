@@ -1,0 +1,168 @@
+"""A model being fitted: effects with values, values that belong to one run alone, and each run's timing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
+
+from pipeline.models.effect import Search
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from pipeline.models.effect import Effect
+    from pipeline.models.forward import Timing
+
+DelayName = Literal["wheel_delay_s"]
+Own = Mapping[int, Mapping[tuple[str, str], float]]
+
+_DELAY_STEP = 5e-3
+_LARGEST_DELAY = 0.6
+
+
+@dataclass(frozen=True)
+class Free:
+    """A number that is fitted.
+
+    Attributes:
+        effect: id of the effect; empty for a delay of a run.
+        name: of the parameter or of the delay.
+        run: number of the run it belongs to; None where all runs share it.
+        bounds: smallest and largest value.
+        step: for numerical derivatives.
+        unit: SI, `1` for a plain number.
+        search: how it is found.
+    """
+
+    effect: str
+    name: str
+    run: int | None
+    bounds: tuple[float, float]
+    step: float
+    unit: str = "s"
+    search: Search = Search.DIRECT
+
+    @property
+    def label(self) -> str:
+        """``effect.name``, or ``timing.name``."""
+        return f"{self.effect or 'timing'}.{self.name}"
+
+    @property
+    def is_smooth(self) -> bool:
+        """Whether derivatives find it; else a grid does."""
+        return self.search is not Search.GRID
+
+
+@dataclass(frozen=True)
+class State:
+    """A model with its values, run by run.
+
+    Attributes:
+        effects: with the values that runs share, in the order of a command's way.
+        timing: delays of each run.
+        own: values that belong to one run: by run number, then ``(effect, name)``.
+    """
+
+    effects: tuple[Effect, ...]
+    timing: tuple[Timing, ...]
+    own: Own = field(default_factory=dict)
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Ids of the effects."""
+        return tuple(effect.id for effect in self.effects)
+
+    def find(self, name: str) -> Effect | None:
+        """The effect of that id, None without."""
+        return next((effect for effect in self.effects if effect.id == name), None)
+
+    def effects_of(self, run: int) -> tuple[Effect, ...]:
+        """The effects as they act in one run."""
+        own = self.own.get(run)
+        if not own:
+            return self.effects
+        return tuple(
+            effect.change(**{name: value for (owner, name), value in own.items() if owner == effect.id})
+            for effect in self.effects
+        )
+
+    def add(self, *effects: Effect) -> State:
+        """The state with effects added, or put in the place of those with their ids."""
+        new = {effect.id for effect in effects}
+        kept = [effect for effect in self.effects if effect.id not in new]
+        ordered = sorted([*kept, *effects], key=lambda effect: (effect.place, effect.rank, effect.id))
+        return replace(self, effects=tuple(ordered))
+
+    def drop(self, names: Iterable[str]) -> State:
+        """The state without some effects."""
+        gone = set(names)
+        return replace(self, effects=tuple(effect for effect in self.effects if effect.id not in gone))
+
+    def list_free(self, delays: Sequence[DelayName], per_run: Sequence[str] = ()) -> tuple[Free, ...]:
+        """Free numbers: parameters that are not fixed and say how much, then the delays of every run.
+
+        Args:
+            delays: which delays of a run are free.
+            per_run: labels ``effect.name``, or ids of effects, whose values belong to each run alone.
+        """
+        runs = range(len(self.timing))
+        found: list[Free] = []
+        for effect in self.effects:
+            for p in effect.parameters:
+                is_given = math.isfinite(effect.values[p.name]) and effect.is_used(p)
+                if p.name in effect.fixed or not is_given:
+                    continue
+                alone = f"{effect.id}.{p.name}" in per_run or effect.id in per_run
+                found += [
+                    Free(effect.id, p.name, run, p.bounds, p.step, p.unit, p.search)
+                    for run in (runs if alone else (None,))
+                ]
+        bounds = (-_LARGEST_DELAY, _LARGEST_DELAY)
+        found += [Free("", name, run, bounds, _DELAY_STEP) for run in runs for name in delays]
+        return tuple(found)
+
+    def get(self, free: Free) -> float:
+        """Value of a free number; NaN where its effect is gone."""
+        if not free.effect:
+            return float(getattr(self.timing[free.run or 0], free.name))
+        if free.run is not None and (free.effect, free.name) in self.own.get(free.run, {}):
+            return self.own[free.run][free.effect, free.name]
+        effect = self.find(free.effect)
+        return math.nan if effect is None else effect.values[free.name]
+
+    def neutral_of(self, free: Free) -> float:
+        """Value at which a free number does nothing; zero for a delay, NaN where it only says where."""
+        effect = self.find(free.effect)
+        return 0.0 if effect is None else effect.parameter(free.name).neutral
+
+    def set(self, free: Free, value: float) -> State:
+        """The state with another value of a free number, held to its bounds."""
+        value = min(max(value, free.bounds[0]), free.bounds[1])
+        if not free.effect:
+            timing = list(self.timing)
+            timing[free.run or 0] = replace(timing[free.run or 0], **{free.name: value})
+            return replace(self, timing=tuple(timing))
+        if free.run is not None:
+            own = {**self.own.get(free.run, {}), (free.effect, free.name): value}
+            return replace(self, own={**self.own, free.run: own})
+        changed = (
+            effect.change(**{free.name: value}) if effect.id == free.effect else effect
+            for effect in self.effects
+        )
+        return replace(self, effects=tuple(changed))
+
+    def take_over(self, other: State, free: Iterable[Free]) -> State:
+        """The state with the values that another one has of some numbers."""
+        state = self
+        for number in free:
+            state = state.set(number, other.get(number))
+        return state
+
+    def move(self, free: Sequence[Free], step: Sequence[float]) -> State:
+        """The state with free numbers changed by a step."""
+        state = self
+        for number, change in zip(free, step, strict=True):
+            state = state.set(number, state.get(number) + change)
+        return state

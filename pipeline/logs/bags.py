@@ -1,0 +1,299 @@
+"""Recordings that are not MCAP: bags of ROS 1 and the SQLite files of rosbag2, read through rosbags.
+
+Their messages come one by one and are decoded in blocks, as those of MCAP files are.
+"""
+
+from __future__ import annotations
+
+import bz2
+import os
+import re
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache, partial
+from io import BufferedReader, FileIO
+from pathlib import Path, PosixPath
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import quote
+
+from mcap.records import Channel, Schema
+
+from pipeline.logs.errors import LogError, Loss
+from pipeline.logs.inflate import InflateError, inflate_message, largest_plausible
+from pipeline.logs.payloads import Payloads, join_payloads
+from pipeline.logs.remote import RemotePath, to_location
+from pipeline.logs.scan import Catalog
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from collections.abc import Set as AbstractSet
+
+    from rosbags.interfaces import Connection
+    from rosbags.rosbag1 import Reader as BagReader
+    from rosbags.rosbag1.reader import Chunk
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+    from pipeline.logs.records import Buffer
+    from pipeline.logs.source import ByteSource
+
+    Opened = BagReader | Sqlite3Reader
+
+ROS1_BAG: Final = "ROS 1 bag"
+SQLITE_BAG: Final = "rosbag2 SQLite file"
+_MAGICS: Final = {b"#ROSBAG V": ROS1_BAG, b"SQLite format 3\0": SQLITE_BAG}
+
+LONGEST_MAGIC: Final = max(map(len, _MAGICS))
+LONGEST_HEAD: Final = 1 << 12
+"""So many bytes at the start of a bag tell what it is and how long it should be."""
+
+_INDEX_PLACE: Final = re.compile(rb"index_pos=(.{8})", re.DOTALL)
+
+_REPAIRS: Final = {ROS1_BAG: "`rosbag reindex`", SQLITE_BAG: "`sqlite3 FILE .recover`"}
+
+_TOGETHER: Final = 4 << 20
+"""Payload bytes that are handed on at once."""
+
+_LAST_TIME: Final = (1 << 63) - 1
+
+
+def tell_container(head: bytes) -> str:
+    """What kind of bag a file is that begins so; empty for everything else."""
+    return next((kind for magic, kind in _MAGICS.items() if head.startswith(magic)), "")
+
+
+def is_whole(head: bytes, size: int) -> bool:
+    """Whether a bag is as long as it says of itself.
+
+    Args:
+        head: its first `LONGEST_HEAD` bytes.
+        size: bytes of all of it.
+    """
+    if tell_container(head) == ROS1_BAG:
+        # The recorder tells where the index stands when it has written it.
+        found = _INDEX_PLACE.search(head)
+        return found is not None and 0 < int.from_bytes(found[1], "little") <= size
+    page = int.from_bytes(head[16:18], "big")
+    pages = int.from_bytes(head[28:32], "big")
+    # A page of 64 KiB is written as 1.
+    return size >= max(pages, 1) * (page if page > 1 else 1 << 16)
+
+
+def is_written_to(path: Path) -> bool:
+    """Whether a transaction is under way in an SQLite file."""
+    return any(path.with_name(path.name + end).exists() for end in ("-journal", "-wal"))
+
+
+def catalog_bag(source: ByteSource, container: str) -> Catalog:
+    """Find out what a bag holds.
+
+    Args:
+        source: the file.
+        container: `ROS1_BAG` or `SQLITE_BAG`.
+
+    Raises:
+        LogError: ``log_unreadable``.
+    """
+    catalog = Catalog(container=container, profile="ros1" if container == ROS1_BAG else "ros2")
+    path = to_location(source.name)
+    with _refuse_damage(path, container), _open(path, container) as reader:
+        for connection in reader.connections:
+            _note_connection(connection, catalog)
+        told: Any = getattr(reader, "metadata", reader)
+        if any(catalog.counts.values()):
+            catalog.start_ns = max(0, int(told.start_time))
+            catalog.end_ns = min(_LAST_TIME, int(told.end_time) - 1)
+        catalog.compressions = _name_compressions(getattr(reader, "chunks", {}))
+    if not is_whole(source.read_at(0, LONGEST_HEAD), source.size):
+        text = f"the {container} is shorter than it says of itself: its end is missing"
+        catalog.losses.append(Loss("truncated", text))
+    catalog.notes.append(f"it is a {container}, read through rosbags, which stops where the file is damaged")
+    return catalog
+
+
+def _note_connection(connection: Connection, catalog: Catalog) -> None:
+    number, encoding, form = connection.id, "ros1", "ros1msg"
+    if catalog.container == SQLITE_BAG:
+        encoding = str(getattr(connection.ext, "serialization_format", ""))
+        form = "ros2idl" if connection.msgdef.format.name == "IDL" else "ros2msg"
+    # Columns of SQLite hold what somebody put there, whatever their type says.
+    if not all(isinstance(name, str) and name for name in (connection.topic, connection.msgtype)):
+        raise ValueError("a topic has no name or no type")
+    catalog.schemas[number] = Schema(number, connection.msgdef.data.encode(), form, connection.msgtype)
+    catalog.channels[number] = Channel(number, connection.topic, encoding, {}, number)
+    catalog.counts[number] = connection.msgcount
+
+
+@dataclass(slots=True)
+class BagMessages:
+    """Some messages of a bag: payloads by channel number, and what was lost up to here."""
+
+    payloads: dict[int, Payloads] = field(default_factory=dict)
+    losses: list[Loss] = field(default_factory=list)
+
+
+def read_bag(path: Path, container: str, numbers: AbstractSet[int]) -> Iterator[BagMessages]:
+    """Read the messages of some channels in the order of their times, a few megabytes at once.
+
+    Args:
+        path: the file.
+        container: `ROS1_BAG` or `SQLITE_BAG`.
+        numbers: of the channels.
+
+    Raises:
+        LogError: ``log_unreadable``.
+    """
+    collected = _Collected()
+    with _open(path, container) as reader:
+        wanted = [connection for connection in reader.connections if connection.id in numbers]
+        if not wanted:
+            return
+        try:
+            for connection, time, data in reader.messages(wanted):
+                collected.add(connection.id, time, data)
+                if collected.size > _TOGETHER:
+                    yield BagMessages(collected.take())
+        except MemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001 - what damage raises in there has no common type
+            text = f"the {container} breaks off: what comes after {collected.count} messages cannot be read"
+            text += f" ({_tell(error)})"
+            collected.losses.append(Loss("damaged_record", text, start_ns=collected.last))
+    if collected.odd:
+        text = f"{collected.odd} messages of the {container} have no time or no content that can be read"
+        collected.losses.append(Loss("damaged_record", text))
+    yield BagMessages(collected.take(), collected.losses)
+
+
+@dataclass(slots=True)
+class _Collected:
+    """Messages that wait to be handed on."""
+
+    size: int = 0
+    count: int = 0
+    odd: int = 0
+    last: int | None = None
+    losses: list[Loss] = field(default_factory=list)
+    messages: dict[int, tuple[list[int], list[Buffer]]] = field(default_factory=dict)
+
+    def add(self, number: int, time: object, data: object) -> None:
+        if not isinstance(time, int) or not 0 <= time <= _LAST_TIME or not isinstance(data, bytes):
+            self.odd += 1
+            return
+        try:
+            payload = inflate_message(data)
+        except InflateError:
+            self.odd += 1
+            return
+        times, payloads = self.messages.setdefault(number, ([], []))
+        times.append(time)
+        payloads.append(payload)
+        self.size += len(payload)
+        self.count += 1
+        self.last = time
+
+    def take(self) -> dict[int, Payloads]:
+        taken = {number: join_payloads(*lists) for number, lists in self.messages.items()}
+        self.messages, self.size = {}, 0
+        return taken
+
+
+@contextmanager
+def _refuse_damage(path: Path, container: str) -> Iterator[None]:
+    """Whatever is wrong with a bag is one error."""
+    try:
+        yield
+    except (MemoryError, LogError):
+        raise
+    except Exception as error:
+        raise LogError(
+            "log_unreadable",
+            f"the {container} cannot be opened ({_tell(error)})",
+            where=str(path),
+            hint=f"Copy it from its origin again, or repair it there with {_REPAIRS[container]}",
+        ) from error
+
+
+@contextmanager
+def _open(path: Path, container: str) -> Iterator[Opened]:
+    if isinstance(path, RemotePath):
+        raise LogError(
+            "log_unreadable",
+            f"a {container} is not read from an object store",
+            where=str(path),
+            hint="Copy it to this machine, or convert it to MCAP",
+        )
+    with _refuse_damage(path, container):
+        reader = _make_reader(path, container)
+        reader.open()
+        _bound_chunks(getattr(reader, "chunks", {}))
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+class _BoundedFile(BufferedReader):
+    """A file that is not asked for more than it holds: lengths in a bag may be damaged."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """The next bytes; memory is taken for no more than are there."""
+        left = os.fstat(self.fileno()).st_size - self.tell()
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
+class _BoundedPath(PosixPath):
+    """A path as rosbags takes it, whose file is bounded."""
+
+    def open(self, *_args: object, **_options: object) -> _BoundedFile:  # type: ignore[override]
+        """Open it for reading."""
+        return _BoundedFile(FileIO(self))
+
+
+def _make_reader(path: Path, container: str) -> Opened:
+    if container == ROS1_BAG:
+        from rosbags.rosbag1 import Reader  # noqa: PLC0415 - few logs need it
+
+        return Reader(_BoundedPath(path))
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader  # noqa: PLC0415 - few logs need it
+
+    # It is made part of an address, where marks such as ? and % have a meaning.
+    return Sqlite3Reader(Path(quote(str(path.absolute()))))
+
+
+@cache
+def _inflaters() -> dict[str, Callable[[bytes], bytes]]:
+    """By the name of a compression, what inflates a chunk to no more than is plausible."""
+    from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415 - few logs need it
+
+    makers = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor}
+    return {name: partial(_inflate_chunk, maker) for name, maker in makers.items()}
+
+
+def _bound_chunks(chunks: dict[int, Chunk]) -> None:
+    """Have the chunks of a ROS 1 bag inflated to no more than is plausible."""
+    if not chunks:
+        return
+    from rosbags.rosbag1.reader import decompressors  # noqa: PLC0415 - few logs need it
+
+    bounded = {decompressors[name]: inflater for name, inflater in _inflaters().items()}
+    for place, chunk in chunks.items():
+        if chunk.decompressor in bounded:
+            chunks[place] = chunk._replace(decompressor=bounded[chunk.decompressor])
+
+
+def _name_compressions(chunks: dict[int, Chunk]) -> set[str]:
+    names = {inflater: name for name, inflater in _inflaters().items()}
+    return {names.get(chunk.decompressor, "") for chunk in chunks.values()}
+
+
+def _inflate_chunk(maker: Callable[[], bz2.BZ2Decompressor], stored: bytes) -> bytes:
+    decompressor = maker()
+    found = decompressor.decompress(stored, max_length=largest_plausible(len(stored)))
+    if not decompressor.eof:
+        raise InflateError(f"{len(stored)} bytes of a chunk are cut, or hold more than is plausible")
+    return found
+
+
+def _tell(error: Exception) -> str:
+    # The cause says what is wrong without the path, which is told anyway.
+    return " ".join(str(error.__cause__ or error).split()) or type(error).__name__

@@ -1,0 +1,220 @@
+"""Everything the server holds: results, runs made ready, desks, trials, jobs; what is asked, answered."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipeline.models.model_text import write_model
+from pipeline.report.diagnosed import read_model_text
+from pipeline.store import Store
+from pipeline.store.files import make_folder
+from pipeline.web import actions
+from pipeline.web.cards import list_catalogue, show_session
+from pipeline.web.diagnoses import read_diagnosis
+from pipeline.web.errors import WorkbenchError, evaluating
+from pipeline.web.figure_cache import FigureCache
+from pipeline.web.formulas import make_formula
+from pipeline.web.jobs import Jobs
+from pipeline.web.proposals import Trials
+from pipeline.web.run_cache import RunCache
+from pipeline.web.runs import describe_run, find_run
+from pipeline.web.session import SessionFile, switch_off
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from pipeline.batch.work import Report, Task
+    from pipeline.models.formula import FormulaEffect
+    from pipeline.models.model_file import ModelFile
+    from pipeline.report.motion_view import MotionView
+    from pipeline.store import Manifest
+    from pipeline.web.limits import Limits
+    from pipeline.web.places import Places
+    from pipeline.web.requests import Ask
+    from pipeline.web.run_cache import PreparedRun
+    from pipeline.web.session import Session
+
+_MOST_ALBUMS = 6
+
+
+class Sessions:
+    """The workbench without its web side.
+
+    Args:
+        results: the results folder.
+        limits: what logs and the work on them may cost.
+        diagnosis: whether a dropped log is diagnosed too.
+        places: what the page is not told.
+        work: what the worker process does with a task; importable by its name there.
+    """
+
+    def __init__(
+        self,
+        results: Path,
+        limits: Limits,
+        *,
+        diagnosis: bool,
+        places: Places,
+        work: Callable[[Task], Report] | None = None,
+    ) -> None:
+        self.results = results
+        self.store = Store(results)
+        self.jobs = Jobs(results, limits, diagnosis=diagnosis, places=places, work=work)
+        self._cache = RunCache()
+        self._trials = Trials()
+        self._figures: OrderedDict[tuple[str, str], FigureCache] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def answer(self, ask: Ask) -> dict[str, object]:
+        """Do what was asked of a desk, keep it, and say what the page must show.
+
+        Raises:
+            SlipError: it cannot be done; the desk is as it was.
+        """
+        manifest = find_run(self.store, ask.run)
+        file = SessionFile(self.results, ask.run, ask.slot)
+        prepared = self._cache.prepared(manifest, self._input_of(ask, file, manifest))
+        with prepared.lock, evaluating(ask.run):
+            desk = actions.open_session(file, prepared)
+            if ask.action == "preview":
+                return self._preview(file, prepared, desk, ask)
+            changed = actions.learn_floor(
+                self._change(file, prepared, desk, ask), read_diagnosis(self.results, manifest)
+            )
+            # A step that cannot be shown is not kept.
+            shown = self._show(file, prepared, changed)
+            if changed is not desk:
+                file.write(changed)
+            return shown
+
+    def draw(self, ask: Ask) -> dict[str, object]:
+        """All figures of a desk."""
+        figures, view = self._look(ask)
+        with evaluating(ask.run):
+            return figures.draw(view)
+
+    def redraw(self, ask: Ask) -> dict[str, object]:
+        """The rows of a desk's figures that a change moves."""
+        figures, view = self._look(ask)
+        with evaluating(ask.run):
+            return figures.redraw(view)
+
+    def format_model(self, run: str, slot: str) -> str:
+        """The model file of a desk as text."""
+        _, desk = self._read_desk(run, slot)
+        return desk.step.model
+
+    def save_model(self, run: str, slot: str) -> Path:
+        """Write the model file of a desk; the effects that are switched off are left out."""
+        file, desk = self._read_desk(run, slot)
+        parsed = file.parse(desk.step.model)
+        make_folder(file.model_path.parent)
+        write_model(replace(parsed, model=switch_off(parsed.model, desk.step.off)), file.model_path)
+        return file.model_path
+
+    def _input_of(self, ask: Ask, file: SessionFile, manifest: Manifest) -> str | None:
+        if ask.input is not None:
+            return ask.input
+        kept = file.read()
+        return kept.input if kept is not None and kept.key == manifest.key else None
+
+    def _open(self, ask: Ask) -> tuple[PreparedRun, Session, ModelFile]:
+        manifest = find_run(self.store, ask.run)
+        file = SessionFile(self.results, ask.run, ask.slot)
+        prepared = self._cache.prepared(manifest, self._input_of(ask, file, manifest))
+        with prepared.lock, evaluating(ask.run):
+            desk = actions.open_session(file, prepared)
+        return prepared, desk, file.parse(desk.step.model)
+
+    def _read_desk(self, run: str, slot: str) -> tuple[SessionFile, Session]:
+        find_run(self.store, run)
+        file = SessionFile(self.results, run, slot)
+        desk = file.read()
+        if desk is None:
+            raise WorkbenchError(
+                "no_such_desk", "no model of this run lies here", where=run, hint="Open the run first."
+            )
+        return file, desk
+
+    def _change(self, file: SessionFile, prepared: PreparedRun, desk: Session, ask: Ask) -> Session:
+        changes: dict[str, Callable[[], Session]] = {
+            "open": lambda: desk,
+            "add": lambda: actions.add_effect(file, prepared, desk, ask.effect, anyway=ask.anyway),
+            "add_named": lambda: self._add_named(file, prepared, desk, ask),
+            "formula": lambda: actions.add_effect(
+                file, prepared, desk, _read_formula(ask), anyway=ask.anyway
+            ),
+            "drop": lambda: actions.drop_effect(file, prepared, desk, ask.effect),
+            "switch": lambda: actions.switch_effect(file, prepared, desk, ask.effect),
+            "set": lambda: actions.set_value(file, prepared, desk, ask.effect, {ask.parameter: ask.value}),
+            "lock": lambda: actions.lock_value(file, desk, ask.effect, ask.parameter),
+            "fit": lambda: actions.fit_session(file, prepared, desk),
+            "undo": lambda: actions.move(file, desk, -1),
+            "redo": lambda: actions.move(file, desk, 1),
+            "try": lambda: self._begin_trial(file, prepared, desk),
+        }
+        return changes[ask.action]()
+
+    def _add_named(self, file: SessionFile, prepared: PreparedRun, desk: Session, ask: Ask) -> Session:
+        found = read_diagnosis(self.results, prepared.manifest)
+        named = None if found is None else read_model_text(found)
+        if named is None:
+            raise WorkbenchError(
+                "not_diagnosed", "nothing was named on this run", where=ask.run, hint="Diagnose it first."
+            )
+        missing = [effect for effect in named.model if effect.id not in desk.step.order]
+        said = f"+ all {len(missing)} that were named"
+        return actions.add_effects(file, prepared, desk, missing, said, anyway=ask.anyway)
+
+    def _begin_trial(self, file: SessionFile, prepared: PreparedRun, desk: Session) -> Session:
+        model = switch_off(file.parse(desk.step.model).model, desk.step.off)
+        self._trials.begin(prepared, model, f"{file.slot} {file.run}")
+        return desk
+
+    def _preview(
+        self, file: SessionFile, prepared: PreparedRun, desk: Session, ask: Ask
+    ) -> dict[str, object]:
+        """What a value would do, while the slider moves; nothing is kept."""
+        trial = actions.set_value(file, prepared, desk, ask.effect, {ask.parameter: ask.value})
+        parsed = file.parse(trial.step.model)
+        model = switch_off(parsed.model, trial.step.off)
+        view = prepared.view(model, trial.step.timing, trial.step.ladder, desk.floor or None)
+        return {"desk": show_session(trial, parsed), **self._figures_of(prepared.manifest).redraw(view)}
+
+    def _show(self, file: SessionFile, prepared: PreparedRun, desk: Session) -> dict[str, object]:
+        parsed = file.parse(desk.step.model)
+        trial = self._trials.find(prepared, switch_off(parsed.model, desk.step.off))
+        return {
+            "desk": show_session(desk, parsed),
+            "run": describe_run(prepared.manifest),
+            "inputs": self._cache.list_inputs(prepared.manifest),
+            "catalogue": list_catalogue(prepared.vehicle),
+            "diagnosis": read_diagnosis(self.results, prepared.manifest),
+            "trial": trial.show() if trial is not None else None,
+            "slot": file.slot,
+        }
+
+    def _look(self, ask: Ask) -> tuple[FigureCache, MotionView]:
+        prepared, desk, parsed = self._open(ask)
+        model = switch_off(parsed.model, desk.step.off)
+        with evaluating(ask.run):
+            view = prepared.view(model, desk.step.timing, desk.step.ladder, desk.floor or None)
+        return self._figures_of(prepared.manifest), view
+
+    def _figures_of(self, manifest: Manifest) -> FigureCache:
+        key = (manifest.run, manifest.key)
+        with self._lock:
+            if key not in self._figures:
+                self._figures[key] = FigureCache(manifest)
+                while len(self._figures) > _MOST_ALBUMS:
+                    self._figures.popitem(last=False)
+            self._figures.move_to_end(key)
+            return self._figures[key]
+
+
+def _read_formula(ask: Ask) -> FormulaEffect:
+    return make_formula(ask.effect, ask.channel, ask.formula, ask.parameters)

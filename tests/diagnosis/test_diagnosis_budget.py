@@ -1,0 +1,44 @@
+"""A search ends when its time is up, with the best answer so far, and says so."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.diagnosis import read_recording
+from pipeline.analysis.options import Options
+from pipeline.diagnosis import diagnose_runs
+from pipeline.diagnosis.budget import parse_budget, usual_budget
+from pipeline.diagnosis.errors import DiagnosisError
+
+SAMPLE = Path(__file__).parents[2] / "data_samples" / "husky_tile.mcap"
+
+
+def test_a_search_that_is_cut_says_so_and_gives_the_best_answer_so_far(tmp_path: Path) -> None:
+    manifest = analyze_log(SAMPLE, Options(out=tmp_path / "results", report=False)).manifest
+    vehicle, recording = read_recording(manifest)
+    told: list[str] = []
+    cut = diagnose_runs([recording], vehicle, budget_s=0.0, tell=told.append).runs[0]
+    whole = diagnose_runs([recording], vehicle, tell=told.append).runs[0]
+
+    assert [finding["id"] for finding in cut.findings].count("search_cut") == 1
+    assert "search_cut" not in [finding["id"] for finding in whole.findings]
+    assert {effect.id for effect in cut.effects} < {effect.id for effect in whole.effects}
+    assert cut.ladder[0] == whole.ladder[0]
+    assert any("effective_track so far" in line for line in told)
+
+
+def test_a_budget_is_a_time() -> None:
+    assert [parse_budget(text) for text in ("60", "60s", "1.5 min", "2m", "1h")] == [
+        60.0,
+        60.0,
+        90.0,
+        120.0,
+        3600.0,
+    ]
+    assert (usual_budget(60.0), usual_budget(1200.0)) == (60.0, 120.0)
+    for text in ("", "soon", "-5s", "1e3", "5 days"):
+        with pytest.raises(DiagnosisError, match="is no time"):
+            parse_budget(text)

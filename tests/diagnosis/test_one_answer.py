@@ -1,0 +1,191 @@
+"""One run, one answer: the number that one verb says, every other verb, file and page says too."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.diagnosis import read_recording
+from pipeline.analysis.options import Options
+from pipeline.diagnosis import diagnose_runs
+from pipeline.diagnosis.subject import load_recording
+from pipeline.diagnosis.words import describe
+from pipeline.identification import Input, Problem, carry_over
+from pipeline.identification.describe import errors_as_json, ladder_as_json, parameters_as_json
+from pipeline.identification.judgement import judge_model
+from pipeline.models import read_model, write_model
+from pipeline.report.diagnosed import read_model_text, view_diagnosis
+from pipeline.web.actions import add_effects, open_session
+from pipeline.web.run_cache import RunCache
+from pipeline.web.session import SessionFile
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.models import ModelFile
+    from pipeline.store import Manifest
+
+Json = dict[str, Any]
+
+ROOT = Path(__file__).parents[2]
+LOGS = ROOT / ".." / "shared" / "logs"
+SAMPLES = ROOT / "data_samples"
+ERRORS = ("t_mrmse_m", "r_mrmse_rad")
+# What two fits of the same model from the same values differ by: where they stop.
+SAME = 2e-3
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("one") / "results"
+
+
+def analyze(log: Path, results: Path) -> Manifest:
+    return analyze_log(log, Options(out=results, report=False)).manifest
+
+
+def hash_results(results: Path) -> dict[str, str]:
+    files = (path for path in results.rglob("*") if path.is_file())
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def same(one: object, other: object, tolerance: float = SAME) -> bool:
+    if isinstance(one, float | int) and isinstance(other, float | int):
+        return math.isclose(one, other, rel_tol=tolerance, abs_tol=2e-6)
+    return one == other
+
+
+def compare_everywhere(log: Path, source: Input, results: Path, tmp_path: Path) -> None:
+    manifest = analyze(log, results)
+    before = hash_results(results)
+    vehicle, recording = read_recording(manifest)
+    diagnosis = diagnose_runs([recording], vehicle, inputs=(source.value,))
+    told = json.loads(json.dumps(diagnosis.runs[0].to_json()))
+    proposal = diagnosis.runs[0].proposal
+    if proposal is None:
+        assert not told["effects"]
+        return
+    path = tmp_path / "model.toml"
+    write_model(proposal, path)
+    file = read_model(path)
+    check_written(told, file, describe(diagnosis))
+    own = check_model_verbs(
+        told, file, Problem([load_recording(recording, vehicle)], file.model.vehicle, source)
+    )
+    require_no_rise(told["ladder"])
+    if file.model.effects:
+        check_workbench(told, file, own, manifest, SessionFile(tmp_path, manifest.run, "a"))
+        view = view_diagnosis(recording.tables, vehicle, told)
+        assert view is not None
+        assert set(view.effects) == set(file.model.ids)
+        assert view.ladder == told["ladder"]
+    assert hash_results(results) == before
+
+
+def list_numbers(told: Json) -> list[tuple[str, str, Json]]:
+    """Effect, name and number of all that was said and is no clock that was put right beforehand."""
+    return [
+        (effect["id"], name, number)
+        for effect in told["effects"]
+        if not effect["corrected"]
+        for name, number in effect["parameters"].items()
+    ]
+
+
+def check_written(told: Json, file: ModelFile, screen: str) -> None:
+    """What is written, and what is on the screen, is what was said."""
+    assert read_model_text(told) == file
+    assert not {effect["id"] for effect in told["effects"] if effect["corrected"]} & set(file.model.ids)
+    for effect, name, number in list_numbers(told):
+        assert same(file.model.effect(effect).values[name], number["value"], 1e-5)
+        shown = re.escape(f"{number['value']:.3g}")
+        assert re.search(rf"{name} = {shown}(?![\d.])", screen), (effect, name)
+
+
+def check_model_verbs(told: Json, file: ModelFile, problem: Problem) -> Json:
+    """What the model verbs find on the run is what was written; returns the errors of the whole model."""
+    judged = judge_model(problem, file.model)
+    found: Json = parameters_as_json(judged.fitted.model, judged.estimates)
+    for effect, name, number in list_numbers(told):
+        entry = found[f"{effect}.{name}"]
+        assert number["at_bound"] == entry["at_bound"]
+        if number["low"] is None:
+            assert same(number["value"], entry["value"]), (effect, name)
+        else:
+            # Limits make the loss rough: where a fit of it stops is known to a small part of the interval.
+            near = 0.03 * (number["high"] - number["low"]) + 1e-6
+            for end in ("value", "low", "high"):
+                assert abs(number[end] - entry[end]) < near, (effect, name, end)
+    floor = errors_as_json(judged.floor)
+    ladder = ladder_as_json(judged.ladder, judged.floor)
+    (carried,) = carry_over(file.model, list(problem.runs), problem.source)
+    ideal, own = errors_as_json(carried.ideal.pooled), errors_as_json(carried.own.pooled)
+    for key in ERRORS:
+        assert same(told["ladder"][0][key], ladder[0][key])
+        assert same(told["ladder"][0][key], ideal[key])
+        assert same(told["ladder"][-1][key], ladder[-1][key])
+        assert same(told["noise_floor"][key], floor[key])
+        if len(judged.ladder.idle) == 0:
+            assert same(told["ladder"][-1][key], own[key])
+    return own
+
+
+def check_workbench(
+    told: Json, file: ModelFile, own: Json, manifest: Manifest, desk_file: SessionFile
+) -> None:
+    """*Add all* enters the fit of the diagnosis."""
+    prepared = RunCache().prepared(manifest, str(told["input"]))
+    desk = open_session(desk_file, prepared)
+    assert all(same(desk.step.ladder[0][key], told["ladder"][0][key]) for key in ERRORS)
+    desk = add_effects(desk_file, prepared, desk, file.model.effects, "+ all", anyway=True)
+    assert all(same(desk.step.ladder[-1][key], own[key]) for key in ERRORS)
+    kept = desk_file.parse(desk.step.model).model
+    for effect in file.model:
+        for name, value in effect.values.items():
+            low, high = file.intervals.get(f"{effect.id}.{name}", (value, value))
+            found = kept.effect(effect.id).values[name]
+            assert same(found, value) or math.isnan(value) or abs(found - value) < 0.03 * (high - low)
+
+
+def require_no_rise(ladder: list[Mapping[str, float]]) -> None:
+    for below, rung in itertools.pairwise(ladder):
+        for key in ERRORS:
+            assert rung[key] <= 1.001 * below[key]
+
+
+@pytest.mark.parametrize("source", list(Input))
+def test_every_verb_file_and_page_says_the_same_of_a_sample(
+    source: Input, results: Path, tmp_path: Path
+) -> None:
+    compare_everywhere(SAMPLES / "husky_tile.mcap", source, results, tmp_path)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("source", list(Input))
+@pytest.mark.parametrize("name", ["warthog_ice", "ackermann_gravel"])
+def test_every_verb_file_and_page_says_the_same_of_the_other_samples(
+    name: str, source: Input, results: Path, tmp_path: Path
+) -> None:
+    compare_everywhere(SAMPLES / f"{name}.mcap", source, results, tmp_path)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("source", list(Input))
+@pytest.mark.parametrize("name", sorted(path.stem for path in LOGS.glob("*.mcap")) or ["none"])
+def test_every_verb_file_and_page_says_the_same_of_a_recording(
+    name: str, source: Input, results: Path, tmp_path: Path
+) -> None:
+    log = LOGS / f"{name}.mcap"
+    if not log.is_file():
+        pytest.skip("../shared/logs is not here: the real recordings are not part of the repository")
+    if "plank" in name and source is Input.MEASURED:
+        pytest.skip("the measured wheels of this recording are zero throughout")
+    compare_everywhere(log, source, results, tmp_path)

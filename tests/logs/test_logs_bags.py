@@ -1,0 +1,226 @@
+"""Bags of ROS 1 and ROS 2 give what the same recording gives as MCAP; what is wrong with them is said."""
+
+from __future__ import annotations
+
+import hashlib
+import sqlite3
+import tracemalloc
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from bag_files import STORE_1, write_bag, write_db3
+from mcap_files import FLOAT, SHARED, START, small_truth, value_of, write_small
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.rosbag2 import CompressionMode
+
+from pipeline.logs import LogError, Wanted, hash_log, is_finished, open_log, read_topics
+from pipeline.logs import inflate as inflate_module
+
+if TYPE_CHECKING:
+    from mcap_files import Truth
+
+
+def read_all(path: Path) -> Truth:
+    index = open_log(path)
+    data = read_topics(index, [Wanted(topic) for topic in index.topics()])
+    assert not data.losses
+    assert "no checksum" in data.unchecked
+    assert sum(len(columns) for columns in data.topics) == index.message_count
+    return {
+        (columns.topic, time): value_of(columns.fields, row)
+        for columns in data.topics
+        for row, time in enumerate(columns.log_time.tolist())
+    }
+
+
+@pytest.mark.parametrize("mode", [CompressionMode.NONE, CompressionMode.MESSAGE])
+def test_a_folder_of_rosbag2_and_its_file_hold_what_the_mcap_holds(
+    tmp_path: Path, mode: CompressionMode
+) -> None:
+    truth = write_small(tmp_path / "log.mcap")
+    folder = write_db3(tmp_path / "run", mode=mode)
+    (file,) = folder.glob("*.db3")
+    for path in (folder, file):
+        assert read_all(path) == truth
+        assert hash_log(path) == hashlib.sha256(file.read_bytes()).hexdigest()
+    bag, log = open_log(file), open_log(tmp_path / "log.mcap")
+    assert (bag.start_ns, bag.end_ns, bag.topics()) == (log.start_ns, log.end_ns, log.topics())
+    assert {each.type_name for each in bag.channels} == {each.type_name for each in log.channels}
+    assert "rosbags" in bag.notes[0]
+
+
+@pytest.mark.parametrize(
+    "form", [None, BagWriter.CompressionFormat.BZ2, BagWriter.CompressionFormat.LZ4], ids=str
+)
+def test_a_bag_of_ros_1_holds_what_the_mcap_holds(
+    tmp_path: Path, form: BagWriter.CompressionFormat | None
+) -> None:
+    truth = write_small(tmp_path / "log.mcap")
+    assert read_all(write_bag(tmp_path / "run.bag", form)) == truth
+    assert open_log(tmp_path / "run.bag").profile == "ros1"
+
+
+def test_what_a_file_is_is_told_by_its_content(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "run.bag").rename(tmp_path / "run.mcap")
+    assert len(read_all(bag)) == 180
+
+
+def test_a_name_with_marks_of_an_address_is_a_name(tmp_path: Path) -> None:
+    (file,) = write_db3(tmp_path / "run").glob("*.db3")
+    assert len(read_all(file.rename(tmp_path / "50%25 of it? #1 é.db3"))) == 180
+
+
+def test_a_recording_split_over_several_files_is_one(tmp_path: Path) -> None:
+    first, second = (next(write_db3(tmp_path / name).glob("*.db3")) for name in ("a", "b"))
+    folder = tmp_path / "run"
+    folder.mkdir()
+    first.rename(folder / "run_0.db3")
+    with sqlite3.connect(second) as database:
+        database.execute("UPDATE messages SET timestamp = timestamp + 1000000000")
+    database.close()
+    second.rename(folder / "run_1.db3")
+    data = read_topics(folder, [Wanted("/speed")])
+    (speed,) = data.of("/speed")
+    assert len(speed) == 120
+    assert np.diff(speed.log_time).min() > 0
+
+
+def test_a_type_without_definition_is_one_that_is_bundled(tmp_path: Path) -> None:
+    (file,) = write_db3(tmp_path / "run").glob("*.db3")
+    with sqlite3.connect(file) as database:
+        database.executescript("DROP TABLE message_definitions; UPDATE schema SET schema_version = 3;")
+    database.close()
+    assert read_all(file) == small_truth()[1]
+    assert "bundled" in read_topics(file, [Wanted("/speed")]).of("/speed")[0].notes[0]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.6, 0.99])
+@pytest.mark.parametrize("kind", ["bag", "db3"])
+def test_a_bag_that_is_cut_says_so(tmp_path: Path, kind: str, share: float) -> None:
+    path = tmp_path / f"cut.{kind}"
+    whole = (
+        write_bag(tmp_path / "run.bag") if kind == "bag" else next(write_db3(tmp_path / "r").glob("*.db3"))
+    )
+    content = whole.read_bytes()
+    path.write_bytes(content[: max(20, int(share * len(content)))])
+    assert is_finished(whole)
+    # A bag does not tell how long the index at its end is.
+    assert is_finished(path) == (kind == "bag" and share == 0.99)
+    if kind == "db3" and share == 0.99:
+        assert [loss.kind for loss in open_log(path).losses] == ["truncated"]
+        return
+    with pytest.raises(LogError) as caught:
+        open_log(path)
+    assert caught.value.code == "log_unreadable"
+    assert "\n" not in str(caught.value)
+    assert "Copy it" in caught.value.hint
+
+
+def test_what_comes_before_damage_in_a_bag_is_read_and_the_rest_told(tmp_path: Path) -> None:
+    rows = 4000
+    path, values = tmp_path / "run.bag", np.arange(rows) * 0.25
+    writer = BagWriter(path)
+    writer.chunk_threshold = 20_000
+    with writer:
+        connection = writer.add_connection("/x", FLOAT, typestore=STORE_1)
+        for row in range(rows):
+            message = STORE_1.types[FLOAT](float(values[row]))
+            writer.write(connection, START + row, STORE_1.serialize_ros1(message, FLOAT))
+    content = bytearray(path.read_bytes())
+    # The length of a record in the middle points beyond its chunk.
+    place = content.index(b"op=\x02", len(content) // 2) - 8
+    content[place : place + 4] = b"\xff\xff\xff\x7f"
+    path.write_bytes(content)
+    data = read_topics(path, [Wanted("/x")])
+    (columns,) = data.of("/x")
+    assert 100 < len(columns) < rows
+    assert np.array_equal(columns.fields["data"], values[: len(columns)])
+    (loss,) = data.losses
+    assert f"after {len(columns)} messages" in loss.text
+    assert loss.start_ns == columns.log_time[-1]
+
+
+def test_what_no_recorder_puts_into_a_table_is_left_out_and_said(tmp_path: Path) -> None:
+    (file,) = write_db3(tmp_path / "run").glob("*.db3")
+    with sqlite3.connect(file) as database:
+        for time, content in ((-5, b"x"), ("now", b"x"), (START, "text"), (START, 3.5)):
+            database.execute(
+                "INSERT INTO messages(topic_id, timestamp, data) VALUES (1, ?, ?)", (time, content)
+            )
+        bomb = b"\x28\xb5\x2f\xfd" + b"\xe0" + (1 << 40).to_bytes(8, "little") + bytes(20)
+        database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (1, ?, ?)", (START, bomb))
+    database.close()
+    data = read_topics(file, [Wanted("/speed")])
+    assert len(data.of("/speed")[0]) == 60
+    assert [loss.text.split()[0] for loss in data.losses] == ["5"]
+
+
+@pytest.mark.parametrize("change", ["name = NULL", "type = NULL", "name = x'00ff'"])
+def test_a_topic_without_name_or_type_is_refused(tmp_path: Path, change: str) -> None:
+    (file,) = write_db3(tmp_path / "run").glob("*.db3")
+    with sqlite3.connect(file) as database:
+        database.execute("CREATE TABLE odd AS SELECT * FROM topics")
+        database.execute(f"UPDATE odd SET {change}")  # noqa: S608 - our own words
+        database.executescript("DROP TABLE topics; ALTER TABLE odd RENAME TO topics")
+    database.close()
+    with pytest.raises(LogError, match="no name or no type"):
+        open_log(file)
+
+
+@pytest.mark.parametrize("form", [BagWriter.CompressionFormat.BZ2, BagWriter.CompressionFormat.LZ4], ids=str)
+def test_a_chunk_that_grows_beyond_what_is_plausible_is_refused(
+    tmp_path: Path, form: BagWriter.CompressionFormat, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inflate_module, "_PLAUSIBLE", 1000)
+    monkeypatch.setattr(inflate_module, "_PLAUSIBLE_RATIO", 2)
+    data = read_topics(write_bag(tmp_path / "run.bag", form), [Wanted("/speed")])
+    assert len(data.of("/speed")[0]) == 0
+    assert "more than is plausible" in data.losses[0].text
+
+
+def test_a_database_of_something_else_is_no_recording(tmp_path: Path) -> None:
+    path = tmp_path / "notes.db3"
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TABLE notes(text TEXT)")
+    database.close()
+    with pytest.raises(LogError, match="missing tables") as caught:
+        open_log(path)
+    assert caught.value.code == "log_unreadable"
+
+
+def test_a_transaction_under_way_is_a_recording_under_way(tmp_path: Path) -> None:
+    (file,) = write_db3(tmp_path / "run").glob("*.db3")
+    assert is_finished(file)
+    Path(f"{file}-journal").write_bytes(b"x")
+    assert not is_finished(file)
+
+
+def test_the_foreign_bags_hold_what_their_readers_say() -> None:
+    folder = SHARED / "foreign"
+    if not folder.is_dir():
+        pytest.skip("../shared/foreign is not here: the logs of others are not part of the repository")
+    bag = open_log(folder / "fuse_turtlebot3.bag")
+    assert {each.topic: each.message_count for each in bag.channels}["/odom"] == 2741
+    (odometry,) = read_topics(bag, [Wanted("/odom", ("pose.pose.position.x",))]).of("/odom")
+    assert odometry.header_time is not None
+    assert np.isfinite(odometry.fields["pose.pose.position.x"]).all()
+    database = open_log(folder / "nvnmangla_roomba.db3")
+    (joints,) = read_topics(database, [Wanted("/joint_states")]).of("/joint_states")
+    assert len(joints) == 672
+    assert joints.fields["name"].row(0) == ["wheel_left_joint", "wheel_right_joint"]
+
+
+def test_a_damaged_length_asks_for_no_memory(tmp_path: Path) -> None:
+    content = bytearray(write_bag(tmp_path / "run.bag").read_bytes())
+    told = content.index(b"index_pos=") + len(b"index_pos=")
+    place = int.from_bytes(content[told : told + 8], "little")
+    content[place : place + 4] = b"\xff\xff\xff\xff"
+    (tmp_path / "run.bag").write_bytes(content)
+    tracemalloc.start()
+    with pytest.raises(LogError, match="cannot be opened"):
+        open_log(tmp_path / "run.bag")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50_000_000
