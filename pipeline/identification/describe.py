@@ -123,7 +123,7 @@ def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
         name = "ideal" if number == 0 else f"+ {_added(ladder.rungs[number - 1], rung)}"
         gone = "" if share is None else f"{share:7.0%}"
         lines.append(f"{name:<34}{_columns(rung.errors)}{gone}")
-        lines += _describe_rises(ladder.rungs[max(number - 1, 0)].errors, rung.errors, "taken")
+        lines += _describe_rises(ladder.rungs[max(number - 1, 0)].errors, rung.errors, "within chance")
     if floor is not None:
         lines.append(f"{'noise floor (estimated)':<34}{_columns(floor)}")
     if ladder.idle:
@@ -136,13 +136,13 @@ def describe_step(before: Rung, after: Rung) -> list[str]:
     old, new = before.errors, after.errors
     position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
     heading = f"{old.r_mrmse_rad:.4f} -> {new.r_mrmse_rad:.4f} rad"
-    done = "taken" if set(after.effects) > set(before.effects) else "done"
+    word = "taken" if set(after.effects) > set(before.effects) else "done"
     line = f"{'all effects, before -> after':<34}{position}   {heading}"
-    return [line, *_describe_rises(old, new, done)]
+    return [line, *_describe_rises(old, new, f"{word} because asked for")]
 
 
-def _describe_rises(below: Errors, errors: Errors, done: str) -> list[str]:
-    return [f"  ! {text}: {done} because asked for" for text in describe_rises(below, errors)]
+def _describe_rises(below: Errors, errors: Errors, why: str) -> list[str]:
+    return [f"  ! {text}: {why}" for text in describe_rises(below, errors)]
 
 
 def describe_rises(below: Errors, errors: Errors) -> list[str]:

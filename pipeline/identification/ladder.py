@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from pipeline.models.model import Model
 
 _NOTHING = 1e-3
+# What two fits of one model differ by on other folds: a rung may cost so much of one error for the other.
+_CHANCE = 1e-2
 _LEAST_SQUARE = 1e-24
 
 
@@ -61,8 +63,9 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
     """Build the ladder of a model's effects, the most useful first.
 
     At each rung every remaining effect is tried on top of those below; the one that lowers the loss most is
-    taken if it lowers the held-out loss too. Neither error over 2 s rises from rung to rung: effects that
-    lower them only together are one rung. Effects that do not help are left out and named.
+    taken if it lowers the held-out loss too. Neither error over 2 s rises from rung to rung by more than
+    chance (1 %): effects that lower them only together are one rung. Effects that do not help are left out
+    and named.
 
     Args:
         problem: the runs.
@@ -79,7 +82,7 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
             break
         name, last = taken
         del hoped[name]
-        if not list_rises(rungs[-1].errors, last.errors):
+        if not list_rises(rungs[-1].errors, last.errors, _CHANCE):
             rungs.append(last)
     # What was taken since the last rung has not made up for the error that it raised.
     left = tuple(effect.id for effect in problem.active_effects(model) if effect.id not in rungs[-1].effects)
@@ -103,7 +106,7 @@ def _take_next(
         if compare_losses(rung.held_out, last.held_out) >= 1.0:
             break
         first = first or (name, rung)
-        if not list_rises(shown.errors, rung.errors):
+        if not list_rises(shown.errors, rung.errors, _CHANCE):
             return name, rung
         del waiting[name]
     return first
@@ -135,15 +138,21 @@ def _take_best(
     return best[1], best[2]
 
 
-def list_rises(below: Errors, errors: Errors) -> tuple[str, ...]:
-    """Errors over 2 s that are larger than one step below: `t_mrmse_m`, `r_mrmse_rad`; never unknown ones."""
+def list_rises(below: Errors, errors: Errors, forgiven: float = _NOTHING) -> tuple[str, ...]:
+    """Errors over 2 s that are larger than one step below: `t_mrmse_m`, `r_mrmse_rad`; never unknown ones.
+
+    Args:
+        below: errors before the step.
+        errors: after it.
+        forgiven: share by which an error may be larger.
+    """
     names = ("t_mrmse_m", "r_mrmse_rad")
-    return tuple(name for name in names if is_risen(getattr(below, name), getattr(errors, name)))
+    return tuple(name for name in names if is_risen(getattr(below, name), getattr(errors, name), forgiven))
 
 
-def is_risen(before: float, after: float) -> bool:
-    """Whether an error is higher than it was, beyond rounding; never an unknown one."""
-    return after > before * (1.0 + _NOTHING)
+def is_risen(before: float, after: float, forgiven: float = _NOTHING) -> bool:
+    """Whether an error is higher than it was, by default beyond rounding; never an unknown one."""
+    return after > before * (1.0 + forgiven)
 
 
 def compare_losses(new: HeldOut, old: HeldOut) -> float:

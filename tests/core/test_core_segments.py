@@ -20,11 +20,9 @@ def drive_circle(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses of a vehicle on a circle, on a plane tilted by (roll, pitch)."""
     yaw = yaw_rate * times
-    if abs(yaw_rate) > 1e-9:
-        radius = speed / yaw_rate
-        flat = np.stack((radius * np.sin(yaw), radius * (1.0 - np.cos(yaw)), 0.0 * yaw), axis=-1)
-    else:
-        flat = np.stack((speed * times, 0.0 * yaw, 0.0 * yaw), axis=-1)
+    # The chord, in the direction half-way: exact however slowly it turns.
+    chord = speed * times * np.sinc(yaw / (2.0 * np.pi))
+    flat = np.stack((chord * np.cos(0.5 * yaw), chord * np.sin(0.5 * yaw), 0.0 * yaw), axis=-1)
     plane = rigid.quaternions_from_euler(np.array([tilt[0]]), np.array([tilt[1]]), np.zeros(1))
     plane = np.repeat(plane, times.size, axis=0)
     quaternion = rigid.multiply_quaternions(plane, rigid.quaternions_from_yaw(yaw))
