@@ -160,3 +160,27 @@ def test_a_robot_without_a_pose_is_refused_before_its_vehicle_is_asked_for(forei
         describe_subject(foreign_logs / "abitobot.mcap", Options())
     assert caught.value.code == "no_pose"
     assert "/joint_states" in str(caught.value)
+
+
+def test_a_turtlebot_that_does_not_say_so_is_recognized_by_its_geometry(foreign_logs: Path) -> None:
+    log = foreign_logs / "fuse_turtlebot3.bag"
+    chosen = choose(open_log(log), load_configuration(log), {})
+    assert chosen.vehicle_source == "fitted"
+    assert chosen.vehicle.wheel_radius_m == pytest.approx(0.033, rel=0.03)
+    assert chosen.vehicle.track_width_m == pytest.approx(0.287, rel=0.03)
+    said = " ".join(finding.text for finding in chosen.findings)
+    assert "turtlebot3_waffle" in said
+    assert "computed from the wheels" in said
+
+
+def test_a_recorded_robot_description_tells_the_vehicle(foreign_logs: Path) -> None:
+    log = foreign_logs / "nvnmangla_roomba.db3"
+    chosen = choose(open_log(log), load_configuration(log), {})
+    assert (chosen.vehicle.id, chosen.vehicle_source) == ("turtlebot3_burger", "robot_description")
+    assert chosen.ratings[0].from_wheels
+
+
+def test_a_log_without_pose_and_wheels_is_refused_with_that_reason(foreign_logs: Path) -> None:
+    with pytest.raises(JobError) as caught:
+        describe_subject(foreign_logs / "philipsltd_full_nav.db3", Options())
+    assert caught.value.code == "no_pose"
