@@ -33,6 +33,7 @@ class Alignments(Table):
         nullable=True,
     )
     heading_delay_error = fields.number("s", "standard error of that delay", nullable=True)
+    wheel_delay = fields.number("s", "how late the encoders were against the gyro: the latency of the wheels")
     gyro_residual = fields.number("1", "turning that the gyro leaves, as a share of it", nullable=True)
     latency_spread = fields.number("s", "standard deviation of the latencies that were taken off the poses")
     outlier_time = fields.number("s", "time in which the localization goes where the wheels did not")

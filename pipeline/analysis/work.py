@@ -291,6 +291,8 @@ def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:
     """An extracted table before it is aligned: nothing is corrected yet."""
     if table == "poses":
         return frame.with_columns(pl.lit(0.0).alias("latency"), pl.lit(value=False).alias("outlier"))
+    if table == "wheels":
+        return frame.with_columns(pl.lit(0.0).alias("latency"))
     if table == "commands":
         return frame.with_columns(
             pl.col(name).alias(f"{name}_aligned") for name in ("left", "right", "speed")

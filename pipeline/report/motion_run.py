@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
 
-_WHEELS = ("t", "left", "right", "speed", "steering")
+_WHEELS = ("t", "left", "right", "speed", "steering", "latency")
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "poses": (
         *("t", "segment", "x", "y", "z", "q_x", "q_y", "q_z", "q_w"),
@@ -25,7 +25,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     ),
     "alignments": (
         *("hold_time", "command_scale", "track_multiplier", "gyro_scale", "gyro_bias", "heading_delay"),
-        *("heading_delay_error", "gyro_residual", "latency_spread", "outlier_time"),
+        *("heading_delay_error", "wheel_delay", "gyro_residual", "latency_spread", "outlier_time"),
         *("recorded_modulus_command", "recorded_modulus_measured"),
     ),
     "commands": ("t", "left_aligned", "right_aligned", "speed_aligned", "steering"),

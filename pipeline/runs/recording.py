@@ -36,6 +36,7 @@ _NUMBERS = (
     "gyro_bias",
     "heading_delay",
     "heading_delay_error",
+    "wheel_delay",
     "gyro_residual",
     "recorded_modulus_command",
     "recorded_modulus_measured",
@@ -110,6 +111,7 @@ class Alignment:
         track_multiplier: by which the controller multiplies the track width.
         gyro: how the gyro fits the poses; None without a good one.
         heading_delay_s: how late the reported heading was against the gyro: taken off the poses.
+        wheel_delay_s: how late the encoders were against the gyro: taken off the wheels.
         latency_spread_s: standard deviation of the latencies that were taken off the poses.
         outlier_s: time in which the localization goes where the wheels did not, beside bad stretches.
         recorded_moduli: median slip modulus with L = 1 m by input before anything was put right [m/s].
@@ -120,6 +122,7 @@ class Alignment:
     track_multiplier: float = 1.0
     gyro: GyroFit | None = None
     heading_delay_s: float = 0.0
+    wheel_delay_s: float = 0.0
     latency_spread_s: float = 0.0
     outlier_s: float = 0.0
     recorded_moduli: Mapping[str, float | None] = field(default_factory=dict)
@@ -251,6 +254,7 @@ def read_alignment(table: pl.DataFrame) -> Alignment:
         row["track_multiplier"],
         gyro,
         row["heading_delay"] or 0.0,
+        row["wheel_delay"],
         row["latency_spread"],
         row["outlier_time"],
         {name: row[f"recorded_modulus_{name}"] for name in _INPUTS},
@@ -272,6 +276,7 @@ def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
             "gyro_bias": [fit.bias if fit and known else None],
             "heading_delay": [alignment.heading_delay_s if fit and known else None],
             "heading_delay_error": [fit.delay_error_s if fit and known else None],
+            "wheel_delay": [alignment.wheel_delay_s],
             "gyro_residual": [fit.residual if fit and known else None],
             "latency_spread": [alignment.latency_spread_s],
             "outlier_time": [alignment.outlier_s],
@@ -341,10 +346,16 @@ def _unroll(piece: pl.DataFrame) -> Track:
     )
 
 
+def read_wheel_times(table: pl.DataFrame) -> Floats:
+    """When the drive did what a table says [s]: its stamps, less how late they are where that is known."""
+    times = table["t"].to_numpy()
+    return times - table["latency"].to_numpy() if "latency" in table.columns else times
+
+
 def _read_drive(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | None:
     if table is None or table.is_empty():
         return None
-    times = table["t"].to_numpy()
+    times = read_wheel_times(table)
     aligned = "left_aligned" in table.columns
 
     def read(name: str) -> Floats:

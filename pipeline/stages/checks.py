@@ -136,7 +136,7 @@ def check_limits(samples: Samples, vehicle: Vehicle) -> list[Finding]:
 
 
 def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
-    """Delays of the poses and of the encoders, and a heading that is later than the position."""
+    """A heading that is later than the position."""
     ideal = samples.measured if samples.measured is not None else samples.command
     if ideal is None:
         return []
@@ -155,13 +155,6 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
             )
             name = find_late_effect(Late.HEADING).id
             findings.append(Finding(name, "warning", text, where="pose", value=skew))
-    if samples.measured is not None and np.isfinite(samples.gyro).any():
-        usable = np.flatnonzero(known & np.isfinite(samples.gyro))
-        late = _delay_of(samples.measured[:, 2], samples.gyro, usable, samples)
-        # The other way round, a body that follows its wheels late is physics, not an encoder.
-        if late is not None and late[0] > _SKEW:
-            text = f"the encoders are {late[0] * 1e3:.0f} ms late against the gyro (a filter or a clock)"
-            findings.append(Finding("wheels_delay", "info", text, where="wheels", value=late[0]))
     return findings
 
 

@@ -10,6 +10,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import timegrid
+from pipeline.runs.recording import read_wheel_times
 from pipeline.stages import steps
 from pipeline.stages.errors import StageError
 from pipeline.stages.finding import Finding
@@ -183,7 +184,7 @@ def hold_commands(times: Floats, commands: pl.DataFrame, vehicle: Vehicle, hold:
 
 def interpolate_wheels(times: Floats, wheels: pl.DataFrame, vehicle: Vehicle) -> Ideal:
     """Ideal velocities of the measured wheels, interpolated; unknown inside holes of the encoders."""
-    stamps = wheels["t"].to_numpy()
+    stamps = read_wheel_times(wheels)
     values = timegrid.interpolate_linearly(times, stamps, _predict(wheels, vehicle))
     left = timegrid.hold_indices(times, stamps)
     right = np.minimum(left + 1, stamps.size - 1)

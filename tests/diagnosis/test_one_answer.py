@@ -28,7 +28,6 @@ from pipeline.web.run_cache import RunCache
 from pipeline.web.session import SessionFile
 
 if TYPE_CHECKING:
-
     from pipeline.models import ModelFile
     from pipeline.store import Manifest
 

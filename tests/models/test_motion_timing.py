@@ -127,8 +127,10 @@ def test_the_delay_of_the_encoders_is_measured_against_the_gyro(
     late: float, tables: Mapping[str, pl.DataFrame]
 ) -> None:
     wheels = tables["wheels"].with_columns(pl.col("t") + late)
-    problem = Problem([load(tables, wheels=wheels)], HUSKY, Input.COMMAND)
+    run = load(tables, wheels=wheels)
     model = Model(HUSKY, tuple(find_effect(name)() for name in SKID))
-    found = fit_model(problem, model).state.timing[0].wheel_delay_s
+    left = fit_model(Problem([run], HUSKY, Input.COMMAND), model).state.timing[0].wheel_delay_s
     # Read twenty times a second, wheels that step seem late by up to half that time.
-    assert late - 0.02 < found < late + 0.045
+    assert (run.alignment.wheel_delay_s > 0.0) == (late > 0.0)
+    assert late - 0.02 < run.alignment.wheel_delay_s + left < late + 0.045
+    assert abs(left) < 0.03

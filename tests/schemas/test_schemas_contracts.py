@@ -67,6 +67,7 @@ POSE = {
     "held": False, "active": True,
 }  # fmt: skip
 DRIVE = {**WHO, **TIMES, "left": 1.0, "right": 1.0, "speed": None, "steering": None, "active": True}
+WHEEL = {**DRIVE, "latency": 0.0}
 COMMAND = {
     **DRIVE, "body_x": None, "body_w": None, "left_aligned": 1.0, "right_aligned": 1.0, "speed_aligned": None
 }  # fmt: skip
@@ -96,7 +97,7 @@ def broken_rows(table: str, row: dict[str, object]) -> int:
     ("table", "row"),
     [
         ("poses", POSE),
-        ("wheels", DRIVE),
+        ("wheels", WHEEL),
         ("commands", COMMAND),
         ("slip", SLIP),
         ("findings", FINDING),
@@ -119,10 +120,10 @@ NAN, INF = float("nan"), float("inf")
         ("poses", POSE, {"y": INF}),
         ("poses", POSE, {"segment": -1}),
         ("poses", POSE, {"held": None}),
-        ("wheels", DRIVE, {"left": NAN}),
-        ("wheels", DRIVE, {"left": None}),
-        ("wheels", DRIVE, {"left": None, "right": None}),
-        ("wheels", DRIVE, {"left": None, "right": None, "speed": 1.0}),
+        ("wheels", WHEEL, {"left": NAN}),
+        ("wheels", WHEEL, {"left": None}),
+        ("wheels", WHEEL, {"left": None, "right": None}),
+        ("wheels", WHEEL, {"left": None, "right": None, "speed": 1.0}),
         ("commands", COMMAND, {"right": INF}),
         ("slip", SLIP, {"g_x": 0.3}),
         ("slip", SLIP, {"modulus": -0.1}),
@@ -140,5 +141,5 @@ def test_a_bad_row_is_told(table: str, row: dict[str, object], change: dict[str,
 
 
 def test_a_car_has_speed_and_steering_in_place_of_wheels() -> None:
-    car = {**DRIVE, "left": None, "right": None, "speed": 1.0, "steering": 0.1}
+    car = {**WHEEL, "left": None, "right": None, "speed": 1.0, "steering": 0.1}
     assert broken_rows("wheels", car) == 0

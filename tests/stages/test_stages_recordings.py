@@ -90,8 +90,8 @@ def test_a_recording_gives_its_known_numbers_and_its_known_faults(name: str, res
     recorded = Store(results).read(str(summary["run"]), "alignments")
     assert recorded["recorded_modulus_measured"][0] == pytest.approx(known.measured, rel=0.15)
     assert recorded["recorded_modulus_command"][0] == pytest.approx(known.command, rel=0.15)
-    # Poses at the moments they belong to, without outliers, show less slip and never more.
-    assert measured["median_modulus"] <= 1.01 * recorded["recorded_modulus_measured"][0]
+    # Poses and wheels at the moments they belong to, without outliers, show less slip and never more.
+    assert measured["median_modulus"] <= 1.02 * recorded["recorded_modulus_measured"][0]
     assert measured["median_window_norm"] <= 1.15 * known.norm
     if "command_scale" not in known.faults:
         assert command["median_modulus"] <= 1.02 * recorded["recorded_modulus_command"][0]

@@ -18,6 +18,7 @@ from pipeline.stages.align.command_scale import CommandScale, measure_command_sc
 from pipeline.stages.align.outliers import SAMPLE_S, find_outliers
 from pipeline.stages.align.pose_latency import estimate_latency
 from pipeline.stages.align.stretches import find_bad_stretches
+from pipeline.stages.align.wheel_delay import measure_wheel_delay
 from pipeline.stages.finding import Finding
 from pipeline.stages.gyro import describe_gyro
 from pipeline.stages.samples import Samples, gather_samples
@@ -103,6 +104,17 @@ def align_tables(
     alignment = Alignment(hold, scale.scale, scale.track_multiplier, recorded_moduli=grid.recorded)
     poses, alignment = _align_poses(corrected, aligned_vehicle, alignment, grid, where)
     imu = tables.get("imu")
+    if not wheels.is_empty():
+        late = measure_wheel_delay(
+            velocities["t"].to_numpy(),
+            wheels,
+            pl.DataFrame() if imu is None else imu,
+            alignment.gyro,
+            aligned_vehicle,
+        )
+        alignment = replace(alignment, wheel_delay_s=late)
+        corrected = {**corrected, "wheels": wheels.with_columns(pl.lit(late).alias("latency"))}
+        findings += _describe_wheels(late)
     if imu is not None and not imu.is_empty():
         findings += describe_gyro(alignment, velocities["v_w"].to_numpy())
     findings += _describe_poses(alignment)
@@ -231,6 +243,13 @@ def _spread_to_poses(grid: _Grid, times: Floats) -> Flags:
         return np.zeros(times.size, dtype=bool)
     found: Flags = grid.bad[timegrid.nearest_indices(times, grid.velocities["t"].to_numpy())]
     return found
+
+
+def _describe_wheels(late: float) -> list[Finding]:
+    if late == 0.0:
+        return []
+    text = f"the encoders are {late * 1e3:.0f} ms late against the gyro (a filter or a clock): put right"
+    return [Finding("wheels_delay", "info", text, where="wheels", value=late)]
 
 
 def _describe_poses(alignment: Alignment) -> list[Finding]:
