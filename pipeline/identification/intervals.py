@@ -24,6 +24,7 @@ _SHORTEST_BLOCK_S = 6.0
 _TAUS = 5.0
 _DELAY_STEP = 5e-3
 _RISEN = 1.92
+_LONGEST_S = 20.0
 _SEED = 20240513
 
 
@@ -220,14 +221,16 @@ def integrate_correlation(part: Part, fit: PartFit) -> float:
         if power <= 0.0:
             continue
         total = 0.5
-        for lag in range(1, min(int(20.0 / step), centred.size // 4)):
+        most = min(int(_LONGEST_S / step), centred.size // 4)
+        for lag in range(1, most):
             same = label[lag:] == label[:-lag]
             if same.sum() < 50:  # noqa: PLR2004 - too few pairs to know
                 break
             value = float(np.mean(centred[lag:][same] * centred[:-lag][same])) / power
-            if value < 0.05:  # noqa: PLR2004 - from here on it is noise
+            if value <= 0.0:
                 break
-            total += value
+            # Bartlett's weights: what is far counts little, and nothing comes or goes at a threshold.
+            total += (1.0 - lag / most) * value
         longest = max(longest, 2.0 * total * step)
     return longest
 

@@ -54,20 +54,21 @@ def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) 
         per_run: labels whose values belong to each run alone.
     """
     ladder = climb(problem, model, per_run=per_run)
-    top = ladder.rungs[-1]
+    top = _settle(problem, ladder.rungs[-1], per_run)
+    ladder = replace(ladder, rungs=(*ladder.rungs[:-1], top))
     wanted = {effect.id for effect in problem.active_effects(model)}
-    is_top = wanted == set(top.effects)
-    begin = top.fitted.model if is_top else model.keep(wanted)
-    start = top.fitted if is_top else None
-    fitted = fit_model(problem, begin, per_run=per_run, start=start, exact=True)
-    held_out = hold_out(problem, fitted)
-    whole = Rung(fitted, held_out)
-    if is_top:
-        top = whole
-        ladder = replace(ladder, rungs=(*ladder.rungs[:-1], whole))
-    best = whole if compare_losses(held_out, top.held_out) < 1.0 else top
+    whole = top
+    if wanted != set(top.effects):
+        fitted = fit_model(problem, model.keep(wanted), per_run=per_run, exact=True)
+        whole = Rung(fitted, hold_out(problem, fitted))
+    best = whole if compare_losses(whole.held_out, top.held_out) < 1.0 else top
     floor = hold_below(estimate_floor(problem, best.held_out), top.errors)
-    return Judgement(problem, ladder, whole, estimate_intervals(problem, fitted), floor)
+    return Judgement(problem, ladder, whole, estimate_intervals(problem, whole.fitted), floor)
+
+
+def _settle(problem: Problem, rung: Rung, per_run: Sequence[str]) -> Rung:
+    fitted = fit_model(problem, rung.fitted.model, per_run=per_run, start=rung.fitted, exact=True)
+    return Rung(fitted, hold_out(problem, fitted))
 
 
 def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:

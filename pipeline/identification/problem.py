@@ -175,6 +175,15 @@ def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
         speed, turn = max(speed, float(np.abs(forward).max())), max(turn, float(np.abs(around).max()))
         wheel = max(wheel, float(np.abs(series.left).max()), float(np.abs(series.right).max()))
         difference = max(difference, float(np.abs(series.right - series.left).max()))
-    places = np.concatenate([run.track.place[run.track.active, 0] for run in runs])
-    tenths = np.quantile(places, np.linspace(0.0, 1.0, 11)) if places.size else np.zeros(11)
-    return Largest(speed, turn, wheel, max(difference, 1e-6), max(run.duration_s for run in runs), tenths)
+    moments, places = (
+        np.concatenate([values[run.track.active] for run, values in pairs])
+        for pairs in (
+            [(run, run.track.times) for run in runs],
+            [(run, run.track.place[:, 0]) for run in runs],
+        )
+    )
+    shares = np.linspace(0.0, 1.0, 11)
+    if places.size == 0:
+        return Largest(speed, turn, wheel, max(difference, 1e-6), np.zeros(11), np.zeros(11))
+    tenths = np.quantile(moments, shares), np.quantile(places, shares)
+    return Largest(speed, turn, wheel, max(difference, 1e-6), *tenths)

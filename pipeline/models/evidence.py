@@ -23,12 +23,12 @@ _REACHED = 0.99
 
 @dataclass(frozen=True)
 class Largest:
-    """What relative starts are shares of: the largest that was commanded, and the duration.
+    """What relative starts are shares of: the largest that was commanded, and where and when it was.
 
     Attributes:
         speed, turn, wheel: speed [m/s], yaw rate [rad/s], wheel speed [rad/s].
         difference: of the wheel speeds [rad/s].
-        duration: of the run [s].
+        moments: times [s] before which the tenths of the driving lie, shape (11,).
         places: x [m] in the map below which the tenths of the run lie, shape (11,).
     """
 
@@ -36,7 +36,7 @@ class Largest:
     turn: float
     wheel: float
     difference: float
-    duration: float
+    moments: Floats
     places: Floats
 
     @property
@@ -58,12 +58,15 @@ class Largest:
         """A share of what was asked for; the number itself where it is no share.
 
         Args:
-            share: of the largest or of the duration; for a `place`, the part of the run that lies below it.
+            share: of the largest; for the `duration` the part of the driving that is done by then, for a
+                `place` the part of the run that lies below it.
             of: which.
         """
         if of == "place":
             return float(self.places[round(share * (self.places.size - 1))])
-        whole = {"speed": self.speed, "turn": self.turn, "wheel": self.wheel, "duration": self.duration}
+        if of == "duration":
+            return float(self.moments[round(share * (self.moments.size - 1))])
+        whole = {"speed": self.speed, "turn": self.turn, "wheel": self.wheel}
         return share * whole.get(of, 1.0)
 
     def reaches(self, limit: float, of: Relative) -> bool:

@@ -38,7 +38,7 @@ LOGS = ROOT / ".." / "shared" / "logs"
 SAMPLES = ROOT / "data_samples"
 ERRORS = ("t_mrmse_m", "r_mrmse_rad")
 # What two fits of the same model from the same values differ by: where they stop.
-SAME = 2e-3
+SAME = 5e-3
 
 
 @pytest.fixture(scope="module")
@@ -119,9 +119,10 @@ def check_model_verbs(told: Json, file: ModelFile, problem: Problem) -> Json:
             assert same(number["value"], entry["value"]), (effect, name)
         else:
             # Limits make the loss rough: where a fit of it stops is known to a small part of the interval.
-            near = 0.03 * (number["high"] - number["low"]) + 1e-6
-            for end in ("value", "low", "high"):
-                assert abs(number[end] - entry[end]) < near, (effect, name, end)
+            # The ends of an interval jump a little where one block more or less stands behind it.
+            width = number["high"] - number["low"] + 1e-5
+            for end, near in (("value", 0.03), ("low", 0.15), ("high", 0.15)):
+                assert abs(number[end] - entry[end]) < near * width, (effect, name, end)
     floor = errors_as_json(judged.floor)
     ladder = ladder_as_json(judged.ladder, judged.floor)
     (carried,) = carry_over(file.model, list(problem.runs), problem.source)

@@ -25,7 +25,7 @@ GENERIC = sorted(
     for path in SOURCES.rglob("*.py")
     if OWN not in path.parents and SOURCES / "simulate" not in path.parents and path not in WRITERS
 )
-ASKED = Largest(1.5, 1.2, 9.0, 8.0, 300.0, np.linspace(-5.0, 20.0, 11))
+ASKED = Largest(1.5, 1.2, 9.0, 8.0, np.linspace(0.0, 300.0, 11), np.linspace(-5.0, 20.0, 11))
 
 
 def list_mentions(path: Path) -> list[str]:

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
 _LEAST = Least(0.03, DATA_SHEET)
 _PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")
-# Nearer to the ends of a run it is a wheel radius and a track under another name.
-_EDGE = 0.15
 
 
 class TerrainChange(KinematicEffect):
@@ -91,9 +89,12 @@ class TerrainChange(KinematicEffect):
 
     def is_degenerate(self, evidence: Evidence) -> bool:
         """It does not lie within the run."""
-        at_s, at_x, largest = self.values["at_s"], self.values["at_x"], evidence.largest
-        if math.isfinite(at_s):
-            return not _EDGE <= at_s / largest.duration <= 1.0 - _EDGE
-        tenths = largest.places
-        low, high = 0.5 * (tenths[1] + tenths[2]), 0.5 * (tenths[-3] + tenths[-2])
-        return math.isfinite(at_x) and not low <= at_x <= high
+        # Nearer to the ends of what was driven it is a wheel radius and a track under another name.
+        for at, tenths in (
+            (self.values["at_s"], evidence.largest.moments),
+            (self.values["at_x"], evidence.largest.places),
+        ):
+            low, high = 0.5 * (tenths[1] + tenths[2]), 0.5 * (tenths[-3] + tenths[-2])
+            if math.isfinite(at) and not low <= at <= high:
+                return True
+        return False
