@@ -11,11 +11,11 @@ import msgspec
 
 from pipeline.analysis.diagnosis import diagnose_work, has_diagnosis, key_diagnosis
 from pipeline.analysis.keys import hash_json, key_stages
+from pipeline.analysis.log_setup import LogSetup, describe_subject, name_run
 from pipeline.analysis.options import STAGES
 from pipeline.analysis.peers import find_peers
 from pipeline.analysis.provenance import list_versions
 from pipeline.analysis.relative import hash_model
-from pipeline.analysis.subject import Subject, describe_subject, name_run
 from pipeline.analysis.summary import summarize_run
 from pipeline.analysis.work import Progress, Work, read_subject, stored_contexts, stored_keys
 from pipeline.core.version import read_version
@@ -72,10 +72,10 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
         SlipError: the log, the configuration or a stage cannot go on; nothing of this run is changed then.
     """
     store = Store(options.out)
-    subject = describe_subject(path, options)
-    sha256, data = _identify(path, subject, store, progress)
+    setup = describe_subject(path, options)
+    sha256, data = _identify(path, setup, store, progress)
     run = options.run or name_run(path, sha256, store)
-    keys = key_stages(run, sha256, subject, options.inputs, hash_model(options.model))
+    keys = key_stages(run, sha256, setup, options.inputs, hash_model(options.model))
     current = store.manifest(run)
     if current is not None and store.is_asked_again(current):
         options = replace(options, force=True)
@@ -88,9 +88,9 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
         if previous is not None and not options.force and _is_done(previous, keys, options):
             # Another writer of this run came first, and what it wrote is what is wanted.
             return Outcome(_read_summary(previous, options), previous, (), twin)
-        work = Work(run, subject, options, generation, keys, sha256, data, progress)
+        work = Work(run, setup, options, generation, keys, sha256, data, progress)
         work.run_stages()
-        log = _describe_log(subject, sha256, work)
+        log = _describe_log(setup, sha256, work)
         if options.through == STAGES[-1]:
             _write_outputs(work, log, options, progress, diagnose_work(work))
         manifest = generation.commit(_details(work, log, sha256))
@@ -106,16 +106,16 @@ def _find_twin(path: Path, sha256: str, current: Manifest | None) -> str:
     return str(recorded) if recorded != path.resolve() and recorded.exists() else ""
 
 
-def _identify(path: Path, subject: Subject, store: Store, progress: Progress) -> tuple[str, LogData | None]:
+def _identify(path: Path, setup: LogSetup, store: Store, progress: Progress) -> tuple[str, LogData | None]:
     """Hash of the log: remembered, or computed beside reading it."""
     identities = LogIdentities(store)
     known = identities.lookup(path)
-    read = subject.choice.data
+    read = setup.choice.data
     if known is not None:
         return known, read
     progress("read")
     seen = see_log(path)
-    data = read_subject(subject) if read is None else read
+    data = read_subject(setup) if read is None else read
     identities.remember(path, data.sha256, seen=seen)
     return data.sha256, data
 
@@ -136,13 +136,13 @@ def _is_done(manifest: Manifest, keys: Mapping[str, str], options: Options) -> b
     return SUMMARY in files and has_report and has_figures and diagnosed
 
 
-def _describe_log(subject: Subject, sha256: str, work: Work) -> dict[str, JSON]:
+def _describe_log(setup: LogSetup, sha256: str, work: Work) -> dict[str, JSON]:
     losses = work.contexts["extract"].get("losses", [])
     return {
-        "path": spell_location(subject.path.resolve()),
+        "path": spell_location(setup.path.resolve()),
         "sha256": sha256,
-        "bytes": subject.index.size_bytes,
-        "duration_s": round(subject.index.duration_s, 6),
+        "bytes": setup.index.size_bytes,
+        "duration_s": round(setup.index.duration_s, 6),
         "complete": not losses,
         "losses": losses,
         "unchecked": work.contexts["extract"].get("unchecked"),
@@ -204,14 +204,14 @@ def _details(work: Work, log: Mapping[str, JSON], sha256: str) -> dict[str, JSON
         "inputs": list(work.options.inputs),
         "configuration": _configuration(work),
         "vehicle": msgspec.to_builtins(work.vehicle),
-        "terrain": work.subject.terrain,
-        "dataset": work.subject.dataset,
+        "terrain": work.setup.terrain,
+        "dataset": work.setup.dataset,
         "versions": cast("JSON", list_versions(work)),
     }
 
 
 def _configuration(work: Work) -> JSON:
-    plain: JSON = msgspec.to_builtins(work.subject.configuration)
+    plain: JSON = msgspec.to_builtins(work.setup.configuration)
     return plain
 
 
@@ -232,13 +232,13 @@ def update_datasets(store: Store) -> None:
     """
     import polars as pl  # noqa: PLC0415 - heavy
 
-    from pipeline.analysis.material import find_material  # noqa: PLC0415 - heavy
+    from pipeline.analysis.compared_runs import find_material  # noqa: PLC0415 - heavy
     from pipeline.fleet import gather_runs, pool_runs  # noqa: PLC0415 - heavy
 
-    material = find_material(store, ("dataset",), trusted_only=False, tables=("aggregates",))
-    if not material.manifests and not material.notes:
+    compared = find_material(store, ("dataset",), trusted_only=False, tables=("aggregates",))
+    if not compared.manifests and not compared.notes:
         return
-    runs = list(material.manifests)
-    aggregates = material.scan("aggregates").filter(pl.col("run").is_in(runs)).collect()
-    pooled = pool_runs(gather_runs(aggregates, material.labels), ("dataset",))
+    runs = list(compared.manifests)
+    aggregates = compared.scan("aggregates").filter(pl.col("run").is_in(runs)).collect()
+    pooled = pool_runs(gather_runs(aggregates, compared.labels), ("dataset",))
     store.write_results_table("datasets", pooled)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
+from pipeline.analysis.compared_runs import ComparedRuns, find_material, keep_runs
 from pipeline.analysis.errors import JobError
-from pipeline.analysis.material import Material, find_material, keep_runs
 from pipeline.analysis.samples import follow_published_runs, read_moduli, read_norms
 from pipeline.fleet import (
     Group,
@@ -91,69 +91,71 @@ def compare_results(store: Store, question: Question) -> Answer:
         JobError: ``nothing_to_compare``.
         ComparisonError: ``no_such_column``.
     """
-    material = find_material(store, question.by, trusted_only=True)
-    runs = _gather(material)
-    material, runs, notes = _agree_on_scale(material, runs)
+    compared = find_material(store, question.by, trusted_only=True)
+    runs = _gather(compared)
+    compared, runs, notes = _agree_on_scale(compared, runs)
     if runs.is_empty():
         raise JobError(
             "nothing_to_compare",
-            "there is no run whose numbers can be compared" + "".join(f"; {note}" for note in material.notes),
+            "there is no run whose numbers can be compared" + "".join(f"; {note}" for note in compared.notes),
             where=str(store.root),
             hint="Analyze logs first: slip analyze LOG... --out RESULTS --terrain NAME.",
         )
     chosen = question.input or _choose_input(runs)
-    runs = add_measures(runs, measure_difficulty(_scan_slip(material), _describe_vehicles(material, runs)))
+    runs = add_measures(runs, measure_difficulty(_scan_slip(compared), _describe_vehicles(compared, runs)))
     quantity = "median_modulus"
     if question.as_published:
         chosen, quantity = "command", "published_norm"
-    moduli = samples = read_moduli(material, chosen)
+    moduli = samples = read_moduli(compared, chosen)
     if question.as_published:
-        samples, runs, told = follow_published_runs(material, runs)
+        samples, runs, told = follow_published_runs(compared, runs)
         notes += told
     elif chosen == "command":
-        notes += _doubt_commands(material)
-    missing = sorted(set(material.manifests) - set(samples))
+        notes += _doubt_commands(compared)
+    missing = sorted(set(compared.manifests) - set(samples))
     if missing:
         notes.append(f"{', '.join(missing)} not compared: no {quantity.replace('_', ' ')} on {chosen}")
-    groups = _group(material, samples)
+    groups = _group(compared, samples)
     pairs = compare_groups(groups)
-    single = _find_single(material)
+    single = _find_single(compared)
     datasets = pool_runs(
         runs,
         question.by,
         within=_bound_single(moduli, single, chosen),
-        norms_within=_bound_single(read_norms(material, chosen), single, chosen),
+        norms_within=_bound_single(read_norms(compared, chosen), single, chosen),
     )
     comparisons = tabulate_pairs(
-        pairs, by=question.by, input_name=chosen, quantity=quantity, keys=_keys(material)
+        pairs, by=question.by, input_name=chosen, quantity=quantity, keys=_keys(compared)
     )
-    windows = _tabulate_windows(samples, chosen) if question.as_published else material.scan("windows")
-    boxes = spread_windows(windows, material.labels.select("run", "group"))
-    all_notes = (*material.notes, *notes, *_sum_up(pairs, groups))
+    windows = _tabulate_windows(samples, chosen) if question.as_published else compared.scan("windows")
+    boxes = spread_windows(windows, compared.labels.select("run", "group"))
+    all_notes = (*compared.notes, *notes, *_sum_up(pairs, groups))
     intervals = _list_intervals(groups, datasets, chosen, quantity)
     return Answer(datasets, comparisons, runs, chosen, quantity, intervals, boxes, all_notes)
 
 
-def _gather(material: Material) -> pl.DataFrame:
-    if not material.manifests:
+def _gather(compared: ComparedRuns) -> pl.DataFrame:
+    if not compared.manifests:
         return pl.DataFrame()
-    aggregates = material.scan("aggregates").filter(pl.col("run").is_in(list(material.manifests))).collect()
-    return gather_runs(aggregates, material.labels).filter(
+    aggregates = compared.scan("aggregates").filter(pl.col("run").is_in(list(compared.manifests))).collect()
+    return gather_runs(aggregates, compared.labels).filter(
         pl.col("median_modulus").is_not_null(), pl.col("median_modulus").is_finite()
     )
 
 
-def _agree_on_scale(material: Material, runs: pl.DataFrame) -> tuple[Material, pl.DataFrame, list[str]]:
+def _agree_on_scale(
+    compared: ComparedRuns, runs: pl.DataFrame
+) -> tuple[ComparedRuns, pl.DataFrame, list[str]]:
     """Leave out runs with another length scale than most: their moduli are other quantities."""
     if runs.is_empty():
-        return material, runs, []
+        return compared, runs, []
     scales = runs.unique("run")["length_scale"]
     usual = float(np.min(scales.drop_nulls().mode().to_numpy()))
     kept = runs.filter(pl.col("length_scale") == usual)["run"].unique().to_list()
-    material = keep_runs(
-        material, kept, f"its length scale is not the {usual:g} m of most runs, or it has no slip"
+    compared = keep_runs(
+        compared, kept, f"its length scale is not the {usual:g} m of most runs, or it has no slip"
     )
-    return material, runs.filter(pl.col("run").is_in(kept)), [NOT_VALID]
+    return compared, runs.filter(pl.col("run").is_in(kept)), [NOT_VALID]
 
 
 def _choose_input(runs: pl.DataFrame) -> str:
@@ -161,10 +163,10 @@ def _choose_input(runs: pl.DataFrame) -> str:
     return "command" if on_command == runs["run"].n_unique() else "measured"
 
 
-def _doubt_commands(material: Material) -> list[str]:
+def _doubt_commands(compared: ComparedRuns) -> list[str]:
     """Runs whose recorded command is known to be scaled wrongly: their slip on it is no slip."""
-    found = material.scan("findings").filter(
-        pl.col("id") == "command_scale", pl.col("run").is_in(list(material.manifests))
+    found = compared.scan("findings").filter(
+        pl.col("id") == "command_scale", pl.col("run").is_in(list(compared.manifests))
     )
     runs = found.select("run").unique().sort("run").collect()["run"].to_list()
     if not runs:
@@ -174,26 +176,26 @@ def _doubt_commands(material: Material) -> list[str]:
     ]
 
 
-def _scan_slip(material: Material) -> pl.LazyFrame:
-    return material.scan("slip").filter(pl.col("run").is_in(list(material.manifests)))
+def _scan_slip(compared: ComparedRuns) -> pl.LazyFrame:
+    return compared.scan("slip").filter(pl.col("run").is_in(list(compared.manifests)))
 
 
-def _describe_vehicles(material: Material, runs: pl.DataFrame) -> pl.DataFrame:
+def _describe_vehicles(compared: ComparedRuns, runs: pl.DataFrame) -> pl.DataFrame:
     scales = runs.unique("run").select("run", "length_scale")
-    return material.labels.select("run", "mass", "inertia").join(scales, on="run")
+    return compared.labels.select("run", "mass", "inertia").join(scales, on="run")
 
 
-def _group(material: Material, samples: Mapping[str, Samples]) -> list[Group]:
+def _group(compared: ComparedRuns, samples: Mapping[str, Samples]) -> list[Group]:
     members: dict[str, list[Samples]] = {}
-    for run, group in material.labels.select("run", "group").sort("group", "run").iter_rows():
+    for run, group in compared.labels.select("run", "group").sort("group", "run").iter_rows():
         if run in samples:
             members.setdefault(group, []).append(samples[run])
     return [Group(name, tuple(runs)) for name, runs in members.items()]
 
 
-def _find_single(material: Material) -> list[str]:
+def _find_single(compared: ComparedRuns) -> list[str]:
     """Runs that are alone in their dataset."""
-    alone = material.labels.filter(pl.len().over("group") == 1)
+    alone = compared.labels.filter(pl.len().over("group") == 1)
     return alone["run"].to_list()
 
 
@@ -225,9 +227,9 @@ def _list_intervals(
     return pl.DataFrame(rows, schema=kinds, orient="row")
 
 
-def _keys(material: Material) -> dict[str, str]:
+def _keys(compared: ComparedRuns) -> dict[str, str]:
     """Run/generation of every run of a group, separated by spaces."""
-    named = material.labels.with_columns(pl.concat_str("run", "key", separator="/").alias("place"))
+    named = compared.labels.with_columns(pl.concat_str("run", "key", separator="/").alias("place"))
     joined = named.group_by("group").agg(pl.col("place").sort().str.join(" "))
     return dict(zip(joined["group"].to_list(), joined["place"].to_list(), strict=True))
 

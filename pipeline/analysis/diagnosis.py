@@ -73,11 +73,11 @@ def _diagnose(work: Work) -> dict[str, JSON]:
     from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy
     from pipeline.diagnosis.words import list_lines  # noqa: PLC0415 - heavy
 
-    generation, subject = work.generation, work.subject
+    generation, setup = work.generation, work.setup
     recording = _make_recording(
         work.run,
         (generation.table_names, generation.read_table),
-        {"sha256": work.sha256, "path": str(subject.path)},
+        {"sha256": work.sha256, "path": str(setup.path)},
     )
     try:
         diagnosis = diagnose_runs([recording], work.vehicle, inputs=work.options.inputs, tell=work.progress)

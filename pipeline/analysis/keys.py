@@ -17,7 +17,7 @@ from pipeline.analysis.options import STAGES
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.analysis.subject import Subject
+    from pipeline.analysis.log_setup import LogSetup
 
 VERSIONS: Mapping[str, int] = {"extract": 4, "align": 2, "velocity": 3, "slip": 3, "aggregate": 1}
 EXTRACTED = ("commands", "wheels", "poses", "imu")
@@ -32,19 +32,19 @@ _DIGITS = 16
 
 
 def key_stages(
-    run: str, sha256: str, subject: Subject, inputs: tuple[str, ...], model: str | None = None
+    run: str, sha256: str, setup: LogSetup, inputs: tuple[str, ...], model: str | None = None
 ) -> dict[str, str]:
     """Key of every stage of a run, in order; ``model`` is the hash of the model that slip is set against."""
     # The contracts bring a table library along, which help and usage errors do without.
     from schemas import contract_of  # noqa: PLC0415
 
-    plain = msgspec.to_builtins(subject.configuration)
+    plain = msgspec.to_builtins(setup.configuration)
     pose_limits = {name: plain["velocity"][name] for name in ("jump_m", "jump_rad", "gap_s")}
     own = {
         "extract": {
             "log": sha256,
-            "run": [run, subject.dataset, subject.terrain],
-            "vehicle": msgspec.to_builtins(subject.vehicle),
+            "run": [run, setup.dataset, setup.terrain],
+            "vehicle": msgspec.to_builtins(setup.vehicle),
             "roles": [plain[role] for role in ("command", "wheels", "pose", "imu", "interval")],
             "use_intervals": plain["use_intervals"],
             "limits": pose_limits,

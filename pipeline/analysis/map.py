@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.analysis.material import find_material
+from pipeline.analysis.compared_runs import find_material
 from pipeline.fleet import add_measures, gather_runs, measure_difficulty, pool_runs
 from pipeline.fleet.deployments import find_own_table, read_deployments
 from pipeline.fleet.place import place_datasets, place_deployments
@@ -49,18 +49,18 @@ def draw_up_map(store: Store, table: Path | None = None) -> DeploymentMap:
         ComparisonError: the table is not there or breaks its schema.
     """
     deployments = read_deployments(table or find_own_table())
-    material = find_material(store, ("dataset",), trusted_only=True)
+    compared = find_material(store, ("dataset",), trusted_only=True)
     datasets = pl.DataFrame()
-    if material.manifests:
-        names = list(material.manifests)
+    if compared.manifests:
+        names = list(compared.manifests)
         runs = gather_runs(
-            material.scan("aggregates").filter(pl.col("run").is_in(names)).collect(), material.labels
+            compared.scan("aggregates").filter(pl.col("run").is_in(names)).collect(), compared.labels
         )
         scales = runs.unique("run").select("run", "length_scale")
-        vehicles = material.labels.select("run", "mass", "inertia").join(scales, on="run")
-        slip = material.scan("slip").filter(pl.col("run").is_in(names))
+        vehicles = compared.labels.select("run", "mass", "inertia").join(scales, on="run")
+        slip = compared.scan("slip").filter(pl.col("run").is_in(names))
         datasets = pool_runs(add_measures(runs, measure_difficulty(slip, vehicles)), ("dataset",))
-    own, notes = _empty_own(), list(material.notes)
+    own, notes = _empty_own(), list(compared.notes)
     keys: tuple[str, ...] = ()
     if not datasets.is_empty():
         # On measured wheels, slip is what the ground did; the drivetrain's share would move with the command.

@@ -13,7 +13,7 @@ from pipeline.logs import ROS1_BAG, SQLITE_BAG
 from pipeline.stages.extract import list_wanted
 
 if TYPE_CHECKING:
-    from pipeline.analysis.subject import Subject
+    from pipeline.analysis.log_setup import LogSetup
     from pipeline.analysis.work import Work
 
 _Packages = Mapping[str, tuple[str, ...]]
@@ -31,18 +31,18 @@ def list_versions(work: Work) -> dict[str, str]:
     Args:
         work: after its stages and its diagnosis.
     """
-    names = {*_ALWAYS, *_list_readers(work.subject)}
+    names = {*_ALWAYS, *_list_readers(work.setup)}
     if "ladder" in work.generation.table_names:
         names.update(_CEILING)
     versions = {name: _look_up(name) for name in sorted(names)}
     return {"python": platform.python_version(), PACKAGE: read_version(), **versions}
 
 
-def _list_readers(subject: Subject) -> set[str]:
+def _list_readers(setup: LogSetup) -> set[str]:
     """Packages that inflate or decode what a run takes from its log."""
-    index = subject.index
+    index = setup.index
     types = {channel.topic: channel.type_name for channel in index.channels}
-    wanted = {one.topic for one in list_wanted(subject.sources, types)}
+    wanted = {one.topic for one in list_wanted(setup.sources, types)}
     encodings = {channel.message_encoding for channel in index.channels if channel.topic in wanted}
     used = [_CONTAINER.get(name, ()) for name in index.containers]
     used += [_COMPRESSION.get(name, ()) for name in index.compressions]

@@ -11,44 +11,44 @@ from pipeline.fleet import Samples, follow_published, read_limits
 from pipeline.fleet.published import WINDOW_S
 
 if TYPE_CHECKING:
-    from pipeline.analysis.material import Material
+    from pipeline.analysis.compared_runs import ComparedRuns
 
 _FEWEST = 2
 
 
-def read_moduli(material: Material, input_name: str) -> dict[str, Samples]:
+def read_moduli(compared: ComparedRuns, input_name: str) -> dict[str, Samples]:
     """Slip moduli of every run on one input, suspect samples left out.
 
     Args:
-        material: the runs.
+        compared: the runs.
         input_name: `command` or `measured`.
     """
-    parts = _split_by_run(material, "slip", input_name, time="t", value="modulus")
+    parts = _split_by_run(compared, "slip", input_name, time="t", value="modulus")
     return {run: _take_samples(part) for run, part in parts.items()}
 
 
-def read_norms(material: Material, input_name: str) -> dict[str, Samples]:
+def read_norms(compared: ComparedRuns, input_name: str) -> dict[str, Samples]:
     """2 s window norms of every run on one input, suspect windows left out.
 
     Args:
-        material: the runs.
+        compared: the runs.
         input_name: `command` or `measured`.
     """
-    parts = _split_by_run(material, "windows", input_name, time="t_start", value="window_norm")
+    parts = _split_by_run(compared, "windows", input_name, time="t_start", value="window_norm")
     return {run: _take_windows(part) for run, part in parts.items()}
 
 
 def _split_by_run(
-    material: Material, table: str, input_name: str, *, time: str, value: str
+    compared: ComparedRuns, table: str, input_name: str, *, time: str, value: str
 ) -> dict[str, pl.DataFrame]:
     """Rows of a table on one input by run: suspect ones and numbers that are none left out."""
     frame = (
-        material.scan(table)
+        compared.scan(table)
         .filter(
             pl.col("input") == input_name,
             ~pl.col("suspect"),
             pl.col(value).is_finite(),
-            pl.col("run").is_in(list(material.manifests)),
+            pl.col("run").is_in(list(compared.manifests)),
         )
         .select("run", time, "segment", "step", value)
         .collect()
@@ -58,7 +58,7 @@ def _split_by_run(
 
 
 def follow_published_runs(
-    material: Material, runs: pl.DataFrame
+    compared: ComparedRuns, runs: pl.DataFrame
 ) -> tuple[dict[str, Samples], pl.DataFrame, list[str]]:
     """Window norms of the published chain for every run that allows it.
 
@@ -67,7 +67,7 @@ def follow_published_runs(
     """
     samples: dict[str, Samples] = {}
     notes: list[str] = []
-    for run, manifest in material.manifests.items():
+    for run, manifest in compared.manifests.items():
         vehicle = manifest.details.get("vehicle")
         findings = set(manifest.read("findings")["id"]) if "findings" in manifest.tables else set()
         found = follow_published(

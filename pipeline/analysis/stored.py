@@ -13,9 +13,9 @@ import msgspec
 
 from pipeline.analysis.analyze import SUMMARY, analyze_log, update_datasets
 from pipeline.analysis.errors import JobError
+from pipeline.analysis.log_setup import describe_subject, name_run
 from pipeline.analysis.lookup import find_run, recorded_path
 from pipeline.analysis.options import INPUTS
-from pipeline.analysis.subject import describe_subject, name_run
 from pipeline.analysis.work import stored_contexts
 from pipeline.core.errors import SlipError
 from pipeline.logs import hash_log, list_files
@@ -133,17 +133,17 @@ def _find_recorded(stored: Manifest) -> Path:
 def _is_changed(path: Path, stored: Manifest, options: Options, *, asked: bool) -> bool:
     """Whether an analysis would be of another vehicle or configuration now."""
     try:
-        subject = describe_subject(path, options)
+        setup = describe_subject(path, options)
     except SlipError:
         if asked:
             raise
         # The log alone does not say what was said when it was analyzed.
         return False
     now = {
-        "configuration": msgspec.to_builtins(subject.configuration),
-        "vehicle": msgspec.to_builtins(subject.vehicle),
-        "terrain": subject.terrain,
-        "dataset": subject.dataset,
+        "configuration": msgspec.to_builtins(setup.configuration),
+        "vehicle": msgspec.to_builtins(setup.vehicle),
+        "terrain": setup.terrain,
+        "dataset": setup.dataset,
         "inputs": options.inputs,
     }
     return any(stored.details.get(key) != value for key, value in json.loads(json.dumps(now)).items())

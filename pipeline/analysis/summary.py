@@ -22,7 +22,7 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
         work: the finished stages.
         log: what is known of the recording: path, sha256, duration_s, complete, losses.
     """
-    subject, generation = work.subject, work.generation
+    setup, generation = work.setup, work.generation
     aggregates = generation.read_table("aggregates")
     velocities = generation.read_table("velocities")
     by_input = {
@@ -35,18 +35,18 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
         "run": work.run,
         "key": generation.key,
         "log": dict(log),
-        "vehicle": subject.vehicle.id,
-        "vehicle_name": subject.vehicle.name,
-        "terrain": subject.terrain,
-        "dataset": subject.dataset,
+        "vehicle": setup.vehicle.id,
+        "vehicle_name": setup.vehicle.name,
+        "terrain": setup.terrain,
+        "dataset": setup.dataset,
         "input": asked,
-        "rate_hz": subject.configuration.velocity.rate_hz,
+        "rate_hz": setup.configuration.velocity.rate_hz,
         "samples": by_input[leading]["samples"],
         "segments": velocities["segment"].n_unique(),
         "median_modulus": by_input[leading]["median_modulus"],
         "median_window_norm": by_input[leading]["median_window_norm"],
         "leading_input": leading,
-        "length_scale_m": subject.configuration.slip.length_scale_m,
+        "length_scale_m": setup.configuration.slip.length_scale_m,
         "by_input": by_input,
         "split": _split(whole),
         "distance_m": _rounded(whole["distance"]),
@@ -60,7 +60,7 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
         },
         "quarantined": work.contexts["extract"].get("quarantined"),
         "topics": _describe_topics(work),
-        **subject.choice.to_json({channel.topic: channel.type_name for channel in subject.index.channels}),
+        **setup.choice.to_json({channel.topic: channel.type_name for channel in setup.index.channels}),
         "findings": list_findings(generation.read_table("findings")),
     }
 
@@ -99,7 +99,7 @@ def _split(row: Mapping[str, float | None]) -> JSON:
 
 
 def _describe_topics(work: Work) -> dict[str, JSON]:
-    sources = work.subject.sources
+    sources = work.setup.sources
     roles = {
         "command": sources.command,
         "wheels": sources.wheels,

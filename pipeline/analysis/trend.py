@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
+from pipeline.analysis.compared_runs import ComparedRuns, find_material
 from pipeline.analysis.errors import JobError
-from pipeline.analysis.material import Material, find_material
 from pipeline.fleet import gather_runs
 from pipeline.fleet.trend import (
     FEWEST_RUNS,
@@ -60,10 +60,10 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
         JobError: ``nothing_to_follow``: there is no run with a date.
         ComparisonError: ``no_such_column``.
     """
-    material = find_material(store, by, trusted_only=False)
-    dated = material.labels.filter(pl.col("day").is_not_null()).sort("day", "start", "run")
-    undated = sorted(set(material.manifests) - set(dated["run"]))
-    notes = list(material.notes)
+    compared = find_material(store, by, trusted_only=False)
+    dated = compared.labels.filter(pl.col("day").is_not_null()).sort("day", "start", "run")
+    undated = sorted(set(compared.manifests) - set(dated["run"]))
+    notes = list(compared.notes)
     if undated:
         notes.append(f"left out, because no date is known: {', '.join(undated)}")
     if dated.is_empty():
@@ -73,8 +73,8 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
             where=str(store.root),
             hint="Analyze logs whose clock was set, or put the date into their names (2026-05-03).",
         )
-    parameters = _read_parameters(material)
-    parts = [_read_slip(material), _read_health(material), parameters]
+    parameters = _read_parameters(compared)
+    parts = [_read_slip(compared), _read_health(compared), parameters]
     values = (
         dated.select("run", "group", "day")
         .with_row_index("order")
@@ -93,7 +93,7 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
     alerts = raise_alerts(series, threshold=threshold, limits=limits)
     known = {quantity for one in series for quantity in (one.quantity, one.quantity.split(" (")[0])}
     notes += [f"no run has the quantity {name!r} that a limit is for" for name in limits if name not in known]
-    keys = tuple(f"{run}/{material.manifests[run].key}" for run in dated["run"])
+    keys = tuple(f"{run}/{compared.manifests[run].key}" for run in dated["run"])
     return Trend(tuple(series), tuple(alerts), keys, tuple(notes))
 
 
@@ -134,10 +134,10 @@ def describe_trend(trend: Trend) -> dict[str, object]:
     }
 
 
-def _read_slip(material: Material) -> pl.DataFrame:
-    names = list(material.manifests)
+def _read_slip(compared: ComparedRuns) -> pl.DataFrame:
+    names = list(compared.manifests)
     runs = gather_runs(
-        material.scan("aggregates").filter(pl.col("run").is_in(names)).collect(), material.labels
+        compared.scan("aggregates").filter(pl.col("run").is_in(names)).collect(), compared.labels
     )
     long = runs.unpivot(list(_SLIP), index=["run", "input"], variable_name="quantity", value_name="value")
     return long.drop_nulls("value").select(
@@ -148,11 +148,11 @@ def _read_slip(material: Material) -> pl.DataFrame:
     )
 
 
-def _read_health(material: Material) -> pl.DataFrame:
+def _read_health(compared: ComparedRuns) -> pl.DataFrame:
     """Findings by their value, the number of warnings, and the share of suspect samples."""
-    names = list(material.manifests)
+    names = list(compared.manifests)
     findings = (
-        material.scan("findings")
+        compared.scan("findings")
         .filter(pl.col("run").is_in(names))
         .select("run", "id", "severity", "value")
         .collect()
@@ -180,7 +180,7 @@ def _read_health(material: Material) -> pl.DataFrame:
         )
     )
     suspect = (
-        material.scan("slip")
+        compared.scan("slip")
         .filter(pl.col("run").is_in(names))
         .group_by("run")
         .agg(pl.col("suspect").mean().alias("value"))
@@ -190,10 +190,10 @@ def _read_health(material: Material) -> pl.DataFrame:
     return pl.concat([told, counted, suspect])
 
 
-def _read_parameters(material: Material) -> pl.DataFrame:
+def _read_parameters(compared: ComparedRuns) -> pl.DataFrame:
     return (
-        material.scan("parameters")
-        .filter(pl.col("run").is_in(list(material.manifests)))
+        compared.scan("parameters")
+        .filter(pl.col("run").is_in(list(compared.manifests)))
         .select(
             "run",
             pl.format("{}.{} ({})", "effect", "parameter", pl.col("input").cast(pl.String)).alias("quantity"),

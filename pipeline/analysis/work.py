@@ -26,8 +26,8 @@ from pipeline.vehicles import DriveForm
 from schemas import contract_of
 
 if TYPE_CHECKING:
+    from pipeline.analysis.log_setup import LogSetup
     from pipeline.analysis.options import Options
-    from pipeline.analysis.subject import Subject
     from pipeline.store import JSON, Generation, Manifest, TableReport
     from pipeline.store.tables import CheckedTable
     from pipeline.vehicles import Vehicle
@@ -59,7 +59,7 @@ class Work:
     """
 
     run: str
-    subject: Subject
+    setup: LogSetup
     options: Options
     generation: Generation
     keys: Mapping[str, str]
@@ -80,14 +80,14 @@ class Work:
     def vehicle(self) -> Vehicle:
         """The vehicle, with the controller's track multiplier that the run shows once it is aligned."""
         if "alignments" not in self.generation.table_names:
-            return self.subject.vehicle
+            return self.setup.vehicle
         multiplier = self.alignment.track_multiplier
-        return msgspec.structs.replace(self.subject.vehicle, controller_track_multiplier=multiplier)
+        return msgspec.structs.replace(self.setup.vehicle, controller_track_multiplier=multiplier)
 
     @property
     def _is_body_commanded(self) -> bool:
         """Whether the command is a body command, which the controller turns into wheel speeds."""
-        source = self.subject.sources.command
+        source = self.setup.sources.command
         return source is not None and source.form is DriveForm.BODY
 
     def run_stages(self) -> None:
@@ -133,9 +133,9 @@ class Work:
     def _identify(self, table: str, frame: pl.DataFrame) -> pl.DataFrame:
         who = {
             "run": self.run,
-            "dataset": self.subject.dataset,
-            "vehicle": self.subject.vehicle.id,
-            "terrain": self.subject.terrain,
+            "dataset": self.setup.dataset,
+            "vehicle": self.setup.vehicle.id,
+            "terrain": self.setup.terrain,
         }
         columns = contract_of(table).schema.column_names()
         labelled = frame.with_columns(pl.lit(text).alias(name) for name, text in who.items())
@@ -148,11 +148,9 @@ class Work:
         return pl.DataFrame()
 
     def _extract(self) -> StageOutcome:
-        data = self.data if self.data is not None else read_subject(self.subject, self.sha256)
-        subject = self.subject
-        made = extract_tables(
-            data, subject.sources, subject.configuration, subject.vehicle, where=str(subject.path)
-        )
+        data = self.data if self.data is not None else read_subject(self.setup, self.sha256)
+        setup = self.setup
+        made = extract_tables(data, setup.sources, setup.configuration, setup.vehicle, where=str(setup.path))
         self._extracted = {
             name: check_table(name, self._identify(name, as_recorded(name, frame)))
             for name, frame in made.tables.items()
@@ -196,7 +194,7 @@ class Work:
             "losses": [describe_loss(loss, data.index.start_ns) for loss in data.losses],
             "unchecked": data.unchecked or None,
         }
-        return StageOutcome((*subject.choice.findings, *made.findings, *found, *notes), context)
+        return StageOutcome((*setup.choice.findings, *made.findings, *found, *notes), context)
 
     def _align(self) -> StageOutcome:
         previous = self.generation.previous
@@ -208,10 +206,10 @@ class Work:
             }
         made = align_tables(
             {name: checked.valid for name, checked in self._extracted.items()},
-            self.subject.vehicle,
-            hold_s=self.subject.configuration.command.hold_s,
+            self.setup.vehicle,
+            hold_s=self.setup.configuration.command.hold_s,
             body_commanded=self._is_body_commanded,
-            where=str(self.subject.path),
+            where=str(self.setup.path),
         )
         for name, checked in self._extracted.items():
             aligned = self._identify(name, made.tables[name])
@@ -234,24 +232,24 @@ class Work:
             self._read("poses"),
             self._read("imu"),
             self.alignment.gyro,
-            self.subject.configuration.velocity,
-            where=str(self.subject.path),
+            self.setup.configuration.velocity,
+            where=str(self.setup.path),
         )
         self.write("velocities", made.table)
         return StageOutcome(made.findings)
 
     def _slip(self) -> StageOutcome:
-        subject, vehicle = self.subject, self.vehicle
+        setup, vehicle = self.setup, self.vehicle
         velocities = self._read("velocities")
         made = slip.compute_slip(
             velocities,
             self._read("commands"),
             self._read("wheels"),
             vehicle=vehicle,
-            configuration=subject.configuration,
+            configuration=setup.configuration,
             hold_s=self.alignment.hold_s,
             inputs=self.options.inputs,
-            where=str(subject.path),
+            where=str(setup.path),
         )
         table, left_out = self._set_against_model(made.slip)
         self.write("slip", table)
@@ -263,7 +261,7 @@ class Work:
 
     def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
         """Table `slip` with the velocity of the model that was given, as it is without one."""
-        path, configuration = self.options.model, self.subject.configuration
+        path, configuration = self.options.model, self.setup.configuration
         if path is None:
             return table, ()
         read = {name: self._read(name) for name in TABLES["align"]}
@@ -281,7 +279,7 @@ class Work:
             self._read("windows"),
             self._read("velocities"),
             vehicle=self.vehicle,
-            length=self.subject.configuration.slip.length_scale_m,
+            length=self.setup.configuration.slip.length_scale_m,
         )
         self.write("aggregates", made)
         return StageOutcome(())
@@ -300,10 +298,10 @@ def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:
     return frame
 
 
-def read_subject(subject: Subject, sha256: str | None = None) -> LogData:
+def read_subject(setup: LogSetup, sha256: str | None = None) -> LogData:
     """Read the columns that a run needs; the hash is computed beside it unless it is known."""
-    types = {channel.topic: channel.type_name for channel in subject.index.channels}
-    return read_topics(subject.index, list_wanted(subject.sources, types), sha256=sha256)
+    types = {channel.topic: channel.type_name for channel in setup.index.channels}
+    return read_topics(setup.index, list_wanted(setup.sources, types), sha256=sha256)
 
 
 def describe_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:

@@ -125,17 +125,17 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
     found = find_recordings(request.targets, settle_s=request.settle_s)
     store.check_writable()
     ledger = Ledger(store, mirror)
-    crew = _Crew(request, work, most=len(found.recordings))
+    workforce = _Workforce(request, work, most=len(found.recordings))
     try:
         new = _count_new(found.recordings, ledger, request.shard)
         if new:
-            crew.call(new)
+            workforce.call(new)
         plan = make_plan(found.recordings, store, request)
         todo = _select(plan.todo, request.shard)
         watch.plan(len(todo), len(plan.settled), sum(item.log.size for item in todo))
-        result = _work_through(todo, request, ledger, watch, crew)
+        result = _work_through(todo, request, ledger, watch, workforce)
     finally:
-        crew.dismiss()
+        workforce.dismiss()
     problems, removed = _tidy_up(store, mirror, request)
     growing = [Line(path=str(path), state="growing", reason="still being written") for path in found.growing]
     skipped = [Line(path=str(each.path), state="skipped", reason=each.reason) for each in found.skipped]
@@ -178,7 +178,7 @@ def _number(run: str) -> int:
     return int.from_bytes(hashlib.sha256(run.encode()).digest()[:8], "big")
 
 
-class _Crew:
+class _Workforce:
     """The workers: called when it is certain that there is work, which may be before it is planned."""
 
     def __init__(self, request: Request, work: Callable[[Task], Report], *, most: int) -> None:
@@ -213,11 +213,11 @@ def _count_new(paths: Sequence[Path], ledger: Ledger, shard: Shard | None) -> in
 
 
 def _work_through(
-    todo: Sequence[Item], request: Request, ledger: Ledger, watch: Watch, crew: _Crew
+    todo: Sequence[Item], request: Request, ledger: Ledger, watch: Watch, workforce: _Workforce
 ) -> Result:
     if not todo:
         return Result(reports=(), left=())
-    executor = crew.call(len(todo))
+    executor = workforce.call(len(todo))
     # This process only waits while the others work.
     loading = threading.Thread(target=load_libraries, name="libraries", daemon=True)
     loading.start()

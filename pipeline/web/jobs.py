@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.analysis.log_setup import name_run
 from pipeline.analysis.options import STAGES, Options
-from pipeline.analysis.subject import name_run
 from pipeline.core.errors import SlipError
 from pipeline.store import LogSighting, Store, see_log
 from pipeline.web.errors import WorkbenchError

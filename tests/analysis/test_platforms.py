@@ -11,8 +11,8 @@ from platforms import give_geometry, hidden_effects, try_platform
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.choice import Choice, choose
 from pipeline.analysis.errors import JobError
+from pipeline.analysis.log_setup import describe_subject
 from pipeline.analysis.options import Options
-from pipeline.analysis.subject import describe_subject
 from pipeline.logs import open_log
 from pipeline.simulate import PLATFORMS, simulate_case
 from pipeline.vehicles import load_configuration

@@ -70,8 +70,8 @@ class LocalExecutor:
         self._watchdog = MemoryWatchdog(settings.memory_bytes)
         self._watchdog.start()
         self._closing = threading.Event()
-        self._nurse = threading.Thread(target=self._look_after_workers, name="nurse", daemon=True)
-        self._nurse.start()
+        self._supervisor = threading.Thread(target=self._look_after_workers, name="supervisor", daemon=True)
+        self._supervisor.start()
 
     @property
     def depth(self) -> int:
@@ -132,7 +132,7 @@ class LocalExecutor:
     def close(self) -> None:
         """End the workers, without waiting for unfinished tasks."""
         self._closing.set()
-        self._nurse.join()
+        self._supervisor.join()
         self._watchdog.stop()
         for worker in tuple(self._workers):
             self._end_worker(worker)

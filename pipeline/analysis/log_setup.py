@@ -26,7 +26,7 @@ UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True)
-class Subject:
+class LogSetup:
     """Everything known about a log before its messages are read."""
 
     path: Path
@@ -39,7 +39,7 @@ class Subject:
     choice: Choice
 
 
-def describe_subject(path: Path, options: Options) -> Subject:
+def describe_subject(path: Path, options: Options) -> LogSetup:
     """Open a log and settle configuration, vehicle and topics.
 
     Args:
@@ -71,7 +71,7 @@ def describe_subject(path: Path, options: Options) -> Subject:
     vehicle = chosen.vehicle
     terrain = configuration.run.terrain or recorded.get("terrain") or UNKNOWN
     dataset = configuration.run.dataset or f"{vehicle.id}_{terrain}"
-    return Subject(path, index, configuration, vehicle, terrain, dataset, chosen.sources, chosen)
+    return LogSetup(path, index, configuration, vehicle, terrain, dataset, chosen.sources, chosen)
 
 
 def _require_sources(sources: Sources, index: LogIndex, options: Options) -> None:

@@ -33,7 +33,7 @@ _SCHEMA = {
 
 
 @dataclass(frozen=True)
-class Material:
+class ComparedRuns:
     """Runs to compare.
 
     Attributes:
@@ -55,7 +55,7 @@ class Material:
 
 def find_material(
     store: Store, by: Sequence[str], *, trusted_only: bool, tables: Sequence[str] = _TABLES
-) -> Material:
+) -> ComparedRuns:
     """The current runs of the results, each recording once.
 
     Left out, with a note: damaged results, a log that another run holds too, tables of another contract
@@ -90,40 +90,40 @@ def find_material(
         pl.col("day").str.slice(0, 7).alias("month"), pl.col("day").str.slice(0, 4).alias("year")
     )
     labels = label_runs(dated, by)
-    material = Material(labels, kept, store, tuple(notes))
+    compared = ComparedRuns(labels, kept, store, tuple(notes))
     reason = f"{' and '.join(by)} unknown, not pooled"
-    material = _leave_out(material, pl.col("group").is_null(), reason)
-    return _leave_out_untrusted(material) if trusted_only else material
+    compared = _leave_out(compared, pl.col("group").is_null(), reason)
+    return _leave_out_untrusted(compared) if trusted_only else compared
 
 
-def keep_runs(material: Material, runs: Sequence[str], reason: str) -> Material:
+def keep_runs(compared: ComparedRuns, runs: Sequence[str], reason: str) -> ComparedRuns:
     """The material with only these runs, and a note on the others."""
-    return _leave_out(material, ~pl.col("run").is_in(list(runs)), reason)
+    return _leave_out(compared, ~pl.col("run").is_in(list(runs)), reason)
 
 
-def _leave_out(material: Material, which: pl.Expr, reason: str) -> Material:
-    gone = material.labels.filter(which)["run"].to_list()
+def _leave_out(compared: ComparedRuns, which: pl.Expr, reason: str) -> ComparedRuns:
+    gone = compared.labels.filter(which)["run"].to_list()
     if not gone:
-        return material
-    kept = {run: manifest for run, manifest in material.manifests.items() if run not in set(gone)}
+        return compared
+    kept = {run: manifest for run, manifest in compared.manifests.items() if run not in set(gone)}
     note = f"left out, {reason}: {', '.join(gone)}"
-    return Material(material.labels.filter(~which), kept, material.store, (*material.notes, note))
+    return ComparedRuns(compared.labels.filter(~which), kept, compared.store, (*compared.notes, note))
 
 
-def _leave_out_untrusted(material: Material) -> Material:
-    if not material.manifests:
-        return material
+def _leave_out_untrusted(compared: ComparedRuns) -> ComparedRuns:
+    if not compared.manifests:
+        return compared
     grave = (
-        material.scan("findings")
-        .filter(pl.col("severity") == "error", pl.col("run").is_in(list(material.manifests)))
+        compared.scan("findings")
+        .filter(pl.col("severity") == "error", pl.col("run").is_in(list(compared.manifests)))
         .select("run", "id")
         .unique()
         .sort("run", "id")
         .collect()
     )
     for (finding,), rows in sorted(grave.partition_by("id", as_dict=True).items()):
-        material = _leave_out(material, pl.col("run").is_in(rows["run"].to_list()), f"finding {finding}")
-    return material
+        compared = _leave_out(compared, pl.col("run").is_in(rows["run"].to_list()), f"finding {finding}")
+    return compared
 
 
 def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
