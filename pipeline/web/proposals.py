@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from pipeline.core.errors import SlipError
 from pipeline.diagnosis.verdict import compare
 from pipeline.identification import fit_model, hold_out
-from pipeline.identification.ladder import compare_losses
+from pipeline.identification.ladder import compare_losses, list_rises
 from pipeline.identification.weights import make_weights
 from pipeline.models import list_effects
 from pipeline.runs import MotionError
@@ -144,9 +144,10 @@ def _try_each(prepared: PreparedRun, model: Model, names: list[str], trial: Tria
 
 
 def _reaches_further(base: HeldOut, new: HeldOut) -> bool:
-    """Whether a planner would feel it: predictions over two seconds get better in position or heading."""
+    """Whether a planner would feel it: predictions over two seconds get better, and neither error rises."""
     before, after = base.pooled, new.pooled
-    return after.t_mrmse_m < before.t_mrmse_m or after.r_mrmse_rad < before.r_mrmse_rad
+    falls = after.t_mrmse_m < before.t_mrmse_m or after.r_mrmse_rad < before.r_mrmse_rad
+    return falls and not list_rises(before, after)
 
 
 def _is_sure(problem: Problem, base: HeldOut, new: HeldOut) -> bool:
