@@ -297,9 +297,10 @@ def _change(
 
 def _require_no_rise(path: Path, old: Judgement, new_one: Judgement) -> None:
     from pipeline.identification.describe import describe_rises  # noqa: PLC0415 - heavy
+    from pipeline.identification.ladder import CHANCE  # noqa: PLC0415
     from pipeline.runs.errors import MotionError  # noqa: PLC0415
 
-    rises = describe_rises(old.whole.errors, new_one.whole.errors)
+    rises = describe_rises(old.whole.errors, new_one.whole.errors, CHANCE)
     if rises:
         added = [name for name in new_one.whole.effects if name not in old.whole.effects]
         raise MotionError(

@@ -6,7 +6,7 @@ import inspect
 import math
 from typing import TYPE_CHECKING
 
-from pipeline.identification.ladder import list_rises
+from pipeline.identification.ladder import NOTHING, list_rises
 from pipeline.models.effect import Search
 from pipeline.models.formula.formula_effect import FormulaEffect
 
@@ -145,12 +145,12 @@ def _describe_rises(below: Errors, errors: Errors, why: str) -> list[str]:
     return [f"  ! {text}: {why}" for text in describe_rises(below, errors)]
 
 
-def describe_rises(below: Errors, errors: Errors) -> list[str]:
-    """Errors over 2 s that are higher than before, each in words."""
+def describe_rises(below: Errors, errors: Errors, forgiven: float = NOTHING) -> list[str]:
+    """Errors over 2 s that are higher than before by more than a share of them, each in words."""
     names = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
     return [
         f"{names[key][0]} error rises {getattr(below, key):.4f} -> {getattr(errors, key):.4f} {names[key][1]}"
-        for key in list_rises(below, errors)
+        for key in list_rises(below, errors, forgiven)
     ]
 
 

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from pipeline.identification.scoring import Errors
     from pipeline.models.model import Model
 
-_NOTHING = 1e-3
+NOTHING = 1e-3
 # What two fits of one model differ by on other folds: a rung may cost so much of one error for the other.
-_CHANCE = 1e-2
+CHANCE = 1e-2
 _LEAST_SQUARE = 1e-24
 
 
@@ -82,7 +82,7 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
             break
         name, last = taken
         del hoped[name]
-        if not list_rises(rungs[-1].errors, last.errors, _CHANCE):
+        if not list_rises(rungs[-1].errors, last.errors, CHANCE):
             rungs.append(last)
     # What was taken since the last rung has not made up for the error that it raised.
     left = tuple(effect.id for effect in problem.active_effects(model) if effect.id not in rungs[-1].effects)
@@ -106,7 +106,7 @@ def _take_next(
         if compare_losses(rung.held_out, last.held_out) >= 1.0:
             break
         first = first or (name, rung)
-        if not list_rises(shown.errors, rung.errors, _CHANCE):
+        if not list_rises(shown.errors, rung.errors, CHANCE):
             return name, rung
         del waiting[name]
     return first
@@ -138,7 +138,7 @@ def _take_best(
     return best[1], best[2]
 
 
-def list_rises(below: Errors, errors: Errors, forgiven: float = _NOTHING) -> tuple[str, ...]:
+def list_rises(below: Errors, errors: Errors, forgiven: float = NOTHING) -> tuple[str, ...]:
     """Errors over 2 s that are larger than one step below: `t_mrmse_m`, `r_mrmse_rad`; never unknown ones.
 
     Args:
@@ -150,7 +150,7 @@ def list_rises(below: Errors, errors: Errors, forgiven: float = _NOTHING) -> tup
     return tuple(name for name in names if is_risen(getattr(below, name), getattr(errors, name), forgiven))
 
 
-def is_risen(before: float, after: float, forgiven: float = _NOTHING) -> bool:
+def is_risen(before: float, after: float, forgiven: float = NOTHING) -> bool:
     """Whether an error is higher than it was, by default beyond rounding; never an unknown one."""
     return after > before * (1.0 + forgiven)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from pipeline.identification.describe import errors_as_json
-from pipeline.identification.ladder import is_risen
+from pipeline.identification.ladder import CHANCE, is_risen
 from pipeline.models import find_effect
 from pipeline.web.cards import show_session
 from pipeline.web.errors import WorkbenchError
@@ -118,7 +118,7 @@ def _describe_rises(before: Mapping[str, object], after: Mapping[str, object]) -
     told = []
     for key, (word, unit) in {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}.items():
         old, new = before.get(key), after.get(key)
-        if isinstance(old, float) and isinstance(new, float) and is_risen(old, new):
+        if isinstance(old, float) and isinstance(new, float) and is_risen(old, new, CHANCE):
             told.append(f"the {word} error over 2 s rises from {old:.3g} to {new:.3g} {unit}")
     return told
 
