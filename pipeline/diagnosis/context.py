@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
-import numpy as np
-
 from pipeline.diagnosis.errors import DiagnosisError
 from pipeline.identification.comparison import Input
 from pipeline.identification.problem import Problem
 from pipeline.models.catalogue import list_effects
 from pipeline.models.effect import Place
 from pipeline.models.evidence import LEAST_DELAY_S, Evidence
-from pipeline.models.forward import Timing
 from pipeline.runs.errors import MotionError
 
 if TYPE_CHECKING:
@@ -73,13 +70,7 @@ class Context:
     @property
     def sampling_s(self) -> float:
         """Delay that sampled encoders may feign: a little more than half their period."""
-        periods = [float(np.median(np.diff(run.wheels.times))) for run in self.runs if run.wheels is not None]
-        return 0.6 * max(periods, default=0.0)
-
-    @property
-    def timing(self) -> tuple[Timing, ...]:
-        """Delays to start from: none, the runs are aligned."""
-        return (Timing(),) * len(self.runs)
+        return 0.6 * max(run.wheel_period_s for run in self.runs)
 
     def list_candidates(self, source: Input) -> tuple[Candidate, ...]:
         """Effects that can be told on an input of this vehicle."""

@@ -53,7 +53,7 @@ class Search:
 def search_body(context: Context, source: Input, known: Sequence[Effect], budget: Budget) -> Search:
     """Search from an input to the body."""
     usable = [e for e in known if source is Input.COMMAND or e.place > Place.DRIVE]
-    start = State((), context.timing).add(*usable)
+    start = context.problem.start_state(usable)
     candidates = context.list_candidates(source)
     problem = context.problem.behind_wheels if source is Input.MEASURED else context.problem
     selection, first = open_selection(problem.whole, start, candidates, context.evidence, budget)

@@ -6,7 +6,7 @@ import inspect
 import math
 from typing import TYPE_CHECKING
 
-from pipeline.identification.ladder import NOTHING, list_rises
+from pipeline.identification.ladder import ERRORS_OVER_2S, NOTHING, list_rises
 from pipeline.models.effect import Search
 from pipeline.models.formula.formula_effect import FormulaEffect
 
@@ -147,11 +147,11 @@ def _describe_rises(below: Errors, errors: Errors, why: str) -> list[str]:
 
 def describe_rises(below: Errors, errors: Errors, forgiven: float = NOTHING) -> list[str]:
     """Errors over 2 s that are higher than before by more than a share of them, each in words."""
-    names = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
-    return [
-        f"{names[key][0]} error rises {getattr(below, key):.4f} -> {getattr(errors, key):.4f} {names[key][1]}"
-        for key in list_rises(below, errors, forgiven)
-    ]
+    lines = []
+    for key in list_rises(below, errors, forgiven):
+        word, unit = ERRORS_OVER_2S[key]
+        lines.append(f"{word} error rises {getattr(below, key):.4f} -> {getattr(errors, key):.4f} {unit}")
+    return lines
 
 
 def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:

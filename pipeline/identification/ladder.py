@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf
-from typing import TYPE_CHECKING
+from math import inf, nan
+from typing import TYPE_CHECKING, Final
 
 from pipeline.identification.fit import Fitted, fit_model
 from pipeline.identification.scoring import HeldOut, hold_out
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 NOTHING = 1e-3
 # What two fits of one model differ by on other folds: a rung may cost so much of one error for the other.
 CHANCE = 1e-2
+ERRORS_OVER_2S: Final = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
+"""By name in `Errors` and in JSON: of what, and the unit."""
 _LEAST_SQUARE = 1e-24
 
 
@@ -138,21 +141,27 @@ def _take_best(
     return best[1], best[2]
 
 
-def list_rises(below: Errors, errors: Errors, forgiven: float = NOTHING) -> tuple[str, ...]:
-    """Errors over 2 s that are larger than one step below: `t_mrmse_m`, `r_mrmse_rad`; never unknown ones.
+def list_rises(
+    below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object], forgiven: float = NOTHING
+) -> tuple[str, ...]:
+    """Names in `ERRORS_OVER_2S` of the errors that are larger than one step below; never of unknown ones.
 
     Args:
-        below: errors before the step.
+        below: errors before the step, or the rung in JSON.
         errors: after it.
-        forgiven: share by which an error may be larger.
+        forgiven: share by which an error may be larger, by default that of rounding.
     """
-    names = ("t_mrmse_m", "r_mrmse_rad")
-    return tuple(name for name in names if is_risen(getattr(below, name), getattr(errors, name), forgiven))
+    return tuple(
+        name
+        for name in ERRORS_OVER_2S
+        if _read_error(errors, name) > _read_error(below, name) * (1.0 + forgiven)
+    )
 
 
-def is_risen(before: float, after: float, forgiven: float = NOTHING) -> bool:
-    """Whether an error is higher than it was, by default beyond rounding; never an unknown one."""
-    return after > before * (1.0 + forgiven)
+def _read_error(errors: Errors | Mapping[str, object], name: str) -> float:
+    """An error by its name; NaN where it is not known."""
+    value = errors.get(name) if isinstance(errors, Mapping) else getattr(errors, name)
+    return float(value) if isinstance(value, int | float) else nan
 
 
 def compare_losses(new: HeldOut, old: HeldOut) -> float:

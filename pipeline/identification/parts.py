@@ -5,7 +5,7 @@ A part of the way from command to body: the whole of it, from the wheels to the 
 
 from __future__ import annotations
 
-import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -36,9 +36,11 @@ _LEAST_SPREAD = 2e-4
 _STANDING = 0.02
 # Encoders are read between commands: half a period of one is half a percent of half a second of the other.
 _LEAST_SHARE = 0.005
+# A width over the standard deviation of what is spread evenly over it.
+_SPREAD_OF_EVEN = 12.0**0.5
 
 
-class Part:
+class Part(ABC):
     """Residuals over windows of half a second: x [m/s], y [m/s], w [rad/s].
 
     Args:
@@ -71,13 +73,13 @@ class Part:
         self.block: Integers = np.concatenate([w.block + shift[i] for i, w in enumerate(windows)])
         self.live = find_live(self.find_ideal())
 
+    @abstractmethod
     def owns(self, effect: Effect) -> bool:
         """Whether an effect acts on this part of the way."""
-        raise NotImplementedError
 
+    @abstractmethod
     def find_run_residuals(self, state: State, run: int) -> Floats:
         """Measured less predicted of one run's windows, shape (m, 3)."""
-        raise NotImplementedError
 
     def find_residuals(self, state: State) -> Floats:
         """Measured less predicted of all runs, shape (n, 3)."""
@@ -91,13 +93,13 @@ class Part:
         """
         return np.concatenate([average_lags(c, c.predict_velocity((), _NO_DELAY)) for c in self.comparisons])
 
+    @abstractmethod
     def list_clock_errors(self) -> Floats:
         """Standard error of each run's clock that is no free number of this part [s], shape (runs,)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
         """Residuals of one run's windows if that clock were late by ``late_s`` [s], shape (m, 3)."""
-        raise NotImplementedError
 
     @cached_property
     def noise(self) -> Floats:
@@ -162,7 +164,7 @@ class BodyPart(Part):
     def _find_clock_error(self, comparison: Comparison) -> float:
         if comparison.heading.gyro is not None:
             return comparison.heading.gyro.delay_error_s
-        return 0.0 if self.whole else find_sampling_error(comparison)
+        return 0.0 if self.whole else comparison.run.wheel_period_s / _SPREAD_OF_EVEN
 
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
         """See `Part`: of poses that are later by ``late_s`` than they are taken for."""
@@ -208,19 +210,13 @@ class WheelPart(Part):
 
     def list_clock_errors(self) -> Floats:
         """See `Part`: wheels that are read now and then step somewhere between two readings."""
-        return np.array([find_sampling_error(comparison) for comparison in self.comparisons])
+        return np.array([comparison.run.wheel_period_s for comparison in self.comparisons]) / _SPREAD_OF_EVEN
 
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
         """See `Part`: of encoders that are later by ``late_s`` than they are taken for."""
         timing = list(state.timing)
         timing[run] = Timing(timing[run].wheel_delay_s + late_s)
         return self.find_run_residuals(replace(state, timing=tuple(timing)), run)
-
-
-def find_sampling_error(comparison: Comparison) -> float:
-    """Standard deviation [s] of when wheels step that are read now and then; zero without encoders."""
-    wheels = comparison.run.wheels
-    return 0.0 if wheels is None else float(np.median(np.diff(wheels.times))) / math.sqrt(12.0)
 
 
 def number_units(run: Integers, times: Floats, length: float = UNIT_S) -> Integers:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -108,7 +109,6 @@ class Problem:
         """The same runs fed with their measured wheels; what is ready is shared."""
         if self.source is Input.MEASURED:
             return self
-        found = Problem.__new__(Problem)
         body = self.parts[0]
         if not isinstance(body, BodyPart) or body is self.whole:
             raise MotionError(
@@ -117,8 +117,11 @@ class Problem:
                 where=", ".join(self.names),
                 hint="Choose the other input.",
             )
-        found.runs, found.vehicle, found.heading = self.runs, self.vehicle, self.heading
-        found.source, found.largest = Input.MEASURED, self.largest
+        found = copy(self)
+        # What was worked out for the other input must not be taken over.
+        for name in ("behind_wheels", "folds", "training"):
+            found.__dict__.pop(name, None)
+        found.source = Input.MEASURED
         found.comparisons, found.whole, found.parts = body.comparisons, body, (body,)
         return found
 
@@ -175,13 +178,8 @@ def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
         speed, turn = max(speed, float(np.abs(forward).max())), max(turn, float(np.abs(around).max()))
         wheel = max(wheel, float(np.abs(series.left).max()), float(np.abs(series.right).max()))
         difference = max(difference, float(np.abs(series.right - series.left).max()))
-    moments, places = (
-        np.concatenate([values[run.track.active] for run, values in pairs])
-        for pairs in (
-            [(run, run.track.times) for run in runs],
-            [(run, run.track.place[:, 0]) for run in runs],
-        )
-    )
+    moments = np.concatenate([run.track.times[run.track.active] for run in runs])
+    places = np.concatenate([run.track.place[run.track.active, 0] for run in runs])
     shares = np.linspace(0.0, 1.0, 11)
     if places.size == 0:
         return Largest(speed, turn, wheel, max(difference, 1e-6), np.zeros(11), np.zeros(11))

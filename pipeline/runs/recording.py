@@ -165,6 +165,11 @@ class MotionRun:
         """How the gyro fits the poses; None without a good one."""
         return self.alignment.gyro
 
+    @property
+    def wheel_period_s(self) -> float:
+        """Median time between two readings of the wheels [s]; zero without wheels."""
+        return 0.0 if self.wheels is None else float(np.median(np.diff(self.wheels.times)))
+
     def correct_vehicle(self, vehicle: Vehicle) -> Vehicle:
         """A vehicle with the controller's track multiplier that this recording shows."""
         return msgspec.structs.replace(vehicle, controller_track_multiplier=self.alignment.track_multiplier)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from pipeline.identification.describe import errors_as_json
-from pipeline.identification.ladder import CHANCE, is_risen
+from pipeline.identification.ladder import CHANCE, ERRORS_OVER_2S, list_rises
 from pipeline.models import find_effect
 from pipeline.web.cards import show_session
 from pipeline.web.errors import WorkbenchError
@@ -116,10 +116,9 @@ def add_effects(
 
 def _describe_rises(before: Mapping[str, object], after: Mapping[str, object]) -> list[str]:
     told = []
-    for key, (word, unit) in {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}.items():
-        old, new = before.get(key), after.get(key)
-        if isinstance(old, float) and isinstance(new, float) and is_risen(old, new, CHANCE):
-            told.append(f"the {word} error over 2 s rises from {old:.3g} to {new:.3g} {unit}")
+    for key in list_rises(before, after, CHANCE):
+        word, unit = ERRORS_OVER_2S[key]
+        told.append(f"the {word} error over 2 s rises from {before[key]:.3g} to {after[key]:.3g} {unit}")
     return told
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import altair as alt
 import polars as pl
 
-from pipeline.identification.ladder import is_risen
+from pipeline.identification.ladder import ERRORS_OVER_2S, list_rises
 from pipeline.report import theme
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
 from pipeline.report.run import INPUT_WORDS, mapping_in, number_in, objects_in
@@ -115,11 +115,7 @@ def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
 
 def _describe_rises(below: Mapping[str, object], rung: Mapping[str, object]) -> str:
     """What must not pass for progress: which error is higher than one rung below."""
-    risen = []
-    for key, word in (("t_mrmse_m", "position"), ("r_mrmse_rad", "heading")):
-        old, new = number_in(below, key), number_in(rung, key)
-        if old is not None and new is not None and is_risen(old, new):
-            risen.append(word)
+    risen = [ERRORS_OVER_2S[key][0] for key in list_rises(below, rung)]
     return f" ({' and '.join(risen)} error rises)" if risen else ""
 
 
