@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season format fuzz inspect lock map platforms samples \
+.PHONY: ablate hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season format fuzz inspect lock map platforms samples \
 	serve test test-long trend
 
 help: ## print this list
@@ -74,6 +74,9 @@ hidden-effect: $(VENV)/.ready-dev ## SEED=7: draw logs by seed, diagnose them, o
 	@[ -n "$$SEED" ] || { echo "Say which seed: make hidden-effect SEED=7, or SEED=7-12" >&2; exit 2; }
 	@$(BIN)/python benchmarks/hidden/play.py --category "$${CATEGORY:-all}" --seeds "$$SEED" \
 		$${EFFECT:+--effect "$$EFFECT"} $${SCORES:+--out "$$SCORES" --resume} $$ARGS
+
+ablate: $(VENV)/.ready-dev ## each rule of the diagnosis off in turn, on drawn logs and the recordings: what pays [SEED=81000-81038, SCORES=file, ARGS=]
+	@$(BIN)/python benchmarks/hidden/ablate.py --seeds "$${SEED:-81000-81038}" $${SCORES:+--out "$$SCORES" --resume} $$ARGS
 
 hidden-table: $(VENV)/.ready-dev ## SCORES=scores.jsonl: the score of what was played, without playing more
 	@[ -n "$$SCORES" ] || { echo "Say which: make hidden-table SCORES=scores.jsonl" >&2; exit 2; }
