@@ -54,8 +54,7 @@ def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) 
         per_run: labels whose values belong to each run alone.
     """
     ladder = climb(problem, model, per_run=per_run)
-    top = _settle(problem, ladder.rungs[-1], per_run)
-    ladder = replace(ladder, rungs=(*ladder.rungs[:-1], top))
+    top = ladder.rungs[-1]
     wanted = {effect.id for effect in problem.active_effects(model)}
     whole = top
     if wanted != set(top.effects):
@@ -64,11 +63,6 @@ def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) 
     best = whole if compare_losses(whole.held_out, top.held_out) < 1.0 else top
     floor = hold_below(estimate_floor(problem, best.held_out), top.errors)
     return Judgement(problem, ladder, whole, estimate_intervals(problem, whole.fitted), floor)
-
-
-def _settle(problem: Problem, rung: Rung, per_run: Sequence[str]) -> Rung:
-    fitted = fit_model(problem, rung.fitted.model, per_run=per_run, start=rung.fitted, exact=True)
-    return Rung(fitted, hold_out(problem, fitted))
 
 
 def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:

@@ -105,7 +105,8 @@ def _take_next(
     while waiting:
         name, fitted = _take_best(problem, model, last.fitted, waiting, per_run)
         hoped.update(waiting)
-        rung = Rung(fitted, hold_out(problem, fitted))
+        # Settled, so that a rung is the same whatever its numbers were begun with.
+        rung = _settle(problem, fitted, per_run)
         if compare_losses(rung.held_out, last.held_out) >= 1.0:
             break
         first = first or (name, rung)
@@ -113,6 +114,11 @@ def _take_next(
             return name, rung
         del waiting[name]
     return first
+
+
+def _settle(problem: Problem, fitted: Fitted, per_run: Sequence[str]) -> Rung:
+    exact = fit_model(problem, fitted.model, per_run=per_run, start=fitted, exact=True)
+    return Rung(exact, hold_out(problem, exact))
 
 
 def _take_best(
