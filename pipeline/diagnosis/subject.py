@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from pipeline.runs import load_run
+from pipeline.stages.wiring import FAULTS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from pipeline.vehicles import Vehicle
 
 # Where one of these stands, a fit means nothing: no effect is named.
-FATAL = ("not_moving", "pose_from_wheels")
+FATAL = ("not_moving", "pose_from_wheels", *FAULTS)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from pipeline.stages.finding import Finding
 from pipeline.stages.samples import Samples, gather_samples
 from pipeline.stages.scale import check_scale
 from pipeline.stages.trust import check_live_commands
+from pipeline.stages.wiring import check_wiring
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,12 +48,15 @@ def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     stuck = check_dead_wheels(samples, vehicle) + ([] if scaled else check_motion(samples, vehicle))
     if stuck:
         return stuck
+    wired = check_wiring(samples, vehicle)
+    if any(finding.severity == "error" for finding in wired):
+        return scaled + wired
     checks: tuple[Callable[[Samples, Vehicle], list[Finding]], ...] = (
         check_live_commands,
         check_limits,
         check_delays,
     )
-    return scaled + [finding for check in checks for finding in check(samples, vehicle)]
+    return scaled + wired + [finding for check in checks for finding in check(samples, vehicle)]
 
 
 def check_dead_wheels(samples: Samples, _vehicle: Vehicle) -> list[Finding]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import segments, timegrid
+from pipeline.core.robust import fit_robustly
 from pipeline.stages.finding import Finding
 
 if TYPE_CHECKING:
@@ -96,13 +97,8 @@ def measure_rest(moved: Floats, driven: Floats, changed: Floats) -> float | None
     size = float(np.sqrt(np.mean(moved**2)))
     if size < _LIVE * _SPAN:
         return None
-    design = np.column_stack((driven, changed))
-    rest, weight = moved, np.ones(moved.size)
-    for _ in range(10):
-        found, *_ = np.linalg.lstsq(design * weight[:, None], moved * weight, rcond=None)
-        rest = np.abs(moved - design @ found)
-        weight = 1.0 / np.sqrt(1.0 + (rest / (2.0 * max(float(np.median(rest)), 1e-9))) ** 2)
-    return float(np.median(rest)) / size
+    _, rest = fit_robustly(np.column_stack((driven, changed)), moved)
+    return float(np.median(np.abs(rest))) / size
 
 
 def check_live_commands(samples: Samples, _vehicle: Vehicle) -> list[Finding]:

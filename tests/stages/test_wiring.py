@@ -1,0 +1,148 @@
+"""Faults of the wiring: told before any effect is looked for, with the line that mends them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from pipeline.analysis import work
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.diagnosis import read_recording
+from pipeline.analysis.options import Options
+from pipeline.diagnosis import diagnose_runs
+from pipeline.stages.wiring import FAULTS, check_wiring
+
+if TYPE_CHECKING:
+    from pipeline.stages.samples import Samples
+    from pipeline.vehicles import Vehicle
+
+ROOT = Path(__file__).parents[2]
+SAMPLE = ROOT / "data_samples" / "husky_tile.mcap"
+LOGS = ROOT / ".." / "shared" / "logs"
+STANDING = {"husky_wheels_avide2", "husky_wheels_plank_2024_10_24_11h24s5"}
+
+LEFT, RIGHT = ('["front_left_wheel", "rear_left_wheel"]', '["front_right_wheel", "rear_right_wheel"]')
+
+
+def exchange(section: str, topic: str) -> str:
+    return f'[{section}]\ntopic = "{topic}"\nleft = {RIGHT}\nright = {LEFT}\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "told", "mend"),
+    [
+        (exchange("wheels", "/joint_states"), ("sides_exchanged", "wheels"), "exchange left and right under"),
+        (
+            '[wheels]\ntopic = "/joint_states"\nsign = -1\n',
+            ("wheel_sign", "wheels"),
+            "sign = -1 under [wheels]",
+        ),
+        (exchange("command", "/wheel_commands"), ("sides_exchanged", "command"), "under [command]"),
+        (
+            '[command]\ntopic = "/controller/cmd_vel"\nsign = -1\n',
+            ("wheel_sign", "command"),
+            "turn the sign of linear.x",
+        ),
+        ("", None, ""),
+    ],
+)
+def test_a_wrong_line_of_the_configuration_is_told_and_nothing_is_fitted(
+    text: str, told: tuple[str, str] | None, mend: str, tmp_path: Path
+) -> None:
+    log = tmp_path / SAMPLE.name
+    shutil.copy(SAMPLE, log)
+    (tmp_path / "run.toml").write_text(text)
+    manifest = analyze_log(log, Options(out=tmp_path / "out", report=False, diagnosis=False)).manifest
+    vehicle, recording = read_recording(manifest)
+    found = {(f["id"], f["where"]): str(f["text"]) for f in recording.list_findings() if f["id"] in FAULTS}
+    assert set(found) == ({told} if told else set())
+    if told:
+        assert mend in found[told]
+        assert diagnose_runs([recording], vehicle).runs[0].effects == ()
+
+
+Sides = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def rewire(samples: Samples, track_m: float, name: str, change: Sides) -> Samples:
+    """A recording whose command or measured wheels came over other wires."""
+    ideal = getattr(samples, name)
+    half = 0.5 * track_m * ideal[:, 2]
+    left, right = change(ideal[:, 0] - half, ideal[:, 0] + half)
+    wired = np.column_stack((0.5 * (left + right), ideal[:, 1], (right - left) / track_m))
+    return replace(samples, **{name: wired})
+
+
+# What was done to the wires, and finding and place that tell it.
+FAULTY: dict[str, tuple[str, Sides, tuple[str, str]]] = {
+    "encoders exchanged": ("measured", lambda a, b: (b, a), ("sides_exchanged", "wheels")),
+    "encoders negative": ("measured", lambda a, b: (-a, -b), ("wheel_sign", "wheels")),
+    "encoders exchanged and negative": ("measured", lambda a, b: (-b, -a), ("wheel_sign", "wheels")),
+    "left negative": ("measured", lambda a, b: (-a, b), ("wheel_sign", "wheels left")),
+    "right negative": ("measured", lambda a, b: (a, -b), ("wheel_sign", "wheels right")),
+    "left dead": ("measured", lambda a, b: (0.0 * a, b), ("wheel_dead", "wheels left")),
+    "right dead": ("measured", lambda a, b: (a, 0.0 * b), ("wheel_dead", "wheels right")),
+    "left low": ("measured", lambda a, b: (0.9 * a, b), ("wheel_scale", "wheels left")),
+    "right low": ("measured", lambda a, b: (a, 0.9 * b), ("wheel_scale", "wheels right")),
+    "commands exchanged": ("command", lambda a, b: (b, a), ("sides_exchanged", "command")),
+    "commands negative": ("command", lambda a, b: (-a, -b), ("wheel_sign", "command")),
+}
+
+
+def gather(log: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Samples, Vehicle]:
+    """The samples that the checks are given."""
+    kept: list[tuple[Samples, Vehicle]] = []
+    run_checks = work.checks.run_checks
+    monkeypatch.setattr(
+        work.checks,
+        "run_checks",
+        lambda samples, vehicle: kept.append((samples, vehicle)) or run_checks(*kept[0]),
+    )
+    analyze_log(log, Options(out=out, report=False, diagnosis=False))
+    return kept[0]
+
+
+def check_all(samples: Samples, vehicle: Vehicle) -> None:
+    assert check_wiring(samples, vehicle) == []
+    assert vehicle.track_width_m is not None
+    for words, (name, change, told) in FAULTY.items():
+        if getattr(samples, name) is None:
+            continue
+        wired = rewire(samples, vehicle.track_width_m, name, change)
+        if "low" in words and samples.command is None:
+            continue
+        (found,) = check_wiring(wired, vehicle)
+        assert (found.id, found.where) == told, words
+    for factors in ((1.0, -1.0, -1.0), (-1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)):
+        turned = replace(samples, velocity=samples.velocity * np.array(factors))
+        (found,) = check_wiring(turned, vehicle)
+        assert (found.id, found.where) == ("pose_mirrored", "pose"), factors
+
+
+def test_every_fault_is_told_apart_on_a_sample(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    check_all(*gather(SAMPLE, tmp_path, monkeypatch))
+
+
+def test_without_commands_the_poses_tell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    samples, vehicle = gather(SAMPLE, tmp_path, monkeypatch)
+    track_m = vehicle.track_width_m or 1.0
+    for words in ("encoders exchanged", "left negative", "right dead"):
+        _, change, told = FAULTY[words]
+        wired = replace(rewire(samples, track_m, "measured", change), command=None)
+        (found,) = check_wiring(wired, vehicle)
+        assert (found.id, found.where) == told, words
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not LOGS.is_dir(), reason="../shared/logs is not here")
+@pytest.mark.parametrize("name", sorted({path.stem for path in LOGS.glob("*.mcap")} - STANDING) or ["none"])
+def test_every_fault_is_told_apart_on_recordings(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    check_all(*gather(LOGS / f"{name}.mcap", tmp_path, monkeypatch))
