@@ -48,14 +48,21 @@ class Amount:
 
         The effects of what is given count as sources, not as something that the result stands for.
         """
-        value = function(self.value, *(amount.value for amount in given))
-        return Amount(value, _unite(self, *given), self.effects)
+        return Amount(_compute(function, self, *given), _unite(self, *given), self.effects)
 
 
 def combine(function: Callable[..., float], *amounts: Amount) -> Amount:
     """The number that a function makes of several; it came from where they came from."""
-    value = function(*(amount.value for amount in amounts))
-    return Amount(value, _unite(*amounts), frozenset[str]().union(*(amount.effects for amount in amounts)))
+    effects = frozenset[str]().union(*(amount.effects for amount in amounts))
+    return Amount(_compute(function, *amounts), _unite(*amounts), effects)
+
+
+def _compute(function: Callable[..., float], *amounts: Amount) -> float:
+    """The function's value; a quotient by zero is not known."""
+    try:
+        return function(*(amount.value for amount in amounts))
+    except ZeroDivisionError:
+        return math.nan
 
 
 def _unite(*amounts: Amount) -> tuple[str, ...]:

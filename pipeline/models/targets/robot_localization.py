@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from pipeline.models.body_limits import find_speed_acceleration, find_turn_acceleration
 from pipeline.models.effect import Place
 from pipeline.models.quantity import Quantity
@@ -30,7 +32,6 @@ _UNSEEN = {Quantity.STEERING_GAIN, Quantity.STEERING_OFFSET}
 _POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 _STATE = (*_POSE, *(f"v{name}" for name in _POSE), "ax", "ay", "az")
 _FUSED = tuple(name in {"vx", "vy", "vyaw"} for name in _STATE)
-_CHANNELS = 3
 _INDEPENDENT = (
     "z, roll and pitch are not measured and not fused; errors last about half a second, and a filter that "
     "takes f messages a second for independent is as sure as it should be with 0.5 s * f times as much"
@@ -52,13 +53,13 @@ def write(file: ModelFile, current: Current) -> str:
     facts = Facts(file)
     facts.require_kind(TARGET.name, *_CONTROLLERS)
     controller, known = _CONTROLLERS[facts.vehicle.kind]
-    effects, errors = _find_errors(file, known)
+    step = _find_step(file, known)
     sources = (
-        f"squares of the held-out errors over half a second with {', '.join(effects) or 'no effect'}",
+        f"squares of the held-out errors over half a second with {', '.join(step.effects) or 'no effect'}",
         "for odometry that is corrected first: --to ros2_control",
-        *_warn(file, effects, known),
+        *_warn(file, step, known),
     )
-    x, y, w = (Amount(error * error, sources) for error in errors)
+    x, y, w = (Amount(error * error, sources) for error in step.velocity_rms)
     sheet = start_sheet(facts, TARGET)
     sheet.settings.append(Setting((*_FILTER, "odom0_config"), _FUSED, ("vx, vy and the yaw rate of odom0",)))
     acceleration, turning = find_speed_acceleration(facts), find_turn_acceleration(facts)
@@ -70,24 +71,28 @@ def write(file: ModelFile, current: Current) -> str:
     return write_yaml(facts, sheet)
 
 
-def _find_errors(file: ModelFile, known: Collection[Quantity]) -> tuple[list[str], list[float]]:
-    """Effects and held-out errors x, y [m/s], w [rad/s] of the last step that wheel odometry can follow."""
-    ladder = file.fit.get("ladder")
-    found: tuple[list[str], list[float]] | None = None
-    for step in ladder if isinstance(ladder, list) else ():
-        effects, errors = step.get("effects"), step.get("velocity_rms")
-        if not isinstance(effects, list) or not isinstance(errors, list) or len(errors) != _CHANNELS:
-            break
-        if all(name in file.model and _is_seen(file.model.effect(name), known) for name in effects):
-            found = effects, [float(error) for error in errors]
-    if found is None:
-        raise MotionError(
-            "not_fitted",
-            "the model was never fitted: it has no held-out errors to make a covariance of",
-            where="fit.ladder",
-            hint="Fit it first: slip model fit MODEL --on LOG --input measured.",
-        )
-    return found
+class _Step(msgspec.Struct):
+    """What a step of the ladder in a model file says of its errors, x and y in m/s, w in rad/s."""
+
+    effects: list[str]
+    velocity_rms: tuple[float, float, float]
+
+
+def _find_step(file: ModelFile, known: Collection[Quantity]) -> _Step:
+    """The last step of the ladder whose effects wheel odometry can follow."""
+    try:
+        steps = msgspec.convert(file.fit.get("ladder", []), list[_Step])
+    except msgspec.ValidationError:
+        steps = []
+    for step in reversed(steps):
+        if all(name in file.model and _is_seen(file.model.effect(name), known) for name in step.effects):
+            return step
+    raise MotionError(
+        "not_fitted",
+        "the model was never fitted: it has no held-out errors to make a covariance of",
+        where="fit.ladder",
+        hint="Fit it first: slip model fit MODEL --on LOG --input measured.",
+    )
 
 
 def _is_seen(effect: Effect, known: Collection[Quantity]) -> bool:
@@ -98,7 +103,7 @@ def _is_seen(effect: Effect, known: Collection[Quantity]) -> bool:
     return bool(quantities) and quantities <= set(known)
 
 
-def _warn(file: ModelFile, effects: list[str], known: Collection[Quantity]) -> list[str]:
+def _warn(file: ModelFile, step: _Step, known: Collection[Quantity]) -> list[str]:
     """What makes the variances larger than they need to be."""
     lines = []
     if file.fit.get("input") != "measured":
@@ -106,7 +111,7 @@ def _warn(file: ModelFile, effects: list[str], known: Collection[Quantity]) -> l
             "fitted on commands; for odometry of encoders: slip model fit MODEL --on LOG --input measured"
         )
     unseen = " ".join(effect.id for effect in file.model if not _is_seen(effect, known))
-    if unseen and len(effects) < len(file.model.effects):
+    if unseen and len(step.effects) < len(file.model.effects):
         lines.append(f"odometry does not follow {unseen}; sharper: slip model drop MODEL {unseen} --on LOG")
     return lines
 

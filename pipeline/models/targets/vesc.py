@@ -31,7 +31,8 @@ def write(file: ModelFile, current: Current) -> str:
 
     Args:
         file: a fitted model.
-        current: gains and offset with which the log was driven; those of the vehicle's preset without.
+        current: gains and offset with which the speeds and angles of the log were turned into ERPM and servo
+            values; those of the vehicle's preset without, which commands in ERPM were read with.
 
     Raises:
         MotionError: ``wrong_vehicle``; ``gains_unknown``, neither is there.
