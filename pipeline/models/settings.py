@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Amount", "Facts", "Setting", "Sheet", "combine", "start_sheet"]
 
-Path = tuple[str, ...]
-
 
 @dataclass(frozen=True)
 class Amount:
@@ -74,13 +72,13 @@ class Setting:
     """One parameter of a target.
 
     Attributes:
-        path: names of the nodes and groups above it, its own last.
+        path: names of the nodes and groups above it, its own last, dots between.
         value: as it is written: a number, or several in a row.
         sources: where it came from.
         effects: ids of effects that it stands for.
     """
 
-    path: Path
+    path: str
     value: float | bool | tuple[float, ...] | tuple[bool, ...]
     sources: tuple[str, ...] = ()
     effects: frozenset[str] = frozenset()
@@ -98,19 +96,19 @@ class Sheet:
     head: list[str] = field(default_factory=list)
     settings: list[Setting] = field(default_factory=list)
 
-    def add(self, path: Path, amount: Amount, note: str = "") -> None:
+    def add(self, path: str, amount: Amount, note: str = "") -> None:
         """Add a number, unless nothing is known of it."""
         if amount.is_known:
             self._append(path, _round(amount.value), amount, note)
 
-    def add_row(self, path: Path, amounts: tuple[Amount | float, ...], note: str = "") -> None:
+    def add_row(self, path: str, amounts: tuple[Amount | float, ...], note: str = "") -> None:
         """Add a parameter of several numbers, unless one of them that is no constant is not known."""
         measured = [amount for amount in amounts if isinstance(amount, Amount)]
         if all(amount.is_known for amount in measured):
             numbers = tuple(_round(a.value if isinstance(a, Amount) else a) for a in amounts)
             self._append(path, numbers, combine(lambda *_: math.nan, *measured), note)
 
-    def _append(self, path: Path, value: float | tuple[float, ...], amount: Amount, note: str) -> None:
+    def _append(self, path: str, value: float | tuple[float, ...], amount: Amount, note: str) -> None:
         notes = (note,) if note else ()
         self.settings.append(Setting(path, value, (*amount.sources, *notes), amount.effects))
 

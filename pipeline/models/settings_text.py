@@ -36,12 +36,12 @@ def write_yaml(facts: Facts, sheet: Sheet) -> str:
     tree = CommentedMap()
     for setting in sheet.settings:
         group = tree
-        for name in setting.path[:-1]:
-            group = group.setdefault(name, CommentedMap())
-        group[setting.path[-1]] = _make_value(setting.value)
-        depth = _INDENT * (len(setting.path) - 1)
+        *above, name = setting.path.split(".")
+        for node in above:
+            group = group.setdefault(node, CommentedMap())
+        group[name] = _make_value(setting.value)
         comment = "\n".join(make_plain(line) for line in setting.sources)
-        group.yaml_set_comment_before_after_key(setting.path[-1], before=comment, indent=depth)
+        group.yaml_set_comment_before_after_key(name, before=comment, indent=_INDENT * len(above))
     comments = "".join(f"# {line}\n" for line in list_comments(facts, sheet))
     if not tree:
         return comments

@@ -2,10 +2,12 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+import yaml
 from motion_runs import QUIET, simulate, vehicle_of
 
 from pipeline.identification import Input, Problem, carry_over, fit_model
@@ -104,20 +106,17 @@ def test_controllers_get_the_parameters_they_have_and_are_told_of_the_rest() -> 
     assert "wheel_separation_multiplier: 1.9" in text
     assert "left_wheel_radius_multiplier: 0.931" in text
     assert "right_wheel_radius_multiplier: 0.969" in text
-    assert "angular.z.max_velocity: 1" in text
-    assert "lateral_skid" in text.splitlines()[1]
+    parameters = yaml.safe_load(text)["diff_drive_controller"]["ros__parameters"]
+    assert parameters["angular"]["z"] == {"max_velocity": 1.0, "min_velocity": -1.0}
+    assert "#   lateral_skid.c = 0.1 s" in text.splitlines()
 
 
 def test_controllers_get_doubles_where_they_declare_doubles() -> None:
-    """ROS 2 refuses `1` for a parameter declared as a double."""
-    limits = (find_effect("body_speed_limit")(limit=2.0), find_effect("body_turn_limit")(limit=1.0))
-    text = export_model(
-        ModelFile(Model(HUSKY, (find_effect("effective_track")(k=2.0), *limits))), "ros2_control"
-    )
-    values = [line.split(": ")[1] for line in text.splitlines() if ": " in line and not line.startswith("#")]
-    numbers = [number for value in values for number in value.strip("[]").split(", ")]
-    assert len(numbers) == 15
-    assert all("." in number for number in numbers)
+    """ROS 2 refuses `1` for a parameter declared as a double, and reads `1e-05` as a text."""
+    limits = (find_effect("body_speed_limit")(limit=2.0), find_effect("transport_delay")(d=1e-5))
+    text = export_model(ModelFile(Model(HUSKY, limits)), "nav2")
+    values = [line.split(": ")[1] for line in text.splitlines() if re.fullmatch(r" +\w+: .+", line)]
+    assert values == ["1.0e-05", "1.0e-05", "2.0", "-2.0", "2.0", "-2.0"]
 
 
 def test_json_holds_no_number_that_json_does_not_know() -> None:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pipeline.models.settings import Sheet
     from pipeline.models.target import Current
 
-_ALL = ("/**", "ros__parameters")
+_ALL = "/**.ros__parameters"
 _INFO = "vehicle_info.param.yaml"
 _MPC = "mpc_lateral_controller"
 _PID = "pid_longitudinal_controller"
@@ -32,20 +32,20 @@ def write(file: ModelFile, current: Current) -> str:
     facts = Facts(file)
     facts.require_kind(TARGET.name, "ackermann")
     sheet = start_sheet(facts, TARGET)
-    sheet.add((*_ALL, "wheel_radius"), find_radius(facts), _INFO)
-    sheet.add((*_ALL, "wheel_base"), facts.measure("wheelbase_m"), _INFO)
-    sheet.add((*_ALL, "wheel_tread"), facts.measure("track_width_m"), _INFO)
-    sheet.add((*_ALL, "max_steer_angle"), facts.measure("max_steering_rad"), _INFO)
+    sheet.add(f"{_ALL}.wheel_radius", find_radius(facts), _INFO)
+    sheet.add(f"{_ALL}.wheel_base", facts.measure("wheelbase_m"), _INFO)
+    sheet.add(f"{_ALL}.wheel_tread", facts.measure("track_width_m"), _INFO)
+    sheet.add(f"{_ALL}.max_steer_angle", facts.measure("max_steering_rad"), _INFO)
     delay, lag = facts.take(Quantity.COMMAND_DELAY), facts.take(Quantity.STEERING_LAG)
-    sheet.add((*_ALL, "input_delay"), delay, _MPC)
-    sheet.add((*_ALL, "vehicle_model_steer_tau"), lag, f"{_MPC} with vehicle_model_type: kinematics")
-    sheet.add((*_ALL, "delay_compensation_time"), delay, _PID)
-    sheet.add((*_ALL, "vel_time_delay"), delay, _SIMULATOR)
-    sheet.add((*_ALL, "vel_time_constant"), facts.take(Quantity.SPEED_LAG), _SIMULATOR)
-    sheet.add((*_ALL, "steer_time_delay"), delay, _SIMULATOR)
-    sheet.add((*_ALL, "steer_time_constant"), lag, _SIMULATOR)
-    sheet.add((*_ALL, "vel_lim"), find_speed_limit(facts), _SIMULATOR)
-    sheet.add((*_ALL, "vel_rate_lim"), find_speed_acceleration(facts), _SIMULATOR)
+    sheet.add(f"{_ALL}.input_delay", delay, _MPC)
+    sheet.add(f"{_ALL}.vehicle_model_steer_tau", lag, f"{_MPC} with vehicle_model_type: kinematics")
+    sheet.add(f"{_ALL}.delay_compensation_time", delay, _PID)
+    sheet.add(f"{_ALL}.vel_time_delay", delay, _SIMULATOR)
+    sheet.add(f"{_ALL}.vel_time_constant", facts.take(Quantity.SPEED_LAG), _SIMULATOR)
+    sheet.add(f"{_ALL}.steer_time_delay", delay, _SIMULATOR)
+    sheet.add(f"{_ALL}.steer_time_constant", lag, _SIMULATOR)
+    sheet.add(f"{_ALL}.vel_lim", find_speed_limit(facts), _SIMULATOR)
+    sheet.add(f"{_ALL}.vel_rate_lim", find_speed_acceleration(facts), _SIMULATOR)
     _add_offset(facts, sheet)
     return write_yaml(facts, sheet)
 
@@ -53,7 +53,7 @@ def write(file: ModelFile, current: Current) -> str:
 def _add_offset(facts: Facts, sheet: Sheet) -> None:
     offset = facts.take(Quantity.STEERING_OFFSET)
     sign = "measured less true angle: what is steered of itself to the left is a negative bias"
-    sheet.add((*_ALL, "steer_bias"), negate(offset), f"{_SIMULATOR}; {sign}")
+    sheet.add(f"{_ALL}.steer_bias", negate(offset), f"{_SIMULATOR}; {sign}")
     if offset.is_known:
         sheet.head.append(
             f"steer_offset = {offset.value:.5g} rad, true less measured angle as in steer_offset_estimator; "

@@ -41,15 +41,15 @@ def write(file: ModelFile, current: Current) -> str:
     facts = Facts(file)
     facts.require_kind(TARGET.name, *_SYSTEMS)
     sheet = start_sheet(facts, TARGET)
-    sheet.add(("wheel_radius",), find_radius(facts))
+    sheet.add("plugin.wheel_radius", find_radius(facts))
     if facts.vehicle.kind == "differential":
         note = "for a simulated ground on which the wheels skid as on the real one"
-        sheet.add(("wheel_separation",), find_track(facts), note)
+        sheet.add("plugin.wheel_separation", find_track(facts), note)
     else:
-        sheet.add(("wheel_separation",), facts.measure("track_width_m"))
-        sheet.add(("wheel_base",), facts.measure("wheelbase_m"))
+        sheet.add("plugin.wheel_separation", facts.measure("track_width_m"))
+        sheet.add("plugin.wheel_base", facts.measure("wheelbase_m"))
         angle = facts.measure("max_steering_rad").change(operator.mul, facts.take(Quantity.STEERING_GAIN))
-        sheet.add(("steering_limit",), angle)
+        sheet.add("plugin.steering_limit", angle)
     _add_limits(facts, sheet)
     return _write_element(facts, sheet)
 
@@ -66,8 +66,8 @@ def _add_limits(facts: Facts, sheet: Sheet) -> None:
             ("angular_acceleration", find_turn_acceleration(facts)),
         ]
     for name, limit in limits:
-        sheet.add((f"min_{name}",), negate(limit))
-        sheet.add((f"max_{name}",), limit)
+        sheet.add(f"plugin.min_{name}", negate(limit))
+        sheet.add(f"plugin.max_{name}", limit)
 
 
 def _write_element(facts: Facts, sheet: Sheet) -> str:
@@ -78,7 +78,7 @@ def _write_element(facts: Facts, sheet: Sheet) -> str:
     for setting in sheet.settings:
         for line in setting.sources:
             plugin.append(ET.Comment(_make_comment(line)))
-        ET.SubElement(plugin, setting.path[-1]).text = repr(setting.value)
+        ET.SubElement(plugin, setting.path.rpartition(".")[2]).text = repr(setting.value)
     ET.indent(plugin)
     return ET.tostring(plugin, encoding="unicode") + "\n"
 

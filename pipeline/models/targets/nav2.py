@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from pipeline.models.settings import Sheet
     from pipeline.models.target import Current
 
-_CONTROLLER = ("controller_server", "ros__parameters", "FollowPath")
-_SMOOTHER = ("velocity_smoother", "ros__parameters")
+_CONTROLLER = "controller_server.ros__parameters.FollowPath"
+_SMOOTHER = "velocity_smoother.ros__parameters"
 _DELAY = "MPPI: dead times and time constants added up, as a smooth command is followed that late"
 
 
@@ -41,11 +41,11 @@ def write(file: ModelFile, current: Current) -> str:
     facts = Facts(file)
     facts.require_kind(TARGET.name, "differential", "ackermann")
     sheet = start_sheet(facts, TARGET)
-    sheet.add((*_CONTROLLER, "model_delay_vx"), find_speed_delay(facts), _DELAY)
-    sheet.add((*_CONTROLLER, "model_delay_wz"), find_turn_delay(facts), _DELAY)
+    sheet.add(f"{_CONTROLLER}.model_delay_vx", find_speed_delay(facts), _DELAY)
+    sheet.add(f"{_CONTROLLER}.model_delay_wz", find_turn_delay(facts), _DELAY)
     _add_limits(facts, sheet)
     if facts.vehicle.kind == "ackermann":
-        place = (*_CONTROLLER, "ackermann", "min_turning_r")
+        place = f"{_CONTROLLER}.ackermann.min_turning_r"
         sheet.add(place, find_turning_radius(facts), "MPPI with motion_model: ackermann")
     return write_yaml(facts, sheet)
 
@@ -53,31 +53,31 @@ def write(file: ModelFile, current: Current) -> str:
 def _add_limits(facts: Facts, sheet: Sheet) -> None:
     speed, turn = find_speed_limit(facts), find_turn_limit(facts)
     acceleration, turning = find_speed_acceleration(facts), find_turn_acceleration(facts)
-    sheet.add((*_CONTROLLER, "vx_max"), speed, "MPPI")
-    sheet.add((*_CONTROLLER, "vx_min"), negate(speed), "MPPI")
-    sheet.add((*_CONTROLLER, "wz_max"), turn, "MPPI")
-    sheet.add((*_CONTROLLER, "ax_max"), acceleration, "MPPI")
-    sheet.add((*_CONTROLLER, "ax_min"), negate(acceleration), "MPPI")
-    sheet.add((*_CONTROLLER, "az_max"), turning, "MPPI")
+    sheet.add(f"{_CONTROLLER}.vx_max", speed, "MPPI")
+    sheet.add(f"{_CONTROLLER}.vx_min", negate(speed), "MPPI")
+    sheet.add(f"{_CONTROLLER}.wz_max", turn, "MPPI")
+    sheet.add(f"{_CONTROLLER}.ax_max", acceleration, "MPPI")
+    sheet.add(f"{_CONTROLLER}.ax_min", negate(acceleration), "MPPI")
+    sheet.add(f"{_CONTROLLER}.az_max", turning, "MPPI")
     sheet.add_row(
-        (*_CONTROLLER, "VelocityDeadbandCritic", "deadband_velocities"),
+        f"{_CONTROLLER}.VelocityDeadbandCritic.deadband_velocities",
         (find_deadband(facts)[0], 0.0, find_deadband(facts)[1]),
         "MPPI with VelocityDeadbandCritic among its critics",
     )
     pursuit = "regulated pure pursuit"
-    sheet.add((*_CONTROLLER, "max_linear_vel"), speed, f"{pursuit}; desired_linear_vel up to Kilted")
-    sheet.add((*_CONTROLLER, "min_linear_vel"), negate(speed), pursuit)
-    sheet.add((*_CONTROLLER, "max_angular_vel"), turn, pursuit)
-    sheet.add((*_CONTROLLER, "min_angular_vel"), negate(turn), pursuit)
-    sheet.add((*_CONTROLLER, "max_linear_accel"), acceleration, pursuit)
-    sheet.add((*_CONTROLLER, "max_linear_decel"), negate(acceleration), pursuit)
-    sheet.add((*_CONTROLLER, "max_angular_accel"), turning, pursuit)
-    sheet.add((*_CONTROLLER, "max_angular_decel"), negate(turning), pursuit)
+    sheet.add(f"{_CONTROLLER}.max_linear_vel", speed, f"{pursuit}; desired_linear_vel up to Kilted")
+    sheet.add(f"{_CONTROLLER}.min_linear_vel", negate(speed), pursuit)
+    sheet.add(f"{_CONTROLLER}.max_angular_vel", turn, pursuit)
+    sheet.add(f"{_CONTROLLER}.min_angular_vel", negate(turn), pursuit)
+    sheet.add(f"{_CONTROLLER}.max_linear_accel", acceleration, pursuit)
+    sheet.add(f"{_CONTROLLER}.max_linear_decel", negate(acceleration), pursuit)
+    sheet.add(f"{_CONTROLLER}.max_angular_accel", turning, pursuit)
+    sheet.add(f"{_CONTROLLER}.max_angular_decel", negate(turning), pursuit)
     # The smoother takes a limit for every axis or none.
-    sheet.add_row((*_SMOOTHER, "max_velocity"), (speed, 0.0, turn))
-    sheet.add_row((*_SMOOTHER, "min_velocity"), (negate(speed), 0.0, negate(turn)))
-    sheet.add_row((*_SMOOTHER, "max_accel"), (acceleration, 0.0, turning))
-    sheet.add_row((*_SMOOTHER, "max_decel"), (negate(acceleration), 0.0, negate(turning)))
+    sheet.add_row(f"{_SMOOTHER}.max_velocity", (speed, 0.0, turn))
+    sheet.add_row(f"{_SMOOTHER}.min_velocity", (negate(speed), 0.0, negate(turn)))
+    sheet.add_row(f"{_SMOOTHER}.max_accel", (acceleration, 0.0, turning))
+    sheet.add_row(f"{_SMOOTHER}.max_decel", (negate(acceleration), 0.0, negate(turning)))
 
 
 TARGET = Target(

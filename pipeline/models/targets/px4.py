@@ -47,12 +47,12 @@ def write(file: ModelFile, current: Current) -> str:
     facts.require_kind(TARGET.name, "differential", "ackermann")
     sheet = start_sheet(facts, TARGET)
     if facts.vehicle.kind == "differential":
-        sheet.add(("RD_WHEEL_TRACK",), facts.measure("track_width_m"))
-        sheet.add(("RO_YAW_RATE_CORR",), facts.take(Quantity.TRACK))
+        sheet.add("RD_WHEEL_TRACK", facts.measure("track_width_m"))
+        sheet.add("RO_YAW_RATE_CORR", facts.take(Quantity.TRACK))
     else:
-        sheet.add(("RA_WHEEL_BASE",), facts.measure("wheelbase_m"))
-        sheet.add(("RA_MAX_STR_ANG",), find_largest_steering(facts))
-    sheet.add((_FULL_SPEED,), _find_full_speed(facts, current))
+        sheet.add("RA_WHEEL_BASE", facts.measure("wheelbase_m"))
+        sheet.add("RA_MAX_STR_ANG", find_largest_steering(facts))
+    sheet.add(_FULL_SPEED, _find_full_speed(facts, current))
     _add_limits(facts, sheet)
     return _write_lines(facts, sheet)
 
@@ -93,12 +93,12 @@ def _add_limits(facts: Facts, sheet: Sheet) -> None:
     turn, turning = (
         amount.change(math.degrees) for amount in (find_turn_limit(facts), find_turn_acceleration(facts))
     )
-    sheet.add(("RO_SPEED_LIM",), find_speed_limit(facts))
-    sheet.add(("RO_YAW_RATE_LIM",), turn, "in deg/s")
-    sheet.add(("RO_ACCEL_LIM",), acceleration)
-    sheet.add(("RO_DECEL_LIM",), acceleration)
-    sheet.add(("RO_YAW_ACCEL_LIM",), turning, "in deg/s^2")
-    sheet.add(("RO_YAW_DECEL_LIM",), turning, "in deg/s^2")
+    sheet.add("RO_SPEED_LIM", find_speed_limit(facts))
+    sheet.add("RO_YAW_RATE_LIM", turn, "in deg/s")
+    sheet.add("RO_ACCEL_LIM", acceleration)
+    sheet.add("RO_DECEL_LIM", acceleration)
+    sheet.add("RO_YAW_ACCEL_LIM", turning, "in deg/s^2")
+    sheet.add("RO_YAW_DECEL_LIM", turning, "in deg/s^2")
 
 
 def _write_lines(facts: Facts, sheet: Sheet) -> str:
@@ -108,7 +108,7 @@ def _write_lines(facts: Facts, sheet: Sheet) -> str:
     text.write("#\n# Vehicle-Id Component-Id Name Value Type\n")
     for setting in sheet.settings:
         text.writelines(f"# {make_plain(line)}\n" for line in setting.sources)
-        writer.writerow([1, 1, setting.path[-1], setting.value, _REAL32])
+        writer.writerow([1, 1, setting.path, setting.value, _REAL32])
     return text.getvalue()
 
 

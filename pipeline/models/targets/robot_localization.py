@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pipeline.models.model_file import ModelFile
     from pipeline.models.target import Current
 
-_FILTER = ("ekf_filter_node", "ros__parameters")
+_FILTER = "ekf_filter_node.ros__parameters"
 _CONTROLLERS = {
     "differential": ("diff_drive_controller", {Quantity.RADIUS, Quantity.RADIUS_DIFFERENCE, Quantity.TRACK}),
     "ackermann": ("ackermann_steering_controller", {Quantity.RADIUS}),
@@ -61,12 +61,12 @@ def write(file: ModelFile, current: Current) -> str:
     )
     x, y, w = (Amount(error * error, sources) for error in step.velocity_rms)
     sheet = start_sheet(facts, TARGET)
-    sheet.settings.append(Setting((*_FILTER, "odom0_config"), _FUSED, ("vx, vy and the yaw rate of odom0",)))
+    sheet.settings.append(Setting(f"{_FILTER}.odom0_config", _FUSED, ("vx, vy and the yaw rate of odom0",)))
     acceleration, turning = find_speed_acceleration(facts), find_turn_acceleration(facts)
     for name in ("acceleration_limits", "deceleration_limits"):
         limits = (acceleration, 0.0, 0.0, 0.0, 0.0, turning)
-        sheet.add_row((*_FILTER, name), limits, "with use_control: true")
-    place = (controller, "ros__parameters", "twist_covariance_diagonal")
+        sheet.add_row(f"{_FILTER}.{name}", limits, "with use_control: true")
+    place = f"{controller}.ros__parameters.twist_covariance_diagonal"
     sheet.add_row(place, (x, y, 0.0, 0.0, 0.0, w), _INDEPENDENT)
     return write_yaml(facts, sheet)
 

@@ -41,32 +41,32 @@ def write(file: ModelFile, current: Current) -> str:
 
 
 def _add_differential(facts: Facts, sheet: Sheet) -> None:
-    node = ("diff_drive_controller", "ros__parameters")
+    node = "diff_drive_controller.ros__parameters"
     radius, difference = facts.take(Quantity.RADIUS), facts.take(Quantity.RADIUS_DIFFERENCE)
-    sheet.add((*node, "wheel_separation"), facts.measure("track_width_m"))
-    sheet.add((*node, "wheel_radius"), facts.measure("wheel_radius_m"))
+    sheet.add(f"{node}.wheel_separation", facts.measure("track_width_m"))
+    sheet.add(f"{node}.wheel_radius", facts.measure("wheel_radius_m"))
     track = facts.take(Quantity.TRACK)
-    sheet.add((*node, "wheel_separation_multiplier"), track, "in place of the one in use")
+    sheet.add(f"{node}.wheel_separation_multiplier", track, "in place of the one in use")
     left = combine(lambda k, e: k * (1.0 - e / 2.0), radius, difference)
     right = combine(lambda k, e: k * (1.0 + e / 2.0), radius, difference)
-    sheet.add((*node, "left_wheel_radius_multiplier"), left)
-    sheet.add((*node, "right_wheel_radius_multiplier"), right)
+    sheet.add(f"{node}.left_wheel_radius_multiplier", left)
+    sheet.add(f"{node}.right_wheel_radius_multiplier", right)
     for axis, limit, acceleration in (
         ("linear.x", find_speed_limit(facts), find_speed_acceleration(facts)),
         ("angular.z", find_turn_limit(facts), find_turn_acceleration(facts)),
     ):
-        sheet.add((*node, f"{axis}.max_velocity"), limit)
-        sheet.add((*node, f"{axis}.min_velocity"), negate(limit))
-        sheet.add((*node, f"{axis}.max_acceleration"), acceleration)
-        sheet.add((*node, f"{axis}.max_deceleration"), negate(acceleration))
+        sheet.add(f"{node}.{axis}.max_velocity", limit)
+        sheet.add(f"{node}.{axis}.min_velocity", negate(limit))
+        sheet.add(f"{node}.{axis}.max_acceleration", acceleration)
+        sheet.add(f"{node}.{axis}.max_deceleration", negate(acceleration))
     sheet.head.append("On Humble limits also need has_velocity_limits and has_acceleration_limits.")
 
 
 def _add_ackermann(facts: Facts, sheet: Sheet) -> None:
-    node = ("ackermann_steering_controller", "ros__parameters")
-    sheet.add((*node, "wheelbase"), facts.measure("wheelbase_m"))
-    sheet.add((*node, "traction_track_width"), facts.measure("track_width_m"))
-    sheet.add((*node, "traction_wheels_radius"), find_radius(facts))
+    node = "ackermann_steering_controller.ros__parameters"
+    sheet.add(f"{node}.wheelbase", facts.measure("wheelbase_m"))
+    sheet.add(f"{node}.traction_track_width", facts.measure("track_width_m"))
+    sheet.add(f"{node}.traction_wheels_radius", find_radius(facts))
     sheet.head.append("On Humble the last two are called rear_wheel_track and rear_wheels_radius.")
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pipeline.models.model_file import ModelFile
     from pipeline.models.target import Current
 
-_ALL = ("/**", "ros__parameters")
+_ALL = "/**.ros__parameters"
 _SPEED_GAIN = "speed_to_erpm_gain"
 _STEERING_GAIN = "steering_angle_to_servo_gain"
 _STEERING_OFFSET = "steering_angle_to_servo_offset"
@@ -43,13 +43,13 @@ def write(file: ModelFile, current: Current) -> str:
     radius = facts.take(Quantity.RADIUS)
     gain, offset = facts.take(Quantity.STEERING_GAIN), facts.take(Quantity.STEERING_OFFSET)
     sheet = start_sheet(facts, TARGET)
-    sheet.add((*_ALL, _SPEED_GAIN), combine(operator.truediv, speed, radius))
-    sheet.add((*_ALL, _STEERING_GAIN), combine(operator.truediv, servo, gain))
+    sheet.add(f"{_ALL}.{_SPEED_GAIN}", combine(operator.truediv, speed, radius))
+    sheet.add(f"{_ALL}.{_STEERING_GAIN}", combine(operator.truediv, servo, gain))
     straight = combine(lambda c, s, g, o: c - s * o / g, centre, servo, gain, offset)
-    sheet.add((*_ALL, _STEERING_OFFSET), straight)
-    sheet.add(("vesc_to_odom_node", "ros__parameters", "wheelbase"), facts.measure("wheelbase_m"))
+    sheet.add(f"{_ALL}.{_STEERING_OFFSET}", straight)
+    sheet.add("vesc_to_odom_node.ros__parameters.wheelbase", facts.measure("wheelbase_m"))
     limit = find_speed_acceleration(facts)
-    sheet.add(("throttle_interpolator", "ros__parameters", "max_acceleration"), limit)
+    sheet.add("throttle_interpolator.ros__parameters.max_acceleration", limit)
     return write_yaml(facts, sheet)
 
 
