@@ -67,7 +67,9 @@ def _add_ackermann(facts: Facts, sheet: Sheet) -> None:
     sheet.add(f"{node}.wheelbase", facts.measure("wheelbase_m"))
     sheet.add(f"{node}.traction_track_width", facts.measure("track_width_m"))
     sheet.add(f"{node}.traction_wheels_radius", find_radius(facts))
-    sheet.head.append("On Humble the last two are called rear_wheel_track and rear_wheels_radius.")
+    sheet.head.append(
+        "On Humble traction_track_width is rear_wheel_track, traction_wheels_radius rear_wheels_radius."
+    )
 
 
 TARGET = Target(
