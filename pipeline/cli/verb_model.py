@@ -101,11 +101,11 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
     """
     from pipeline.identification.describe import describe_parameters, parameters_as_json  # noqa: PLC0415 - heavy
     from pipeline.identification.intervals import NOTHING  # noqa: PLC0415
-    from pipeline.models.export import export_json  # noqa: PLC0415
+    from pipeline.models.export import export_model  # noqa: PLC0415
 
     file = open_model(model, trust_code=trust_code)
     if json:
-        sys.stdout.write(export_json(file))
+        sys.stdout.write(export_model(file, "json"))
         return CLEAN
     parameters = parameters_as_json(file.model, NOTHING)
     for label, (low, high) in file.intervals.items():
@@ -221,29 +221,43 @@ def export(  # noqa: D417 - the options document themselves
     model: Path,
     /,
     *,
-    to: Literal["ros2_control", "json", "python"],
+    to: str,
+    current: Annotated[
+        Path | None, Parameter(help="vesc, px4: the robot's file of parameters, which is corrected")
+    ] = None,
     out: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
     trust_code: TrustCode = False,
 ) -> int:
-    """Export a model to what people run.
+    """Export a model to what people run; each line says which effect it came from.
 
     Args:
         model: the model file.
-        to: controller and nav2 parameters, JSON, or a Python function without dependencies.
+        to: ros2_control, nav2, autoware, vesc, px4, robot_localization, gazebo, json or python.
     """
-    from pipeline.models import export as exports  # noqa: PLC0415 - heavy
+    from pipeline.models.export import export_model, read_current  # noqa: PLC0415 - heavy
 
-    write = {
-        "ros2_control": exports.export_ros2_control,
-        "json": exports.export_json,
-        "python": exports.export_python,
-    }[to]
-    text = write(open_model(model, trust_code=trust_code))
+    used = None if current is None else read_current(current, to)
+    text = export_model(open_model(model, trust_code=trust_code), to, used)
     if out is None:
         sys.stdout.write(text)
     else:
-        out.write_text(text, encoding="utf-8")
+        _write(out, text)
     return CLEAN
+
+
+def _write(path: Path, text: str) -> None:
+    from pipeline.runs.errors import MotionError  # noqa: PLC0415 - heavy
+    from pipeline.store.files import replace_file  # noqa: PLC0415
+
+    try:
+        replace_file(path, text.encode())
+    except OSError as error:
+        raise MotionError(
+            "export_unwritable",
+            f"cannot be written: {error.strerror}",
+            where=str(path),
+            hint="Check the folder and its permissions.",
+        ) from None
 
 
 def _change(

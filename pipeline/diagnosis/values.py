@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.diagnosis.diagnosis import Value
-from pipeline.identification.intervals import stands_at_bound
+from pipeline.models.bounds import stands_at_bound
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -239,6 +239,8 @@ def _describe_sizes(parameter: Parameter) -> list[str]:
     if parameter.least is not None:
         least = parameter.least
         lines.append(f"too small below {least.size:g}{unit} off neutral: {least.reason}")
+    if parameter.quantities:
+        lines.append(f"exported as {' and '.join(quantity.about for quantity in parameter.quantities)}")
     if parameter.plausible is not None:
         range_ = parameter.plausible
         lines.append(f"vehicles show {range_.low:g} to {range_.high:g}{unit}: {range_.source}")

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.models.bounds import stands_at_bound
+
 if TYPE_CHECKING:
     from pipeline.identification.fit import Fitted, PartFit
     from pipeline.identification.parts import Part
@@ -134,13 +136,6 @@ def _estimate_part(part: Part, fit: PartFit) -> Estimates:
             )
         )
     return Estimates(tuple(items), correlation, pieces)
-
-
-def stands_at_bound(value: float, bounds: tuple[float, float]) -> bool:
-    """Whether a number stopped because it may go no further."""
-    low, high = bounds
-    margin = 1e-6 * (abs(low) + abs(high)) if np.isfinite(low + high) else 0.0
-    return not low + margin < value < high - margin
 
 
 def _carry_clocks(part: Part, fit: PartFit, total: Floats, rows: Integers, size: Floats) -> Floats:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from pipeline.models.evidence import Evidence, Largest, Relative
+    from pipeline.models.quantity import Quantity
     from pipeline.runs.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
 
 INF = math.inf
@@ -125,6 +126,7 @@ class Parameter:
         plausible: what vehicles show; None for all within the bounds.
         one_sign: whether physics has positive values only: the other sign is a clock or chance.
         instead_of: the parameter that counts no more once this one is given; this one is not searched alone.
+        quantities: what it is to a controller; none where no controller knows of it.
     """
 
     name: str
@@ -141,6 +143,7 @@ class Parameter:
     plausible: Plausible | None = None
     one_sign: bool = False
     instead_of: str = ""
+    quantities: tuple[Quantity, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -181,6 +184,8 @@ class Effect(ABC):
         parts: numbers of other effects under which it is searched; found together, they are named as it.
         late: what it makes late, where its only number is a delay.
         price: share of the held-out error that it must take away before it counts.
+        python: its step in the exported function, numbers as `{name}`; None where there is none.
+        python_state: names that its step carries on to the next one; zero at the start.
         values: the numbers themselves.
         fixed: names of parameters that a fit leaves alone.
     """
@@ -199,6 +204,8 @@ class Effect(ABC):
     parts: tuple[Part, ...] = ()
     late: Late | None = None
     price: float = 0.0
+    python: str | None = None
+    python_state: tuple[str, ...] = ()
 
     def __init__(self, *, fixed: Iterable[str] = (), **values: float) -> None:
         self.values: Mapping[str, float] = self._complete(values)
@@ -253,6 +260,11 @@ class Effect(ABC):
         return cls().change(
             **{part.name: part.factor * found[part.effect].values[part.parameter] for part in cls.parts}
         )
+
+    def choose_python(self, kind: str) -> str | None:
+        """Its step in the exported function on a kind of vehicle; see `python`."""
+        del kind
+        return self.python
 
     def can_show(self, evidence: Evidence) -> bool:
         """Whether sensors and driving let it be told at all."""

@@ -8,113 +8,17 @@ import math
 from typing import TYPE_CHECKING, cast
 
 from pipeline.models.catalogue import is_own
+from pipeline.models.effect import Place
 from pipeline.models.formula.formula_effect import FormulaEffect
+from pipeline.models.quantity import Quantity
 from pipeline.runs.errors import MotionError
 
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
     from pipeline.models.model import Model
-    from pipeline.vehicles import Vehicle
 
-# What each effect does in one step; `{k}` and the like become the fitted numbers.
-_ON_COMMAND = {
-    "body_speed_limit": """
-        asked = R * (left + right) / 2.0
-        excess = (asked - max(-{limit}, min({limit}, asked))) / R
-        left, right = left - excess, right - excess""",
-    "body_turn_limit": """
-        asked = (right - left) * R / (B * MULTIPLIER)
-        excess = (asked - max(-{limit}, min({limit}, asked))) * B * MULTIPLIER / (2.0 * R)
-        left, right = left + excess, right - excess""",
-    "deadband": """
-        left = 0.0 if R * abs(left) < {d} else left
-        right = 0.0 if R * abs(right) < {d} else right""",
-    "wheel_speed_limit": """
-        left = max(-{limit}, min({limit}, left))
-        right = max(-{limit}, min({limit}, right))""",
-}
-_CAR_TURN_LIMIT = """
-        moving = max(abs(R * (left + right) / 2.0), 1e-9)
-        widest = math.atan({limit} * WHEELBASE / moving)
-        steering = max(-widest, min(widest, steering))"""
-_ON_DRIVE = {
-    "acceleration_limit": """
-        most = {limit} * step_s
-        limited_left = approach(limited_left, left, most)
-        limited_right = approach(limited_right, right, most)
-        left, right = limited_left, limited_right""",
-    "drive_lag": """
-        keep = math.exp(-step_s / {tau}) if {tau} > 0.0 else 0.0
-        lag_left = left + (lag_left - left) * keep
-        lag_right = right + (lag_right - right) * keep
-        left, right = lag_left, lag_right""",
-    "turn_lag": """
-        keep = math.exp(-step_s / {tau_mean}) if {tau_mean} > 0.0 else 0.0
-        lag_mean = (left + right) / 2.0 + (lag_mean - (left + right) / 2.0) * keep
-        keep = math.exp(-step_s / {tau_diff}) if {tau_diff} > 0.0 else 0.0
-        lag_difference = right - left + (lag_difference - (right - left)) * keep
-        left, right = lag_mean - lag_difference / 2.0, lag_mean + lag_difference / 2.0""",
-    "turn_droop": """
-        lost = (1.0 - {gain}) * (right - left - max(-{threshold}, min({threshold}, right - left)))
-        left, right = left + lost / 2.0, right - lost / 2.0""",
-    "steering_gain": """
-        steering = {g} * steering""",
-    "steering_lag": """
-        keep = math.exp(-step_s / {tau}) if {tau} > 0.0 else 0.0
-        lag_steering = steering + (lag_steering - steering) * keep
-        steering = lag_steering""",
-    "steering_offset": """
-        steering = steering + {o}""",
-}
-_ON_ROLLING = {
-    "wheel_asymmetry": """
-        v0, w0 = v0 + {e} * B * w0 / 4.0, w0 + {e} * v0 / B""",
-    "effective_track": """
-        w0 = w0 / {k}""",
-    "wheel_radius": """
-        v0, w0 = {k} * v0, {k} * w0""",
-    "understeer": """
-        w0 = w0 / max(1.0 + {K} / WHEELBASE * v0 * v0, 0.05)""",
-    "time_drift": """
-        fade = 1.0 - {k} * t / until_s
-        v0, w0 = fade * v0, fade * w0""",
-    "terrain_change": """
-        if (x > {at_x}) if {has_x} else (t >= {at_s}):
-            v0, w0 = {k_v} * v0, {k_w} * w0""",
-}
-_ON_BODY = {
-    "body_inertia": """
-        keep = math.exp(-step_s / {tau}) if {tau} > 0.0 else 0.0
-        slide_w = w0 + (slide_w - w0) * keep
-        turn = slide_w * step_s
-        ahead, aside = v0 + (slide_x - v0) * keep, slide_y * keep
-        slide_x = ahead * math.cos(turn) + aside * math.sin(turn)
-        slide_y = aside * math.cos(turn) - ahead * math.sin(turn)
-        v_x, v_y, v_w = slide_x, slide_y, slide_w""",
-}
-_ON_GROUND = {
-    "lateral_skid": """
-        v_y = v_y - {c} * v0 * w0""",
-    "speed_slip": """
-        v_x = v_x - {k} * v0 * abs(v0)""",
-    "turning_resistance": """
-        v_x = v_x - {k} * v0 * abs(w0)""",
-    "slope_drift": """
-        v_x = v_x + {k} * math.sin(pitch) * turning
-        v_y = v_y - {k} * math.cos(pitch) * math.sin(roll) * turning""",
-    "lateral_drift": """
-        v_y = v_y + {c} * turning""",
-    "yaw_drift": """
-        v_w = v_w + {c} * turning""",
-}
-_ON_CENTRE = {
-    "icr_lateral": """
-        v_x = v_x + {y_icr} * v_w""",
-    "icr_offset": """
-        v_y = v_y - {x_icr} * v_w""",
-}
 _PLAIN_NAMES = ("abs", "min", "max", "sign")
-_STAGES = (_ON_COMMAND, _ON_DRIVE, _ON_ROLLING, _ON_BODY, _ON_GROUND, _ON_CENTRE)
+_PLACES = tuple(place for place in Place if place is not Place.LOCALIZATION)
 _HEAD = '''"""Motion of a vehicle from its commands. Made by `slip model export`; needs nothing but Python."""
 
 import math
@@ -152,9 +56,7 @@ def predict(commands, until_s, step_s=0.005, pose=(0.0, 0.0, 0.0), roll=0.0, pit
         A list of (time, x, y, yaw, v_x, v_y, v_w).
     """
     x, y, yaw = pose
-    limited_left = limited_right = lag_left = lag_right = lag_mean = lag_difference = lag_steering = 0.0
-    slide_x = slide_y = slide_w = 0.0
-    rows = []
+    rows = []{state}
     index = -1
     for number in range(round(until_s / step_s)):
         t = (number + 0.5) * step_s
@@ -172,48 +74,50 @@ _TAIL = """
 
 
 def write_function(model: Model) -> str:
-    """The function's source.
+    """The function's source; effects of the localization are left out.
 
     Raises:
         MotionError: ``not_exportable``.
     """
     vehicle = model.vehicle
-    delay = model.effect("transport_delay").values["d"] if "transport_delay" in model else 0.0
-    parts = [_write_head(vehicle, delay)]
-    written = {"transport_delay"}
-    for number, stage in enumerate(_STAGES):
-        if number == _STAGES.index(_ON_ROLLING):
+    parts = [_write_head(model)]
+    for place in _PLACES:
+        if place is Place.KINEMATICS:
             parts.append(_roll(vehicle.kind))
-        if number == _STAGES.index(_ON_BODY):
+        if place is Place.BODY:
             parts.append("\n        v_x, v_y, v_w = v0, 0.0, w0")
-        for effect in model:
-            if isinstance(effect, FormulaEffect):
-                if stage is _ON_GROUND:
-                    parts.append(_formula(effect))
-                    written.add(effect.id)
-            elif effect.id in stage and not is_own(type(effect)):
-                parts.append(
-                    _fill(
-                        effect, _CAR_TURN_LIMIT if _is_car_limit(effect, vehicle.kind) else stage[effect.id]
-                    )
-                )
-                written.add(effect.id)
-    missing = [effect.id for effect in model if effect.id not in written]
-    if missing:
-        raise MotionError(
-            "not_exportable",
-            f"{missing[0]} is Python of your own and cannot be written out",
-            where=missing[0],
-            hint="Write it as a formula in the model file, or export without it (slip model drop).",
-        )
+        parts += [_write_step(effect, vehicle.kind) for effect in model if effect.place is place]
     lever_m = vehicle.kinematics.lever_m(vehicle)
     if lever_m:
         parts.append(f"\n        v_y = v_y + {lever_m!r} * v_w")
     return "".join([*parts, _TAIL])
 
 
-def _write_head(vehicle: Vehicle, delay: float) -> str:
-    text = _HEAD
+def _write_step(effect: Effect, kind: str) -> str:
+    if isinstance(effect, FormulaEffect):
+        return _formula(effect)
+    text = None if is_own(type(effect)) else effect.choose_python(kind)
+    if text is None:
+        raise MotionError(
+            "not_exportable",
+            f"{effect.id} is Python of your own and cannot be written out",
+            where=effect.id,
+            hint="Write it as a formula in the model file, or export without it (slip model drop).",
+        )
+    for name, value in effect.values.items():
+        text = text.replace(f"{{{name}}}", _number(value))
+    return text
+
+
+def _write_head(model: Model) -> str:
+    vehicle, text = model.vehicle, _HEAD
+    delay = math.fsum(
+        effect.values[parameter.name]
+        for effect in model
+        for parameter in effect.parameters
+        if Quantity.COMMAND_DELAY in parameter.quantities and not is_own(type(effect))
+    )
+    state = [name for effect in model for name in effect.python_state]
     for key, number in (
         ("radius", vehicle.wheel_radius_m),
         ("track", vehicle.track_width_m or 1.0),
@@ -222,12 +126,9 @@ def _write_head(vehicle: Vehicle, delay: float) -> str:
         ("delay", delay),
     ):
         text = text.replace(f"{{{key}}}", _number(number))
+    text = text.replace("{state}", "".join(f"\n    {name} = 0.0" for name in state))
     # The name last: what stands in it is not looked at again.
     return text.replace("{name}", ascii(vehicle.name))
-
-
-def _is_car_limit(effect: Effect, kind: str) -> bool:
-    return effect.id == "body_turn_limit" and kind == "ackermann"
 
 
 def _roll(kind: str) -> str:
@@ -237,13 +138,6 @@ def _roll(kind: str) -> str:
         f_x = R * (left + right) / 2.0
         f_w = {turning}
         v0, w0 = f_x, f_w"""
-
-
-def _fill(effect: Effect, text: str) -> str:
-    values = dict(effect.values)
-    for name, value in values.items():
-        text = text.replace(f"{{{name}}}", _number(value))
-    return text.replace("{has_x}", str(math.isfinite(values.get("at_x", math.nan))))
 
 
 def _number(value: float) -> str:

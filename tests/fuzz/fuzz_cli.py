@@ -31,6 +31,17 @@ from cli_worker import Answer, Worker  # noqa: E402 - the repository is put on t
 from fuzz_logs import mutate  # noqa: E402 - the repository is put on the path first
 
 EXIT_CODES = {0, 1, 2, 3, 4}
+TARGETS = (
+    "ros2_control",
+    "nav2",
+    "autoware",
+    "vesc",
+    "px4",
+    "robot_localization",
+    "gazebo",
+    "json",
+    "python",
+)
 ODD_TEXTS = (
     *(
         "nan",
@@ -255,7 +266,7 @@ def make_case(seeds: Path, folder: Path, rng: random.Random) -> Case:
             folder / "model.toml",
             [
                 ["model", "show", "model.toml"],
-                ["model", "export", "model.toml", "--to", rng.choice(("json", "python", "ros2_control"))],
+                ["model", "export", "model.toml", "--to", rng.choice(TARGETS)],
                 ["analyze", "log.mcap", *analyze, "--model", "model.toml", "--out", "out"],
             ],
         )

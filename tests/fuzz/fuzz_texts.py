@@ -20,6 +20,7 @@ import tempfile
 import time
 import warnings
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT)]
@@ -29,13 +30,19 @@ import yaml  # noqa: E402
 
 from pipeline.core.errors import SlipError  # noqa: E402
 from pipeline.models import list_effects  # noqa: E402
-from pipeline.models.export import export_json, export_python, export_ros2_control  # noqa: E402
+from pipeline.models.export import export_model, find_target, list_targets  # noqa: E402
 from pipeline.models.formula import SIGNAL_UNITS, parse_expression, parse_unit  # noqa: E402
 from pipeline.models.model_file import parse_model  # noqa: E402
 from pipeline.models.model_text import format_model  # noqa: E402
 from pipeline.vehicles import load_configuration, resolve_vehicle  # noqa: E402
 
 HANG_S = 10
+PARSERS = {
+    "json": json.loads,
+    "python": ast.parse,
+    "gazebo": ET.fromstring,
+    "px4": find_target("px4").read_current,
+}
 MEMORY = 3 << 30
 LONGEST_ERROR = 4000
 UNITS = {**{name: parse_unit(unit, "") for name, unit in SIGNAL_UNITS.items()}, "k": parse_unit("1", "")}
@@ -204,12 +211,13 @@ def check_model(text: str) -> None:
     again = parse_model(written, path)
     if format_model(again) != written:
         raise AssertionError("written again, the model file is another one")
-    yaml.safe_load(export_ros2_control(file))
-    json.loads(export_json(file))
-    try:
-        ast.parse(export_python(file))
-    except SlipError as error:
-        require_one_line(error)
+    for target in list_targets():
+        try:
+            exported = export_model(file, target.name)
+        except SlipError as error:
+            require_one_line(error)
+        else:
+            PARSERS.get(target.name, yaml.safe_load)(exported)
 
 
 def check_configuration(text: str, folder: Path) -> None:

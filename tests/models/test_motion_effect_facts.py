@@ -19,11 +19,10 @@ EFFECTS = list_effects()
 BY_ID = {effect.id: effect for effect in EFFECTS}
 SOURCES = Path(__file__).parents[2] / "pipeline"
 OWN = SOURCES / "models" / "effects"
-WRITERS = {SOURCES / "models" / "export.py", SOURCES / "models" / "python_text.py"}
 GENERIC = sorted(
     path
     for path in SOURCES.rglob("*.py")
-    if OWN not in path.parents and SOURCES / "simulate" not in path.parents and path not in WRITERS
+    if OWN not in path.parents and SOURCES / "simulate" not in path.parents
 )
 ASKED = Largest(1.5, 1.2, 9.0, 8.0, np.linspace(0.0, 300.0, 11), np.linspace(-5.0, 20.0, 11))
 

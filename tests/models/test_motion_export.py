@@ -21,7 +21,7 @@ from motion_runs import QUIET, simulate, vehicle_of
 from pipeline.identification import Input
 from pipeline.identification.comparison import Comparison
 from pipeline.models import Model, ModelFile, Place, Timing, find_effect, list_effects
-from pipeline.models.export import export_json, export_python, export_ros2_control
+from pipeline.models.export import export_model
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.formula.formula_effect import make_parameter
 from pipeline.models.model_file import parse_model
@@ -153,7 +153,7 @@ def test_an_exported_formula_gives_what_the_model_gives(
         added = float(expression.evaluate({**signals, **effect.values}))
     except MotionError:
         return
-    source = export_python(ModelFile(Model(HUSKY, (effect,))))
+    source = export_model(ModelFile(Model(HUSKY, (effect,))), "python")
     assert list_free_names(source) == set()
     rows = run_exported(source, [(-1.0, left, right)], STEP_S, pose=(x, y, yaw), roll=roll, pitch=pitch)
     expected = added + (signals["v0"] if channel == "v_x" else 0.0)
@@ -162,7 +162,9 @@ def test_an_exported_formula_gives_what_the_model_gives(
 
 def test_a_power_of_a_negative_number_keeps_its_sign() -> None:
     effect = FormulaEffect("f", {"v_x": "k**2 * v0"}, (make_parameter("k", "1", (-1.0, 1.0)),), k=-0.5)
-    rows = run_exported(export_python(ModelFile(Model(HUSKY, (effect,)))), [(-1.0, 1.0, 1.0)], STEP_S)
+    rows = run_exported(
+        export_model(ModelFile(Model(HUSKY, (effect,))), "python"), [(-1.0, 1.0, 1.0)], STEP_S
+    )
     assert rows[0, 4] == pytest.approx(1.25 * HUSKY.wheel_radius_m)
 
 
@@ -198,7 +200,7 @@ def test_every_effect_moves_alike_at_any_of_its_values(name: str, runs: Mapping[
             effect = kind(**values)
             expected = comparison.predict_velocity([effect], Timing())
             fine = run_exported(
-                export_python(ModelFile(model + effect)), rows, run.duration_s, step_s=STEP_S / 5
+                export_model(ModelFile(model + effect), "python"), rows, run.duration_s, step_s=STEP_S / 5
             )
             # The model's cells hold means; so do these.
             got = fine[: len(fine) // 5 * 5].reshape(-1, 5, 7).mean(axis=1)
@@ -222,16 +224,16 @@ def test_no_name_becomes_code_or_structure(name: str, note: str, unit: str, valu
     file = ModelFile(
         Model(vehicle, (effect, find_effect("effective_track")(k=1.5))), note=note, fit={name: [note]}
     )
-    source = export_python(file)
-    plain = export_python(ModelFile(Model(vehicle_of("husky_a200"), file.model.effects)))
+    source = export_model(file, "python")
+    plain = export_model(ModelFile(Model(vehicle_of("husky_a200"), file.model.effects)), "python")
     assert [line for line in source.splitlines() if not line.startswith("VEHICLE = ")] == [
         line for line in plain.splitlines() if not line.startswith("VEHICLE = ")
     ]
     space: dict[str, object] = {}
     exec(compile(source, "exported", "exec"), space)  # noqa: S102 - that is what it is for
     assert space["VEHICLE"] == name
-    assert list(yaml.safe_load(export_ros2_control(file))) == ["diff_drive_controller"]
-    assert json.loads(export_json(file))["fit"] == {name: [note]}
+    assert list(yaml.safe_load(export_model(file, "ros2_control"))) == ["diff_drive_controller"]
+    assert json.loads(export_model(file, "json"))["fit"] == {name: [note]}
 
 
 TREES = st.recursive(

@@ -2,16 +2,18 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+import yaml
 from motion_runs import QUIET, simulate, vehicle_of
 
 from pipeline.identification import Input, Problem, carry_over, fit_model
 from pipeline.identification.comparison import Comparison
 from pipeline.models import Model, ModelFile, Timing, find_effect
-from pipeline.models.export import export_json, export_python, export_ros2_control
+from pipeline.models.export import export_model
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.formula.formula_effect import make_parameter
 from pipeline.runs import MotionError
@@ -41,7 +43,7 @@ def run_exported(
     model: Model, commands: list[tuple[float, ...]], until_s: float, **more: float
 ) -> np.ndarray:
     space: dict[str, object] = {}
-    exec(compile(export_python(ModelFile(model)), "exported", "exec"), space)  # noqa: S102 - that is what it is for
+    exec(compile(export_model(ModelFile(model), "python"), "exported", "exec"), space)  # noqa: S102 - that is what it is for
     rows = space["predict"](commands, until_s, **more)  # type: ignore[operator]
     return np.array(rows)
 
@@ -89,7 +91,7 @@ def test_formulas_are_exported_and_other_python_is_refused() -> None:
     assert rows[-1, 5] == pytest.approx(0.2)
     rate = FormulaEffect("rate", {"v_y": "k * v0_rate"}, (make_parameter("k", "s", (-1.0, 1.0)),))
     with pytest.raises(MotionError, match="rate of a signal"):
-        export_python(ModelFile(Model(HUSKY, (rate,))))
+        export_model(ModelFile(Model(HUSKY, (rate,))), "python")
 
 
 def test_controllers_get_the_parameters_they_have_and_are_told_of_the_rest() -> None:
@@ -100,27 +102,26 @@ def test_controllers_get_the_parameters_they_have_and_are_told_of_the_rest() -> 
         find_effect("body_turn_limit")(limit=1.0),
         find_effect("lateral_skid")(c=0.1),
     )
-    text = export_ros2_control(ModelFile(Model(HUSKY, effects)))
+    text = export_model(ModelFile(Model(HUSKY, effects)), "ros2_control")
     assert "wheel_separation_multiplier: 1.9" in text
     assert "left_wheel_radius_multiplier: 0.931" in text
     assert "right_wheel_radius_multiplier: 0.969" in text
-    assert "angular.z.max_velocity: 1" in text
-    assert "lateral_skid" in text.splitlines()[1]
+    parameters = yaml.safe_load(text)["diff_drive_controller"]["ros__parameters"]
+    assert parameters["angular"]["z"] == {"max_velocity": 1.0, "min_velocity": -1.0}
+    assert "#   lateral_skid.c = 0.1 s" in text.splitlines()
 
 
 def test_controllers_get_doubles_where_they_declare_doubles() -> None:
-    """ROS 2 refuses `1` for a parameter declared as a double."""
-    limits = (find_effect("body_speed_limit")(limit=2.0), find_effect("body_turn_limit")(limit=1.0))
-    text = export_ros2_control(ModelFile(Model(HUSKY, (find_effect("effective_track")(k=2.0), *limits))))
-    values = [line.split(": ")[1] for line in text.splitlines() if ": " in line and not line.startswith("#")]
-    numbers = [number for value in values for number in value.strip("[]").split(", ")]
-    assert len(numbers) == 15
-    assert all("." in number for number in numbers)
+    """ROS 2 refuses `1` for a parameter declared as a double, and reads `1e-05` as a text."""
+    limits = (find_effect("body_speed_limit")(limit=2.0), find_effect("transport_delay")(d=1e-5))
+    text = export_model(ModelFile(Model(HUSKY, limits)), "nav2")
+    values = [line.split(": ")[1] for line in text.splitlines() if re.fullmatch(r" +\w+: .+", line)]
+    assert values == ["1.0e-05", "1.0e-05", "2.0", "-2.0", "2.0", "-2.0"]
 
 
 def test_json_holds_no_number_that_json_does_not_know() -> None:
     file = ModelFile(Model(HUSKY, (find_effect("body_speed_limit")(), find_effect("turn_droop")())))
-    content = json.loads(export_json(file))
+    content = json.loads(export_model(file, "json"))
     assert content["effects"][0]["parameters"]["limit"] == {
         "value": None,
         "low": None,

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.models.effect import INF, DriveEffect, Excitation, Parameter, Search
 from pipeline.models.filters import limit_rate
+from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence, Largest
@@ -39,10 +40,17 @@ class AccelerationLimit(DriveEffect):
             search=Search.STARTS,
             starts=(1.0, 2.5, 6.0, 12.0, 25.0),
             step=1e-2,
+            quantities=(Quantity.WHEEL_ACCELERATION_LIMIT,),
         ),
     )
     needs = (Excitation.CHANGES, Excitation.LARGE)
     confused_with = ("drive_lag", "body_inertia")
+    python_state = ("limited_left", "limited_right")
+    python = """
+        most = {limit} * step_s
+        limited_left = approach(limited_left, left, most)
+        limited_right = approach(limited_right, right, most)
+        left, right = limited_left, limited_right"""
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

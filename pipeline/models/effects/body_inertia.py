@@ -16,6 +16,7 @@ import numpy as np
 
 from pipeline.models.effect import STAMPS, BodyEffect, Excitation, Late, Least, Parameter, Plausible, Search
 from pipeline.models.filters import lag_signal
+from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Velocity
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ class BodyInertia(BodyEffect):
             step=5e-3,
             least=Least(0.02, STAMPS),
             plausible=Plausible(0.0, 3.0, "wider than the 0.2 to 1 s of ice"),
+            quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
         ),
     )
     needs = (Excitation.CHANGES, Excitation.TURNING)
@@ -47,6 +49,15 @@ class BodyInertia(BodyEffect):
     equivalent_to = ("drive_lag",)
     equivalent_when = "never turning, or only turning on the spot"
     late = Late.BODY
+    python_state = ("slide_x", "slide_y", "slide_w")
+    python = """
+        keep = math.exp(-step_s / {tau}) if {tau} > 0.0 else 0.0
+        slide_w = w0 + (slide_w - w0) * keep
+        turn = slide_w * step_s
+        ahead, aside = v0 + (slide_x - v0) * keep, slide_y * keep
+        slide_x = ahead * math.cos(turn) + aside * math.sin(turn)
+        slide_y = aside * math.cos(turn) - ahead * math.sin(turn)
+        v_x, v_y, v_w = slide_x, slide_y, slide_w"""
 
     def move_body(self, rolling: Rolling, around: RunContext) -> Velocity:
         """See the formula above."""

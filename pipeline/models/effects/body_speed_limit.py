@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter, Search
+from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
@@ -37,10 +38,15 @@ class BodySpeedLimit(CommandEffect):
             starts=(0.3, 0.5, 0.7, 0.85, 0.95),
             relative_to="speed",
             step=1e-3,
+            quantities=(Quantity.SPEED_LIMIT,),
         ),
     )
     needs = (Excitation.LARGE, Excitation.SPEED_SPREAD)
     confused_with = ("wheel_speed_limit", "speed_slip")
+    python = """
+        asked = R * (left + right) / 2.0
+        excess = (asked - max(-{limit}, min({limit}, asked))) / R
+        left, right = left - excess, right - excess"""
 
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""

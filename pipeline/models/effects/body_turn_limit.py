@@ -17,11 +17,17 @@ import numpy as np
 
 from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter, Search
 from pipeline.models.effects.turn_droop import TurnDroop
+from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
     from pipeline.models.evidence import Evidence, Largest
     from pipeline.runs.signals import Commands, RunContext
+
+_ON_A_CAR = """
+        moving = max(abs(R * (left + right) / 2.0), 1e-9)
+        widest = math.atan({limit} * WHEELBASE / moving)
+        steering = max(-widest, min(widest, steering))"""
 
 
 class BodyTurnLimit(CommandEffect):
@@ -41,10 +47,19 @@ class BodyTurnLimit(CommandEffect):
             starts=(0.3, 0.5, 0.7, 0.85, 0.95),
             relative_to="turn",
             step=1e-3,
+            quantities=(Quantity.TURN_LIMIT,),
         ),
     )
     needs = (Excitation.LARGE, Excitation.TURNING)
     confused_with = ("wheel_speed_limit", "turn_droop")
+    python = """
+        asked = (right - left) * R / (B * MULTIPLIER)
+        excess = (asked - max(-{limit}, min({limit}, asked))) * B * MULTIPLIER / (2.0 * R)
+        left, right = left + excess, right - excess"""
+
+    def choose_python(self, kind: str) -> str | None:
+        """On a car it is the steering angle that is held back."""
+        return _ON_A_CAR if kind == "ackermann" else self.python
 
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""

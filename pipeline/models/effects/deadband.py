@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.models.effect import CommandEffect, Excitation, Parameter, Search
+from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence, Largest
@@ -39,10 +40,14 @@ class Deadband(CommandEffect):
             search=Search.GRID,
             starts=(0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45),
             step=0.02,
+            quantities=(Quantity.DEADBAND,),
         ),
     )
     needs = (Excitation.SMALL,)
     confused_with = ("turn_droop",)
+    python = """
+        left = 0.0 if R * abs(left) < {d} else left
+        right = 0.0 if R * abs(right) < {d} else right"""
 
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""

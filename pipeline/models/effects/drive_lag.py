@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.models.effect import STAMPS, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.filters import lag_signal
+from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
@@ -38,6 +39,7 @@ class DriveLag(DriveEffect):
             step=5e-3,
             least=Least(0.015, STAMPS, sampled=True),
             plausible=Plausible(0.0, 3.0, "wider than the 0.55 to 1.2 s of Husky and Warthog"),
+            quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
         ),
     )
     needs = (Excitation.CHANGES,)
@@ -45,6 +47,12 @@ class DriveLag(DriveEffect):
     equivalent_to = ("body_inertia",)
     equivalent_when = "never turning, or only turning on the spot"
     same_in_one_motion = ("turn_lag",)
+    python_state = ("lag_left", "lag_right")
+    python = """
+        keep = math.exp(-step_s / {tau}) if {tau} > 0.0 else 0.0
+        lag_left = left + (lag_left - left) * keep
+        lag_right = right + (lag_right - right) * keep
+        left, right = lag_left, lag_right"""
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -21,6 +21,7 @@ from pipeline.models.effect import (
     Plausible,
 )
 from pipeline.models.effects.wheel_radius import WheelRadius
+from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
@@ -43,10 +44,13 @@ class EffectiveTrack(KinematicEffect):
             1.8,
             least=Least(0.01, DATA_SHEET),
             plausible=Plausible(0.7, 4.0, "wider than the 1.8 and 1.9 of Warthog and Husky"),
+            quantities=(Quantity.TRACK,),
         ),
     )
     needs = (Excitation.TURNING,)
     confused_with = ("wheel_radius", "terrain_change")
+    python = """
+        w0 = w0 / {k}"""
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

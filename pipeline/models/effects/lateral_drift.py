@@ -28,6 +28,8 @@ class LateralDrift(LinearEffect):
     parameters = (Parameter("c", "m/s", (-0.5, 0.5), 0.0, "speed to the left", 0.05),)
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("yaw_misalignment", "slope_drift")
+    python = """
+        v_y = v_y + {c} * turning"""
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

@@ -41,6 +41,8 @@ class LateralSkid(LinearEffect):
     )
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("icr_offset", "body_inertia", "heading_skew", "drive_lag")
+    python = """
+        v_y = v_y - {c} * v0 * w0"""
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

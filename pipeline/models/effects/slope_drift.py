@@ -42,6 +42,9 @@ class SlopeDrift(LinearEffect):
     )
     needs = (Excitation.SLOPE,)
     confused_with = ("lateral_drift",)
+    python = """
+        v_x = v_x + {k} * math.sin(pitch) * turning
+        v_y = v_y - {k} * math.cos(pitch) * math.sin(roll) * turning"""
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pipeline.models.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter, Plausible
+from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
@@ -34,10 +35,13 @@ class SteeringGain(DriveEffect):
             0.85,
             least=Least(0.01, DATA_SHEET),
             plausible=Plausible(0.5, 1.5, "wider than the 0.85 of a worn linkage"),
+            quantities=(Quantity.STEERING_GAIN,),
         ),
     )
     needs = (Excitation.STEERING,)
     confused_with = ("understeer",)
+    python = """
+        steering = {g} * steering"""
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.models.effect import ACKERMANN, STAMPS, DriveEffect, Excitation, Least, Parameter, Search
 from pipeline.models.filters import lag_signal
+from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
@@ -37,10 +38,16 @@ class SteeringLag(DriveEffect):
             starts=(0.1, 0.3, 0.7, 1.4),
             step=5e-3,
             least=Least(0.015, STAMPS, sampled=True),
+            quantities=(Quantity.STEERING_LAG,),
         ),
     )
     needs = (Excitation.CHANGES, Excitation.STEERING)
     confused_with = ("transport_delay",)
+    python_state = ("lag_steering",)
+    python = """
+        keep = math.exp(-step_s / {tau}) if {tau} > 0.0 else 0.0
+        lag_steering = steering + (lag_steering - steering) * keep
+        steering = lag_steering"""
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pipeline.models.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter
+from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
@@ -33,10 +34,13 @@ class SteeringOffset(DriveEffect):
             "angle at which straight ahead is asked",
             0.04,
             least=Least(0.002, DATA_SHEET),
+            quantities=(Quantity.STEERING_OFFSET,),
         ),
     )
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("yaw_drift",)
+    python = """
+        steering = steering + {o}"""
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

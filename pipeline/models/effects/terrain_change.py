@@ -76,6 +76,14 @@ class TerrainChange(KinematicEffect):
     # A change point fits anything a little.
     price = 0.05
 
+    def choose_python(self, kind: str) -> str | None:
+        """The place of the change where it is given, else its time."""
+        del kind
+        beyond = "x > {at_x}" if math.isfinite(self.values["at_x"]) else "t >= {at_s}"
+        return f"""
+        if {beyond}:
+            v0, w0 = {{k_v}} * v0, {{k_w}} * w0"""
+
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
         at_x, at_s = self.values["at_x"], self.values["at_s"]

@@ -36,6 +36,9 @@ class TimeDrift(KinematicEffect):
     )
     needs = (Excitation.LONG,)
     confused_with = ("terrain_change", "wheel_radius")
+    python = """
+        fade = 1.0 - {k} * t / until_s
+        v0, w0 = fade * v0, fade * w0"""
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

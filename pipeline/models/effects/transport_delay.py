@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.models.effect import STAMPS, CommandEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.evidence import LEAST_DELAY_S
+from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
@@ -39,12 +40,15 @@ class TransportDelay(CommandEffect):
             step=5e-3,
             least=Least(LEAST_DELAY_S, STAMPS, sampled=True),
             plausible=Plausible(0.0, 0.8, "wider than the 0.5 s after which a ros2_control drive stops"),
+            quantities=(Quantity.COMMAND_DELAY,),
         ),
     )
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "body_inertia")
     equivalent_to = ("clock_offset",)
     equivalent_when = "the input is the command and there are neither encoders, gyro nor another clock"
+
+    python = ""  # the exported function looks commands up that much earlier
 
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""

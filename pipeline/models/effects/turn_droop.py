@@ -70,6 +70,9 @@ class TurnDroop(DriveEffect):
     needs = (Excitation.LARGE, Excitation.TURNING)
     confused_with = ("effective_track", "wheel_speed_limit", "body_turn_limit")
     contains = ("effective_track",)
+    python = """
+        lost = (1.0 - {gain}) * (right - left - max(-{threshold}, min({threshold}, right - left)))
+        left, right = left + lost / 2.0, right - lost / 2.0"""
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

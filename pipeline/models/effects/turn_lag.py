@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from pipeline.models.effect import DIFFERENTIAL, DriveEffect, Excitation, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import DriveLag
 from pipeline.models.filters import lag_signal
+from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
@@ -47,6 +48,7 @@ class TurnLag(DriveEffect):
             starts=(0.1, 0.4),
             step=5e-3,
             plausible=_PLAUSIBLE,
+            quantities=(Quantity.SPEED_LAG,),
         ),
         Parameter(
             "tau_diff",
@@ -59,12 +61,20 @@ class TurnLag(DriveEffect):
             starts=(0.3, 1.2),
             step=5e-3,
             plausible=_PLAUSIBLE,
+            quantities=(Quantity.TURN_LAG,),
         ),
     )
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("drive_lag", "transport_delay", "turn_droop")
     same_in_one_motion = ("drive_lag",)
     contains = ("drive_lag",)
+    python_state = ("lag_mean", "lag_difference")
+    python = """
+        keep = math.exp(-step_s / {tau_mean}) if {tau_mean} > 0.0 else 0.0
+        lag_mean = (left + right) / 2.0 + (lag_mean - (left + right) / 2.0) * keep
+        keep = math.exp(-step_s / {tau_diff}) if {tau_diff} > 0.0 else 0.0
+        lag_difference = right - left + (lag_difference - (right - left)) * keep
+        left, right = lag_mean - lag_difference / 2.0, lag_mean + lag_difference / 2.0"""
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -39,6 +39,8 @@ class Understeer(KinematicEffect):
     )
     needs = (Excitation.SPEED_SPREAD, Excitation.STEERING)
     confused_with = ("steering_gain",)
+    python = """
+        w0 = w0 / max(1.0 + {K} / WHEELBASE * v0 * v0, 0.05)"""
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

@@ -21,6 +21,7 @@ from pipeline.models.effect import (
     Parameter,
     Plausible,
 )
+from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import Rolling, RunContext
@@ -42,10 +43,13 @@ class WheelAsymmetry(KinematicEffect):
             0.04,
             least=Least(0.003, DATA_SHEET),
             plausible=Plausible(-0.2, 0.2, "wider than the 8 % of one soft side"),
+            quantities=(Quantity.RADIUS_DIFFERENCE,),
         ),
     )
     needs = (Excitation.BOTH_SIGNS, Excitation.SPEED_SPREAD)
     confused_with = ("yaw_drift", "lever_arm", "icr_lateral")
+    python = """
+        v0, w0 = v0 + {e} * B * w0 / 4.0, w0 + {e} * v0 / B"""
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

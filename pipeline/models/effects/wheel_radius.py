@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.models.effect import DATA_SHEET, Excitation, KinematicEffect, Least, Parameter, Plausible
+from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import Rolling, RunContext
@@ -32,10 +33,13 @@ class WheelRadius(KinematicEffect):
             0.92,
             least=Least(0.004, DATA_SHEET),
             plausible=Plausible(0.7, 1.3, "wider than the 2 to 25 % that were seen"),
+            quantities=(Quantity.RADIUS,),
         ),
     )
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("speed_slip", "effective_track")
+    python = """
+        v0, w0 = {k} * v0, {k} * w0"""
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

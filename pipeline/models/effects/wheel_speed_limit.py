@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter, Search
+from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
@@ -37,10 +38,14 @@ class WheelSpeedLimit(CommandEffect):
             starts=(0.3, 0.5, 0.7, 0.85, 0.95),
             relative_to="wheel",
             step=1e-2,
+            quantities=(Quantity.WHEEL_SPEED_LIMIT,),
         ),
     )
     needs = (Excitation.LARGE,)
     confused_with = ("body_speed_limit", "body_turn_limit")
+    python = """
+        left = max(-{limit}, min({limit}, left))
+        right = max(-{limit}, min({limit}, right))"""
 
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""

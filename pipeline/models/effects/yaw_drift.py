@@ -29,6 +29,8 @@ class YawDrift(LinearEffect):
     parameters = (Parameter("c", "rad/s", (-0.5, 0.5), 0.0, "yaw rate to the left", 0.06),)
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("wheel_asymmetry", "steering_offset")
+    python = """
+        v_w = v_w + {c} * turning"""
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

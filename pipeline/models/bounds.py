@@ -1,0 +1,17 @@
+"""Whether a number stopped because it may go no further."""
+
+from __future__ import annotations
+
+import math
+
+__all__ = ["stands_at_bound"]
+
+_MARGIN = 1e-6
+"""Of the size of the bounds: fits stop that close to them."""
+
+
+def stands_at_bound(value: float, bounds: tuple[float, float]) -> bool:
+    """Whether a number stopped because it may go no further."""
+    low, high = bounds
+    margin = _MARGIN * (abs(low) + abs(high)) if math.isfinite(low + high) else 0.0
+    return not low + margin < value < high - margin

@@ -1,0 +1,1 @@
+"""What a model is exported to, one file each: it is found by being there and holds one `TARGET`."""

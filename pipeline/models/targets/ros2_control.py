@@ -1,0 +1,81 @@
+"""Parameters of ros2_control's wheeled controllers: diff_drive_controller, ackermann_steering_controller."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.models.body_limits import (
+    find_radius,
+    find_speed_acceleration,
+    find_speed_limit,
+    find_turn_acceleration,
+    find_turn_limit,
+    negate,
+)
+from pipeline.models.quantity import Quantity
+from pipeline.models.settings import Facts, combine, start_sheet
+from pipeline.models.settings_text import write_yaml
+from pipeline.models.target import Target
+
+if TYPE_CHECKING:
+    from pipeline.models.model_file import ModelFile
+    from pipeline.models.settings import Sheet
+    from pipeline.models.target import Current
+
+
+def write(file: ModelFile, current: Current) -> str:
+    """The parameters as YAML; they stand for the controller's own, not beside them.
+
+    Raises:
+        MotionError: ``wrong_vehicle``.
+    """
+    del current
+    facts = Facts(file)
+    facts.require_kind(TARGET.name, "differential", "ackermann")
+    sheet = start_sheet(facts, TARGET)
+    if facts.vehicle.kind == "differential":
+        _add_differential(facts, sheet)
+    else:
+        _add_ackermann(facts, sheet)
+    return write_yaml(facts, sheet)
+
+
+def _add_differential(facts: Facts, sheet: Sheet) -> None:
+    node = "diff_drive_controller.ros__parameters"
+    radius, difference = facts.take(Quantity.RADIUS), facts.take(Quantity.RADIUS_DIFFERENCE)
+    sheet.add(f"{node}.wheel_separation", facts.measure("track_width_m"))
+    sheet.add(f"{node}.wheel_radius", facts.measure("wheel_radius_m"))
+    track = facts.take(Quantity.TRACK)
+    sheet.add(f"{node}.wheel_separation_multiplier", track, "in place of the one in use")
+    left = combine(lambda k, e: k * (1.0 - e / 2.0), radius, difference)
+    right = combine(lambda k, e: k * (1.0 + e / 2.0), radius, difference)
+    sheet.add(f"{node}.left_wheel_radius_multiplier", left)
+    sheet.add(f"{node}.right_wheel_radius_multiplier", right)
+    for axis, limit, acceleration in (
+        ("linear.x", find_speed_limit(facts), find_speed_acceleration(facts)),
+        ("angular.z", find_turn_limit(facts), find_turn_acceleration(facts)),
+    ):
+        sheet.add(f"{node}.{axis}.max_velocity", limit)
+        sheet.add(f"{node}.{axis}.min_velocity", negate(limit))
+        sheet.add(f"{node}.{axis}.max_acceleration", acceleration)
+        sheet.add(f"{node}.{axis}.max_deceleration", negate(acceleration))
+    sheet.head.append("On Humble limits also need has_velocity_limits and has_acceleration_limits.")
+
+
+def _add_ackermann(facts: Facts, sheet: Sheet) -> None:
+    node = "ackermann_steering_controller.ros__parameters"
+    sheet.add(f"{node}.wheelbase", facts.measure("wheelbase_m"))
+    sheet.add(f"{node}.traction_track_width", facts.measure("track_width_m"))
+    sheet.add(f"{node}.traction_wheels_radius", find_radius(facts))
+    sheet.head.append(
+        "On Humble traction_track_width is rear_wheel_track, traction_wheels_radius rear_wheels_radius."
+    )
+
+
+TARGET = Target(
+    "ros2_control",
+    "parameters of ros2_control's wheeled controllers",
+    "ros-controls/ros2_controllers 4.42 (Jazzy) to 6.9 (Rolling), diff_drive_controller_parameter.yaml and "
+    "ackermann_steering_controller.yaml",
+    write,
+)
