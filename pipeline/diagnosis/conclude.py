@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.budget import Budget
     from pipeline.diagnosis.context import Context
     from pipeline.diagnosis.diagnose import Explored
-    from pipeline.diagnosis.diagnosis import Json
+    from pipeline.diagnosis.diagnosis import Json, Value
     from pipeline.diagnosis.naming_rules import Clocks
     from pipeline.diagnosis.subject import Recording
     from pipeline.identification.judgement import Judgement
@@ -133,8 +133,12 @@ def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Con
 
 def _doubt(effect: Named) -> str | None:
     """Why an effect with its numbers is none of a vehicle's; None where it may well be one."""
-    values = {name: value.value for name, value in effect.parameters.items()}
-    return find_implausible(find_effect(effect.id)().change(**values))
+    return find_implausible(_restore(effect.id, effect.parameters))
+
+
+def _restore(name: str, values: Mapping[str, Value]) -> Effect:
+    """The effect with the numbers that are told of it."""
+    return find_effect(name)().change(**{key: value.value for key, value in values.items()})
 
 
 def _note_doubts(described: Sequence[Named]) -> list[Mapping[str, Json]]:
@@ -241,6 +245,7 @@ def _describe(
         corrected=_was_aligned(effect, context),
         way=way.search.way,
         selected=selected,
+        sentence=_restore(effect.id, values).describe_motion(context.vehicle),
     )
 
 

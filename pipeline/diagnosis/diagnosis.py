@@ -47,6 +47,7 @@ class Named:
         corrected: whether it is a clock that was put right before any model: no effect of the written one.
         way: on which way it was found: `command`, `measured` or `wheels`.
         selected: share of resampled recordings in which it is still worth its place.
+        sentence: what the vehicle does by it, with its numbers.
         tentative: far more structure stays in its channel than it explains; or it lowers no error on its own
             way; or its interval holds doing nothing.
     """
@@ -59,12 +60,14 @@ class Named:
     corrected: bool
     way: str
     selected: float
+    sentence: str
     tentative: bool = False
 
     def to_json(self) -> dict[str, Json]:
         """The promised keys, and more."""
         return {
             "id": self.id,
+            "sentence": self.sentence,
             "parameters": {
                 name: {
                     "value": _clean(v.value),

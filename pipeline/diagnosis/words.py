@@ -17,7 +17,7 @@ _WAYS = {"command": "from the command", "measured": "from the measured wheels"}
 
 
 def describe(diagnosis: Diagnosis) -> str:
-    """A diagnosis for a tired person; of runs that were judged together what they share is said once."""
+    """A diagnosis in plain text; of runs that were judged together what they share is said once."""
     if len(diagnosis.runs) == 1:
         return _write(_describe_alone(diagnosis.runs[0]))
     first = diagnosis.runs[0]
@@ -89,6 +89,7 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
             notes.append("tentative")
         note = f"  ({'; '.join(notes)})" if notes else ""
         rows.append(f"{effect.id:<20}{_values(effect):<{width}}{falls.get(effect.id, '')}{note}")
+        rows.append(f"{'':<20}{effect.sentence}")
     rows += [
         f"{'undecided':<20}{' or '.join(item.candidates)}: {item.separate_by}" for item in diagnosis.undecided
     ]

@@ -9,18 +9,57 @@ from __future__ import annotations
 import enum
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
 
+from pipeline.models.parameter import (
+    DATA_SHEET,
+    MOUNTING,
+    STAMPS,
+    Excitation,
+    Least,
+    Parameter,
+    Part,
+    Plausible,
+    Search,
+)
 from pipeline.runs.errors import MotionError
 from pipeline.vehicles.kinematics import list_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from pipeline.models.evidence import Evidence, Largest, Relative
-    from pipeline.models.quantity import Quantity
+    from pipeline.models.evidence import Evidence, Largest
     from pipeline.runs.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
+    from pipeline.vehicles import Vehicle
+
+__all__ = [  # what a file of an effect needs
+    "ACKERMANN",
+    "ANY",
+    "DATA_SHEET",
+    "DIFFERENTIAL",
+    "INF",
+    "MOUNTING",
+    "NAN",
+    "STAMPS",
+    "AddedEffect",
+    "BodyEffect",
+    "Column",
+    "CommandEffect",
+    "DriveEffect",
+    "Effect",
+    "Excitation",
+    "KinematicEffect",
+    "Late",
+    "Least",
+    "LinearEffect",
+    "Parameter",
+    "Part",
+    "Place",
+    "Plausible",
+    "ReportEffect",
+    "Search",
+    "find_late",
+]
 
 INF = math.inf
 NAN = math.nan
@@ -41,125 +80,12 @@ class Place(enum.IntEnum):
     LOCALIZATION = 7
 
 
-class Excitation(enum.Enum):
-    """What a run must contain for an effect to leave a trace of its own."""
-
-    DRIVING = "driving"
-    TURNING = "turning both ways"
-    SPEED_SPREAD = "several speeds"
-    BOTH_SIGNS = "driving forward and backward"
-    CHANGES = "changes of command"
-    SLOPE = "slopes in several directions"
-    LARGE = "commands near the limits"
-    SMALL = "commands near zero"
-    LONG = "a run of several minutes"
-    STEERING = "steering to both sides"
-
-
-class Search(enum.Enum):
-    """How a parameter is found: from one start, from several, or on a shrinking grid if it is not smooth."""
-
-    DIRECT = "direct"
-    STARTS = "starts"
-    GRID = "grid"
-
-
 class Late(enum.Enum):
     """What an effect makes late whose only number is a delay: sensors may know that delay beforehand."""
 
     POSES = "poses are stamped late"
     HEADING = "the heading is older than its position"
     BODY = "the body follows its wheels late, which hides a delay of the encoders"
-
-
-@dataclass(frozen=True)
-class Least:
-    """The smallest size of a number that is worth a name.
-
-    Attributes:
-        size: distance from the neutral value, in the parameter's unit.
-        reason: what makes as much of nothing, however small the interval is.
-        sampled: whether sampling the wheels does too: then its delay is the least.
-    """
-
-    size: float
-    reason: str
-    sampled: bool = False
-
-
-STAMPS = "stamps are off by as much"
-MOUNTING = "sensors are mounted no better"
-DATA_SHEET = "a data sheet allows as much"
-
-
-@dataclass(frozen=True)
-class Plausible:
-    """The range that vehicles show, wider than was ever seen: outside, a name stands for something else.
-
-    Attributes:
-        low, high: ends of the range, in the parameter's unit.
-        source: where it comes from.
-    """
-
-    low: float
-    high: float
-    source: str
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One number of an effect.
-
-    Attributes:
-        name: as in the formula.
-        unit: SI, `1` for a plain number.
-        bounds: smallest and largest value.
-        neutral: value at which the effect changes nothing; NaN for a number that only says where it acts.
-        about: what it is.
-        typical: a usual size.
-        search: how it is found.
-        starts: values to start or to begin the grid from.
-        relative_to: what the starts are shares of: the largest commanded `speed`, `turn` or `wheel` speed,
-            the run's `duration`, or its way along x (`place`); empty where they are values.
-        step: change used for numerical derivatives.
-        least: smallest size worth a name; None where every size is, or where `Effect.is_degenerate` tells.
-        plausible: what vehicles show; None for all within the bounds.
-        one_sign: whether physics has positive values only: the other sign is a clock or chance.
-        instead_of: the parameter that counts no more once this one is given; this one is not searched alone.
-        quantities: what it is to a controller; none where no controller knows of it.
-    """
-
-    name: str
-    unit: str
-    bounds: tuple[float, float]
-    neutral: float
-    about: str
-    typical: float
-    search: Search = Search.DIRECT
-    starts: tuple[float, ...] = ()
-    relative_to: Relative = ""
-    step: float = 1e-4
-    least: Least | None = None
-    plausible: Plausible | None = None
-    one_sign: bool = False
-    instead_of: str = ""
-    quantities: tuple[Quantity, ...] = ()
-
-
-@dataclass(frozen=True)
-class Part:
-    """A number of an effect that is searched as that of another effect.
-
-    Attributes:
-        name: of the number.
-        effect, parameter: under which it is searched.
-        factor: what that is multiplied with.
-    """
-
-    name: str
-    effect: str
-    parameter: str
-    factor: float
 
 
 DIFFERENTIAL = ("differential",)
@@ -260,6 +186,12 @@ class Effect(ABC):
         return cls().change(
             **{part.name: part.factor * found[part.effect].values[part.parameter] for part in cls.parts}
         )
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """What the vehicle does, with numbers; by default what the docstring begins with."""
+        del vehicle
+        summary = (type(self).__doc__ or self.id).strip().splitlines()[0].rstrip(".")
+        return summary.partition(": ")[2] or summary
 
     def choose_python(self, kind: str) -> str | None:
         """Its step in the exported function on a kind of vehicle; see `python`."""

@@ -232,7 +232,7 @@ export class Pane {
         h("b", {}, effect.id),
         h("button", { type: "button", class: "switch", "aria-pressed": String(!effect.off), title: "on or off, without a fit", onclick: () => this.act("switch", { effect: effect.id }) }, effect.off ? "off" : "on"),
         h("button", { type: "button", class: "drop", title: "drop it and fit the rest", "aria-label": `drop ${effect.id}`, onclick: () => this.act("drop", { effect: effect.id }) }, "×")),
-      h("p", { class: "quiet" }, effect.formula.length ? effect.formula.join("; ") : effect.about),
+      h("p", { class: "quiet" }, effect.formula.length ? effect.formula.join("; ") : effect.sentence || effect.about),
       effect.parameters.map((parameter) => this.slider(effect, parameter)),
       carries !== null && carries > 0 && h("p", { class: "carries" }, `without it ${say(effect.without_m)} m`));
   }
@@ -324,7 +324,7 @@ export class Pane {
       return h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", onclick: () => this.diagnose() }, "Diagnose"));
     const effects = (diagnosis.effects ?? []).filter((entry) => !there.has(entry.id) && !entry.corrected).sort((a, b) => (b.gain ?? 0) - (a.gain ?? 0));
     const told = effects.map((entry) => h("li", { class: "first", data: { effect: entry.id }, bar: 1 },
-      h("div", {}, h("b", {}, entry.id), h("span", { class: "quiet" }, `named by the diagnosis${Number.isFinite(entry.gain) ? `: without it the loss is ${say(entry.gain + 1)} times as high` : ""}${(entry.equivalent_to ?? []).length ? `; same as ${entry.equivalent_to.join(", ")}` : ""}`)),
+      h("div", {}, h("b", {}, entry.id), entry.sentence && h("span", {}, entry.sentence), h("span", { class: "quiet" }, `named by the diagnosis${Number.isFinite(entry.gain) ? `: without it the loss is ${say(entry.gain + 1)} times as high` : ""}${(entry.equivalent_to ?? []).length ? `; same as ${entry.equivalent_to.join(", ")}` : ""}`)),
       h("button", { type: "button", class: "add", "aria-label": `add ${entry.id}, named by the diagnosis`, onclick: () => this.add(entry.id) }, "Add")));
     const all = effects.length > 1 && h("button", { type: "button", class: "add-all", onclick: () => this.addAll() }, `Add all ${effects.length}`);
     const undecided = (diagnosis.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. ${entry.separate_by ?? ""}`));

@@ -119,8 +119,9 @@ def test_what_is_missing_stands_in_the_order_of_the_ladder(skidding: Diagnosis) 
     lines = list_lines(run)
     place = [label for label, _ in lines].index("missing")
     assert lines[place][1].startswith(run.effects[0].id)
-    assert lines[place + 1] == ("", lines[place + 1][1])
-    assert lines[place + 1][1].startswith(run.effects[1].id)
+    # Below each effect stands what the vehicle does by it.
+    assert lines[place + 1] == ("", f"{'':<20}{run.effects[0].sentence}")
+    assert lines[place + 2][1].startswith(run.effects[1].id)
 
 
 def test_the_ladder_table_keeps_its_contract(skidding: Diagnosis) -> None:

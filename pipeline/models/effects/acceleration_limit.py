@@ -19,6 +19,7 @@ from pipeline.models.quantity import Quantity
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence, Largest
     from pipeline.runs.signals import RunContext, Wheels
+    from pipeline.vehicles import Vehicle
 
 # A limit that the largest wheel speed is reached under in less shows in no pose.
 _LEAST_RAMP_S = 0.08
@@ -51,6 +52,11 @@ class AccelerationLimit(DriveEffect):
         limited_left = approach(limited_left, left, most)
         limited_right = approach(limited_right, right, most)
         left, right = limited_left, limited_right"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        return f"changes no wheel's speed faster than {self.values['limit']:.3g} rad/s^2"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

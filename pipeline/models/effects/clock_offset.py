@@ -18,6 +18,7 @@ from pipeline.models.evidence import LEAST_DELAY_S
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Velocity
+    from pipeline.vehicles import Vehicle
 
 
 class ClockOffset(ReportEffect):
@@ -45,6 +46,13 @@ class ClockOffset(ReportEffect):
     equivalent_to = ("transport_delay",)
     equivalent_when = "the input is the command and there are neither encoders, gyro nor another clock"
     late = Late.POSES
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        late = self.values["d"]
+        way = "late" if late >= 0.0 else "early"
+        return f"stamps its poses {abs(late) * 1e3:.0f} ms {way}"
 
     def report(self, velocity: Velocity, around: RunContext) -> Velocity:
         """See the formula above."""

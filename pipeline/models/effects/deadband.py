@@ -19,6 +19,7 @@ from pipeline.models.quantity import Quantity
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence, Largest
     from pipeline.runs.signals import Commands, RunContext
+    from pipeline.vehicles import Vehicle
 
 # Of the largest speed: less is passed through in one step of a command.
 _LEAST_SHARE = 0.02
@@ -48,6 +49,11 @@ class Deadband(CommandEffect):
     python = """
         left = 0.0 if R * abs(left) < {d} else left
         right = 0.0 if R * abs(right) < {d} else right"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        return f"does not move a wheel for less than {self.values['d']:.2g} m/s at its rim"
 
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""

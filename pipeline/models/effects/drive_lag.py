@@ -19,6 +19,7 @@ from pipeline.models.quantity import Quantity
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Wheels
+    from pipeline.vehicles import Vehicle
 
 
 class DriveLag(DriveEffect):
@@ -53,6 +54,11 @@ class DriveLag(DriveEffect):
         lag_left = left + (lag_left - left) * keep
         lag_right = right + (lag_right - right) * keep
         left, right = lag_left, lag_right"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        return f"follows its commands {self.values['tau']:.2f} s late, gradually"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -26,6 +26,7 @@ from pipeline.models.quantity import Quantity
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
     from pipeline.runs.signals import Rolling, RunContext
+    from pipeline.vehicles import Vehicle
 
 
 class EffectiveTrack(KinematicEffect):
@@ -51,6 +52,13 @@ class EffectiveTrack(KinematicEffect):
     confused_with = ("wheel_radius", "terrain_change")
     python = """
         w0 = w0 / {k}"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        wide = self.values["k"] * (vehicle.track_width_m or 1.0)
+        return (
+            f"turns as if its wheels stood {wide:.2f} m apart instead of {vehicle.track_width_m or 1.0:.2f}"
+        )
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

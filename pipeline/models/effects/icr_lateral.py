@@ -12,12 +12,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.models.effect import MOUNTING, Excitation, Least, LinearEffect, Parameter, Place, Plausible
+from pipeline.models.wording import name_side
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
+    from pipeline.vehicles import Vehicle
 
 
 class IcrLateral(LinearEffect):
@@ -43,6 +45,12 @@ class IcrLateral(LinearEffect):
     equivalent_when = "always: a pose of a point l_y = -y_icr to the left moves alike"
     python = """
         v_x = v_x + {y_icr} * v_w"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        offset = self.values["y_icr"]
+        return f"turns about a point {abs(offset) * 100.0:.2g} cm to the {name_side(offset)} of its middle"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
+    from pipeline.vehicles import Vehicle
 
 
 class IcrOffset(LinearEffect):
@@ -44,6 +45,13 @@ class IcrOffset(LinearEffect):
     equivalent_when = "always: a pose of a point l_x = -x_icr ahead moves alike"
     python = """
         v_y = v_y - {x_icr} * v_w"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        offset = self.values["x_icr"]
+        way = "ahead of" if offset >= 0.0 else "behind"
+        return f"turns about a point {abs(offset) * 100.0:.2g} cm {way} its middle"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

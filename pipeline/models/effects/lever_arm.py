@@ -12,12 +12,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.models.effect import Excitation, LinearEffect, Parameter, Part, Place
+from pipeline.models.wording import name_side
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
+    from pipeline.vehicles import Vehicle
 
 
 class LeverArm(LinearEffect):
@@ -35,6 +37,14 @@ class LeverArm(LinearEffect):
     equivalent_to = ("icr_offset", "icr_lateral")
     equivalent_when = "always: a centre of rotation at (-l_x, -l_y) moves alike"
     parts = (Part("l_x", "icr_offset", "x_icr", -1.0), Part("l_y", "icr_lateral", "y_icr", -1.0))
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        ahead, left = self.values["l_x"], self.values["l_y"]
+        way = "ahead of" if ahead >= 0.0 else "behind"
+        aside = f"{abs(left) * 100.0:.2g} cm to the {name_side(left)}"
+        return f"reports the pose of a point {abs(ahead) * 100.0:.2g} cm {way} its middle and {aside}"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

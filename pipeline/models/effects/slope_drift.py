@@ -10,6 +10,7 @@ Source: Seegmiller and Kelly, RSS 2014, the gravity term of the slip model.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
+    from pipeline.vehicles import Vehicle
 
 
 class SlopeDrift(LinearEffect):
@@ -45,6 +47,13 @@ class SlopeDrift(LinearEffect):
     python = """
         v_x = v_x + {k} * math.sin(pitch) * turning
         v_y = v_y - {k} * math.cos(pitch) * math.sin(roll) * turning"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        speed = self.values["k"] * math.sin(math.radians(10.0))
+        way = "downhill" if speed >= 0.0 else "uphill"
+        return f"slides {way} at {abs(speed):.2g} m/s on a slope of 10 degrees"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

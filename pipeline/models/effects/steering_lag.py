@@ -18,6 +18,7 @@ from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
+    from pipeline.vehicles import Vehicle
 
 
 class SteeringLag(DriveEffect):
@@ -48,6 +49,11 @@ class SteeringLag(DriveEffect):
         keep = math.exp(-step_s / {tau}) if {tau} > 0.0 else 0.0
         lag_steering = steering + (lag_steering - steering) * keep
         steering = lag_steering"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        return f"follows its steering commands {self.values['tau']:.2f} s late, gradually"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -14,9 +14,11 @@ from typing import TYPE_CHECKING
 
 from pipeline.models.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter
 from pipeline.models.quantity import Quantity
+from pipeline.models.wording import name_side
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
+    from pipeline.vehicles import Vehicle
 
 
 class SteeringOffset(DriveEffect):
@@ -41,6 +43,12 @@ class SteeringOffset(DriveEffect):
     confused_with = ("yaw_drift",)
     python = """
         steering = steering + {o}"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        angle = self.values["o"]
+        return f"steers {abs(angle):.2g} rad to the {name_side(angle)} when straight ahead is asked"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -29,6 +29,7 @@ from pipeline.models.effect import (
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import Rolling, RunContext
+    from pipeline.vehicles import Vehicle
 
 _LEAST = Least(0.03, DATA_SHEET)
 _PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")
@@ -75,6 +76,13 @@ class TerrainChange(KinematicEffect):
     contains = ("effective_track", "wheel_radius", "time_drift")
     # A change point fits anything a little.
     price = 0.05
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        at_x, at_s = self.values["at_x"], self.values["at_s"]
+        where = f"beyond x = {at_x:.3g} m" if math.isfinite(at_x) else f"from {at_s:.0f} s on"
+        return f"travels {self.values['k_v']:.0%} and turns {self.values['k_w']:.0%} of before {where}"
 
     def choose_python(self, kind: str) -> str | None:
         """The place of the change where it is given, else its time."""

@@ -20,6 +20,7 @@ from pipeline.models.quantity import Quantity
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import Commands, RunContext
+    from pipeline.vehicles import Vehicle
 
 
 class TransportDelay(CommandEffect):
@@ -49,6 +50,11 @@ class TransportDelay(CommandEffect):
     equivalent_when = "the input is the command and there are neither encoders, gyro nor another clock"
 
     python = ""  # the exported function looks commands up that much earlier
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        return f"does what was asked {self.values['d']:.2f} s ago"
 
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pipeline.models.effect import Effect
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Wheels
+    from pipeline.vehicles import Vehicle
 
 _PLAUSIBLE = Plausible(0.0, 3.0, "wider than the 0.1 to 1.6 s of Husky and Warthog")
 # Closer together, as a share of the slower one or in seconds, both time constants are one.
@@ -75,6 +76,12 @@ class TurnLag(DriveEffect):
         keep = math.exp(-step_s / {tau_diff}) if {tau_diff} > 0.0 else 0.0
         lag_difference = right - left + (lag_difference - (right - left)) * keep
         left, right = lag_mean - lag_difference / 2.0, lag_mean + lag_difference / 2.0"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        mean, difference = self.values["tau_mean"], self.values["tau_diff"]
+        return f"follows commanded turning {difference:.2f} s late, and speed {mean:.2f} s"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

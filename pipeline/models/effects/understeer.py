@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.models.effect import ACKERMANN, Excitation, KinematicEffect, Parameter, Plausible
+from pipeline.models.wording import describe_share
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import Rolling, RunContext
+    from pipeline.vehicles import Vehicle
 
 
 class Understeer(KinematicEffect):
@@ -41,6 +43,13 @@ class Understeer(KinematicEffect):
     confused_with = ("steering_gain",)
     python = """
         w0 = w0 / max(1.0 + {K} / WHEELBASE * v0 * v0, 0.05)"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        at = 3.0
+        wheelbase = vehicle.wheelbase_m or 1.0
+        share = 1.0 - wheelbase / (wheelbase + self.values["K"] * at**2)
+        return f"turns {describe_share(1.0 - share)} than it steers at {at:g} m/s, and ever less with speed"
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

@@ -22,9 +22,11 @@ from pipeline.models.effect import (
     Plausible,
 )
 from pipeline.models.quantity import Quantity
+from pipeline.models.wording import name_side
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import Rolling, RunContext
+    from pipeline.vehicles import Vehicle
 
 
 class WheelAsymmetry(KinematicEffect):
@@ -50,6 +52,12 @@ class WheelAsymmetry(KinematicEffect):
     confused_with = ("yaw_drift", "lever_arm", "icr_lateral")
     python = """
         v0, w0 = v0 + {e} * B * w0 / 4.0, w0 + {e} * v0 / B"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        share = self.values["e"]
+        return f"rolls on {name_side(-share)} wheels {abs(share):.1%} larger than those on the other side"
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

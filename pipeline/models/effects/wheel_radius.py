@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 
 from pipeline.models.effect import DATA_SHEET, Excitation, KinematicEffect, Least, Parameter, Plausible
 from pipeline.models.quantity import Quantity
+from pipeline.models.wording import describe_share
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import Rolling, RunContext
+    from pipeline.vehicles import Vehicle
 
 
 class WheelRadius(KinematicEffect):
@@ -40,6 +42,11 @@ class WheelRadius(KinematicEffect):
     confused_with = ("speed_slip", "effective_track")
     python = """
         v0, w0 = {k} * v0, {k} * w0"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        return f"travels {describe_share(self.values['k'])} than its wheels turn"
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

@@ -19,6 +19,7 @@ from pipeline.models.quantity import Quantity
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import Commands, RunContext
+    from pipeline.vehicles import Vehicle
 
 
 class WheelSpeedLimit(CommandEffect):
@@ -46,6 +47,11 @@ class WheelSpeedLimit(CommandEffect):
     python = """
         left = max(-{limit}, min({limit}, left))
         right = max(-{limit}, min({limit}, right))"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        return f"turns no wheel faster than {self.values['limit']:.3g} rad/s"
 
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""

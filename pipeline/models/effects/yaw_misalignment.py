@@ -15,9 +15,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pipeline.models.effect import MOUNTING, Excitation, Least, Parameter, Plausible, ReportEffect
+from pipeline.models.wording import name_side
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Velocity
+    from pipeline.vehicles import Vehicle
 
 
 class YawMisalignment(ReportEffect):
@@ -39,6 +41,12 @@ class YawMisalignment(ReportEffect):
     )
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("lateral_drift",)
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        angle = math.degrees(self.values["psi"])
+        return f"reports a heading {abs(angle):.2g} degrees too far {name_side(angle)}, or crabs as much"
 
     def report(self, velocity: Velocity, around: RunContext) -> Velocity:
         """See the formula above."""

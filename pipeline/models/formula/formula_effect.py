@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from pipeline.models.formula.units import Unit
     from pipeline.runs.signals import Rolling, RunContext, Velocity
+    from pipeline.vehicles import Vehicle
 
 
 _BASE_UNITS = {
@@ -106,6 +107,11 @@ class FormulaEffect(AddedEffect):
         lines = [f"{self.id}: a formula of the model file.", ""]
         lines += [f"    {channel} += {text}" for channel, text in self.formulas.items()]
         return "\n".join(lines)
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The formulas themselves."""
+        del vehicle
+        return "moves by " + ", ".join(f"{channel} += {text}" for channel, text in self.formulas.items())
 
     def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
         """Add the formulas' values."""

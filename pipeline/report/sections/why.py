@@ -30,7 +30,7 @@ def view_why(page: Page) -> dict[str, object]:
     known = drivetrain is not None and ground is not None
     return {
         "diagnosed": bool(report.diagnosis),
-        "named": [entry.get("id", "") for entry in effects],
+        "named": [(entry.get("id", ""), entry.get("sentence") or "shows") for entry in effects],
         "explained": number_in(report.diagnosis, "explained_share"),
         "table": Table("Missing from the ideal model", _HEAD, rows),
         "open": list(_list_open(report)),

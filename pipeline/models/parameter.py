@@ -1,0 +1,124 @@
+"""The numbers of an effect: units, bounds, how they are searched, and what of them is worth a name."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pipeline.models.evidence import Relative
+    from pipeline.models.quantity import Quantity
+
+
+class Excitation(enum.Enum):
+    """What a run must contain for an effect to leave a trace of its own."""
+
+    DRIVING = "driving"
+    TURNING = "turning both ways"
+    SPEED_SPREAD = "several speeds"
+    BOTH_SIGNS = "driving forward and backward"
+    CHANGES = "changes of command"
+    SLOPE = "slopes in several directions"
+    LARGE = "commands near the limits"
+    SMALL = "commands near zero"
+    LONG = "a run of several minutes"
+    STEERING = "steering to both sides"
+
+
+class Search(enum.Enum):
+    """How a parameter is found: from one start, from several, or on a shrinking grid if it is not smooth."""
+
+    DIRECT = "direct"
+    STARTS = "starts"
+    GRID = "grid"
+
+
+@dataclass(frozen=True)
+class Least:
+    """The smallest size of a number that is worth a name.
+
+    Attributes:
+        size: distance from the neutral value, in the parameter's unit.
+        reason: what makes as much of nothing, however small the interval is.
+        sampled: whether sampling the wheels does too: then its delay is the least.
+    """
+
+    size: float
+    reason: str
+    sampled: bool = False
+
+
+STAMPS = "stamps are off by as much"
+MOUNTING = "sensors are mounted no better"
+DATA_SHEET = "a data sheet allows as much"
+
+
+@dataclass(frozen=True)
+class Plausible:
+    """The range that vehicles show, wider than was ever seen: outside, a name stands for something else.
+
+    Attributes:
+        low, high: ends of the range, in the parameter's unit.
+        source: where it comes from.
+    """
+
+    low: float
+    high: float
+    source: str
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an effect.
+
+    Attributes:
+        name: as in the formula.
+        unit: SI, `1` for a plain number.
+        bounds: smallest and largest value.
+        neutral: value at which the effect changes nothing; NaN for a number that only says where it acts.
+        about: what it is.
+        typical: a usual size.
+        search: how it is found.
+        starts: values to start or to begin the grid from.
+        relative_to: what the starts are shares of: the largest commanded `speed`, `turn` or `wheel` speed,
+            the run's `duration`, or its way along x (`place`); empty where they are values.
+        step: change used for numerical derivatives.
+        least: smallest size worth a name; None where every size is, or where `Effect.is_degenerate` tells.
+        plausible: what vehicles show; None for all within the bounds.
+        one_sign: whether physics has positive values only: the other sign is a clock or chance.
+        instead_of: the parameter that counts no more once this one is given; this one is not searched alone.
+        quantities: what it is to a controller; none where no controller knows of it.
+    """
+
+    name: str
+    unit: str
+    bounds: tuple[float, float]
+    neutral: float
+    about: str
+    typical: float
+    search: Search = Search.DIRECT
+    starts: tuple[float, ...] = ()
+    relative_to: Relative = ""
+    step: float = 1e-4
+    least: Least | None = None
+    plausible: Plausible | None = None
+    one_sign: bool = False
+    instead_of: str = ""
+    quantities: tuple[Quantity, ...] = ()
+
+
+@dataclass(frozen=True)
+class Part:
+    """A number of an effect that is searched as that of another effect.
+
+    Attributes:
+        name: of the number.
+        effect, parameter: under which it is searched.
+        factor: what that is multiplied with.
+    """
+
+    name: str
+    effect: str
+    parameter: str
+    factor: float
