@@ -23,9 +23,10 @@ def rank(record: Record) -> tuple[int, ...]:
     """How wrong an answer is, the gravest first: falsely named, missed, left open."""
     score = record.score
     flags = int(bool(score.flagged) and not record.answer.odd)
+    unseen = int(bool(record.answer.odd) and not score.flagged)
     return (
         len(score.false) + flags,
-        len(score.missed),
+        len(score.missed) + unseen,
         len(score.undecided) + len(score.unobservable),
     )
 

@@ -133,6 +133,7 @@ def _as_json(value: object) -> object:
 def _from_json(line: dict[str, dict[str, object]]) -> Record:
     content = dict(line)
     score = {key: tuple(v) if isinstance(v, list) else v for key, v in content.pop("score").items()}
+    score["intervals"] = tuple(tuple(entry) for entry in score.get("intervals", ()))
     score["errors"] = tuple(math.nan if v is None else v for v in score["errors"])
     checked = content.pop("checked")
     models = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from draw import Answer  # noqa: TC002 - it runs as a script, too
@@ -40,6 +40,8 @@ class Score:
         flagged: channel in which structure was called unexplained, empty without.
         errors: 2 s position error before, after, and the floor [m].
         groups: what was left undecided: candidates joined by `|`.
+        intervals: of every number that was rightly named for itself: on which way it was found, its label,
+            the truth, the value, and the ends of its 95 % interval.
     """
 
     truth: tuple[str, ...]
@@ -52,6 +54,7 @@ class Score:
     flagged: str
     errors: tuple[float, float, float]
     groups: tuple[str, ...] = ()
+    intervals: tuple[tuple[str, str, float, float, float, float], ...] = ()
 
     @property
     def is_exact(self) -> bool:
@@ -88,7 +91,24 @@ def score_run(answer: Answer, run: Json) -> Score:
     return Score(
         truth, tuple(named), tuple(found), tuple(undecided), tuple(unobservable), tuple(missed),
         tuple(false), channel, _errors(run), tuple("|".join(sorted(group)) for group in groups),
+        tuple(_list_intervals(answer, entries)),
     )  # fmt: skip
+
+
+def _list_intervals(
+    answer: Answer, entries: Sequence[Json]
+) -> Iterator[tuple[str, str, float, float, float, float]]:
+    for entry in entries:
+        true = answer.effects.get(str(entry["id"]), {})
+        told = entry.get("parameters")
+        for name, number in told.items() if isinstance(told, Mapping) else ():
+            ends = [number.get(key) for key in ("value", "low", "high")]
+            # A clock that was put right beforehand, and a number at its bound, have no interval.
+            if name not in true or None in ends or number.get("at_bound"):
+                continue
+            value, low, high = map(float, ends)
+            way, label = str(entry.get("found_on", "")), f"{entry['id']}.{name}"
+            yield way, label, float(true[name]), value, low, high
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:

@@ -81,6 +81,7 @@ def describe(category: str, played: Sequence[Record]) -> list[str]:
                 f"{7.0 * sum(extras) / len(extras):.2f} in seven"
             )
     right = _choose_test(category)
+    lines += describe_intervals(counted)
     lines += _list_kinds(category, counted, right)
     if category == "odd":
         lines += _list_kinds(category, counted, has_useful_formula, "a formula that helps, by kind")
@@ -94,6 +95,22 @@ def describe(category: str, played: Sequence[Record]) -> list[str]:
     misses = [record for record in counted if record.outcome == "scored" and not right(record)]
     lines += [_describe_miss(record) for record in misses]
     return lines
+
+
+def describe_intervals(played: Sequence[Record]) -> list[str]:
+    """How often a stated 95 % interval holds the truth, by the way that the number was found on."""
+    found: dict[str, list[bool]] = defaultdict(list)
+    missed: Counter[str] = Counter()
+    for record in played:
+        for way, label, truth, _, low, high in record.score.intervals:
+            found[way].append(low <= truth <= high)
+            missed[label] += not found[way][-1]
+    lines = [
+        describe_rate(f"95 % intervals that hold the truth, {way}", sum(held), len(held))
+        for way, held in sorted(found.items())
+    ]
+    outside = ", ".join(f"{label} {count}" for label, count in missed.most_common() if count)
+    return [*lines, f"  outside: {outside}"] if outside else lines
 
 
 def is_clean(record: Record) -> bool:
