@@ -138,7 +138,7 @@ def test_a_saved_model_is_a_model_file(workbench: Workbench) -> None:
 def test_no_link_in_the_results_leads_what_is_kept_outside(
     results: Path, tmp_path: Path, folder: str
 ) -> None:
-    """The results may be a stranger's: a link in them must not choose which file a model takes the place of."""
+    """The results may be a stranger's: no link in them chooses which file a model takes the place of."""
     victim = tmp_path / "victim"
     victim.mkdir()
     for name in ("hidden.toml", "hidden.json"):
