@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import polars as pl
 import pytest
 from store_samples import read_seed, write_generation
 
 from pipeline.store import Mirror, Store, StoreError
+from pipeline.store.manifest import hash_bytes
 
 fsspec = pytest.importorskip("fsspec", reason="the extra s3 is not installed")
 
@@ -236,6 +239,22 @@ def test_a_pipe_in_the_results_is_not_waited_for(store: Store, name: str) -> Non
         store.query("SELECT * FROM slip, datasets")
     assert caught.value.code == "not_a_file"
     assert [problem.path for problem in store.verify()] == ([] if path.parent == store.root else [path])
+
+
+@pytest.mark.parametrize("change", ["a column less", "another type"])
+def test_a_table_has_the_columns_of_its_contract(store: Store, change: str) -> None:
+    """Whoever makes results can give their hashes as well."""
+    manifest = write_generation(store, RUN, "k", 1)
+    path = manifest.path("slip")
+    frame = pl.read_parquet(path)
+    odd = frame.drop("t") if change == "a column less" else frame.with_columns(pl.lit("x").alias("t"))
+    odd.write_parquet(path)
+    home = path.parents[1] / "manifest.json"
+    entry = {**asdict(manifest.tables["slip"]), "sha256": hash_bytes(path.read_bytes())}
+    edit(home, {"tables": {"slip": entry}})
+    with pytest.raises(StoreError, match="not those of its contract") as caught:
+        store.read(RUN, "slip")
+    assert caught.value.code == "table_damaged"
 
 
 @pytest.mark.parametrize("name", ["listed", "batch", "batch/logs", "batch/claims", "identities"])
