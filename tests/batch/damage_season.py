@@ -156,12 +156,13 @@ def run_batch(logs: Path, out: Path) -> tuple[int, dict[str, object], str]:
     from pipeline.batch import recordings  # noqa: PLC0415 - the repository is put on the path first
     from pipeline.cli.app import main as slip  # noqa: PLC0415
 
-    arguments = ["batch", str(logs), "--out", str(out), "--executor", "inline", "--settle", "1", "--json"]
+    arguments = ["batch", str(logs), "--out", str(out), "--executor", "inline", "--settle", "600", "--json"]
     said, errors = io.StringIO(), io.StringIO()
     defaults = recordings.find_recordings.__kwdefaults__
     with (
         odd_folders(),
         mock.patch.dict(defaults, {"patience_s": 0.3}),
+        mock.patch.object(recordings, "_LONGEST_LOOK_S", 1.0),
         contextlib.redirect_stdout(said),
         contextlib.redirect_stderr(errors),
     ):
