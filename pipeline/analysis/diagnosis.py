@@ -96,10 +96,12 @@ def _diagnose(work: Work) -> dict[str, JSON]:
 
 
 def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
-    """A stored run as it is diagnosed, and its vehicle."""
-    import msgspec  # noqa: PLC0415 - only for stored runs
+    """A stored run as it is diagnosed, and its vehicle.
 
-    from pipeline.vehicles import Vehicle  # noqa: PLC0415 - heavy
+    Raises:
+        SlipError: the results do not say the vehicle, or a table of them cannot be read.
+    """
+    from pipeline.report.motion_run import load_vehicle  # noqa: PLC0415 - heavy, and only for stored runs
 
     log = manifest.details.get("log")
     recording = _make_recording(
@@ -107,7 +109,7 @@ def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
         (manifest.tables, manifest.read),
         log if isinstance(log, dict) else {},
     )
-    return msgspec.convert(manifest.details["vehicle"], Vehicle), recording
+    return load_vehicle(manifest), recording
 
 
 def read_choices(manifest: Manifest) -> dict[str, object]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as decoder
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -90,7 +89,7 @@ def _find_named(manifest: Manifest) -> tuple[Model | None, str | None]:
 
     if DIAGNOSIS not in manifest.files:
         return None, None
-    diagnosis = decoder.loads(manifest.path(DIAGNOSIS).read_text(encoding="utf-8"))
+    diagnosis = manifest.read_json(DIAGNOSIS)
     named_on = diagnosis.get("input")
     usable = named_on if named_on in {"command", "measured"} else None
     file = read_model_text(diagnosis)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 import unicodedata
 from typing import TYPE_CHECKING, TypeVar
 
@@ -42,7 +43,7 @@ def resolve_inside(root: AnyPath, name: str, *, follow_links: bool = False) -> A
     Raises:
         PathError: ``path_outside``: the name is empty, absolute, has a drive letter, a backslash, a control
             character or a part that is or may be taken for ``.`` or ``..``, is too long for a file, or a link
-            leads out of the folder.
+            leads out of the folder; ``not_a_file``: it is a pipe, a socket or a device.
     """
     problem = _find_problem(name)
     if problem:
@@ -50,8 +51,12 @@ def resolve_inside(root: AnyPath, name: str, *, follow_links: bool = False) -> A
     path = root / name
     if len(os.fsencode(path)) > _LONGEST_PATH:
         raise _outside(str(root), name, "is too long")
-    if not follow_links and _has_link(root, name) and not path.resolve().is_relative_to(root.resolve()):
+    mode, has_link = _look_at(root, name)
+    if has_link and not follow_links and not path.resolve().is_relative_to(root.resolve()):
         raise _outside(str(root), name, "is a link that leads out of its folder")
+    # Opening a pipe would wait for ever, reading a device as well.
+    if mode and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise _refuse("not_a_file", str(root), name, "is a pipe, a socket or a device, and no file")
     return path
 
 
@@ -98,19 +103,27 @@ def _fold(name: str) -> str:
     return unicodedata.normalize("NFKC", visible)
 
 
-def _has_link(root: Path, name: str) -> bool:
-    place = os.fspath(root)
-    for part in name.split("/"):
-        place = f"{place}/{part}"
-        if os.path.islink(place):  # noqa: PTH114 - asked for every file of a season
-            return True
-    return False
+def _look_at(root: Path, name: str) -> tuple[int, bool]:
+    """Mode of what a name stands for, 0 where there is nothing, and whether a link is in its way."""
+    place, mode, has_link = os.fspath(root), 0, False
+    try:
+        for part in name.split("/"):
+            place = f"{place}/{part}"
+            mode = os.lstat(place).st_mode
+            has_link |= stat.S_ISLNK(mode)
+        return (os.stat(place).st_mode if stat.S_ISLNK(mode) else mode), has_link  # noqa: PTH116 - of a text
+    except OSError:
+        return 0, has_link
 
 
 def _outside(where: str, name: str, problem: str) -> PathError:
+    return _refuse("path_outside", where, name, problem)
+
+
+def _refuse(code: str, where: str, name: str, problem: str) -> PathError:
     shown = name if len(name) <= _SHOWN else f"{name[:_SHOWN]}..."
     return PathError(
-        "path_outside",
+        code,
         f"the name {shown!r} {problem}",
         where=where,
         hint="It comes from outside and is not used; get the data from a source that you trust",

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 Value: TypeAlias = "float | str | bool | list[Value] | dict[str, Value] | None"
 Leaf: TypeAlias = "float | str | bool"
 _LARGEST_INTEGER = 1 << 63
+_MOST_CELLS = 20_000_000
+"""Rows times fields of a topic: messages that name their fields at will would fill any memory."""
 _TIMES = {"nanos": "nanosec", "seconds": "sec", "nsec": "nanosec", "secs": "sec", "nsecs": "nanosec"}
 
 
@@ -79,7 +81,11 @@ class ObjectDecoder:
         if isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
             largest = sys.float_info.max
             return float(value) if -largest <= value <= largest else math.inf * (1 if value > 0 else -1)
-        if not isinstance(value, str) or len(value) <= MAX_TEXT:
+        if not isinstance(value, str):
+            return value
+        # JSON can spell half of a character, which no table can hold.
+        value = value if value.isascii() else value.encode(errors="replace").decode()
+        if len(value) <= MAX_TEXT:
             return value
         self.shortened[path] = self.shortened.get(path, 0) + 1
         return f"{value[:MAX_TEXT]} (cut, of {len(value)} characters)"
@@ -88,7 +94,7 @@ class ObjectDecoder:
         """Columns of the given rows, in their order.
 
         Raises:
-            LogError: ``field_not_found`` when no message has a wanted field.
+            LogError: ``field_not_found`` when no message has a wanted field; ``too_many_fields``.
         """
         messages = [self._rows[row] for row in rows.tolist()]
         leaves = tuple(dict.fromkeys(path for message in messages for path in message))
@@ -96,6 +102,13 @@ class ObjectDecoder:
             return {}
         chosen = select_leaves(leaves, self._fields, where=self._where)
         chosen |= {path for path in leaves if path.startswith(STAMPS)}
+        if len(chosen) * len(messages) > _MOST_CELLS:
+            raise LogError(
+                "too_many_fields",
+                f"its {len(messages)} messages have {len(chosen)} different fields, which no table can hold",
+                where=self._where,
+                hint="Leave the topic out",
+            )
         return {path: self._column(path, messages) for path in leaves if path in chosen}
 
     def _column(self, path: str, messages: list[dict[str, list[Leaf]]]) -> Column:
@@ -140,6 +153,7 @@ def protobuf_decoder(schema: bytes, type_name: str, *, where: str) -> Callable[[
         from google.protobuf.message import (  # type: ignore[import-untyped]  # noqa: PLC0415 - an extra
             DecodeError,
         )
+        from mcap.exceptions import McapError  # noqa: PLC0415 - an extra
         from mcap.records import Schema  # noqa: PLC0415 - an extra
         from mcap_protobuf.decoder import DecoderFactory  # noqa: PLC0415 - an extra
     except ImportError:
@@ -153,7 +167,7 @@ def protobuf_decoder(schema: bytes, type_name: str, *, where: str) -> Callable[[
         parse = DecoderFactory().decoder_for(
             "protobuf", Schema(id=1, name=type_name, encoding="protobuf", data=schema)
         )
-    except (DecodeError, TypeError, KeyError, ValueError) as error:
+    except (DecodeError, McapError, TypeError, KeyError, ValueError) as error:
         raise _damaged(str(error), where) from None
     if parse is None:
         raise _damaged("its type is not in it", where)
@@ -176,22 +190,32 @@ def _damaged(reason: str, where: str) -> LogError:
     )
 
 
-def _plain(message: object) -> Value:
-    """A protobuf message, known only by its descriptor, as nested values."""
-    descriptor = getattr(message, "DESCRIPTOR", None)
+def _plain(message: object, above: frozenset[str] = frozenset()) -> Value:
+    """A protobuf message, known only by its descriptor, as nested values; maps are left out.
+
+    Args:
+        message: the message, or a value in one.
+        above: names of the types that it stands in.
+    """
+    # Of the class: a field may bear any name.
+    descriptor = getattr(type(message), "DESCRIPTOR", None)
     if descriptor is None:
         if isinstance(message, bytes):
             return list(message)
         return message if isinstance(message, str | bool | int | float) else None
+    inside = above | {descriptor.full_name}
     found: dict[str, Value] = {}
     for field in descriptor.fields:
         value = getattr(message, field.name)
-        if hasattr(value, "items"):
-            continue
-        if hasattr(value, "DESCRIPTOR") or isinstance(value, str | bytes | bool | int | float):
+        if isinstance(value, str | bytes | bool | int | float):
             found[field.name] = _plain(value)
-        else:
-            found[field.name] = [_plain(each) for each in value]
+        elif hasattr(type(value), "DESCRIPTOR"):
+            # What is not set is read as its defaults, which would never end in a type that holds itself.
+            is_set = type(message).HasField(message, field.name)  # type: ignore[attr-defined]
+            if is_set or field.message_type.full_name not in inside:
+                found[field.name] = _plain(value, inside)
+        elif not hasattr(value, "items"):
+            found[field.name] = [_plain(each, inside) for each in value]
     return found
 
 

@@ -22,6 +22,7 @@ from pipeline.store.files import (
     temporary_beside,
 )
 from pipeline.store.manifest import MANIFEST, hash_bytes
+from pipeline.store.names import place_inside
 from pipeline.store.seals import seal, unseal
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ class Replacement:
     def __init__(self, root: Path, path: Path, data: bytes | None, manifest: Manifest | None = None) -> None:
         self._path, self._data, self._manifest = path, data, manifest
         self._name = path.relative_to(root).as_posix()
-        self._place = root / entry_name(self._name)
+        self._place = place_inside(root, entry_name(self._name))
         self._new = ABSENT if data is None else hash_bytes(data)
         self._drafted = temporary_beside(path)
         self.folder = self._place.parent

@@ -122,9 +122,17 @@ class Manifest:
         """A table of exactly this generation, or the ``quarantine_<table>`` of one.
 
         Raises:
-            StoreError: ``no_such_table``; ``file_missing`` when it was pruned or deleted meanwhile.
+            StoreError: ``no_such_table``; ``file_missing`` when it was pruned or deleted meanwhile;
+                ``table_damaged``, it cannot be read, or has not the columns of its contract.
         """
-        return read_parquet(self.path(table))
+        from pipeline.store.tables import is_of_contract  # noqa: PLC0415 - heavy
+
+        path = self.path(table)
+        frame = read_parquet(path)
+        entry = self.tables.get(table)
+        if entry is not None and not is_of_contract(table, entry.contract_version, frame.schema):
+            raise _table_damaged("its columns are not those of its contract", path)
+        return frame
 
     def read_json(self, name: str) -> dict[str, JSON]:
         """A JSON object of exactly this generation.
@@ -197,12 +205,16 @@ def name_damage(path: Path) -> Iterator[None]:
         raise file_missing(path) from error
     # Arrow's errors are errors of values and of files.
     except (pl.exceptions.PolarsError, OSError, ValueError) as error:
-        raise StoreError(
-            "table_damaged",
-            f"the table cannot be read: {str(error).splitlines()[0]}",
-            where=str(path),
-            hint="Analyze the log again with --force",
-        ) from error
+        raise _table_damaged(str(error).splitlines()[0], path) from error
+
+
+def _table_damaged(why: str, path: Path) -> StoreError:
+    return StoreError(
+        "table_damaged",
+        f"the table cannot be read: {why}",
+        where=str(path),
+        hint="Analyze the log again with --force",
+    )
 
 
 def file_missing(path: Path) -> StoreError:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.core.paths import PathError, resolve_inside
 from pipeline.store.errors import StoreError
 from pipeline.store.manifest import MANIFEST, FileEntry, Manifest, TableEntry
-from pipeline.store.names import is_file_name, is_key
+from pipeline.store.names import is_file_name, is_key, place_inside
 from pipeline.store.seals import check_seal, seal, unseal
 
 if TYPE_CHECKING:
@@ -49,11 +49,12 @@ def load_manifest(home: Path) -> Manifest | None:
     """The manifest in a run's folder; None when there is none.
 
     Raises:
-        StoreError: ``manifest_damaged``, or ``manifest_too_new`` when a newer version wrote it.
+        StoreError: ``manifest_damaged``; ``manifest_too_new``, a newer version wrote it; ``not_a_file``;
+            ``file_outside``, it is a link that leads away.
         OSError: the file cannot be read.
     """
     try:
-        data = (home / MANIFEST).read_bytes()
+        data = place_inside(home, MANIFEST).read_bytes()
     except (FileNotFoundError, NotADirectoryError):
         return None
     return parse_manifest(data, home)

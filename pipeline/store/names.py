@@ -113,12 +113,13 @@ def place_inside(folder: Path, name: str) -> Path:
     """A file of the results by a name that something outside of the program gave.
 
     Raises:
-        StoreError: ``file_outside``, the name or a link in its way leads out of the folder.
+        StoreError: ``file_outside``, the name or a link in its way leads out of the folder; ``not_a_file``.
     """
     try:
         return resolve_inside(folder, name)
     except PathError as error:
-        raise StoreError("file_outside", error.what, where=error.where, hint=error.hint) from None
+        code = "file_outside" if error.code == "path_outside" else error.code
+        raise StoreError(code, error.what, where=error.where, hint=error.hint) from None
 
 
 def is_file_name(name: str) -> bool:

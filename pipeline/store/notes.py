@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, cast
 from pipeline.store.errors import StoreError, name_disk_errors
 from pipeline.store.files import temporary_beside
 from pipeline.store.manifest import hash_bytes
+from pipeline.store.names import place_inside
 from pipeline.store.seals import seal, unseal
 
 if TYPE_CHECKING:
@@ -37,11 +38,17 @@ class Notes:
     """Notes by name in one folder.
 
     Args:
-        folder: where they stand; made when the first is written.
+        root: the results folder.
+        folder: where they stand in it; made when the first is written.
+
+    Raises:
+        StoreError: ``file_outside``, a link leads out of the results.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, root: Path, folder: str) -> None:
+        self._root = root
         self._folder = folder
+        place_inside(root, folder)
 
     def write(self, name: str, content: Mapping[str, JSON]) -> bool:
         """Write a note in the place of the one before; failing to is no error.
@@ -57,24 +64,30 @@ class Notes:
 
     def read(self, name: str) -> dict[str, JSON] | None:
         """A note; None when there is none that can be read."""
-        return _load(self.path_of(name))
+        with suppress(StoreError):
+            return _load(self.path_of(name))
+        return None
 
     def read_all(self) -> Iterator[dict[str, JSON]]:
         """Every note that can be read, in no order that matters."""
-        for path in sorted(self._folder.glob("*/*.json")):
+        for path in sorted((self._root / self._folder).glob("*/*.json")):
             content = _load(path)
             if content is not None:
                 yield content
 
     def remove(self, name: str) -> None:
         """Forget a note, which need not be there."""
-        with suppress(OSError):
+        with suppress(OSError, StoreError):
             self.path_of(name).unlink()
 
     def path_of(self, name: str) -> Path:
-        """File of a note, which may be called anything."""
+        """File of a note, which may be called anything.
+
+        Raises:
+            StoreError: ``file_outside``, a link leads out of the results; ``not_a_file``.
+        """
         digits = hash_bytes(os.fsencode(name))
-        return self._folder / digits[:2] / f"{digits[2:]}.json"
+        return place_inside(self._root, f"{self._folder}/{digits[:2]}/{digits[2:]}.json")
 
     def _write(self, path: Path, data: bytes) -> None:
         # No waiting for the disk: after a power cut an empty note only costs time.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from pipeline.store.errors import StoreError, name_disk_errors
+from pipeline.store.names import place_inside
 from pipeline.store.partitions import describe_run
 from pipeline.store.tables import QUARANTINE, find_contract, schema_of
 from schemas import list_contracts
@@ -60,7 +61,7 @@ def scan_table(table: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.L
     there are null, columns that are no more are left out.
 
     Raises:
-        StoreError: ``no_such_table``.
+        StoreError: ``no_such_table``; ``file_outside`` or ``not_a_file``, a link or a pipe stands for it.
     """
     if table == RUNS_TABLE:
         return tabulate_runs(manifests).lazy()
@@ -73,8 +74,9 @@ def scan_table(table: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.L
         if entry is not None and (table in manifest.tables or f"{table}.parquet" in manifest.files):
             path = manifest.path(table)
             (current if entry.contract_version == present else others).append(path)
-    if (root / f"{table}.parquet").exists():
-        others.append(root / f"{table}.parquet")
+    pooled = place_inside(root, f"{table}.parquet")
+    if pooled.exists():
+        others.append(pooled)
     frames = [_fit(pl.scan_parquet(path, glob=False), schema) for path in others]
     if current:
         frames.insert(0, pl.scan_parquet(current, glob=False))

@@ -254,8 +254,8 @@ class Store:
         with self._lock(path.parent), name_disk_errors(path):
             manifest = load_manifest(path.parent) if is_run_manifest(name) else None
             entry = make_entry(name, hash_file(path), manifest=manifest)
-            make_folder(self.root / LIST)
-            replace_file(self.root / entry_name(name), encode_entry(entry))
+            make_folder(place_inside(self.root, LIST))
+            replace_file(place_inside(self.root, entry_name(name)), encode_entry(entry))
 
     def remove(self, name: str) -> None:
         """Remove a file that nobody can use any more: a damaged manifest, entry or note.
@@ -319,7 +319,7 @@ class Store:
 
     def notes(self, folder: str) -> Notes:
         """Small notes beside the results, in a folder of their own."""
-        return Notes(self.root / folder)
+        return Notes(self.root, folder)
 
     def check_writable(self) -> None:
         """Find out before the work whether results can be written.
@@ -339,7 +339,7 @@ class Store:
         Yields:
             Whether it is ours. Different names may, rarely, stand in each other's way.
         """
-        folder = self.root / CLAIMS
+        folder = place_inside(self.root, CLAIMS)
         with name_disk_errors(folder):
             make_folder(folder)
         try:

@@ -80,6 +80,20 @@ def schema_of(name: str) -> pl.Schema:
     return pl.Schema(schema)
 
 
+def is_of_contract(name: str, version: int, schema: pl.Schema) -> bool:
+    """Whether a stored table has the columns that its contract gives it.
+
+    Args:
+        name: of the table.
+        version: of the contract under which it was written; only of the present one the columns are known.
+        schema: columns and types that were found.
+
+    Raises:
+        StoreError: ``no_such_table``.
+    """
+    return version != find_contract(name).version or schema == schema_of(name)
+
+
 # Contracts never change while the program runs, and asking one takes as long as checking a small table.
 @cache
 def _list_columns(contract: Contract) -> Mapping[str, pl.DataType]:

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 from pipeline.analysis.diagnosis import DIAGNOSIS, read_recording
 from pipeline.analysis.options import INPUTS
 from pipeline.store.files import make_folder, replace_file
-from pipeline.store.names import encode_run
 from pipeline.web.runs import read_json
-from pipeline.web.session import FOLDER
+from pipeline.web.session import place_of_run
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -44,5 +43,4 @@ def write_diagnosis(results: Path, manifest: Manifest) -> None:
 
 
 def _path_of(results: Path, manifest: Manifest) -> Path:
-    place = encode_run(manifest.run)
-    return results / FOLDER / "diagnoses" / place.with_name(f"{place.name}.json")
+    return place_of_run(results, "diagnoses", manifest.run, ".json")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from pipeline.core.paths import resolve_inside
 from pipeline.models import Model
 from pipeline.models.model_file import ModelFile, parse_model
 from pipeline.models.model_text import format_model
@@ -17,7 +18,7 @@ from pipeline.web.errors import WorkbenchError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path, PurePosixPath
+    from pathlib import Path
 
     from pipeline.vehicles import Vehicle
 
@@ -114,18 +115,27 @@ class SessionFile:
 
     @property
     def path(self) -> Path:
-        """The file."""
+        """The file.
+
+        Raises:
+            WorkbenchError: ``no_such_slot``.
+            PathError: a link leads out of the results.
+        """
         if self.slot not in SLOTS:
             raise WorkbenchError(
                 "no_such_slot", f"there is no desk {self.slot!r}", hint=f"Use one of {', '.join(SLOTS)}."
             )
-        return self.results / FOLDER / "desks" / self.slot / _with_suffix(encode_run(self.run), ".json")
+        return place_of_run(self.results, f"desks/{self.slot}", self.run, ".json")
 
     @property
     def model_path(self) -> Path:
-        """Where the model is saved."""
+        """Where the model is saved.
+
+        Raises:
+            PathError: a link leads out of the results.
+        """
         suffix = ".toml" if self.slot == "a" else f".{self.slot}.toml"
-        return self.results / FOLDER / "models" / _with_suffix(encode_run(self.run), suffix)
+        return place_of_run(self.results, "models", self.run, suffix)
 
     def read(self) -> Session | None:
         """The desk; None when there is none that can be read."""
@@ -172,5 +182,11 @@ def switch_off(model: Model, off: list[str]) -> Model:
     return replace(model, effects=tuple(effect for effect in model if effect.id not in off))
 
 
-def _with_suffix(path: PurePosixPath, suffix: str) -> PurePosixPath:
-    return path.with_name(f"{path.name}{suffix}")
+def place_of_run(results: Path, folder: str, run: str, suffix: str) -> Path:
+    """Where the workbench keeps something of a run: in the results, which may be a stranger's.
+
+    Raises:
+        PathError: a link leads out of the results, or a pipe or device stands there.
+    """
+    place = encode_run(run)
+    return resolve_inside(results, f"{FOLDER}/{folder}/{place.with_name(f'{place.name}{suffix}')}")

@@ -17,8 +17,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pipeline.core.errors import SlipError
+from pipeline.core.paths import resolve_inside
 from pipeline.store.locks import hold_lock
 from pipeline.web.errors import WorkbenchError
+from pipeline.web.session import FOLDER
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -73,7 +75,7 @@ class Uploads:
         self._known: dict[str, Upload] = {}
         self._held = ExitStack()
         self._folder: Path | None = None
-        self._root = results.resolve() / "workbench" / "uploads"
+        self._root = resolve_inside(results.resolve(), f"{FOLDER}/uploads")
         _sweep(self._root)
 
     async def take(

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 HERE = Path(__file__).parent
+IMPORTABLE = os.pathsep.join(str(folder) for folder in (HERE, HERE.parent, HERE.parents[1]))
+"""PYTHONPATH of a fresh process in which these tests can be imported."""
 
 
 class Watch:

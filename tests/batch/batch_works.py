@@ -8,6 +8,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from poison import do_harm
+
 from pipeline.analysis import analyze
 from pipeline.batch.work import Report, Task, work_on
 from pipeline.store import Store
@@ -16,27 +18,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-class Panic(BaseException):
-    """What a library in Rust raises when it gives up: no exception that `except Exception` catches."""
-
-
 def work_poisoned(task: Task) -> Report:
     """As usual, but logs whose names say so are poison."""
     kind = task.path.stem
-    if kind == "raises":
-        raise RuntimeError("poison")
-    if kind == "panics":
-        raise Panic("poison")
-    if kind == "hangs":
-        time.sleep(3600.0)
-    if kind == "eats":
-        hoard = []
-        while True:
-            hoard.append(b"x" * (1 << 26))
-    if kind == "dies":
-        os.kill(os.getpid(), signal.SIGSEGV)
-    if kind == "leaves":
-        os._exit(7)
+    do_harm(kind, str(task.path))
     if kind == "unpicklable":
         return lambda: None  # type: ignore[return-value]
     return work_on(task)

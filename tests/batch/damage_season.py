@@ -35,7 +35,7 @@ class Kind:
     """An entry of a season.
 
     Attributes:
-        make: puts it into a folder, given a good log.
+        make: puts it into a folder, given a whole log that is not the good one: the same content counts once.
         state: of its line; empty where it gets none.
         words: what its line says.
         code: exit code of the batch.
@@ -156,12 +156,13 @@ def run_batch(logs: Path, out: Path) -> tuple[int, dict[str, object], str]:
     from pipeline.batch import recordings  # noqa: PLC0415 - the repository is put on the path first
     from pipeline.cli.app import main as slip  # noqa: PLC0415
 
-    arguments = ["batch", str(logs), "--out", str(out), "--executor", "inline", "--settle", "1", "--json"]
+    arguments = ["batch", str(logs), "--out", str(out), "--executor", "inline", "--settle", "600", "--json"]
     said, errors = io.StringIO(), io.StringIO()
     defaults = recordings.find_recordings.__kwdefaults__
     with (
         odd_folders(),
         mock.patch.dict(defaults, {"patience_s": 0.3}),
+        mock.patch.object(recordings, "_LONGEST_LOOK_S", 1.0),
         contextlib.redirect_stdout(said),
         contextlib.redirect_stderr(errors),
     ):
@@ -185,7 +186,8 @@ def main() -> int:
     tell(f"{'beside a good log stands':<40}{'good log':<10}{'entry':<10}{'exit':<6}{'[s]':<6}said")
     with tempfile.TemporaryDirectory() as temporary:
         top = Path(temporary)
-        simulate_case("husky_tile", out=top / "good.mcap", duration_s=12.0, seed=1)
+        for seed, log in enumerate(("good.mcap", "other.mcap")):
+            simulate_case("husky_tile", out=top / log, duration_s=12.0, seed=seed)
         for name, kind in KINDS.items():
             folder = top / "season"
             shutil.rmtree(folder, ignore_errors=True)
@@ -193,7 +195,7 @@ def main() -> int:
             folder.mkdir()
             shutil.copy2(top / "good.mcap", folder / "good.mcap")
             os.utime(folder / "good.mcap", (1e9, 1e9))
-            kind.make(folder, top / "good.mcap")
+            kind.make(folder, top / "other.mcap")
             started = time.monotonic()
             code, found, _ = run_batch(folder, top / "out")
             lines = {line["path"].rpartition("/")[2]: line for line in found["logs"]}  # type: ignore[attr-defined]

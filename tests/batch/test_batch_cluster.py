@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from batch_tools import HERE, batch, counts, read_tables
+from batch_tools import IMPORTABLE, batch, counts, read_tables
 from batch_works import work_poisoned, work_slowly
 
 from pipeline.batch import BatchError
@@ -31,7 +31,7 @@ def scheduler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[str]:
     begun = tmp_path / "begun"
     begun.mkdir()
     monkeypatch.setenv("BEGUN", str(begun))
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(HERE), str(HERE.parents[1]))))
+    monkeypatch.setenv("PYTHONPATH", IMPORTABLE)
     monkeypatch.setenv("POLARS_MAX_THREADS", "1")
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, protocol="tcp://", dashboard_address=None, silence_logs=50
@@ -98,7 +98,7 @@ def test_a_worker_killed_in_the_middle_costs_nothing(scheduler: str, season: Pat
 def test_poison_on_a_cluster_of_our_own_is_named(
     season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(HERE), str(HERE.parents[1]))))
+    monkeypatch.setenv("PYTHONPATH", IMPORTABLE)
     for number, kind in enumerate(("raises", "hangs", "eats", "dies")):
         (season / f"{kind}.mcap").write_bytes((season / "a.mcap").read_bytes() + bytes(number + 1))
     outcome = batch(
@@ -158,7 +158,7 @@ def test_a_scheduler_lost_in_the_middle_ends_the_batch(
     begun.mkdir()
     monkeypatch.setenv("BEGUN", str(begun))
     monkeypatch.setenv("PAUSE_S", "60")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(HERE), str(HERE.parents[1]))))
+    monkeypatch.setenv("PYTHONPATH", IMPORTABLE)
     with start_cluster() as (address, pid):
 
         def lose() -> None:

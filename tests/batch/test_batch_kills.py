@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 import pytest
-from batch_tools import HERE, batch, counts, read_tables, start_slip
+from batch_tools import IMPORTABLE, batch, counts, read_tables, start_slip
 from batch_works import work_dying_at_steps
 
 from pipeline.store import STEPS, Store
@@ -180,7 +180,7 @@ def test_a_batch_killed_with_all_its_workers_at_a_step_goes_on(
     process = subprocess.Popen(
         [sys.executable, "-c", code, season, tmp_path / "out"],
         start_new_session=True,
-        env=os.environ | {"DIE_AT": step, "PYTHONPATH": os.pathsep.join((str(HERE), str(HERE.parents[1])))},
+        env=os.environ | {"DIE_AT": step, "PYTHONPATH": IMPORTABLE},
     )
     assert process.wait(60) == -signal.SIGKILL
     assert Store(tmp_path / "out").verify() == ()

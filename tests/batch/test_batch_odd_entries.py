@@ -8,6 +8,7 @@ import shutil
 import time
 from pathlib import Path
 
+import damage_season
 import pytest
 from damage_season import KINDS, NO_TEXT, cut_in_future, odd_folders, run_batch
 
@@ -52,6 +53,12 @@ def test_everything_at_once_costs_itself_and_nothing_else(mess: Path, tmp_path: 
                 state,
             )
     assert found["skipped"] == sum("skipped" in kind.state for kind in KINDS.values())
+
+
+@pytest.mark.long
+def test_each_alone_costs_itself_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+    """`make damage-season`."""
+    assert damage_season.main() == 0, capsys.readouterr().out
 
 
 def test_what_is_left_out_is_named(mess: Path) -> None:

@@ -14,6 +14,7 @@ from pipeline.analysis.options import Options
 from pipeline.cli import main
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
+from pipeline.store.seals import seal, unseal
 
 
 def slip(*arguments: object) -> int:
@@ -65,6 +66,30 @@ def test_a_fit_leaves_stored_results_byte_for_byte(
     assert slip("model", "fit", "husky.toml", "--on", name, "--predict", name, "--quiet") == 0
     assert slip("model", "compare", "husky.toml", "husky.toml", "--on", name, "--quiet") == 0
     assert hash_tree(place / "results") == before
+
+
+@pytest.mark.parametrize("vehicle", [None, {}, {"track_width_m": "x"}, []])
+def test_results_that_do_not_tell_a_vehicle_are_one_line(
+    place: Path, capsys: pytest.CaptureFixture[str], vehicle: object
+) -> None:
+    path = place / "results" / "runs" / "field" / "wide" / "manifest.json"
+    content = unseal(path.read_bytes())
+    details = content["details"]
+    assert isinstance(details, dict)
+    told = {**details["vehicle"], **vehicle} if isinstance(vehicle, dict) and vehicle else vehicle
+    path.write_bytes(seal({**content, "details": {**details, "vehicle": told}}))
+    assert slip("diagnose", "field/wide", "--out", place / "results") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "do not say which vehicle" in line
+
+
+def test_a_damaged_diagnosis_is_not_exported(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = Store(place / "results").manifests()[0].path("diagnosis.json")
+    path.write_bytes(path.read_bytes()[:-40])
+    words = ["export", "field/wide", "--to", "mcap", "--file", place / "x.mcap", "--out", place / "results"]
+    assert slip(*words) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "is not what was written" in line
 
 
 def test_a_copied_log_is_the_stored_run(place: Path) -> None:

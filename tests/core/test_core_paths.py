@@ -114,6 +114,16 @@ def test_links_that_lead_out_are_refused(tmp_path: Path) -> None:
     assert resolve_inside(tmp_path / "elsewhere", "x") == tmp_path / "elsewhere" / "x"
 
 
+def test_nothing_that_is_no_file_is_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("pipe")
+    (tmp_path / "device").symlink_to("/dev/zero")
+    for name, follow_links in (("pipe", False), ("link", False), ("link", True), ("device", True)):
+        with pytest.raises(PathError, match="a pipe, a socket or a device") as caught:
+            resolve_inside(tmp_path, name, follow_links=follow_links)
+        assert caught.value.code == "not_a_file"
+
+
 def test_addresses_stay_addresses() -> None:
     root = RemotePath("s3://bucket/recording")
     assert str(resolve_inside(root, "part_0.mcap")) == "s3://bucket/recording/part_0.mcap"

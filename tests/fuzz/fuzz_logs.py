@@ -24,6 +24,8 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "logs")]
 
 import numpy as np  # noqa: E402 - the repository is put on the path first
 from bag_files import BagWriter, write_bag, write_db3  # noqa: E402
+from google.protobuf.descriptor_pb2 import FileDescriptorSet  # noqa: E402
+from google.protobuf.struct_pb2 import Value  # noqa: E402
 from mcap.writer import CompressionType, IndexType, Writer  # noqa: E402
 
 from pipeline.logs import (  # noqa: E402
@@ -102,10 +104,13 @@ def write_seeds(folder: Path) -> list[bytes]:
             ]
             idl = writer2.register_schema("demo/msg/T", "ros2idl", IDL.encode())
             channels.append(writer2.register_channel("/idl", "cdr", idl))
+            buf = writer2.register_schema("google.protobuf.Value", "protobuf", describe_value())
+            channels.append(writer2.register_channel("/protobuf", "protobuf", buf))
             bodies = (*bodies, b"\0\1\0\0" + bytes(8) + b"\1\0\0\0\2\0\0\0q\0\0\0" + bytes(12))
-            for number in range(24):
+            bodies = (*bodies, b"\x32\x0d\x0a\x0b\x11" + bytes(8) + b"\x08\0")
+            for number in range(25):
                 time_ns = START + number
-                writer2.add_message(channels[number % 4], time_ns, bodies[number % 4], time_ns)
+                writer2.add_message(channels[number % 5], time_ns, bodies[number % 5], time_ns)
             writer2.finish()
         seeds.append(path.read_bytes())
     bags = Path(tempfile.mkdtemp(dir=folder))
@@ -113,6 +118,13 @@ def write_seeds(folder: Path) -> list[bytes]:
     seeds += [write_bag(bags / f"{form}.bag", form).read_bytes() for form in forms]
     seeds += [file.read_bytes() for file in write_db3(bags / "run").glob("*.db3")]
     return seeds
+
+
+def describe_value() -> bytes:
+    """The definition of a protobuf type that holds itself, in lists and in maps."""
+    files = FileDescriptorSet()
+    Value.DESCRIPTOR.file.CopyToProto(files.file.add())
+    return files.SerializeToString()
 
 
 def mutate(seeds: list[bytes], rng: random.Random) -> bytes:

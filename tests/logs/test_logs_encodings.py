@@ -22,6 +22,7 @@ from mcap_files import (
 from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.logs import (
+    LogError,
     Strings,
     Wanted,
     read_topics,
@@ -136,6 +137,68 @@ def test_protobuf_messages_are_columns(tmp_path: Path) -> None:
     fields = read_one(path, "/p").fields
     assert fields["seconds"].tolist() == [0, 1, 2]
     assert fields["nanos"].tolist() == [0, 2, 4]
+
+
+PROTOBUF_NAMES = ("DESCRIPTOR", "items", "__class__", "HasField")
+
+
+def describe_protobuf(*files: str) -> Any:  # noqa: ANN401 - made at run time
+    """A set of files, each with a type ``T``: numbers by the names above, an ``In``, and a ``T`` in it."""
+    pytest.importorskip("google.protobuf", reason="protobuf is not installed")
+    from google.protobuf import descriptor_pb2  # noqa: PLC0415 - optional
+
+    found = descriptor_pb2.FileDescriptorSet()
+    for file in files:
+        described = found.file.add(name=file, syntax="proto3")
+        outer, inner = described.message_type.add(name="T"), described.message_type.add(name="In")
+        inner.field.add(name="items", number=1, type=1, label=1)
+        for number, name in enumerate(PROTOBUF_NAMES, 1):
+            outer.field.add(name=name, number=number, type=1, label=1)
+        outer.field.add(name="inner", number=10, type=11, label=1, type_name=".In")
+        outer.field.add(name="next", number=11, type=11, label=1, type_name=".T")
+    return found
+
+
+def test_protobuf_fields_may_bear_any_name_and_types_hold_themselves(tmp_path: Path) -> None:
+    def spell(value: float, inside: bytes = b"") -> bytes:
+        numbers = b"".join(bytes([(n << 3) | 1]) + struct.pack("<d", value + n) for n in range(1, 5))
+        inner = b"\x52\x09\x09" + struct.pack("<d", value)
+        return numbers + inner + (bytes([(11 << 3) | 2, len(inside)]) + inside if inside else b"")
+
+    path = tmp_path / "log.mcap"
+    schema = describe_protobuf("a.proto").SerializeToString()
+    messages = [spell(1.0), spell(2.0, spell(5.0))]
+    write_channels(path, [("/p", "T", "protobuf", schema, "protobuf", messages)])
+    fields = read_one(path, "/p").fields
+    for number, name in enumerate(PROTOBUF_NAMES, 1):
+        assert fields[name].tolist() == [1.0 + number, 2.0 + number]
+    assert fields["inner.items"].tolist() == [1.0, 2.0]
+    assert np.array_equal(fields["next.inner.items"], [np.nan, 5.0], equal_nan=True)
+
+
+def test_a_protobuf_schema_that_contradicts_itself_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    schema = describe_protobuf("a.proto", "a.proto").SerializeToString()
+    write_channels(path, [("/p", "T", "protobuf", schema, "protobuf", [b""])])
+    (loss,) = read_topics(path, [Wanted("/p")]).losses
+    assert "the protobuf schema is damaged" in loss.text
+
+
+def test_messages_that_name_their_fields_at_will_fill_no_memory(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    messages = [json.dumps({"a": row, f"k{row}": 1}).encode() for row in range(5000)]
+    write_channels(path, [("/j", "T", "jsonschema", b"{}", "json", messages)])
+    with pytest.raises(LogError, match="5000 messages have 5001 different fields"):
+        read_topics(path, [Wanted("/j")])
+    assert read_topics(path, [Wanted("/j", ("a",))]).of("/j")[0].fields["a"].tolist() == list(range(5000))
+
+
+def test_half_a_character_in_json_is_a_mark(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    write_channels(
+        path, [("/j", "T", "jsonschema", b"{}", "json", [b'{"a": "x\\ud800"}', b'{"a": "\xc3\xa9"}'])]
+    )
+    assert read_one(path, "/j").fields["a"].to_list() == ["x?", "é"]
 
 
 def test_ros1_messages_are_columns(tmp_path: Path) -> None:

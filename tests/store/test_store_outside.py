@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import polars as pl
 import pytest
 from store_samples import read_seed, write_generation
 
 from pipeline.store import Mirror, Store, StoreError
+from pipeline.store.manifest import hash_bytes
 
 fsspec = pytest.importorskip("fsspec", reason="the extra s3 is not installed")
 
@@ -222,3 +226,69 @@ def test_notes_of_strange_content_are_no_notes(store: Store) -> None:
     path.unlink()
     os.mkfifo(path)
     assert list(notes.read_all()) == []
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "slip.parquet", "datasets.parquet"])
+def test_a_pipe_in_the_results_is_not_waited_for(store: Store, name: str) -> None:
+    manifest = write_generation(store, RUN, "k", 1)
+    places = {"manifest.json": manifest.folder.parent, "datasets.parquet": store.root}
+    path = places.get(name, manifest.folder) / name
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+    with pytest.raises(StoreError, match="a pipe, a socket or a device") as caught:
+        store.query("SELECT * FROM slip, datasets")
+    assert caught.value.code == "not_a_file"
+    assert [problem.path for problem in store.verify()] == ([] if path.parent == store.root else [path])
+
+
+@pytest.mark.parametrize("change", ["a column less", "another type"])
+def test_a_table_has_the_columns_of_its_contract(store: Store, change: str) -> None:
+    """Whoever makes results can give their hashes as well."""
+    manifest = write_generation(store, RUN, "k", 1)
+    path = manifest.path("slip")
+    frame = pl.read_parquet(path)
+    odd = frame.drop("t") if change == "a column less" else frame.with_columns(pl.lit("x").alias("t"))
+    odd.write_parquet(path)
+    home = path.parents[1] / "manifest.json"
+    entry = {**asdict(manifest.tables["slip"]), "sha256": hash_bytes(path.read_bytes())}
+    edit(home, {"tables": {"slip": entry}})
+    with pytest.raises(StoreError, match="not those of its contract") as caught:
+        store.read(RUN, "slip")
+    assert caught.value.code == "table_damaged"
+
+
+@pytest.mark.parametrize("name", ["listed", "batch", "batch/logs", "batch/claims", "identities"])
+def test_no_link_in_the_results_leads_what_is_written_outside(store: Store, place: Path, name: str) -> None:
+    write_generation(store, RUN, "k", 1)
+    shutil.rmtree(store.root / name, ignore_errors=True)
+    (store.root / name).parent.mkdir(exist_ok=True)
+    (store.root / name).symlink_to(place / "victim", target_is_directory=True)
+    before = look(place / "victim")
+
+    def claim() -> None:
+        with store.claim("x"):
+            pass
+
+    writers = {
+        "listed": lambda: write_generation(store, RUN, "k2", 2),
+        "batch/claims": claim,
+        "identities": lambda: store.notes("identities").write("x", {"a": 1}),
+    }
+    with pytest.raises(StoreError) as caught:
+        writers.get(name, lambda: store.notes("batch/logs").write("x", {"a": 1}))()
+    assert caught.value.code == "file_outside"
+    assert look(place / "victim") == before
+    if name == "listed":
+        assert read_seed(store, RUN) == 1
+
+
+def test_a_link_among_notes_leads_nowhere_outside(store: Store, place: Path) -> None:
+    notes = store.notes("batch/logs")
+    folder = notes.path_of("x").parent
+    folder.parent.mkdir(parents=True)
+    folder.symlink_to(place / "victim", target_is_directory=True)
+    before = look(place / "victim")
+    assert not notes.write("x", {"a": 1})
+    assert notes.read("x") is None
+    notes.remove("x")
+    assert look(place / "victim") == before

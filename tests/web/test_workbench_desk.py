@@ -10,6 +10,7 @@ from typing import cast
 import pytest
 from workbench_server import RUN, TRACK, Workbench
 
+from pipeline.core.errors import SlipError
 from pipeline.models import read_model
 from pipeline.simulate import simulate_case
 
@@ -131,6 +132,31 @@ def test_a_saved_model_is_a_model_file(workbench: Workbench) -> None:
     assert status == 200
     assert "hidden.toml" in headers["content-disposition"]
     assert b"effective_track" in body
+
+
+@pytest.mark.parametrize("folder", ["models", "desks/a", "uploads"])
+def test_no_link_in_the_results_leads_what_is_kept_outside(
+    results: Path, tmp_path: Path, folder: str
+) -> None:
+    """The results may be a stranger's: no link in them chooses which file a model takes the place of."""
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    for name in ("hidden.toml", "hidden.json"):
+        (victim / name).write_text("precious")
+    link = results / "workbench" / (folder if folder == "uploads" else f"{folder}/field")
+    link.parent.mkdir(parents=True)
+    link.symlink_to(victim, target_is_directory=True)
+    if folder == "uploads":
+        with pytest.raises(SlipError, match="leads out of its folder"):
+            Workbench(results)
+    else:
+        server = Workbench(results)
+        assert server.refuse("/api/desk", run=RUN, action="open")["code"] == "path_outside"
+        server.close()
+    assert {path.name: path.read_text() for path in victim.iterdir()} == {
+        "hidden.toml": "precious",
+        "hidden.json": "precious",
+    }
 
 
 def test_working_on_a_model_leaves_the_run_byte_for_byte(workbench: Workbench) -> None:

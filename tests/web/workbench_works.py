@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import time
 from typing import TYPE_CHECKING
+
+from poison import do_harm
 
 from pipeline.web.workers import work_on_errand
 
@@ -15,17 +14,5 @@ if TYPE_CHECKING:
 
 def work_poisoned(task: Task) -> Report:
     """As usual, but logs whose names say so are poison."""
-    kind = (task.options.run or "").rpartition("/")[2]
-    if kind == "hangs":
-        time.sleep(3600.0)
-    if kind == "eats":
-        hoard = []
-        while True:
-            hoard.append(b"x" * (1 << 26))
-    if kind == "dies":
-        os.kill(os.getpid(), signal.SIGSEGV)
-    if kind == "leaves":
-        os._exit(7)
-    if kind == "raises":
-        raise RuntimeError(f"poison in {task.path}")
+    do_harm((task.options.run or "").rpartition("/")[2], str(task.path))
     return work_on_errand(task)
