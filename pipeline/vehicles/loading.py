@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import os
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
@@ -56,14 +57,28 @@ def load_configuration(
 def list_configuration_files(
     log: Path, *, given: Path | None = None, fleet: Path | None = None
 ) -> tuple[Path, ...]:
-    """The files that configure a log, later ones winning; arguments as of `load_configuration`."""
+    """The files that configure a log, later ones winning; arguments as of `load_configuration`.
+
+    A fleet file above the log counts where it belongs to the user, to root or to whom the log's folder
+    belongs: anybody may put one into a folder like `/tmp`.
+    """
     folder = log.resolve().parent
     fleets = [place / FLEET_FILE for place in (*reversed(folder.parents), folder)]
     beside = [folder / RUN_FILE, folder / f"{log.stem}.toml"]
-    found = [file for file in fleets if file.is_file() and (fleet is None or file != fleet.resolve())]
+    found = [
+        file for file in fleets if _may_speak(file, folder) and (fleet is None or file != fleet.resolve())
+    ]
     found += [] if fleet is None else [fleet]
     found += [given] if given is not None else [file for file in beside if file.is_file()]
     return tuple(found)
+
+
+def _may_speak(file: Path, folder: Path) -> bool:
+    """Whether a fleet file is there, of an owner who may say something of the logs in a folder."""
+    if not file.is_file():
+        return False
+    owners = {0, getattr(os, "getuid", int)(), folder.stat().st_uid if folder.is_dir() else 0}
+    return file.stat().st_uid in owners
 
 
 def _forget_other_vehicles(layers: list[Tree]) -> list[Tree]:

@@ -1,4 +1,4 @@
-"""What one does at a desk: add, drop, switch, set, fit, undo. Each takes a desk and gives the next one."""
+"""What one does in a session: add, drop, switch, set, fit, undo. Each gives the next session."""
 
 from __future__ import annotations
 
@@ -27,52 +27,52 @@ if TYPE_CHECKING:
 
 
 def open_session(file: SessionFile, prepared: PreparedRun) -> Session:
-    """The desk of a run as it was left; begun anew where there is none or the results have changed.
+    """The session of a run as it was left; begun anew where there is none or the results have changed.
 
     Steps that cannot be opened any more are left out.
     """
-    desk = file.read()
+    session = file.read()
     source = prepared.problem.source.value
-    if desk is not None and (desk.key != prepared.manifest.key or desk.input != source):
-        desk = None
-    desk = desk.move(0) if desk is not None else None
-    while desk is not None and desk.steps and not _can_open(file, desk):
-        desk = desk.drop(desk.at)
-    if desk is None or not desk.steps:
-        desk = begin_session(prepared.manifest.run, prepared.manifest.key, source, prepared.vehicle)
+    if session is not None and (session.key != prepared.manifest.key or session.input != source):
+        session = None
+    session = session.move(0) if session is not None else None
+    while session is not None and session.steps and not _can_open(file, session):
+        session = session.drop(session.at)
+    if session is None or not session.steps:
+        session = begin_session(prepared.manifest.run, prepared.manifest.key, source, prepared.vehicle)
         fitted = _fit_anew(
             prepared,
-            desk,
-            _model_of(file, desk),
-            desk.step.order,
-            desk.step.said,
-            off=desk.step.off,
+            session,
+            _model_of(file, session),
+            session.step.order,
+            session.step.said,
+            off=session.step.off,
             known={},
         )
-        desk = msgspec.structs.replace(fitted, steps=[fitted.step], at=0)
-        file.write(desk)
-    return desk
+        session = msgspec.structs.replace(fitted, steps=[fitted.step], at=0)
+        file.write(session)
+    return session
 
 
-def move(file: SessionFile, desk: Session, by: int) -> Session:
-    """The desk a step back (-1) or forward (1); steps that cannot be opened any more are left out."""
+def move(file: SessionFile, session: Session, by: int) -> Session:
+    """The session a step back (-1) or forward (1); steps that cannot be opened any more are left out."""
     while True:
-        moved = desk.move(by)
-        if moved.at == desk.at or _can_open(file, moved):
+        moved = session.move(by)
+        if moved.at == session.at or _can_open(file, moved):
             return moved
-        desk = desk.drop(moved.at)
+        session = session.drop(moved.at)
 
 
-def _can_open(file: SessionFile, desk: Session) -> bool:
+def _can_open(file: SessionFile, session: Session) -> bool:
     try:
-        show_session(desk, file.parse(desk.step.model))
+        show_session(session, file.parse(session.step.model))
     except Exception:  # noqa: BLE001 - whatever a file holds that was written elsewhere
         return False
     return True
 
 
 def add_effect(
-    file: SessionFile, prepared: PreparedRun, desk: Session, effect: Effect | str, *, anyway: bool = False
+    file: SessionFile, prepared: PreparedRun, session: Session, effect: Effect | str, *, anyway: bool = False
 ) -> Session:
     """Put an effect on top of the model and fit all of it.
 
@@ -80,13 +80,13 @@ def add_effect(
         WorkbenchError: ``error_rises``, see `add_effects`.
     """
     made = find_effect(effect)() if isinstance(effect, str) else effect
-    return add_effects(file, prepared, desk, [made], f"+ {made.id}", anyway=anyway)
+    return add_effects(file, prepared, session, [made], f"+ {made.id}", anyway=anyway)
 
 
 def add_effects(
     file: SessionFile,
     prepared: PreparedRun,
-    desk: Session,
+    session: Session,
     effects: Sequence[Effect],
     said: str,
     *,
@@ -98,17 +98,19 @@ def add_effects(
         WorkbenchError: ``error_rises``, an error over 2 s is higher with them and nobody said to take them
             anyway.
     """
-    model = _model_of(file, desk)
+    model = _model_of(file, session)
     for made in effects:
         model = model + made
-    order = [*desk.step.order, *(made.id for made in effects)]
-    changed = _fit_anew(prepared, desk, model, order, said, off=desk.step.off, known=_known_rungs(desk.step))
-    rises = _describe_rises(desk.step.ladder[-1], changed.step.ladder[-1])
+    order = [*session.step.order, *(made.id for made in effects)]
+    changed = _fit_anew(
+        prepared, session, model, order, said, off=session.step.off, known=_known_rungs(session.step)
+    )
+    rises = _describe_rises(session.step.ladder[-1], changed.step.ladder[-1])
     if rises and not anyway:
         raise WorkbenchError(
             "error_rises",
             f"with {said.removeprefix('+ ')} {' and '.join(rises)}: it was not taken",
-            where=desk.run,
+            where=session.run,
             hint="Take something else, or take it anyway",
         )
     return changed
@@ -122,53 +124,55 @@ def _describe_rises(before: Mapping[str, object], after: Mapping[str, object]) -
     return told
 
 
-def drop_effect(file: SessionFile, prepared: PreparedRun, desk: Session, name: str) -> Session:
+def drop_effect(file: SessionFile, prepared: PreparedRun, session: Session, name: str) -> Session:
     """Take an effect away and fit the rest."""
-    model = _model_of(file, desk) - name
-    order = [each for each in desk.step.order if each != name]
-    off = [each for each in desk.step.off if each != name]
-    return _fit_anew(prepared, desk, model, order, f"\u2212 {name}", off=off, known=_known_rungs(desk.step))
+    model = _model_of(file, session) - name
+    order = [each for each in session.step.order if each != name]
+    off = [each for each in session.step.off if each != name]
+    return _fit_anew(
+        prepared, session, model, order, f"\u2212 {name}", off=off, known=_known_rungs(session.step)
+    )
 
 
-def fit_session(file: SessionFile, prepared: PreparedRun, desk: Session) -> Session:
+def fit_session(file: SessionFile, prepared: PreparedRun, session: Session) -> Session:
     """Fit all values that are not locked, from where they are."""
-    model = _model_of(file, desk)
-    return _fit_anew(prepared, desk, model, desk.step.order, "fit", off=desk.step.off, known={})
+    model = _model_of(file, session)
+    return _fit_anew(prepared, session, model, session.step.order, "fit", off=session.step.off, known={})
 
 
-def switch_effect(file: SessionFile, prepared: PreparedRun, desk: Session, name: str) -> Session:
+def switch_effect(file: SessionFile, prepared: PreparedRun, session: Session, name: str) -> Session:
     """Switch an effect off, or on again, without a fit: what it carries alone shows at once."""
-    model = _model_of(file, desk)
+    model = _model_of(file, session)
     model.effect(name)
-    off = desk.step.off
+    off = session.step.off
     off = [each for each in off if each != name] if name in off else [*off, name]
     said = f"{name} {'off' if name in off else 'on'}"
-    return desk.push(_score_by_hand(prepared, desk.step, model, said, off))
+    return session.push(_score_by_hand(prepared, session.step, model, said, off))
 
 
 def set_value(
-    file: SessionFile, prepared: PreparedRun, desk: Session, name: str, values: Mapping[str, float]
+    file: SessionFile, prepared: PreparedRun, session: Session, name: str, values: Mapping[str, float]
 ) -> Session:
     """Set values of an effect by hand, without a fit."""
-    model = _model_of(file, desk).change(name, **values)
+    model = _model_of(file, session).change(name, **values)
     told = ", ".join(f"{key} = {value:.4g}" for key, value in values.items())
-    step = _score_by_hand(prepared, desk.step, model, f"{name}: {told}", desk.step.off)
-    return desk.push(step)
+    step = _score_by_hand(prepared, session.step, model, f"{name}: {told}", session.step.off)
+    return session.push(step)
 
 
-def lock_value(file: SessionFile, desk: Session, name: str, parameter: str) -> Session:
+def lock_value(file: SessionFile, session: Session, name: str, parameter: str) -> Session:
     """Lock a value against fits, or unlock it."""
-    parsed = file.parse(desk.step.model)
+    parsed = file.parse(session.step.model)
     effect = parsed.model.effect(name)
     changed = effect.loosen(parameter) if parameter in effect.fixed else effect.fix(parameter)
     model = parsed.model.swap(changed)
     said = f"{name}.{parameter} {'locked' if parameter in changed.fixed else 'unlocked'}"
-    step = msgspec.structs.replace(desk.step, said=said, model=format_step(model, parsed.intervals))
-    return desk.push(step)
+    step = msgspec.structs.replace(session.step, said=said, model=format_step(model, parsed.intervals))
+    return session.push(step)
 
 
-def _model_of(file: SessionFile, desk: Session) -> Model:
-    return file.parse(desk.step.model).model
+def _model_of(file: SessionFile, session: Session) -> Model:
+    return file.parse(session.step.model).model
 
 
 def _score_by_hand(prepared: PreparedRun, step: Step, model: Model, said: str, off: list[str]) -> Step:
@@ -189,7 +193,7 @@ def _effects_of(rung: Mapping[str, object]) -> list[str]:
 
 def _fit_anew(
     prepared: PreparedRun,
-    desk: Session,
+    session: Session,
     model: Model,
     order: list[str],
     said: str,
@@ -201,7 +205,7 @@ def _fit_anew(
 
     Args:
         prepared: the run.
-        desk: whose step it follows.
+        session: whose step it follows.
         model: with the effects that are switched off.
         order: of its effects.
         said: what was done.
@@ -209,7 +213,7 @@ def _fit_anew(
         known: rungs that need not be fitted again.
     """
     whole = prepared.judge(switch_off(model, off))
-    _require_numbers(whole.errors, desk.run)
+    _require_numbers(whole.errors, session.run)
     fitted = whole.fitted.model
     shown = [name for name in order if name in fitted]
     ladder = []
@@ -230,7 +234,7 @@ def _fit_anew(
         ladder=ladder,
         without={name: prepared.score(fitted - name, delays).t_mrmse_m for name in shown},
     )
-    return msgspec.structs.replace(desk, floor=_lower_floor(desk, whole)).push(step)
+    return msgspec.structs.replace(session, floor=_lower_floor(session, whole)).push(step)
 
 
 def _require_numbers(errors: Errors, run: str) -> None:
@@ -249,19 +253,19 @@ def _known_rungs(step: Step) -> Rungs:
     return {tuple(_effects_of(rung)): rung for rung in rungs}
 
 
-def learn_floor(desk: Session, diagnosis: Mapping[str, object] | None) -> Session:
-    """The desk with the floor that a diagnosis found for the same input, where it is lower."""
-    found = diagnosis.get("noise_floor") if diagnosis and diagnosis.get("input") == desk.input else None
+def learn_floor(session: Session, diagnosis: Mapping[str, object] | None) -> Session:
+    """The session with the floor that a diagnosis found for the same input, where it is lower."""
+    found = diagnosis.get("noise_floor") if diagnosis and diagnosis.get("input") == session.input else None
     lower = found if isinstance(found, dict) and isinstance(found.get("t_mrmse_m"), float) else None
-    if lower is None or not _is_below(lower, desk.floor):
-        return desk
-    return msgspec.structs.replace(desk, floor=lower)
+    if lower is None or not _is_below(lower, session.floor):
+        return session
+    return msgspec.structs.replace(session, floor=lower)
 
 
-def _lower_floor(desk: Session, judged: Judged) -> dict[str, object]:
+def _lower_floor(session: Session, judged: Judged) -> dict[str, object]:
     """The floor can only sink: the better the model, the sharper it is."""
     found = errors_as_json(judged.floor)
-    return found if _is_below(found, desk.floor) else desk.floor
+    return found if _is_below(found, session.floor) else session.floor
 
 
 def _is_below(found: Mapping[str, object], known: Mapping[str, object]) -> bool:

@@ -58,11 +58,11 @@ class Web:
     """What each address answers.
 
     Args:
-        hall: what is asked.
+        sessions: what is asked.
     """
 
-    def __init__(self, hall: Sessions) -> None:
-        self._hall = hall
+    def __init__(self, sessions: Sessions) -> None:
+        self._sessions = sessions
 
     def routes(self) -> list[Route]:
         """All addresses."""
@@ -73,7 +73,7 @@ class Web:
             Route("/report", self.report),
             Route("/api/runs", self.runs),
             Route("/api/jobs", self.jobs),
-            Route("/api/desk", self.desk, methods=["POST"]),
+            Route("/api/session", self.session, methods=["POST"]),
             Route("/api/figures", self.figures, methods=["POST"]),
             Route("/api/rows", self.rows, methods=["POST"]),
             Route("/api/save", self.save, methods=["POST"]),
@@ -85,38 +85,38 @@ class Web:
 
     async def runs(self, _: Request) -> Response:
         """Runs, jobs and known vehicles."""
-        hall = self._hall
-        listed = await run_in_threadpool(list_runs, hall.store)
+        sessions = self._sessions
+        listed = await run_in_threadpool(list_runs, sessions.store)
         presets = [{"id": preset.id, "name": preset.name} for preset in list_presets()]
-        more = {"jobs": hall.jobs.show(), "vehicles": presets, "results": str(hall.results)}
+        more = {"jobs": sessions.jobs.show(), "vehicles": presets, "results": str(sessions.results)}
         return answer({**listed, **more})
 
     async def jobs(self, _: Request) -> Response:
         """Logs on their way to runs."""
-        return answer({"jobs": self._hall.jobs.show()})
+        return answer({"jobs": self._sessions.jobs.show()})
 
-    async def desk(self, request: Request) -> Response:
-        """A change to a desk, and what it looks like then."""
-        return answer(await run_in_threadpool(self._hall.answer, await read_ask(request)))
+    async def session(self, request: Request) -> Response:
+        """A change to a session, and what it looks like then."""
+        return answer(await run_in_threadpool(self._sessions.answer, await read_ask(request)))
 
     async def figures(self, request: Request) -> Response:
-        """All figures of a desk."""
-        return answer(await run_in_threadpool(self._hall.draw, await read_ask(request)))
+        """All figures of a session."""
+        return answer(await run_in_threadpool(self._sessions.draw, await read_ask(request)))
 
     async def rows(self, request: Request) -> Response:
-        """Rows of the figures of a desk."""
-        return answer(await run_in_threadpool(self._hall.redraw, await read_ask(request)))
+        """Rows of the figures of a session."""
+        return answer(await run_in_threadpool(self._sessions.redraw, await read_ask(request)))
 
     async def save(self, request: Request) -> Response:
-        """Write the model file of a desk."""
+        """Write the model file of a session."""
         ask = await read_ask(request)
-        path = await run_in_threadpool(self._hall.save_model, ask.run, ask.slot)
+        path = await run_in_threadpool(self._sessions.save_model, ask.run, ask.slot)
         return answer({"path": str(path)})
 
     async def download(self, request: Request) -> Response:
-        """The model file of a desk."""
+        """The model file of a session."""
         run, slot = request.query_params.get("run", ""), request.query_params.get("slot", "a")
-        text = await run_in_threadpool(self._hall.format_model, run, slot)
+        text = await run_in_threadpool(self._sessions.format_model, run, slot)
         name = quote(f"{run.rpartition('/')[2]}.toml", safe="")
         disposition = f"attachment; filename*=UTF-8''{name}"
         return PlainTextResponse(text, headers={"content-disposition": disposition})
@@ -124,7 +124,7 @@ class Web:
     async def report(self, request: Request) -> Response:
         """The stored report of a run, shut off from this page."""
         run = request.query_params.get("run", "")
-        manifest = await run_in_threadpool(find_run, self._hall.store, run)
+        manifest = await run_in_threadpool(find_run, self._sessions.store, run)
         path = manifest.path(REPORT)
         if not path.is_file():
             raise WorkbenchError("no_report", "its report is gone", where=run, hint="Analyze the log again.")
@@ -144,25 +144,25 @@ class Web:
         if not (length.isascii() and length.isdecimal() and len(length) <= _LONGEST_LENGTH):
             raise WorkbenchError("no_length", "the size of the log is not known", hint="Drop it again.")
         name = request.query_params.get("name", "")
-        job = await self._hall.jobs.take(name, int(length), request.stream())
+        job = await self._sessions.jobs.take(name, int(length), request.stream())
         return answer({"job": job.show()})
 
     async def diagnose(self, request: Request) -> Response:
         """Begin to name what is missing from the model of a run."""
         ask = await read_ask(request)
-        manifest = await run_in_threadpool(find_run, self._hall.store, ask.run)
-        return answer({"job": self._hall.jobs.diagnose(manifest).show()})
+        manifest = await run_in_threadpool(find_run, self._sessions.store, ask.run)
+        return answer({"job": self._sessions.jobs.diagnose(manifest).show()})
 
     async def retry(self, request: Request) -> Response:
         """Analyze a log again, now that its vehicle is known."""
         query = request.query_params
-        job = self._hall.jobs.retry(query.get("id", ""), query.get("vehicle", ""))
+        job = self._sessions.jobs.retry(query.get("id", ""), query.get("vehicle", ""))
         return answer({"job": job.show()})
 
     async def dismiss(self, request: Request) -> Response:
         """Forget a job that has ended."""
-        self._hall.jobs.dismiss(request.query_params.get("id", ""))
-        return answer({"jobs": self._hall.jobs.show()})
+        self._sessions.jobs.dismiss(request.query_params.get("id", ""))
+        return answer({"jobs": self._sessions.jobs.show()})
 
 
 def build_app(
@@ -185,16 +185,16 @@ def build_app(
         work: what the worker process does with a task; importable by its name there.
     """
     places = Places(results)
-    hall = Sessions(results, limits or Limits(), diagnosis=diagnosis, places=places, work=work)
+    sessions = Sessions(results, limits or Limits(), diagnosis=diagnosis, places=places, work=work)
 
     @asynccontextmanager
     async def live(_: Starlette) -> AsyncIterator[None]:
         try:
             yield
         finally:
-            await run_in_threadpool(hall.jobs.close)
+            await run_in_threadpool(sessions.jobs.close)
 
-    app = Starlette(routes=Web(hall).routes(), exception_handlers=make_handlers(places), lifespan=live)
+    app = Starlette(routes=Web(sessions).routes(), exception_handlers=make_handlers(places), lifespan=live)
     return Guard(app, token, hosts)
 
 

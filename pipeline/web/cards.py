@@ -1,4 +1,4 @@
-"""A desk as the page shows it: numbers, effects as cards, what was done."""
+"""A session as the page shows it: numbers, effects as cards, what was done."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ _STEPS = 200
 _LATEST = 12
 
 
-def show_session(desk: Session, file: ModelFile) -> dict[str, object]:
-    """The state of a desk as JSON.
+def show_session(session: Session, file: ModelFile) -> dict[str, object]:
+    """The state of a session as JSON.
 
     Args:
-        desk: with at least one step.
+        session: with at least one step.
         file: the model of the step that counts.
     """
-    step = desk.step
-    before = desk.steps[desk.at - 1] if desk.at > 0 else None
+    step = session.step
+    before = session.steps[session.at - 1] if session.at > 0 else None
     return {
-        "run": desk.run,
-        "input": desk.input,
+        "run": session.run,
+        "input": session.input,
         "said": step.said,
         "by_hand": step.by_hand,
         "ideal": _errors(step.ladder[0]),
         "errors": _errors(step.ladder[-1]),
         "before": _errors(before.ladder[-1]) if before is not None and before.ladder else None,
-        "floor": _errors(desk.floor) if desk.floor else None,
+        "floor": _errors(session.floor) if session.floor else None,
         # What the loader of models left out, and why.
         "warnings": list(file.warnings),
         "effects": [
@@ -46,9 +46,9 @@ def show_session(desk: Session, file: ModelFile) -> dict[str, object]:
             for name in step.order
             if name not in file.left_out
         ],
-        "undo": desk.steps[desk.at].said if desk.at > 0 else None,
-        "redo": desk.steps[desk.at + 1].said if desk.at + 1 < len(desk.steps) else None,
-        "history": [each.said for each in desk.steps[: desk.at + 1]][-_LATEST:],
+        "undo": session.steps[session.at].said if session.at > 0 else None,
+        "redo": session.steps[session.at + 1].said if session.at + 1 < len(session.steps) else None,
+        "history": [each.said for each in session.steps[: session.at + 1]][-_LATEST:],
     }
 
 

@@ -1,4 +1,4 @@
-"""The figures of the report, for one desk: whole, or only the rows that a change of a value moves."""
+"""The figures of the report, for one session: whole, or only the rows that a change of a value moves."""
 
 from __future__ import annotations
 

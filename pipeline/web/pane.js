@@ -1,4 +1,4 @@
-// One desk: its numbers, its model as cards, what to add next, its figures.
+// One session: its numbers, its model as cards, what to add next, its figures.
 import { h, post, runTo, say, sayDuration, sayShare, toast } from "./parts.js";
 
 const WAIT_MS = 60;
@@ -35,7 +35,7 @@ export class Pane {
   }
 
   get run() {
-    return this.state?.desk.run ?? null;
+    return this.state?.session.run ?? null;
   }
 
   // Asking -------------------------------------------------------------------------------------------------
@@ -44,8 +44,8 @@ export class Pane {
     const run = more.run ?? this.run;
     this.busy(true);
     try {
-      const input = more.input ?? this.state?.desk.input ?? null;
-      const state = await post("/api/desk", { ...more, run, input: more.fresh ? null : input, slot: this.slot, action, fresh: undefined });
+      const input = more.input ?? this.state?.session.input ?? null;
+      const state = await post("/api/session", { ...more, run, input: more.fresh ? null : input, slot: this.slot, action, fresh: undefined });
       this.state = state;
       this.show();
       return true;
@@ -104,36 +104,36 @@ export class Pane {
   // Numbers ------------------------------------------------------------------------------------------------
 
   show() {
-    const { desk, run } = this.state;
-    if (!this.hero.querySelector(".numbers") || this.hero.dataset.run !== desk.run + desk.input) this.buildHero();
-    this.showNumbers(desk);
+    const { session, run } = this.state;
+    if (!this.hero.querySelector(".numbers") || this.hero.dataset.run !== session.run + session.input) this.buildHero();
+    this.showNumbers(session);
     const undo = this.hero.querySelector(".undo");
-    undo.disabled = desk.undo === null;
-    undo.title = desk.undo === null ? "nothing to undo" : `undo: ${desk.undo}`;
+    undo.disabled = session.undo === null;
+    undo.title = session.undo === null ? "nothing to undo" : `undo: ${session.undo}`;
     const redo = this.hero.querySelector(".redo");
-    redo.disabled = desk.redo === null;
-    redo.title = desk.redo === null ? "nothing to redo" : `redo: ${desk.redo}`;
-    this.hero.querySelector(".said").textContent = desk.said;
+    redo.disabled = session.redo === null;
+    redo.title = session.redo === null ? "nothing to redo" : `redo: ${session.redo}`;
+    this.hero.querySelector(".said").textContent = session.said;
     this.showModel();
     return run;
   }
 
   buildHero() {
-    const { desk, run, inputs } = this.state;
+    const { session, run, inputs } = this.state;
     const facts = [run.vehicle_name ?? run.vehicle, run.terrain, sayDuration(run.duration_s), this.sayStanding(run)].filter(Boolean);
     const words = { command: "on command", measured: "on measured wheels" };
     const choice = h("div", { class: "inputs", role: "group", "aria-label": "What the model is fed with" },
       inputs.map((name) => h("button", {
-        type: "button", "aria-pressed": String(name === desk.input),
-        onclick: () => name !== desk.input && this.switchInput(name),
+        type: "button", "aria-pressed": String(name === session.input),
+        onclick: () => name !== session.input && this.switchInput(name),
       }, words[name])));
     const number = (key, unit, name) =>
       h("div", { class: `number ${key}` },
         h("p", { class: "big" }, h("span", { class: "value" }, "–"), h("small", {}, ` ${unit}`)),
         h("p", { class: "what" }, name, " ", h("b", { class: "fall" })));
-    this.hero.dataset.run = desk.run + desk.input;
+    this.hero.dataset.run = session.run + session.input;
     const parts = [
-      h("div", { class: "title" }, h("h2", {}, desk.run), h("p", { class: "facts" }, facts.join(" · ")), choice),
+      h("div", { class: "title" }, h("h2", {}, session.run), h("p", { class: "facts" }, facts.join(" · ")), choice),
       this.warn(run),
       h("div", { class: "numbers" }, number("t", "m", "position after 2 s"), number("r", "rad", "heading after 2 s")),
       h("div", { class: "scale" },
@@ -145,8 +145,8 @@ export class Pane {
         h("button", { type: "button", class: "redo", onclick: () => this.act("redo") }, "Redo"),
         h("button", { type: "button", class: "fit", onclick: () => this.act("fit") }, "Fit"),
         h("button", { type: "button", class: "save", onclick: () => this.save() }, "Save model"),
-        h("a", { class: "download button", href: `/model.toml?${new URLSearchParams({ run: desk.run, slot: this.slot })}` }, "Download"),
-        run.report && h("a", { class: "report button", href: `/report?${new URLSearchParams({ run: desk.run })}`, target: "_blank", rel: "noopener" }, "Report"),
+        h("a", { class: "download button", href: `/model.toml?${new URLSearchParams({ run: session.run, slot: this.slot })}` }, "Download"),
+        run.report && h("a", { class: "report button", href: `/report?${new URLSearchParams({ run: session.run })}`, target: "_blank", rel: "noopener" }, "Report"),
         h("span", { class: "said", role: "status" })),
     ];
     this.hero.replaceChildren(...parts.filter(Boolean));
@@ -167,8 +167,8 @@ export class Pane {
     return told.length > 0 && h("details", { class: "doubts" }, h("summary", {}, told[0]), h("ul", {}, told.slice(1).map((text) => h("li", {}, text))));
   }
 
-  showNumbers(desk) {
-    const { errors, ideal, floor, before, by_hand: byHand } = desk;
+  showNumbers(session) {
+    const { errors, ideal, floor, before, by_hand: byHand } = session;
     for (const key of ["t", "r"]) {
       const place = this.hero.querySelector(`.number.${key}`);
       runTo(place.querySelector(".value"), errors[key]);
@@ -211,12 +211,12 @@ export class Pane {
   // Model --------------------------------------------------------------------------------------------------
 
   showModel() {
-    const { desk } = this.state;
+    const { session } = this.state;
     const focus = document.activeElement?.dataset?.keep;
-    const cards = desk.effects.map((effect) => this.card(effect));
+    const cards = session.effects.map((effect) => this.card(effect));
     this.model.replaceChildren(
       h("h3", {}, "Model"),
-      ...desk.warnings.map((told) => h("p", { class: "doubts warning", role: "status" }, told)),
+      ...session.warnings.map((told) => h("p", { class: "doubts warning", role: "status" }, told)),
       cards.length ? h("ul", { class: "cards" }, cards) : h("p", { class: "quiet" }, "The ideal model: no effect yet."),
       h("h3", {}, "Add an effect"),
       this.proposals(),
@@ -225,8 +225,8 @@ export class Pane {
   }
 
   card(effect) {
-    const { desk } = this.state;
-    const carries = effect.without_m !== null && !effect.off ? effect.without_m - desk.errors.t : null;
+    const { session } = this.state;
+    const carries = effect.without_m !== null && !effect.off ? effect.without_m - session.errors.t : null;
     return h("li", { class: `card${effect.off ? " off" : ""}`, data: { effect: effect.id } },
       h("div", { class: "head" },
         h("b", {}, effect.id),
@@ -276,9 +276,9 @@ export class Pane {
         this.wanted = null;
         const turn = this.turn;
         try {
-          const answer = await post("/api/desk", { ...asked, run: this.run, slot: this.slot, input: this.state.desk.input, action: "preview" });
+          const answer = await post("/api/session", { ...asked, run: this.run, slot: this.slot, input: this.state.session.input, action: "preview" });
           if (turn === this.turn) {
-            this.showNumbers({ ...answer.desk, before: this.state.desk.errors });
+            this.showNumbers({ ...answer.session, before: this.state.session.errors });
             this.plots?.feed(answer.rows);
           }
         } catch (error) {
@@ -293,8 +293,8 @@ export class Pane {
   // What to add --------------------------------------------------------------------------------------------
 
   proposals() {
-    const { desk, trial, catalogue, diagnosis } = this.state;
-    const there = new Set(desk.effects.map((effect) => effect.id));
+    const { session, trial, catalogue, diagnosis } = this.state;
+    const there = new Set(session.effects.map((effect) => effect.id));
     const parts = [this.named(diagnosis, there)];
     if (!trial) parts.push(h("button", { type: "button", class: "try", onclick: () => this.tryAll() }, "Try every effect"));
     else {
@@ -302,7 +302,7 @@ export class Pane {
       const running = trial.tried < trial.total;
       if (running) parts.push(h("p", { class: "quiet trying" }, `trying every effect: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.tried / trial.total })));
       parts.push(h("ul", { class: "proposals" }, helping.slice(0, 6).map((entry, rank) => this.proposal(entry, rank === 0 && !running))));
-      if (!running && !helping.length) parts.push(h("p", { class: "nothing" }, this.tellNothing(desk)));
+      if (!running && !helping.length) parts.push(h("p", { class: "nothing" }, this.tellNothing(session)));
     }
     const rest = catalogue.filter((entry) => !there.has(entry.id));
     const chosen = h("select", { "aria-label": "Any effect of the catalogue", class: "catalogue" }, h("option", { value: "" }, "any other effect …"),
@@ -341,15 +341,15 @@ export class Pane {
     }
   }
 
-  tellNothing(desk) {
-    const room = desk.floor ? desk.errors.t / desk.floor.t : Infinity;
+  tellNothing(session) {
+    const room = session.floor ? session.errors.t / session.floor.t : Infinity;
     if (room < 1.3) return "Nothing is missing: the model is as good as the localization lets us see.";
     return "No single effect of the catalogue helps further. What is left may be a formula of your own, or noise.";
   }
 
   async add(effect) {
     await this.act("add", { effect });
-    if (this.state?.desk.effects.some((entry) => entry.id === effect)) this.tryAll();
+    if (this.state?.session.effects.some((entry) => entry.id === effect)) this.tryAll();
   }
 
   // The joint fit of the diagnosis, as one step that can be undone.
@@ -369,7 +369,7 @@ export class Pane {
       await new Promise((done) => setTimeout(done, 700));
       if (this.run !== run || turn !== this.turn || this.root.classList.contains("busy")) continue;
       try {
-        const state = await post("/api/desk", { run, slot: this.slot, input: this.state.desk.input, action: "open" });
+        const state = await post("/api/session", { run, slot: this.slot, input: this.state.session.input, action: "open" });
         if (this.run !== run || turn !== this.turn) return;
         this.state.trial = state.trial;
         if (!state.trial) {
@@ -401,7 +401,7 @@ export class Pane {
   // Figures ------------------------------------------------------------------------------------------------
 
   get request() {
-    return { run: this.run, slot: this.slot, input: this.state.desk.input };
+    return { run: this.run, slot: this.slot, input: this.state.session.input };
   }
 
   async draw() {

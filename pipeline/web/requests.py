@@ -18,11 +18,11 @@ Slot = Literal["a", "b"]
 
 
 class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
-    """A change to a desk.
+    """A change to a session.
 
     Attributes:
         run: name of the run.
-        slot: `a`, or `b` for the desk beside it.
+        slot: `a`, or `b` for the session beside it.
         input: what the model is fed with; None for the usual one.
         action: what to do; `add_named` puts in the model that the diagnosis wrote, fitted as one.
         anyway: take an effect though it raises an error.

@@ -1,4 +1,4 @@
-"""What lies on a desk: a model of a run in the making and every step back to the ideal one, in one file."""
+"""A session: a model of a run in the making and every step back to the ideal one, in one file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _MOST_STEPS = 200
 
 
 class Step(msgspec.Struct, frozen=True, kw_only=True):
-    """A model on the desk and what is known of it.
+    """A model on the session and what is known of it.
 
     Attributes:
         said: what was done, in a few words.
@@ -76,32 +76,35 @@ class Session(msgspec.Struct, frozen=True, kw_only=True):
         """The step that counts.
 
         Raises:
-            WorkbenchError: ``empty_desk``.
+            WorkbenchError: ``empty_session``.
         """
         if not 0 <= self.at < len(self.steps):
             raise WorkbenchError(
-                "empty_desk", "nothing has been fitted here yet", where=self.run, hint="Open the run again."
+                "empty_session",
+                "nothing has been fitted here yet",
+                where=self.run,
+                hint="Open the run again.",
             )
         return self.steps[self.at]
 
     def push(self, step: Step) -> Session:
-        """The desk after another step; what had been undone is forgotten."""
+        """The session after another step; what had been undone is forgotten."""
         steps = [*self.steps[: self.at + 1], step][-_MOST_STEPS:]
         return msgspec.structs.replace(self, steps=steps, at=len(steps) - 1)
 
     def drop(self, which: int) -> Session:
-        """The desk without one of its steps; before it where that one counted."""
+        """The session without one of its steps; before it where that one counted."""
         steps = [step for number, step in enumerate(self.steps) if number != which]
         return msgspec.structs.replace(self, steps=steps, at=max(self.at - (which <= self.at), 0))
 
     def move(self, by: int) -> Session:
-        """The desk some steps back (negative) or forward, as far as there are any."""
+        """The session some steps back (negative) or forward, as far as there are any."""
         return msgspec.structs.replace(self, at=min(max(self.at + by, 0), len(self.steps) - 1))
 
 
 @dataclass(frozen=True)
 class SessionFile:
-    """Where a desk is kept.
+    """Where a session is kept.
 
     Attributes:
         results: the results folder.
@@ -123,7 +126,7 @@ class SessionFile:
         """
         if self.slot not in SLOTS:
             raise WorkbenchError(
-                "no_such_slot", f"there is no desk {self.slot!r}", hint=f"Use one of {', '.join(SLOTS)}."
+                "no_such_slot", f"there is no session {self.slot!r}", hint=f"Use one of {', '.join(SLOTS)}."
             )
         return place_of_run(self.results, f"desks/{self.slot}", self.run, ".json")
 
@@ -138,21 +141,21 @@ class SessionFile:
         return place_of_run(self.results, "models", self.run, suffix)
 
     def read(self) -> Session | None:
-        """The desk; None when there is none that can be read."""
+        """The session; None when there is none that can be read."""
         try:
             return msgspec.json.decode(self.path.read_bytes(), type=Session)
         except (OSError, ValueError, msgspec.DecodeError, RecursionError):
             return None
 
-    def write(self, desk: Session) -> None:
-        """Keep the desk.
+    def write(self, session: Session) -> None:
+        """Keep the session.
 
         Raises:
             WorkbenchError: ``desk_not_written``.
         """
         try:
             make_folder(self.path.parent)
-            replace_file(self.path, json.dumps(msgspec.to_builtins(desk), allow_nan=False).encode())
+            replace_file(self.path, json.dumps(msgspec.to_builtins(session), allow_nan=False).encode())
         except OSError as error:
             raise WorkbenchError(
                 "desk_not_written",
@@ -172,7 +175,7 @@ def format_step(model: Model, intervals: Mapping[str, tuple[float, float]]) -> s
 
 
 def begin_session(run: str, key: str, source: str, vehicle: Vehicle) -> Session:
-    """A desk with the ideal model on it, not fitted yet."""
+    """A session with the ideal model on it, not fitted yet."""
     step = Step(said="ideal model", model=format_step(Model(vehicle), {}))
     return Session(run=run, key=key, input=source, steps=[step], at=0)
 

@@ -1,4 +1,4 @@
-"""Everything the server holds: results, runs made ready, desks, trials, jobs; what is asked, answered."""
+"""Everything the server holds: results, runs made ready, sessions, trials, jobs; what is asked, answered."""
 
 from __future__ import annotations
 
@@ -70,50 +70,50 @@ class Sessions:
         self._lock = threading.Lock()
 
     def answer(self, ask: Ask) -> dict[str, object]:
-        """Do what was asked of a desk, keep it, and say what the page must show.
+        """Do what was asked of a session, keep it, and say what the page must show.
 
         Raises:
-            SlipError: it cannot be done; the desk is as it was.
+            SlipError: it cannot be done; the session is as it was.
         """
         manifest = find_run(self.store, ask.run)
         file = SessionFile(self.results, ask.run, ask.slot)
         prepared = self._cache.prepared(manifest, self._input_of(ask, file, manifest))
         with prepared.lock, evaluating(ask.run):
-            desk = actions.open_session(file, prepared)
+            session = actions.open_session(file, prepared)
             if ask.action == "preview":
-                return self._preview(file, prepared, desk, ask)
+                return self._preview(file, prepared, session, ask)
             changed = actions.learn_floor(
-                self._change(file, prepared, desk, ask), read_diagnosis(self.results, manifest)
+                self._change(file, prepared, session, ask), read_diagnosis(self.results, manifest)
             )
             # A step that cannot be shown is not kept.
             shown = self._show(file, prepared, changed)
-            if changed is not desk:
+            if changed is not session:
                 file.write(changed)
             return shown
 
     def draw(self, ask: Ask) -> dict[str, object]:
-        """All figures of a desk."""
+        """All figures of a session."""
         figures, view = self._look(ask)
         with evaluating(ask.run):
             return figures.draw(view)
 
     def redraw(self, ask: Ask) -> dict[str, object]:
-        """The rows of a desk's figures that a change moves."""
+        """The rows of a session's figures that a change moves."""
         figures, view = self._look(ask)
         with evaluating(ask.run):
             return figures.redraw(view)
 
     def format_model(self, run: str, slot: str) -> str:
-        """The model file of a desk as text."""
-        _, desk = self._read_desk(run, slot)
-        return desk.step.model
+        """The model file of a session as text."""
+        _, session = self._read_session(run, slot)
+        return session.step.model
 
     def save_model(self, run: str, slot: str) -> Path:
-        """Write the model file of a desk; the effects that are switched off are left out."""
-        file, desk = self._read_desk(run, slot)
-        parsed = file.parse(desk.step.model)
+        """Write the model file of a session; the effects that are switched off are left out."""
+        file, session = self._read_session(run, slot)
+        parsed = file.parse(session.step.model)
         make_folder(file.model_path.parent)
-        write_model(replace(parsed, model=switch_off(parsed.model, desk.step.off)), file.model_path)
+        write_model(replace(parsed, model=switch_off(parsed.model, session.step.off)), file.model_path)
         return file.model_path
 
     def _input_of(self, ask: Ask, file: SessionFile, manifest: Manifest) -> str | None:
@@ -127,69 +127,69 @@ class Sessions:
         file = SessionFile(self.results, ask.run, ask.slot)
         prepared = self._cache.prepared(manifest, self._input_of(ask, file, manifest))
         with prepared.lock, evaluating(ask.run):
-            desk = actions.open_session(file, prepared)
-        return prepared, desk, file.parse(desk.step.model)
+            session = actions.open_session(file, prepared)
+        return prepared, session, file.parse(session.step.model)
 
-    def _read_desk(self, run: str, slot: str) -> tuple[SessionFile, Session]:
+    def _read_session(self, run: str, slot: str) -> tuple[SessionFile, Session]:
         find_run(self.store, run)
         file = SessionFile(self.results, run, slot)
-        desk = file.read()
-        if desk is None:
+        session = file.read()
+        if session is None:
             raise WorkbenchError(
                 "no_such_desk", "no model of this run lies here", where=run, hint="Open the run first."
             )
-        return file, desk
+        return file, session
 
-    def _change(self, file: SessionFile, prepared: PreparedRun, desk: Session, ask: Ask) -> Session:
+    def _change(self, file: SessionFile, prepared: PreparedRun, session: Session, ask: Ask) -> Session:
         changes: dict[str, Callable[[], Session]] = {
-            "open": lambda: desk,
-            "add": lambda: actions.add_effect(file, prepared, desk, ask.effect, anyway=ask.anyway),
-            "add_named": lambda: self._add_named(file, prepared, desk, ask),
+            "open": lambda: session,
+            "add": lambda: actions.add_effect(file, prepared, session, ask.effect, anyway=ask.anyway),
+            "add_named": lambda: self._add_named(file, prepared, session, ask),
             "formula": lambda: actions.add_effect(
-                file, prepared, desk, _read_formula(ask), anyway=ask.anyway
+                file, prepared, session, _read_formula(ask), anyway=ask.anyway
             ),
-            "drop": lambda: actions.drop_effect(file, prepared, desk, ask.effect),
-            "switch": lambda: actions.switch_effect(file, prepared, desk, ask.effect),
-            "set": lambda: actions.set_value(file, prepared, desk, ask.effect, {ask.parameter: ask.value}),
-            "lock": lambda: actions.lock_value(file, desk, ask.effect, ask.parameter),
-            "fit": lambda: actions.fit_session(file, prepared, desk),
-            "undo": lambda: actions.move(file, desk, -1),
-            "redo": lambda: actions.move(file, desk, 1),
-            "try": lambda: self._begin_trial(file, prepared, desk),
+            "drop": lambda: actions.drop_effect(file, prepared, session, ask.effect),
+            "switch": lambda: actions.switch_effect(file, prepared, session, ask.effect),
+            "set": lambda: actions.set_value(file, prepared, session, ask.effect, {ask.parameter: ask.value}),
+            "lock": lambda: actions.lock_value(file, session, ask.effect, ask.parameter),
+            "fit": lambda: actions.fit_session(file, prepared, session),
+            "undo": lambda: actions.move(file, session, -1),
+            "redo": lambda: actions.move(file, session, 1),
+            "try": lambda: self._begin_trial(file, prepared, session),
         }
         return changes[ask.action]()
 
-    def _add_named(self, file: SessionFile, prepared: PreparedRun, desk: Session, ask: Ask) -> Session:
+    def _add_named(self, file: SessionFile, prepared: PreparedRun, session: Session, ask: Ask) -> Session:
         found = read_diagnosis(self.results, prepared.manifest)
         named = None if found is None else read_model_text(found)
         if named is None:
             raise WorkbenchError(
                 "not_diagnosed", "nothing was named on this run", where=ask.run, hint="Diagnose it first."
             )
-        missing = [effect for effect in named.model if effect.id not in desk.step.order]
+        missing = [effect for effect in named.model if effect.id not in session.step.order]
         said = f"+ all {len(missing)} that were named"
-        return actions.add_effects(file, prepared, desk, missing, said, anyway=ask.anyway)
+        return actions.add_effects(file, prepared, session, missing, said, anyway=ask.anyway)
 
-    def _begin_trial(self, file: SessionFile, prepared: PreparedRun, desk: Session) -> Session:
-        model = switch_off(file.parse(desk.step.model).model, desk.step.off)
+    def _begin_trial(self, file: SessionFile, prepared: PreparedRun, session: Session) -> Session:
+        model = switch_off(file.parse(session.step.model).model, session.step.off)
         self._trials.begin(prepared, model, f"{file.slot} {file.run}")
-        return desk
+        return session
 
     def _preview(
-        self, file: SessionFile, prepared: PreparedRun, desk: Session, ask: Ask
+        self, file: SessionFile, prepared: PreparedRun, session: Session, ask: Ask
     ) -> dict[str, object]:
         """What a value would do, while the slider moves; nothing is kept."""
-        trial = actions.set_value(file, prepared, desk, ask.effect, {ask.parameter: ask.value})
+        trial = actions.set_value(file, prepared, session, ask.effect, {ask.parameter: ask.value})
         parsed = file.parse(trial.step.model)
         model = switch_off(parsed.model, trial.step.off)
-        view = prepared.view(model, trial.step.timing, trial.step.ladder, desk.floor or None)
-        return {"desk": show_session(trial, parsed), **self._figures_of(prepared.manifest).redraw(view)}
+        view = prepared.view(model, trial.step.timing, trial.step.ladder, session.floor or None)
+        return {"session": show_session(trial, parsed), **self._figures_of(prepared.manifest).redraw(view)}
 
-    def _show(self, file: SessionFile, prepared: PreparedRun, desk: Session) -> dict[str, object]:
-        parsed = file.parse(desk.step.model)
-        trial = self._trials.find(prepared, switch_off(parsed.model, desk.step.off))
+    def _show(self, file: SessionFile, prepared: PreparedRun, session: Session) -> dict[str, object]:
+        parsed = file.parse(session.step.model)
+        trial = self._trials.find(prepared, switch_off(parsed.model, session.step.off))
         return {
-            "desk": show_session(desk, parsed),
+            "session": show_session(session, parsed),
             "run": describe_run(prepared.manifest),
             "inputs": self._cache.list_inputs(prepared.manifest),
             "catalogue": list_catalogue(prepared.vehicle),
@@ -199,10 +199,10 @@ class Sessions:
         }
 
     def _look(self, ask: Ask) -> tuple[FigureCache, MotionView]:
-        prepared, desk, parsed = self._open(ask)
-        model = switch_off(parsed.model, desk.step.off)
+        prepared, session, parsed = self._open(ask)
+        model = switch_off(parsed.model, session.step.off)
         with evaluating(ask.run):
-            view = prepared.view(model, desk.step.timing, desk.step.ladder, desk.floor or None)
+            view = prepared.view(model, session.step.timing, session.step.ladder, session.floor or None)
         return self._figures_of(prepared.manifest), view
 
     def _figures_of(self, manifest: Manifest) -> FigureCache:

@@ -138,15 +138,15 @@ def check_model_verbs(told: Json, file: ModelFile, problem: Problem) -> Json:
 
 
 def check_workbench(
-    told: Json, file: ModelFile, own: Json, manifest: Manifest, desk_file: SessionFile
+    told: Json, file: ModelFile, own: Json, manifest: Manifest, session_file: SessionFile
 ) -> None:
     """*Add all* enters the fit of the diagnosis."""
     prepared = RunCache().prepared(manifest, str(told["input"]))
-    desk = open_session(desk_file, prepared)
-    assert all(same(desk.step.ladder[0][key], told["ladder"][0][key]) for key in ERRORS)
-    desk = add_effects(desk_file, prepared, desk, file.model.effects, "+ all", anyway=True)
-    assert all(same(desk.step.ladder[-1][key], own[key]) for key in ERRORS)
-    kept = desk_file.parse(desk.step.model).model
+    session = open_session(session_file, prepared)
+    assert all(same(session.step.ladder[0][key], told["ladder"][0][key]) for key in ERRORS)
+    session = add_effects(session_file, prepared, session, file.model.effects, "+ all", anyway=True)
+    assert all(same(session.step.ladder[-1][key], own[key]) for key in ERRORS)
+    kept = session_file.parse(session.step.model).model
     for effect in file.model:
         for name, value in effect.values.items():
             low, high = file.intervals.get(f"{effect.id}.{name}", (value, value))

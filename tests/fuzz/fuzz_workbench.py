@@ -2,11 +2,11 @@
 
     python tests/fuzz/fuzz_workbench.py --minutes 5 [--seed 1]
 
-A server on the loopback is asked over HTTP: changes of a desk with damaged and random fields, formulas,
+A server on the loopback is asked over HTTP: changes of a session with damaged and random fields, formulas,
 bodies that are no JSON, uploads with lengths and names that lie, logs with flipped bytes, connections that
 break, requests with foreign hosts, origins and tokens, and results files that somebody damaged. No answer may
 be a 500 or hold a traceback or a path of the server, none may take longer than 30 s, whoever has no token
-gets 403 only, and after each round the desk can be opened, changed and undone.
+gets 403 only, and after each round the session can be opened, changed and undone.
 """
 
 from __future__ import annotations
@@ -60,7 +60,15 @@ GETS = (
     "/..%2f..%2fetc/passwd",
     "/x",
 )
-POSTS = ("/api/desk", "/api/figures", "/api/rows", "/api/save", "/api/diagnose", "/api/retry", "/api/dismiss")
+POSTS = (
+    "/api/session",
+    "/api/figures",
+    "/api/rows",
+    "/api/save",
+    "/api/diagnose",
+    "/api/retry",
+    "/api/dismiss",
+)
 
 
 class Find(Exception):  # noqa: N818 - what a fuzzer looks for
@@ -139,9 +147,9 @@ def make_ask(rng: random.Random) -> bytes:
 
 
 def change(client: Client, rng: random.Random, log: bytes) -> None:
-    """A change of the desk, whole or damaged; an upload of a log, likewise."""
+    """A change of the session, whole or damaged; an upload of a log, likewise."""
     if rng.random() < 0.85:
-        client.ask("POST", rng.choice(("/api/desk", *POSTS[:4])), make_ask(rng))
+        client.ask("POST", rng.choice(("/api/session", *POSTS[:4])), make_ask(rng))
         return
     content = bytearray(log if rng.random() < 0.5 else rng.randbytes(rng.randrange(5000)))
     for _ in range(rng.randrange(20) if content else 0):
@@ -174,7 +182,7 @@ def intrude(client: Client, rng: random.Random, _: bytes) -> None:
         "Host": rng.choice((f"127.0.0.1:{client.server.port}", "evil.example", "", "[", "[::1]:x")),
     }
     known = rng.random() < 0.5
-    path = "/api/desk" if known else rng.choice((*GETS, *POSTS, f"/?token={quote(rng.choice(TEXTS))}"))
+    path = "/api/session" if known else rng.choice((*GETS, *POSTS, f"/?token={quote(rng.choice(TEXTS))}"))
     method = "POST" if known else rng.choice(("GET", "POST"))
     status, _body = client.ask(method, path, make_ask(rng), foreign if known else headers, known=known)
     if status not in {0, 400, 403}:
@@ -182,7 +190,7 @@ def intrude(client: Client, rng: random.Random, _: bytes) -> None:
 
 
 def damage(client: Client, rng: random.Random, _: bytes) -> None:
-    """Flip bytes in the state of a desk or in a summary, as a stranger's results may hold them."""
+    """Flip bytes in the state of a session or in a summary, as a stranger's results may hold them."""
     results = client.server.results
     # The server adds and deletes folders meanwhile: `os.walk` passes over those that are gone.
     names = [Path(folder, name) for folder, _, files in os.walk(results) for name in files]
@@ -208,25 +216,25 @@ KINDS = (change, change, change, change, change, change, wander, break_off, intr
 
 
 def check_usable(client: Client) -> None:
-    """The desk can be opened, changed and undone, and the jobs end."""
+    """The session can be opened, changed and undone, and the jobs end."""
 
-    def desk(action: str, **more: object) -> dict[str, object]:
+    def session(action: str, **more: object) -> dict[str, object]:
         body = json.dumps({"run": RUN, "action": action, **more}).encode()
-        status, answer = client.ask("POST", "/api/desk", body)
+        status, answer = client.ask("POST", "/api/session", body)
         if status != 200:
-            raise Find(f"the desk is not usable: {action} {more}: {answer!r}")
-        return dict(json.loads(answer)["desk"])
+            raise Find(f"the session is not usable: {action} {more}: {answer!r}")
+        return dict(json.loads(answer)["session"])
 
     for _ in range(300):
-        if desk("open")["undo"] is None:
+        if session("open")["undo"] is None:
             break
-        desk("undo")
+        session("undo")
     else:
         raise Find("undo comes to no end")
-    if desk("open")["effects"] != []:
+    if session("open")["effects"] != []:
         raise Find("all undone, and there is an effect")
-    desk("add", effect="effective_track")
-    if desk("undo")["effects"] != []:
+    session("add", effect="effective_track")
+    if session("undo")["effects"] != []:
         raise Find("undo did not take it away")
     for job in client.server.wait_for_jobs():
         client.ask("POST", f"/api/dismiss?id={job['id']}", b"{}")

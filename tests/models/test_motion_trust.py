@@ -219,8 +219,8 @@ def test_a_model_out_of_a_results_folder_runs_nothing_in_the_workbench_and_says_
     shutil.copy(model.parent / "own.py", file.model_path.parent)
     ladder: list[dict[str, object]] = [{"t_mrmse_m": 0.1, "r_mrmse_rad": 0.1}]
     step = Step(said="opened", model=MODEL, order=["effective_track", "tilt"], ladder=ladder)
-    desk = Session(run="run", key="k", input="command", steps=[step], at=0)
-    shown = show_session(desk, file.parse(step.model))
+    session = Session(run="run", key="k", input="command", steps=[step], at=0)
+    shown = show_session(session, file.parse(step.model))
     assert not has_run(model)
     assert "left out: tilt" in str(shown["warnings"])
     assert [card["id"] for card in shown["effects"]] == ["effective_track"]  # type: ignore[attr-defined]

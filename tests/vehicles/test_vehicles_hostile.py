@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from typing import TYPE_CHECKING
 
@@ -43,3 +44,24 @@ def test_one_line_names_the_file_and_the_key(tmp_path: Path, text: str, line: in
     assert caught.value.where == (f"{path}, line {line}" if line else str(path))
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root can give files away")
+def test_a_strangers_fleet_file_above_a_log_says_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mine").mkdir()
+    fleet = tmp_path / "fleet.toml"
+    fleet.write_text('[[match]]\nglob = "*"\n[match.run]\nterrain = "lava"\n')
+    log = tmp_path / "mine" / "run.mcap"
+    assert load_configuration(log).run.terrain == "lava"
+    user = os.getuid() + 1
+    monkeypatch.setattr(os, "getuid", lambda: user)
+    os.chown(tmp_path / "mine", user, -1)
+    os.chown(fleet, user + 1, -1)
+    assert load_configuration(log).run.terrain is None
+    # In a folder of somebody's, that one's fleet file counts, and so does one that is named.
+    os.chown(tmp_path / "mine", user + 1, -1)
+    assert load_configuration(log).run.terrain == "lava"
+    os.chown(tmp_path / "mine", user, -1)
+    assert load_configuration(log, fleet=fleet).run.terrain == "lava"

@@ -49,7 +49,7 @@ def workbench(results: Path) -> Iterator[Workbench]:
 
 @pytest.fixture(scope="session")
 def shared_workbench(analyzed: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workbench]:
-    """For tests that leave the desk as they found it."""
+    """For tests that leave the session as they found it."""
     server = Workbench(Path(shutil.copytree(analyzed, tmp_path_factory.mktemp("shared") / "results")))
     yield server
     server.close()

@@ -138,7 +138,7 @@ def test_what_the_loader_of_models_warns_of_is_shown(
 
 
 def test_two_models_of_a_run_stand_side_by_side(chrome: Chrome, workbench: Workbench, pictures: Path) -> None:
-    workbench.desk(RUN, "add", effect="effective_track")
+    workbench.session(RUN, "add", effect="effective_track")
     chrome.size(LAPTOP, 900)
     chrome.open(workbench.address)
     chrome.wait(SHOWN)
@@ -275,7 +275,7 @@ def test_a_run_stands_beside_those_that_its_report_does(chrome: Chrome, workbenc
 def test_nothing_is_cut_or_overlaps(
     chrome: Chrome, workbench: Workbench, pictures: Path, width: int, *, dark: bool
 ) -> None:
-    workbench.desk(RUN, "add", effect="effective_track")
+    workbench.session(RUN, "add", effect="effective_track")
     chrome.size(width, 844, dark=dark)
     chrome.open(workbench.address)
     chrome.wait(SHOWN)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 EVERYTHING = (
     ("GET", "/"), ("GET", "/page.js"), ("GET", "/vega.js"), ("GET", "/api/runs"), ("GET", "/api/jobs"),
     ("GET", f"/report?run={RUN}"), ("GET", f"/model.toml?run={RUN}"), ("GET", "/nowhere"), ("HEAD", "/"),
-    ("POST", "/api/desk"), ("POST", "/api/upload?name=x.mcap"), ("POST", "/api/diagnose"), ("PUT", "/"),
+    ("POST", "/api/session"), ("POST", "/api/upload?name=x.mcap"), ("POST", "/api/diagnose"), ("PUT", "/"),
 )  # fmt: skip
 STRANGERS: tuple[dict[str, str], ...] = (
     {},
@@ -72,7 +72,7 @@ def test_the_printed_address_gives_a_cookie_that_only_the_browser_sees(workbench
 def test_a_script_sends_the_token_as_a_header(workbench: Workbench) -> None:
     connection = http.client.HTTPConnection("127.0.0.1", workbench.port)
     bearer = {"Authorization": f"Bearer {TOKEN}"}
-    connection.request("POST", "/api/desk", json.dumps({"run": RUN}).encode(), headers=bearer)
+    connection.request("POST", "/api/session", json.dumps({"run": RUN}).encode(), headers=bearer)
     assert connection.getresponse().status == 200
     connection.close()
     # Whatever it knows, another origin is another origin.
@@ -150,7 +150,7 @@ def test_the_loopback_by_any_of_its_names_is_let_in(workbench: Workbench, host: 
 )
 def test_another_origin_is_refused(workbench: Workbench, origin: str) -> None:
     body = json.dumps({"run": RUN, "action": "add", "effect": "drive_lag"}).encode()
-    status, _, _ = workbench.request("POST", "/api/desk", body, headers={"Origin": origin})
+    status, _, _ = workbench.request("POST", "/api/session", body, headers={"Origin": origin})
     assert status == 403
     status, _, _ = workbench.request("GET", "/api/runs", headers={"Origin": origin})
     assert status == 403
@@ -160,7 +160,7 @@ def test_another_origin_is_refused(workbench: Workbench, origin: str) -> None:
 def test_a_change_without_an_origin_is_refused(workbench: Workbench) -> None:
     connection = http.client.HTTPConnection("127.0.0.1", workbench.port)
     cookie = {"Cookie": f"slip-{workbench.port}={TOKEN}"}
-    connection.request("POST", "/api/desk", b"{}", headers=cookie)
+    connection.request("POST", "/api/session", b"{}", headers=cookie)
     assert connection.getresponse().status == 403
     connection.close()
 
@@ -175,7 +175,7 @@ def test_another_site_may_link_here_and_load_nothing(workbench: Workbench) -> No
 
 
 def test_a_body_that_is_too_long_is_not_read_to_its_end(workbench: Workbench) -> None:
-    assert workbench.refuse("/api/desk", run=RUN, formula="x" * 200_000)["code"] == "bad_request"
+    assert workbench.refuse("/api/session", run=RUN, formula="x" * 200_000)["code"] == "bad_request"
 
 
 def test_ports_are_stripped_from_hosts() -> None:

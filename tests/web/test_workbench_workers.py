@@ -44,7 +44,7 @@ def test_whatever_a_log_does_to_its_worker_is_one_sentence(poisoned: Workbench) 
         assert status == 200, body
     # Meanwhile the page is answered.
     assert poisoned.get("/api/runs")["runs"]
-    assert poisoned.desk(RUN)["desk"]
+    assert poisoned.session(RUN)["session"]
     jobs = {str(job["name"]).removesuffix(".mcap"): job for job in poisoned.wait_for_jobs()}
     told = {kind: cast("dict[str, str]", job["error"]) for kind, job in jobs.items()}
     assert {kind: error["code"] for kind, error in told.items()} == kinds
@@ -87,7 +87,7 @@ def test_a_log_with_megabytes_of_terrain_leaves_the_server_alive(results: Path, 
         listed = cast("list[dict[str, object]]", server.get("/api/runs")["runs"])
         assert RUN in {run["run"] for run in listed}
         assert all(len(str(run["terrain"])) < 1000 for run in listed)
-        assert server.desk(RUN)["desk"]
+        assert server.session(RUN)["session"]
     finally:
         server.close()
 

@@ -97,8 +97,8 @@ class Workbench:
         assert status >= 400, body
         return cast("dict[str, str]", json.loads(body)["error"])
 
-    def desk(self, run: str, action: str = "open", **more: object) -> dict[str, object]:
-        return self.post("/api/desk", run=run, action=action, **more)
+    def session(self, run: str, action: str = "open", **more: object) -> dict[str, object]:
+        return self.post("/api/session", run=run, action=action, **more)
 
     def wait_for_jobs(self) -> list[dict[str, object]]:
         end = time.monotonic() + PATIENCE_S

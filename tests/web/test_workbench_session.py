@@ -18,12 +18,12 @@ Session = dict[str, dict[str, float]]
 
 
 def errors(answer: dict[str, object], key: str = "errors") -> dict[str, float]:
-    return cast("Session", answer["desk"])[key]
+    return cast("Session", answer["session"])[key]
 
 
 def effects(answer: dict[str, object]) -> list[dict[str, object]]:
-    desk = cast("dict[str, object]", answer["desk"])
-    return cast("list[dict[str, object]]", desk["effects"])
+    session = cast("dict[str, object]", answer["session"])
+    return cast("list[dict[str, object]]", session["effects"])
 
 
 def value(answer: dict[str, object]) -> float:
@@ -32,42 +32,42 @@ def value(answer: dict[str, object]) -> float:
 
 
 def test_the_hidden_effect_makes_the_error_fall_and_undo_brings_it_back(workbench: Workbench) -> None:
-    opened = workbench.desk(RUN)
-    added = workbench.desk(RUN, "add", effect="effective_track")
+    opened = workbench.session(RUN)
+    added = workbench.session(RUN, "add", effect="effective_track")
 
     assert errors(opened) == errors(opened, "ideal")
     assert errors(added)["r"] < 0.1 * errors(opened)["r"]
     assert value(added) == pytest.approx(TRACK, rel=0.01)
-    undone = workbench.desk(RUN, "undo")
+    undone = workbench.session(RUN, "undo")
     assert errors(undone) == errors(opened)
     assert effects(undone) == []
-    assert errors(workbench.desk(RUN, "redo")) == errors(added)
+    assert errors(workbench.session(RUN, "redo")) == errors(added)
 
 
 def test_the_ladder_has_a_rung_for_each_effect_in_the_order_of_adding(workbench: Workbench) -> None:
-    workbench.desk(RUN, "add", effect="drive_lag")
-    workbench.desk(RUN, "add", effect="effective_track")
+    workbench.session(RUN, "add", effect="drive_lag")
+    workbench.session(RUN, "add", effect="effective_track")
     drawn = workbench.post("/api/rows", run=RUN)
     ladder = cast("dict[str, dict[str, dict[str, object]]]", drawn["rows"])["ladder"]
     assert ladder["step"]["levels"] == ["ideal", "+ drive_lag", "+ effective_track"]
 
-    dropped = workbench.desk(RUN, "drop", effect="drive_lag")
+    dropped = workbench.session(RUN, "drop", effect="drive_lag")
     assert [effect["id"] for effect in effects(dropped)] == ["effective_track"]
 
 
 def test_a_value_set_by_hand_is_scored_and_not_fitted(workbench: Workbench) -> None:
-    added = workbench.desk(RUN, "add", effect="effective_track")
-    wrong = workbench.desk(RUN, "set", effect="effective_track", parameter="k", value=1.2)
+    added = workbench.session(RUN, "add", effect="effective_track")
+    wrong = workbench.session(RUN, "set", effect="effective_track", parameter="k", value=1.2)
     assert value(wrong) == 1.2
     assert errors(added)["r"] < errors(wrong)["r"] < errors(wrong, "ideal")["r"]
 
-    assert value(workbench.desk(RUN, "fit")) == pytest.approx(TRACK, rel=0.01)
+    assert value(workbench.session(RUN, "fit")) == pytest.approx(TRACK, rel=0.01)
 
 
 def test_a_preview_shows_rows_and_keeps_nothing(workbench: Workbench) -> None:
-    added = workbench.desk(RUN, "add", effect="effective_track")
+    added = workbench.session(RUN, "add", effect="effective_track")
     before = (workbench.results / "workbench/desks/a/field/hidden.json").read_bytes()
-    shown = workbench.desk(RUN, "preview", effect="effective_track", parameter="k", value=1.1)
+    shown = workbench.session(RUN, "preview", effect="effective_track", parameter="k", value=1.1)
 
     assert errors(shown)["r"] > errors(added)["r"]
     assert {"arcs", "model_w", "reach", "residual_w", "ladder"} <= set(cast("Session", shown["rows"]))
@@ -75,53 +75,53 @@ def test_a_preview_shows_rows_and_keeps_nothing(workbench: Workbench) -> None:
 
 
 def test_a_locked_value_stays_in_a_fit(workbench: Workbench) -> None:
-    workbench.desk(RUN, "add", effect="effective_track")
-    workbench.desk(RUN, "set", effect="effective_track", parameter="k", value=1.3)
-    workbench.desk(RUN, "lock", effect="effective_track", parameter="k")
-    assert value(workbench.desk(RUN, "fit")) == 1.3
-    workbench.desk(RUN, "lock", effect="effective_track", parameter="k")
-    assert value(workbench.desk(RUN, "fit")) == pytest.approx(TRACK, rel=0.01)
+    workbench.session(RUN, "add", effect="effective_track")
+    workbench.session(RUN, "set", effect="effective_track", parameter="k", value=1.3)
+    workbench.session(RUN, "lock", effect="effective_track", parameter="k")
+    assert value(workbench.session(RUN, "fit")) == 1.3
+    workbench.session(RUN, "lock", effect="effective_track", parameter="k")
+    assert value(workbench.session(RUN, "fit")) == pytest.approx(TRACK, rel=0.01)
 
 
 def test_an_effect_switched_off_shows_what_it_carries(workbench: Workbench) -> None:
-    added = workbench.desk(RUN, "add", effect="effective_track")
-    off = workbench.desk(RUN, "switch", effect="effective_track")
+    added = workbench.session(RUN, "add", effect="effective_track")
+    off = workbench.session(RUN, "switch", effect="effective_track")
     assert errors(off)["r"] > 5.0 * errors(added)["r"]
     assert effects(off)[0]["off"]
-    assert errors(workbench.desk(RUN, "switch", effect="effective_track"))["r"] == pytest.approx(
+    assert errors(workbench.session(RUN, "switch", effect="effective_track"))["r"] == pytest.approx(
         errors(added)["r"], rel=0.3
     )
 
 
 def test_everything_is_there_again_after_the_server_was_started_anew(results: Path) -> None:
     first = Workbench(results)
-    added = first.desk(RUN, "add", effect="effective_track")
+    added = first.session(RUN, "add", effect="effective_track")
     first.close()
     second = Workbench(results)
     try:
-        assert second.desk(RUN)["desk"] == added["desk"]
-        assert errors(second.desk(RUN, "undo")) == errors(added, "ideal")
+        assert second.session(RUN)["session"] == added["session"]
+        assert errors(second.session(RUN, "undo")) == errors(added, "ideal")
     finally:
         second.close()
 
 
 @pytest.mark.parametrize("content", [b'{"run": 3}', b'{"\xed": 1}', b"[" * 100_000, b""])
-def test_a_damaged_desk_is_begun_anew(workbench: Workbench, content: bytes) -> None:
-    workbench.desk(RUN, "add", effect="effective_track")
+def test_a_damaged_session_is_begun_anew(workbench: Workbench, content: bytes) -> None:
+    workbench.session(RUN, "add", effect="effective_track")
     (workbench.results / "workbench/desks/a/field/hidden.json").write_bytes(content)
     assert workbench.refuse("/api/save", run=RUN)["code"] == "no_such_desk"
-    assert effects(workbench.desk(RUN)) == []
+    assert effects(workbench.session(RUN)) == []
 
 
-def test_two_desks_of_a_run_do_not_touch_each_other(workbench: Workbench) -> None:
-    workbench.desk(RUN, "add", effect="effective_track")
-    other = workbench.desk(RUN, "add", effect="wheel_radius", anyway=True, slot="b")
+def test_two_sessions_of_a_run_do_not_touch_each_other(workbench: Workbench) -> None:
+    workbench.session(RUN, "add", effect="effective_track")
+    other = workbench.session(RUN, "add", effect="wheel_radius", anyway=True, slot="b")
     assert [effect["id"] for effect in effects(other)] == ["wheel_radius"]
-    assert [effect["id"] for effect in effects(workbench.desk(RUN))] == ["effective_track"]
+    assert [effect["id"] for effect in effects(workbench.session(RUN))] == ["effective_track"]
 
 
 def test_a_saved_model_is_a_model_file(workbench: Workbench) -> None:
-    added = workbench.desk(RUN, "add", effect="effective_track")
+    added = workbench.session(RUN, "add", effect="effective_track")
     saved = workbench.post("/api/save", run=RUN)
     path = workbench.results / "workbench/models/field/hidden.toml"
     assert saved["path"] == str(path)
@@ -151,7 +151,7 @@ def test_no_link_in_the_results_leads_what_is_kept_outside(
             Workbench(results)
     else:
         server = Workbench(results)
-        assert server.refuse("/api/desk", run=RUN, action="open")["code"] == "path_outside"
+        assert server.refuse("/api/session", run=RUN, action="open")["code"] == "path_outside"
         server.close()
     assert {path.name: path.read_text() for path in victim.iterdir()} == {
         "hidden.toml": "precious",
@@ -165,7 +165,7 @@ def test_working_on_a_model_leaves_the_run_byte_for_byte(workbench: Workbench) -
 
     workbench.get("/api/runs")
     for action, more in (("open", {}), ("add", {"effect": "effective_track"}), ("undo", {})):
-        workbench.desk(RUN, action, **more)
+        workbench.session(RUN, action, **more)
     workbench.post("/api/rows", run=RUN)
     workbench.post("/api/save", run=RUN)
     assert workbench.request("GET", "/report?run=field%2Fhidden")[0] == 200
@@ -174,11 +174,11 @@ def test_working_on_a_model_leaves_the_run_byte_for_byte(workbench: Workbench) -
 
 def test_a_formula_is_parsed_with_its_units_and_never_run(workbench: Workbench) -> None:
     typed = {"effect": "my_track", "channel": "v_w", "formula": "c * w0", "parameters": "c [1] -0.9 .. 0.5"}
-    opened = workbench.desk(RUN)
-    added = workbench.desk(RUN, "formula", **typed)
+    opened = workbench.session(RUN)
+    added = workbench.session(RUN, "formula", **typed)
     assert errors(added)["r"] < 0.1 * errors(opened)["r"]
     assert value(added) == pytest.approx(1.0 / TRACK - 1.0, abs=0.01)
-    workbench.desk(RUN, "drop", effect="my_track")
+    workbench.session(RUN, "drop", effect="my_track")
 
     for wrong in (
         {"formula": "c * v0"},
@@ -191,16 +191,16 @@ def test_a_formula_is_parsed_with_its_units_and_never_run(workbench: Workbench) 
         {"channel": "v_z"},
         {"formula": "c * w0 +" + " w0 +" * 200},
     ):
-        error = workbench.refuse("/api/desk", run=RUN, action="formula", **{**typed, **wrong})
+        error = workbench.refuse("/api/session", run=RUN, action="formula", **{**typed, **wrong})
         assert error["hint"]
-    assert effects(workbench.desk(RUN)) == []
+    assert effects(workbench.session(RUN)) == []
 
 
 def test_every_effect_is_tried_and_the_hidden_one_comes_first(workbench: Workbench) -> None:
-    workbench.desk(RUN, "try")
+    workbench.session(RUN, "try")
     end = time.monotonic() + 60.0
     while True:
-        trial = cast("dict[str, object]", workbench.desk(RUN)["trial"])
+        trial = cast("dict[str, object]", workbench.session(RUN)["trial"])
         if trial["tried"] == trial["total"]:
             break
         assert time.monotonic() < end
@@ -224,37 +224,37 @@ def test_what_a_diagnosis_named_is_shown(workbench: Workbench) -> None:
     (home / manifest["folder"] / "diagnosis.json").write_text(json.dumps(named))
     manifest["files"]["diagnosis.json"] = manifest["files"]["summary.json"]
     (home / "manifest.json").write_text(json.dumps(manifest))
-    opened = workbench.desk(RUN)
+    opened = workbench.session(RUN)
     assert opened["diagnosis"] == named
     assert errors(opened, "floor") == {"t": 0.0011, "r": 0.0004}
 
 
 @pytest.mark.long
 def test_a_diagnosis_that_is_asked_for_is_kept_beside_the_results(workbench: Workbench) -> None:
-    assert workbench.desk(RUN)["diagnosis"] is None
+    assert workbench.session(RUN)["diagnosis"] is None
     workbench.post("/api/diagnose", run=RUN)
     assert workbench.refuse("/api/diagnose", run=RUN)["code"] == "busy"
     (job,) = workbench.wait_for_jobs()
     assert job["error"] is None
-    named = cast("dict[str, list[dict[str, object]]]", workbench.desk(RUN)["diagnosis"])
+    named = cast("dict[str, list[dict[str, object]]]", workbench.session(RUN)["diagnosis"])
     assert [effect["id"] for effect in named["effects"]] == ["effective_track"]
 
 
 def test_what_cannot_be_done_is_said_and_changes_nothing(workbench: Workbench) -> None:
-    assert workbench.refuse("/api/desk", run="nobody")["code"] == "no_such_run"
-    assert workbench.refuse("/api/desk", run=RUN, action="add", effect="magic")["code"] == "unknown_effect"
-    assert workbench.refuse("/api/desk", run=RUN, action="drop", effect="lag")["code"] == "no_such_effect"
-    assert workbench.refuse("/api/desk", run=RUN, action="burn")["code"] == "bad_request"
-    assert workbench.refuse("/api/desk", run=RUN, slot="../a")["code"] == "bad_request"
-    assert workbench.refuse("/api/desk", run="../../etc/passwd")["code"] == "no_such_run"
-    workbench.desk(RUN, "add", effect="effective_track")
+    assert workbench.refuse("/api/session", run="nobody")["code"] == "no_such_run"
+    assert workbench.refuse("/api/session", run=RUN, action="add", effect="magic")["code"] == "unknown_effect"
+    assert workbench.refuse("/api/session", run=RUN, action="drop", effect="lag")["code"] == "no_such_effect"
+    assert workbench.refuse("/api/session", run=RUN, action="burn")["code"] == "bad_request"
+    assert workbench.refuse("/api/session", run=RUN, slot="../a")["code"] == "bad_request"
+    assert workbench.refuse("/api/session", run="../../etc/passwd")["code"] == "no_such_run"
+    workbench.session(RUN, "add", effect="effective_track")
     assert (
-        workbench.refuse("/api/desk", run=RUN, action="add", effect="effective_track")["code"]
+        workbench.refuse("/api/session", run=RUN, action="add", effect="effective_track")["code"]
         == "effect_twice"
     )
     far = {"effect": "effective_track", "parameter": "k", "value": 99.0}
-    assert workbench.refuse("/api/desk", run=RUN, action="set", **far)["code"] == "out_of_bounds"
-    assert len(effects(workbench.desk(RUN))) == 1
+    assert workbench.refuse("/api/session", run=RUN, action="set", **far)["code"] == "out_of_bounds"
+    assert len(effects(workbench.session(RUN))) == 1
 
 
 FORMULA = {"effect": "own", "channel": "v_w", "formula": "c * w0", "parameters": "c [1] -0.9 .. 0.5"}
@@ -296,27 +296,27 @@ UNUSUAL = (
 
 
 @pytest.mark.parametrize("unusual", UNUSUAL, ids=lambda case: str(case)[:50])
-def test_whatever_formula_is_written_the_desk_stays_usable(
+def test_whatever_formula_is_written_the_session_stays_usable(
     shared_workbench: Workbench, unusual: dict[str, str]
 ) -> None:
-    before = shared_workbench.desk(RUN)["desk"]
+    before = shared_workbench.session(RUN)["session"]
     body = json.dumps({"run": RUN, "action": "formula", **FORMULA, **unusual}).encode()
-    status, _, answered = shared_workbench.request("POST", "/api/desk", body)
+    status, _, answered = shared_workbench.request("POST", "/api/session", body)
     if status == 200:
         # What was taken can be opened, drawn, changed, saved and read again, by the command line too.
         for action in ("undo", "redo"):
-            shared_workbench.desk(RUN, action)
+            shared_workbench.session(RUN, action)
         shared_workbench.post("/api/rows", run=RUN)
         saved = shared_workbench.post("/api/save", run=RUN)
         read_model(Path(str(saved["path"])))
-        shared_workbench.desk(RUN, "undo")
+        shared_workbench.session(RUN, "undo")
     else:
         assert status == 422, answered
         error = json.loads(answered)["error"]
         assert error["hint"]
         assert len(error["message"]) < 1000
-    assert shared_workbench.desk(RUN)["desk"]["effects"] == before["effects"]  # type: ignore[index]
-    assert errors(shared_workbench.desk(RUN)) == cast("Session", before)["errors"]
+    assert shared_workbench.session(RUN)["session"]["effects"] == before["effects"]  # type: ignore[index]
+    assert errors(shared_workbench.session(RUN)) == cast("Session", before)["errors"]
 
 
 @pytest.mark.parametrize(
@@ -325,22 +325,22 @@ def test_whatever_formula_is_written_the_desk_stays_usable(
     ids=["no_toml", "unknown_effect", "empty", "deep", "digits", "null"],
 )
 def test_a_step_that_cannot_be_opened_any_more_is_left_out(workbench: Workbench, broken: str) -> None:
-    added = workbench.desk(RUN, "add", effect="effective_track")
+    added = workbench.session(RUN, "add", effect="effective_track")
     path = workbench.results / "workbench/desks/a/field/hidden.json"
     kept = json.loads(path.read_text())
     kept["steps"].append({**kept["steps"][-1], "model": broken, "said": "broken"})
     kept["at"] = 2
     path.write_text(json.dumps(kept))
-    assert errors(workbench.desk(RUN)) == errors(added)
-    assert effects(workbench.desk(RUN, "undo")) == []
-    assert errors(workbench.desk(RUN, "redo")) == errors(added)
+    assert errors(workbench.session(RUN)) == errors(added)
+    assert effects(workbench.session(RUN, "undo")) == []
+    assert errors(workbench.session(RUN, "redo")) == errors(added)
 
     # Also where it stands in the way of undo.
     kept["steps"] = [kept["steps"][0], kept["steps"][2], kept["steps"][1]]
     path.write_text(json.dumps(kept))
-    assert errors(workbench.desk(RUN)) == errors(added)
-    assert effects(workbench.desk(RUN, "undo")) == []
-    assert errors(workbench.desk(RUN, "redo")) == errors(added)
+    assert errors(workbench.session(RUN)) == errors(added)
+    assert effects(workbench.session(RUN, "undo")) == []
+    assert errors(workbench.session(RUN, "redo")) == errors(added)
 
 
 @pytest.mark.parametrize(
@@ -353,7 +353,7 @@ def test_a_step_that_cannot_be_opened_any_more_is_left_out(workbench: Workbench,
     ids=lambda content: content[:20],
 )  # fmt: skip
 def test_a_request_that_cannot_be_read_is_one_sentence(shared_workbench: Workbench, content: str) -> None:
-    for path in ("/api/desk", "/api/figures", "/api/rows", "/api/save", "/api/diagnose"):
+    for path in ("/api/session", "/api/figures", "/api/rows", "/api/save", "/api/diagnose"):
         status, _, body = shared_workbench.request("POST", path, content.encode())
         assert status in {404, 422}, body
         assert len(json.loads(body)["error"]["message"]) < 1000
@@ -369,16 +369,16 @@ def test_ten_minutes_are_answered_within_half_a_second_and_fitted_within_two(tmp
         status, _, _ = server.request("POST", "/api/upload?name=long.mcap", body)
         assert status == 200
         run = str(server.wait_for_jobs()[0]["run"])
-        server.desk(run)
-        server.desk(run, "add", effect="drive_lag")
+        server.session(run)
+        server.session(run, "add", effect="drive_lag")
         started = time.perf_counter()
-        server.desk(run, "add", effect="effective_track")
+        server.session(run, "add", effect="effective_track")
         fitted = time.perf_counter() - started
         server.post("/api/figures", run=run)
         shown = []
         for number in range(5):
             started = time.perf_counter()
-            server.desk(run, "preview", effect="effective_track", parameter="k", value=1.4 + 0.02 * number)
+            server.session(run, "preview", effect="effective_track", parameter="k", value=1.4 + 0.02 * number)
             shown.append(time.perf_counter() - started)
     finally:
         server.close()
