@@ -72,7 +72,6 @@ FIELDS: Final[dict[str, str]] = {
     "bool is_defined_steering_tire_rotation_rate",
     "autoware_control_msgs/Longitudinal": "builtin_interfaces/Time stamp; "
     "builtin_interfaces/Time control_time; "
-    ""
     "float32 velocity; float32 acceleration; float32 jerk; bool is_defined_acceleration; "
     "bool is_defined_jerk",
     "autoware_vehicle_msgs/SteeringReport": "builtin_interfaces/Time stamp; float32 steering_tire_angle",

@@ -77,11 +77,7 @@ def transform(topic: str, source: Source, parent: str, child: str) -> Published:
 
 def joints(topic: str, template: str, places: tuple[str, ...], fields: str = "both") -> Published:
     """Joint states of the wheels; ``fields`` may be ``position`` alone."""
-    names = [template.format(place.removeprefix("steer_")) for place in places]
-    names = [
-        _steering_name(name) if place.startswith("steer") else name
-        for name, place in zip(names, places, strict=True)
-    ]
+    names = [_name_joint(template, place) for place in places]
     turned = tuple(Q("steering") if p.startswith("steer") else Q(f"{_side(p)}_angle") for p in places)
     rolling = tuple(Q("zero") if p.startswith("steer") else Q(_side(p)) for p in places)
     values: Fields = {"name": names, "position": turned}
@@ -97,8 +93,10 @@ def _side(place: str) -> str:
     return place.rsplit("_", 1)[-1]
 
 
-def _steering_name(name: str) -> str:
-    return name.replace("wheel", "steering")
+def _name_joint(template: str, place: str) -> str:
+    """Name of the wheel joint of a place, or of its steering joint."""
+    name = template.format(place.removeprefix("steer_"))
+    return name.replace("wheel", "steering") if place.startswith("steer") else name
 
 
 def imu(topic: str) -> Published:
@@ -124,11 +122,5 @@ def pose_with_covariance(topic: str, every: int) -> Published:
 
 def describe(topic: str, name: str, vehicle: Vehicle, template: str, places: tuple[str, ...]) -> Published:
     """A robot description."""
-    named = {
-        place: _steering_name(template.format(place.removeprefix("steer_")))
-        if place.startswith("steer")
-        else template.format(place)
-        for place in places
-    }
-    text = describe_robot(name, vehicle, named)
+    text = describe_robot(name, vehicle, {place: _name_joint(template, place) for place in places})
     return Published(topic, "std_msgs/msg/String", "once", {"data": text}, stamp="none")

@@ -26,7 +26,7 @@ from pipeline.vehicles.sources import (
     TopicSource,
 )
 from pipeline.vehicles.topics import DEFAULT_INTERVAL, choose_sources
-from pipeline.vehicles.units import convert_unit
+from pipeline.vehicles.units import convert_unit, list_factors
 
 __all__ = [
     "CONFIGURED",
@@ -50,6 +50,7 @@ __all__ = [
     "find_preset",
     "list_configuration_files",
     "list_contradictions",
+    "list_factors",
     "list_presets",
     "load_configuration",
     "read_description",

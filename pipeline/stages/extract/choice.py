@@ -225,8 +225,7 @@ def _compare_with_wheels(
     time, position, yaw = time[inside], position[inside], yaw[inside]
     if time.size < _FEWEST:
         return None, np.inf
-    span = max(round(_SPAN_S / max(float(np.median(np.diff(time))), 1e-3)), 1)
-    ends = np.arange(0, time.size, span)
+    ends = np.arange(0, time.size, timegrid.count_steps(time, _SPAN_S))
     way, _ = _split_chords(position[ends], yaw[ends])
     rolled = np.interp(time[ends], *path)
     rate = np.gradient(path[1], path[0] + np.arange(path[0].size) * 1e-12)
@@ -253,8 +252,7 @@ def _compare_with_gyro(time: Floats, yaw: Floats, imu: pl.DataFrame) -> float | 
     time, yaw = time[inside], yaw[inside]
     if time.size < _FEWEST:
         return None
-    span = max(round(_SPAN_S / max(float(np.median(np.diff(time))), 1e-3)), 1)
-    ends = np.arange(0, time.size, span)
+    ends = np.arange(0, time.size, timegrid.count_steps(time, _SPAN_S))
     rate = np.nan_to_num(imu["rate_z"].to_numpy())
     turned = np.diff(np.interp(time[ends], clock, timegrid.integrate_rate(clock, rate)))
     return measure_rest(np.diff(yaw[ends]), turned, np.diff(time[ends]))
@@ -286,8 +284,7 @@ def fit_geometry(wheels: pl.DataFrame, poses: pl.DataFrame, kind: str) -> dict[s
     if fresh.height < _FEWEST or wheels.height < _FEWEST:
         return None
     time = fresh["t"].to_numpy()
-    span = max(round(_SPAN_S / max(float(np.median(np.diff(time))), 1e-3)), 1)
-    ends = np.arange(0, time.size, span)
+    ends = np.arange(0, time.size, timegrid.count_steps(time, _SPAN_S))
     position = np.stack([fresh[axis].to_numpy() for axis in "xy"], axis=1)[ends]
     yaw = np.unwrap(_yaw_of(np.stack([fresh[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))[ends]
     way, _ = _split_chords(position, yaw)

@@ -14,13 +14,11 @@ from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract import reading
 from pipeline.stages.finding import Finding
-from pipeline.vehicles import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit
+from pipeline.vehicles import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit, list_factors
 from pipeline.vehicles.presets import OwnUnit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-    from pipeline.vehicles.configuration import Unit
 
 Floats = NDArray[np.float64]
 
@@ -32,7 +30,6 @@ _USUAL_UNITS = {
     DriveForm.BODY: ("m/s", "rad/s"),
     DriveForm.STEERING: ("m/s", "rad"),
 }
-_UNIT_GAINS: dict[Unit, float] = {"rpm": 60.0 / (2.0 * np.pi), "deg/s": 180.0 / np.pi}
 _UNIT_NEAR = 0.1
 _LIVE = 0.2
 _STILL_RADPS = 0.05
@@ -127,7 +124,7 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     return Drive(left=sides[0], right=sides[1], findings=tuple(found))
 
 
-def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> Unit | None:
+def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> str | None:
     """Unit of velocities that are not what the positions beside them turn in rad/s; None where they are.
 
     Only a gain that is a unit's, and the same throughout, tells one.
@@ -144,8 +141,8 @@ def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> U
         if float(np.median(np.abs(ratio - gain))) > _UNIT_NEAR * abs(gain):
             return None
         gains.append(gain)
-    for unit, gain in _UNIT_GAINS.items():
-        if gains and all(abs(one / gain - 1.0) < _UNIT_NEAR for one in gains):
+    for unit, factor in list_factors("rad/s").items():
+        if gains and all(abs(one * factor - 1.0) < _UNIT_NEAR for one in gains):
             return unit
     return None
 
