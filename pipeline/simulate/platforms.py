@@ -99,15 +99,28 @@ def _name_joint(template: str, place: str) -> str:
     return name.replace("wheel", "steering") if place.startswith("steer") else name
 
 
-def imu(topic: str) -> Published:
-    """An inertial unit."""
-    fields: Fields = {
-        "header.frame_id": "imu_link",
-        "orientation.w": 1.0,
-    }
+def imu(topic: str, *, attitude: bool = False) -> Published:
+    """An inertial unit, perhaps with an attitude."""
+    fields: Fields = {"header.frame_id": "imu_link", "orientation.w": 1.0}
+    if attitude:
+        fields |= {f"orientation.{axis}": Q(f"attitude_{axis}") for axis in _XYZW}
     fields |= {f"angular_velocity.{axis}": Q(f"rate_{axis}") for axis in _XYZ}
     fields |= {f"linear_acceleration.{axis}": Q(f"force_{axis}") for axis in _XYZ}
     return Published(topic, "sensor_msgs/msg/Imu", "imu", fields)
+
+
+def fix(topic: str, every: int = 2) -> Published:
+    """Fixes of a receiver of satellites."""
+    fields: Fields = {name: Q(name) for name in ("latitude", "longitude", "altitude")}
+    fields |= {"header.frame_id": "gps_link", "status.status": Q("fixed")}
+    return Published(topic, "sensor_msgs/msg/NavSatFix", "satellites", fields, every=every)
+
+
+def ground_velocity(topic: str, every: int = 2) -> Published:
+    """Velocities over ground, as nmea_navsat_driver gives them: east, north."""
+    fields: Fields = {"twist.linear.x": Q("east_speed"), "twist.linear.y": Q("north_speed")}
+    fields["header.frame_id"] = "gps_link"
+    return Published(topic, "geometry_msgs/msg/TwistStamped", "satellites", fields, every=every)
 
 
 def pose_with_covariance(topic: str, every: int) -> Published:

@@ -17,15 +17,18 @@ from numpy.typing import NDArray
 
 from pipeline.core import rigid, timegrid
 from pipeline.core.errors import SlipError
+from pipeline.stages.extract.course import estimate_noise
+from pipeline.stages.extract.drive import read_speed
 from pipeline.stages.extract.tables import extract_tables
 from pipeline.stages.trust import measure_rest
-from pipeline.vehicles import PoseSource
+from pipeline.vehicles import PoseContent, PoseSource
 from pipeline.vehicles.candidates import DEAD_RECKONED, FILTERED, LOCALIZED
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.logs import LogData
+    from pipeline.stages.finding import Finding
     from pipeline.vehicles import Configuration, Sources, Vehicle
 
 Floats = NDArray[np.float64]
@@ -50,6 +53,8 @@ _STILL_M: Final = 1e-4
 _TURNS_RAD: Final = 0.2
 _DRIVES_M: Final = 1.0
 _FEWEST: Final = 20
+_NOISY_MPS: Final = 0.1
+"""Noise of the speed over half a second above which a receiver's velocities tell more than its positions."""
 
 
 @dataclass(frozen=True)
@@ -137,14 +142,20 @@ def _rate(
     coverage = min(float(np.minimum(np.diff(time), 2.0 * period).sum()) / length, 1.0)
     wheels = made.tables["wheels"]
     reach, turned = np.ptp(position, axis=0).max(), np.ptp(yaw)
-    path = _path_of(wheels, vehicle)
+    rolled = read_speed(wheels, vehicle)
+    path = None if rolled is None else (rolled[0], timegrid.integrate_rate(*rolled))
     drove = path is not None and float(np.abs(np.diff(path[1])).sum()) > _DRIVES_M
     if reach < _STILL_M and (turned > _TURNS_RAD or drove):
         living = "its heading turns" if turned > _TURNS_RAD else "the wheels drive"
         return replace(bare, rate_hz=rate, refused=f"its position never changes while {living}")
     share, sideways = _compare_with_wheels(time, position, yaw, path)
     from_wheels = share is not None and share < _FROM_WHEELS and sideways < _SIDEWAYS_MPS
-    score, reasons = _score_frame(str(pose), parent)
+    if pose.content is PoseContent.POSE:
+        score, reasons = _score_frame(str(pose), parent)
+    else:
+        # Satellites know nothing of wheels, and a heading that is the course never moves sideways.
+        from_wheels = False
+        score, reasons = _score_satellites(pose, time, position, made.findings)
     if from_wheels:
         score -= 10.0
         reasons = ["it is computed from the wheels"]
@@ -196,19 +207,23 @@ def _score_frame(name: str, parent: str) -> tuple[float, list[str]]:
     return score, reasons
 
 
-def _path_of(wheels: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats] | None:
-    """Times [s] of the wheels' messages and the way [m] they rolled since the first; None without wheels."""
-    if wheels.height < _FEWEST:
-        return None
-    if wheels["speed"].null_count() < wheels.height:
-        speed = wheels["speed"].to_numpy()
+def _score_satellites(
+    pose: PoseSource, time: Floats, position: Floats, findings: Sequence[Finding]
+) -> tuple[float, list[str]]:
+    """What poses of satellites are worth: below a localization that has a heading of its own."""
+    score, reasons = 2.0, [pose.content.value]
+    if pose.content is PoseContent.VELOCITY:
+        score -= 0.2
+    if any(finding.id == "heading_from_course" for finding in findings):
+        score -= 0.5
+        reasons.append("its heading is its course")
     else:
-        speed = 0.5 * vehicle.wheel_radius_m * (wheels["left"] + wheels["right"]).to_numpy()
-    known = np.isfinite(speed)
-    time = wheels["t"].to_numpy()[known]
-    if time.size < _FEWEST:
-        return None
-    return time, timegrid.integrate_rate(time, speed[known])
+        reasons.append("its heading is the IMU's, put on its course")
+    noise = estimate_noise(position[:, :2]) / np.sqrt(timegrid.count_steps(time, _SPAN_S)) / _SPAN_S
+    if noise > _NOISY_MPS:
+        score -= 0.5
+        reasons.append(f"noisy: {noise:.2g} m/s over half a second")
+    return score, reasons
 
 
 def _compare_with_wheels(

@@ -20,6 +20,8 @@ from pipeline.vehicles.presets import OwnUnit
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    import polars as pl
+
 Floats = NDArray[np.float64]
 
 _LEFT = re.compile(r"left|(^|[_/])(l|lf|fl|rl|bl|ml|lb)([_/\d]|$)")
@@ -34,6 +36,7 @@ _UNIT_NEAR = 0.1
 _LIVE = 0.2
 _STILL_RADPS = 0.05
 _FEWEST_LIVE = 50
+_FEWEST = 20
 _COUNTERS = (2.0**16, 2.0**32)
 """After so many ticks counters of encoders begin again."""
 
@@ -324,3 +327,20 @@ def read_steering(speed: Floats, steering: Floats, vehicle: Vehicle) -> Drive:
             hint='Set vehicle.kind = "ackermann" and vehicle.wheelbase_m.',
         )
     return Drive(speed=speed, steering=steering)
+
+
+def read_speed(table: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats] | None:
+    """Times [s] and speed ahead [m/s] of a table of wheels or commands; None where it has too few.
+
+    Args:
+        table: `wheels` or `commands`.
+        vehicle: whose wheel radius turns wheel speeds into one.
+    """
+    if table.height < _FEWEST:
+        return None
+    if table["speed"].null_count() < table.height:
+        speed = table["speed"].to_numpy()
+    else:
+        speed = 0.5 * vehicle.wheel_radius_m * (table["left"] + table["right"]).to_numpy()
+    known = np.isfinite(speed)
+    return (table["t"].to_numpy()[known], speed[known]) if known.sum() >= _FEWEST else None
