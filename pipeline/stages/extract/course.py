@@ -7,8 +7,8 @@ course is the heading: unknown while the vehicle stands, and blind to sideways s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Complex = NDArray[np.complexfloating]
+T = TypeVar("T", np.float64, np.complex128)
 
 _WINDOW_S: Final = 1.0
 """Over so long a velocity is taken from positions, and turning is compared."""
@@ -156,13 +156,16 @@ def read_over_ground(times: Floats, position: Floats, clock: Floats, velocity: F
     return velocity if rests[0] <= rests[1] else velocity[:, ::-1]
 
 
-def find_heading(times: Floats, course: Course, turnings: Sequence[Turning], topic: str) -> Heading:
+def find_heading(
+    times: Floats, course: Course, turnings: Sequence[Turning], lever: Floats, topic: str
+) -> Heading:
     """The heading at some times.
 
     Args:
         times: [s], shape (n,).
         course: where the antenna went.
         turnings: sensors, the best first.
+        lever: place of the antenna on the vehicle, ahead and left [m], shape (2,).
         topic: for the finding.
     """
     fits = [(turning, fit) for turning in turnings if (fit := _fit_sensor(turning, course)) is not None]
@@ -173,6 +176,12 @@ def find_heading(times: Floats, course: Course, turnings: Sequence[Turning], top
     def turned(at: Floats) -> Floats:
         return scale * np.interp(at, turning.times, turning.angle) + bias * at
 
+    if lever.any():
+        # In a turn the antenna goes another way than the vehicle's middle.
+        arm = np.exp(1j * _put_on_course(course.times, turned, course)) * complex(*lever)
+        swing = 1j * arm * _turn_rate(turned, course.times)
+        middle = course.velocity - np.stack((swing.real, swing.imag), axis=-1)
+        course = replace(course, velocity=middle)
     yaw = _put_on_course(times, turned, course)
     text = (
         f"the heading of {topic} is that of {turning.name}, put on the course over a minute: sideways motion "
@@ -223,23 +232,28 @@ def _put_on_course(times: Floats, turned: Callable[[Floats], Floats], course: Co
     # A course is the better known the faster the vehicle goes.
     weight = np.sum(course.velocity[known] ** 2, axis=1)
     off = angle[known] - turned(clock)
-    half = 0.5 * _WINDOW_S
-    rate = (turned(clock + half) - turned(clock - half)) / _WINDOW_S
+    rate = _turn_rate(turned, clock)
     low, high = (np.searchsorted(clock, clock + by * _ALIGN_S) for by in (-1.0, 1.0))
 
-    def average(series: Floats | Complex) -> Floats | Complex:
-        total = np.concatenate(([0.0], np.cumsum(weight * series)))
-        mean: Floats | Complex = total[high] - total[low]
-        return mean
+    def add_up(series: NDArray[T]) -> NDArray[T]:
+        total = np.concatenate((np.zeros(1), np.cumsum(weight * series)))
+        around: NDArray[T] = total[high] - total[low]
+        return around
 
-    varying = rate - np.real(average(rate) / average(np.ones_like(rate))).astype(np.float64)
+    varying: Floats = rate - add_up(rate) / add_up(np.ones_like(rate))
     skid, offset = 0.0, np.zeros_like(rate)
     for _ in range(_ROUNDS):
-        offset = np.angle(average(np.exp(1j * (off - skid * rate))))
+        offset = np.angle(add_up(np.exp(1j * (off - skid * rate))))
         rest = rigid.wrap_angle(off - skid * rate - offset)
         skid += float(np.sum(weight * rest * varying)) / max(float(np.sum(weight * varying**2)), 1e-12)
     yaw: Floats = turned(times) + np.interp(times, clock, np.unwrap(offset))
     return yaw
+
+
+def _turn_rate(turned: Callable[[Floats], Floats], at: Floats) -> Floats:
+    """Yaw rate over the span of a course [rad/s]."""
+    half = 0.5 * _WINDOW_S
+    return (turned(at + half) - turned(at - half)) / _WINDOW_S
 
 
 def _take_course(times: Floats, course: Course, topic: str) -> Heading:

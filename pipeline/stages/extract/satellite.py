@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pipeline.core import rigid, timegrid
 from pipeline.stages.extract import reading
 from pipeline.stages.extract.course import (
-    Course,
     Turning,
     find_heading,
     follow_track,
@@ -37,6 +36,8 @@ _FLATTENING: Final = 1.0 / 298.257223563
 _ECCENTRICITY_2: Final = _FLATTENING * (2.0 - _FLATTENING)
 _FEWEST: Final = 20
 _UNIT: Final = 0.1
+_ABOUT_S: Final = 0.5
+_MOVES_M: Final = 0.05
 _PARENT: Final = "enu"
 _CHILD: Final = "base_link"
 
@@ -140,8 +141,8 @@ def locate_vehicle(
     if ahead is None:
         text = f"neither wheels nor a command say when the vehicle of {topic} drove backwards: it never did"
         findings.append(Finding("direction_assumed", "warning", text, where=topic))
-    heading = find_heading(times, course, [] if imu is None else _list_turnings(imu), topic)
-    kept = np.isfinite(heading.yaw) & ~_find_repeats(track.position, course, times)
+    heading = find_heading(times, course, [] if imu is None else _list_turnings(imu), lever[:2], topic)
+    kept = np.isfinite(heading.yaw)
     quaternion = rigid.quaternions_from_yaw(heading.yaw[kept])
     arm = rigid.rotate(quaternion, np.broadcast_to(lever, (quaternion.shape[0], 3)))
     arrays = PoseArrays(track.position[kept] - arm, quaternion, _PARENT, _CHILD)
@@ -171,6 +172,8 @@ def _read_track(receiver: Receiver) -> _Track:
     good = rows[fixed[rows]]
     position = to_local_plane(latitude[good], longitude[good], altitude[good])
     lost = rows.size - good.size
+    new = _is_new(receiver.times[good], position)
+    good, position = good[new], position[new]
     if not lost:
         return _Track(good, position)
     text = f"{lost} messages of {columns.topic} are no fix (a status below 0, or no place): left out"
@@ -202,9 +205,12 @@ def _list_turnings(imu: Receiver) -> list[Turning]:
     return found
 
 
-def _find_repeats(position: Floats, course: Course, times: Floats) -> Flags:
-    """Positions that repeat the one before while the antenna moves: the receiver is slower than its topic."""
-    same = np.concatenate(([False], np.all(np.diff(position, axis=0) == 0.0, axis=1)))
-    speed = np.interp(times, course.times, np.hypot(*course.velocity.T))
-    repeats: Flags = same & (speed > course.slowest)
-    return repeats
+def _is_new(times: Floats, position: Floats) -> Flags:
+    """Whether a position is no repeat: one that comes again while the antenna moves is of a slow receiver."""
+    if times.size < 2:  # noqa: PLR2004 - one position is new
+        return np.ones(times.size, dtype=bool)
+    way = [timegrid.interpolate_linearly(times + by, times, position[:, :2]) for by in (-_ABOUT_S, _ABOUT_S)]
+    moves = np.linalg.norm(way[1] - way[0], axis=1) > _MOVES_M
+    again = np.concatenate(([False], np.all(np.diff(position, axis=0) == 0.0, axis=1)))
+    new: Flags = ~(again & moves)
+    return new
