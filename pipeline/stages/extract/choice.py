@@ -135,7 +135,7 @@ def _rate(
         return replace(bare, refused=f"only {poses.height} new poses")
     time = poses["t"].to_numpy()
     position = np.stack([poses[axis].to_numpy() for axis in "xy"], axis=1)
-    yaw = np.unwrap(_yaw_of(np.stack([poses[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))
+    yaw = np.unwrap(yaw_of(np.stack([poses[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))
     length = max(_span_of(table) for table in made.tables.values())
     period = float(np.median(np.diff(time)))
     rate = 1.0 / period if period > 0.0 else 0.0
@@ -241,11 +241,11 @@ def _compare_with_wheels(
     if time.size < _FEWEST:
         return None, np.inf
     ends = np.arange(0, time.size, timegrid.count_steps(time, _SPAN_S))
-    way, _ = _split_chords(position[ends], yaw[ends])
+    way, _ = split_chords(position[ends], yaw[ends])
     rolled = np.interp(time[ends], *path)
     rate = np.gradient(path[1], path[0] + np.arange(path[0].size) * 1e-12)
     share = measure_rest(way, np.diff(rolled), np.diff(np.interp(time[ends], path[0], rate)))
-    ahead, aside = _split_chords(position, yaw)
+    ahead, aside = split_chords(position, yaw)
     turned = ahead * np.diff(yaw)
     gain = float(turned @ aside) / max(float(turned @ turned), 1e-12)
     elapsed = np.maximum(np.diff(time), 1e-3)
@@ -254,7 +254,8 @@ def _compare_with_wheels(
     return share, float(np.median(sideways)) if sideways.size else np.inf
 
 
-def _yaw_of(quaternion: Floats) -> Floats:
+def yaw_of(quaternion: Floats) -> Floats:
+    """Headings [rad], shape (n,), of unit quaternions (n, 4)."""
     return rigid.euler_from_quaternions(quaternion)[2]
 
 
@@ -273,7 +274,7 @@ def _compare_with_gyro(time: Floats, yaw: Floats, imu: pl.DataFrame) -> float | 
     return measure_rest(np.diff(yaw[ends]), turned, np.diff(time[ends]))
 
 
-def _split_chords(position: Floats, yaw: Floats) -> tuple[Floats, Floats]:
+def split_chords(position: Floats, yaw: Floats) -> tuple[Floats, Floats]:
     """Way ahead along the arc, and aside, between neighbouring poses [m]."""
     turned = np.diff(yaw)
     middle = yaw[:-1] + 0.5 * turned
@@ -281,55 +282,6 @@ def _split_chords(position: Floats, yaw: Floats) -> tuple[Floats, Floats]:
     ahead = step[:, 0] * np.cos(middle) + step[:, 1] * np.sin(middle)
     aside = step[:, 1] * np.cos(middle) - step[:, 0] * np.sin(middle)
     return ahead / np.sinc(turned / (2.0 * np.pi)), aside
-
-
-def fit_geometry(wheels: pl.DataFrame, poses: pl.DataFrame, kind: str) -> dict[str, float] | None:
-    """Geometry of an unknown vehicle, as its poses show it.
-
-    Args:
-        wheels: measured with a stand-in of unit radius, track width and wheelbase.
-        poses: of the localization.
-        kind: of vehicle.
-
-    Returns:
-        Wheel radius and effective track width [m], or the wheelbase of a car; None where it does not drive
-        enough to tell.
-    """
-    fresh = poses.filter(~pl.col("held") & pl.col("x").is_finite() & pl.col("q_w").is_finite())
-    if fresh.height < _FEWEST or wheels.height < _FEWEST:
-        return None
-    time = fresh["t"].to_numpy()
-    ends = np.arange(0, time.size, timegrid.count_steps(time, _SPAN_S))
-    position = np.stack([fresh[axis].to_numpy() for axis in "xy"], axis=1)[ends]
-    yaw = np.unwrap(_yaw_of(np.stack([fresh[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))[ends]
-    way, _ = _split_chords(position, yaw)
-    clock = wheels["t"].to_numpy()
-
-    def integral(rate: Floats) -> Floats:
-        return np.diff(np.interp(time[ends], clock, timegrid.integrate_rate(clock, np.nan_to_num(rate))))
-
-    if kind == "ackermann":
-        speed, steering = wheels["speed"].to_numpy(), wheels["steering"].to_numpy()
-        scale = _median_gain(way, integral(speed))
-        bent = _median_gain(np.diff(yaw), integral(speed * np.tan(steering)))
-        return None if not scale or not bent else {"wheelbase_m": 1.0 / bent}
-    left, right = wheels["left"].to_numpy(), wheels["right"].to_numpy()
-    radius = _median_gain(way, integral(0.5 * (left + right)))
-    over = _median_gain(np.diff(yaw), integral(right - left))
-    if not radius or not over or radius <= 0.0 or over <= 0.0:
-        return None
-    return {"wheel_radius_m": radius, "track_width_m": radius / over}
-
-
-def _median_gain(moved: Floats, driven: Floats) -> float | None:
-    """Weighted median of moved over driven; None where hardly anything was driven."""
-    live = np.abs(driven) > 0.1 * float(np.max(np.abs(driven), initial=0.0))
-    if live.sum() < _FEWEST:
-        return None
-    ratio, weight = moved[live] / driven[live], np.abs(driven[live])
-    order = np.argsort(ratio)
-    total = np.cumsum(weight[order])
-    return float(ratio[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
 def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:

@@ -15,6 +15,7 @@ from pipeline.stages.errors import StageError
 from pipeline.stages.extract import reading
 from pipeline.stages.finding import Finding
 from pipeline.vehicles import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit, list_factors
+from pipeline.vehicles.message_types import find_type
 from pipeline.vehicles.presets import OwnUnit
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     """Joint states: wheels by joint name, averaged a side.
 
     Args:
-        columns: a JointState topic with `name`, `velocity`, `position`.
+        columns: a topic of a type that has wheels by name.
         times: time of each message [s].
         section: joint names, unit, sign.
         vehicle: whose wheel radius turns a speed in m/s into rad/s.
@@ -75,11 +76,7 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     Raises:
         StageError: no joint can be told to be on a side, or there is neither velocity nor position.
     """
-    names = columns.fields["name"]
-    if not isinstance(names, RaggedStrings):
-        raise _no_wheels(columns.topic, ())
-    velocity = _joint_matrix(columns.fields["velocity"], names)
-    position = _joint_matrix(columns.fields["position"], names)
+    velocity, position = _read_series(columns)
     joints = sorted(set(velocity) | set(position))
     rolling = [
         joint for joint in joints if joint != section.steering_joint and not _STEERS.search(joint.lower())
@@ -165,6 +162,52 @@ def _mean_steering(position: Mapping[str, Floats], configured: str | None, topic
     return mean
 
 
+def _read_series(columns: TopicColumns) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """Velocities and positions by joint name."""
+    joints = find_type(columns.type_name).joints
+    names = None if joints is None else columns.fields[joints.names]
+    if joints is None or not isinstance(names, RaggedStrings):
+        raise _no_wheels(columns.topic, ())
+    if not joints.interfaces:
+        velocity, position = (
+            _joint_matrix(columns.fields[field], names) for field in (joints.velocity, joints.position)
+        )
+        return velocity, position
+    interfaces, values = columns.fields[joints.interfaces], columns.fields[joints.values]
+    if not isinstance(interfaces, RaggedStrings) or not isinstance(values, Ragged):
+        raise _no_wheels(columns.topic, names.values)
+    table = _read_interfaces(names, interfaces, values)
+    if table is None:
+        raise _no_wheels(columns.topic, names.values)
+    velocity, position = (
+        {joint: series for (joint, each), series in table.items() if each == quantity}
+        for quantity in (joints.velocity, joints.position)
+    )
+    return velocity, position
+
+
+def _read_interfaces(
+    names: RaggedStrings, interfaces: RaggedStrings, values: Ragged
+) -> dict[tuple[str, str], Floats] | None:
+    """Series by joint and quantity; None unless all messages have the same joints with the same quantities.
+
+    The names of quantities stand end to end, those of one joint after those of another. No joint has a name
+    twice, so that they repeat once a joint only where all joints have the same ones.
+    """
+    joints, quantities, numbers = names.fixed(), interfaces.fixed(), values.fixed()
+    if joints is None or quantities is None or numbers is None or not joints.size:
+        return None
+    alike = (joints == joints[0]).all() and (quantities == quantities[0]).all()
+    each, rest = divmod(quantities.shape[1], joints.shape[1])
+    if not alike or rest or quantities.shape != numbers.shape:
+        return None
+    blocks = quantities[0].reshape(joints.shape[1], each)
+    if (blocks != blocks[0]).any() or np.unique(blocks[0]).size != each:
+        return None
+    keys = [(joint, quantity) for joint in names.row(0) for quantity in interfaces.row(0)[:each]]
+    return {key: numbers[:, place].astype(np.float64) for place, key in enumerate(keys)}
+
+
 def _joint_matrix(values: object, names: RaggedStrings) -> dict[str, Floats]:
     """Values by joint name, NaN where a message lacks the joint; the order of joints may change."""
     if not isinstance(values, Ragged):
@@ -238,7 +281,10 @@ def read_signal(
         ConfigurationError: ``unit_unknown``.
     """
     signal = source.signals[number]
-    raw = np.mean([reading.numbers(columns, path) for path in signal.fields()], axis=0) * signal.sign
+    paths = [reading.numbers(columns, path) for path in signal.fields()]
+    # A controller of one wheel has no second: an element that no message has is none to average.
+    there = [values for values in paths if np.isfinite(values).any()] or paths
+    raw = np.mean(there, axis=0) * signal.sign
     own = dict(vehicle.units)
     per_turn = section.per_turn
     if per_turn is None and signal.per_turn:
