@@ -45,7 +45,7 @@ FIELDS: Final[dict[str, str]] = {
     "rcl_interfaces/Parameter[] new_parameters; rcl_interfaces/Parameter[] changed_parameters; "
     "rcl_interfaces/Parameter[] deleted_parameters",
     "rcl_interfaces/ParameterValue": "uint8 type; bool bool_value; int64 integer_value; "
-    "float64 double_value; string string_value; byte[] byte_array_value; bool[] bool_array_value; "
+    "float64 double_value; string string_value; uint8[] byte_array_value; bool[] bool_array_value; "
     "int64[] integer_array_value; float64[] double_array_value; string[] string_array_value",
     "rosgraph_msgs/Clock": "builtin_interfaces/Time clock",
     "sensor_msgs/Imu": f"{_HEADER}; geometry_msgs/Quaternion orientation; "

@@ -388,7 +388,6 @@ PLATFORMS: dict[str, Platform] = {
                 },
             ),
         ),
-        geometry=False,
     ),
     # duckietown/dt-ros-commons, dt-car-interface
     "duckiebot": Platform(

@@ -24,12 +24,10 @@ class Platform:
     Attributes:
         vehicle: geometry as the vendor states it.
         topics: everything in a log.
-        geometry: whether the log says what the vehicle is; else a user has to say it.
     """
 
     vehicle: Vehicle
     topics: tuple[Published, ...]
-    geometry: bool = True
 
     @property
     def layout(self) -> Layout:

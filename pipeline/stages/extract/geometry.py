@@ -20,6 +20,8 @@ _SPAN_S: Final = 0.5
 _ASKED_SPAN_S: Final = 2.0
 """Over so long wheels have done what they were asked, but for a drive's lag at its ends."""
 _STEADY: Final = 0.2
+_LIVE: Final = 0.1
+"""Share of the largest way of a span below which a ratio says nothing."""
 _LIKELY: Final = {"wheel_radius_m": (0.7, 1.4), "track_width_m": (0.8, 4.0)}
 """Geometry by the poses over that of the controller: ice takes a third of the way, a skid-steer may turn by a
 third of what its track asks."""
@@ -83,19 +85,24 @@ def fit_controller(
     if commands["body_x"].null_count() == commands.height or wheels["left"].null_count() == wheels.height:
         return None
     asked, clock = commands["t"].to_numpy(), wheels["t"].to_numpy()
-    ends = np.arange(max(asked[0], clock[0]), min(asked[-1], clock[-1]), _ASKED_SPAN_S)
+    starts = np.arange(max(asked[0], clock[0]), min(asked[-1], clock[-1]) - _ASKED_SPAN_S, _SPAN_S)
+    spans = np.stack((starts, starts + _ASKED_SPAN_S))
     held = np.minimum(np.diff(asked), timegrid.usual_hold(asked))
 
-    def sum_up(name: str) -> Floats:
-        values = np.nan_to_num(commands[name].to_numpy())
-        return np.diff(np.interp(ends, asked, np.concatenate(([0.0], np.cumsum(values[:-1] * held)))))
-
-    def integral(rate: Floats) -> Floats:
-        return np.diff(np.interp(ends, clock, timegrid.integrate_rate(clock, np.nan_to_num(rate))))
+    def sum_up(times: Floats, total: Floats) -> Floats:
+        at: Floats = np.interp(spans, times, total)
+        return at[1] - at[0]
 
     left, right = wheels["left"].to_numpy(), wheels["right"].to_numpy()
-    rolled, turned = integral(0.5 * (left + right)), integral(right - left)
-    radius, over = _steady_gain(sum_up("body_x"), rolled), _steady_gain(sum_up("body_w"), turned)
+    rolled, turned = (
+        sum_up(clock, timegrid.integrate_rate(clock, np.nan_to_num(rate)))
+        for rate in (0.5 * (left + right), right - left)
+    )
+    way, turn = (
+        sum_up(asked, np.append(0.0, np.cumsum(np.nan_to_num(commands[name].to_numpy())[:-1] * held)))
+        for name in ("body_x", "body_w")
+    )
+    radius, over = _steady_gain(way, rolled), _steady_gain(turn, turned)
     if not radius or not over or radius <= 0.0 or over <= 0.0:
         return None
     found = {"wheel_radius_m": radius, "track_width_m": radius / over}
@@ -109,13 +116,14 @@ def _steady_gain(moved: Floats, driven: Floats) -> float | None:
     gain = _median_gain(moved, driven)
     if gain is None:
         return None
-    rest = np.abs(moved - gain * driven)
-    return gain if float(np.median(rest)) < _STEADY * float(np.median(np.abs(moved))) else None
+    live = np.abs(driven) > _LIVE * float(np.max(np.abs(driven)))
+    rest = np.abs(moved[live] / (gain * driven[live]) - 1.0) if gain else np.ones(1)
+    return gain if float(np.median(rest)) < _STEADY else None
 
 
 def _median_gain(moved: Floats, driven: Floats) -> float | None:
     """Weighted median of moved over driven; None where hardly anything was driven."""
-    live = np.abs(driven) > 0.1 * float(np.max(np.abs(driven), initial=0.0))
+    live = np.abs(driven) > _LIVE * float(np.max(np.abs(driven), initial=0.0))
     if live.sum() < _FEWEST:
         return None
     ratio, weight = moved[live] / driven[live], np.abs(driven[live])
