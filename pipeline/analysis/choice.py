@@ -204,7 +204,8 @@ def _recognize_geometry(
 ) -> tuple[Recognized | None, dict[str, float]]:
     """The vehicle that frames of wheels and parameters of a controller describe, and what they say."""
     geometry = {} if controller is None else controller.geometry
-    if configuration.vehicle.preset is not None or configuration.vehicle.wheel_radius_m is not None:
+    section, recorded = configuration.vehicle, find_preset(index.deployment.get("vehicle") or "")
+    if section.preset is not None or section.wheel_radius_m is not None or recorded is not None:
         return None, geometry
     kind, framed = read_frames(find_static_frames(index))
     known = {**framed, **geometry}

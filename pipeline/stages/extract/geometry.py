@@ -90,8 +90,8 @@ def fit_controller(
     held = np.minimum(np.diff(asked), timegrid.usual_hold(asked))
 
     def sum_up(times: Floats, total: Floats) -> Floats:
-        at: Floats = np.interp(spans, times, total)
-        return at[1] - at[0]
+        moved: Floats = np.diff(np.interp(spans, times, total), axis=0)[0]
+        return moved
 
     left, right = wheels["left"].to_numpy(), wheels["right"].to_numpy()
     rolled, turned = (
