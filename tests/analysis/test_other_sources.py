@@ -19,7 +19,7 @@ from pipeline.analysis.options import Options
 from pipeline.core.errors import SlipError
 from pipeline.logs import LogWriter, definition_text, open_log
 from pipeline.simulate import PLATFORMS, Platform, simulate_case
-from pipeline.simulate.platforms import Fields, joints, odometry, twist
+from pipeline.simulate.platforms import Fields, fix, ground_velocity, imu, joints, odometry, twist
 from pipeline.simulate.published import Published, Q
 from pipeline.vehicles import load_configuration
 
@@ -346,3 +346,32 @@ def test_a_receivers_velocity_is_no_command_and_a_fix_is_below_a_localization(tm
     assert "put on its course" in said["/panther/gps/fix"].reason
     assert said["/panther/gps/fix"].score > said["/panther/odometry/wheels"].score
     assert "/panther/gps/vel" not in {str(other) for other in chosen.sources.others["command"]}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("topics", "named"),
+    [
+        ((fix("/gps/fix"), imu("/imu")), {"drive_lag", "effective_track", "lateral_skid"}),
+        ((ground_velocity("/gps/vel"), imu("/imu")), {"drive_lag", "effective_track", "lateral_skid"}),
+        ((fix("/gps/fix"), ground_velocity("/gps/vel")), {"drive_lag", "effective_track"}),
+    ],
+    ids=["fixes and a gyro", "velocities and a gyro", "no gyro: sideways slip cannot be seen"],
+)
+def test_hidden_effects_are_named_by_satellites(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, topics: tuple[Published, ...], named: set[str]
+) -> None:
+    drive = (twist("/a200_0042/platform/cmd_vel"), *DRIVE[1:])
+    monkeypatch.setitem(PLATFORMS, "made_up", Platform(HUSKY, (*drive, *topics)))
+    effects = {"effective_track": 1.5, "drive_lag": 0.3, "lateral_skid": 0.08}
+    log = simulate_case(
+        None, effects, out=tmp_path / "run.mcap", seed=3, duration_s=180.0, platform="made_up"
+    )
+    options = Options(out=tmp_path / "results", report=False, diagnosis=True)
+    diagnosis = analyze_log(log, options).summary["diagnosis"]
+    assert isinstance(diagnosis, dict)
+    found = {effect["id"]: effect["parameters"] for effect in diagnosis["effects"]}
+    assert set(found) == named
+    assert found["effective_track"]["k"]["value"] == pytest.approx(1.5, rel=0.03)
+    if "lateral_skid" in named:
+        assert found["lateral_skid"]["c"]["value"] == pytest.approx(0.08, abs=0.01)

@@ -132,8 +132,9 @@ def receive(change: Callable[[dict[str, np.ndarray]], object]) -> Receiver:
         (lambda fields: fields["status.status"].__setitem__(slice(50, 80), -1.0), 30),
         (lambda fields: [fields[name].__setitem__(7, 0.0) for name in ("latitude", "longitude")], 1),
         (lambda fields: fields["latitude"].__setitem__(slice(0, 5), np.nan), 5),
+        (lambda fields: fields["latitude"].__setitem__(3, 1e9), 1),
     ],
-    ids=["a status below zero", "zero and zero", "no number"],
+    ids=["a status below zero", "zero and zero", "no number", "beyond the pole"],
 )
 def test_what_is_no_fix_is_left_out_and_counted(change: Callable[..., object], lost: int) -> None:
     made = locate_vehicle(receive(change), None, None, None, np.zeros(3))
@@ -152,6 +153,17 @@ def test_an_altitude_that_is_not_known_moves_nothing_sideways() -> None:
     yaw = 2.0 * np.arctan2(made.arrays.quaternion[:, 2], made.arrays.quaternion[:, 3])
     np.testing.assert_allclose(yaw, np.pi / 4.0, atol=1e-2)
     assert "direction_assumed" in {finding.id for finding in made.findings}
+
+
+@pytest.mark.parametrize("count", [0, 1, 30])
+def test_a_log_with_hardly_a_fix_has_no_pose_and_no_crash(count: int) -> None:
+    whole = receive(lambda _: None)
+    few = replace(whole, order=whole.order[:count])
+    stamps = whole.columns.log_time[:0]
+    silent = TopicColumns("/imu", 2, "sensor_msgs/msg/Imu", stamps, stamps, stamps, {}, ())
+    made = locate_vehicle(few, None, Receiver(silent, np.zeros(0), whole.order[:0]), None, np.zeros(3))
+    assert made.rows.size == (count if count == 30 else 0)
+    assert made.arrays.position.shape == (made.rows.size, 3)
 
 
 def test_a_topic_that_repeats_its_fixes_counts_each_once() -> None:

@@ -24,6 +24,7 @@ _LONGEST_NAME = 200
 _NANOSECONDS = 1_000_000_000
 _NED_IN_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 _FRAME = "header.frame_id"
+_POLE_DEG = 90.0
 _FLU_IN_FRD = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -205,7 +206,8 @@ def read_fixes(columns: TopicColumns) -> tuple[Floats, Floats, Floats, NDArray[n
         numbers(columns, name) for name in (fix.latitude, fix.longitude, fix.altitude, fix.status)
     )
     # A receiver without a fix may say zero and zero, in the Gulf of Guinea.
-    there = np.isfinite(latitude) & np.isfinite(longitude) & ((latitude != 0.0) | (longitude != 0.0))
+    there = (np.abs(latitude) <= _POLE_DEG) & (np.abs(longitude) <= 4.0 * _POLE_DEG)
+    there &= (latitude != 0.0) | (longitude != 0.0)
     return latitude, longitude, altitude, there & (status >= 0.0)
 
 

@@ -192,6 +192,8 @@ def _take_distinct(receiver: Receiver) -> tuple[Floats, Floats]:
 def _list_turnings(imu: Receiver) -> list[Turning]:
     """What of an IMU turns with the vehicle."""
     times = imu.times[imu.order]
+    if times.size < _FEWEST:
+        return []
     rates, _ = reading.read_imu(imu.columns)
     rate = np.nan_to_num(rates[imu.order, 2])
     found = [Turning(f"the gyro of {imu.columns.topic}", times, timegrid.integrate_rate(times, rate))]
