@@ -1,7 +1,6 @@
 """What the program makes of logs as platforms publish them: `make platforms`.
 
-Every platform's log is simulated with hidden effects and handed to `slip diagnose` without any configuration;
-where the platform says nowhere what it is, its geometry is given, as a user would.
+Every platform's log is simulated with hidden effects and handed to `slip diagnose` without any configuration.
 """
 
 from __future__ import annotations
@@ -40,20 +39,13 @@ def hidden_effects(platform: Platform) -> dict[str, float]:
     return CAR if platform.vehicle.kind == "ackermann" else SIDES
 
 
-def give_geometry(platform: Platform) -> dict[str, object]:
-    if platform.geometry:
-        return {}
-    vehicle = platform.vehicle
-    return {"vehicle": {"wheel_radius_m": vehicle.wheel_radius_m, "track_width_m": vehicle.track_width_m}}
-
-
 def try_platform(name: str, folder: Path, *, duration_s: float = 180.0, seed: int = 3) -> Row:
     platform = PLATFORMS[name]
     hidden = hidden_effects(platform)
     log = simulate_case(
         None, hidden, out=folder / f"{name}.mcap", seed=seed, duration_s=duration_s, platform=name
     )
-    options = Options(out=folder / "results", overrides=give_geometry(platform), report=False, diagnosis=True)
+    options = Options(out=folder / "results", report=False, diagnosis=True)
     summary = analyze_log(log, options).summary
     topics, diagnosis = summary["topics"], summary["diagnosis"]
     chosen = {role: (topics[role] or {}).get("topic", "-") for role in ("command", "wheels", "pose")}

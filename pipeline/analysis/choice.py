@@ -14,9 +14,11 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.logs import LogError, Strings, Wanted, read_topics
+from pipeline.analysis.vehicle_facts import find_controller, find_description, find_static_frames
+from pipeline.logs import TransformBuffer, read_topics
 from pipeline.stages.extract import extract_tables, list_wanted
-from pipeline.stages.extract.choice import PoseRating, fit_geometry, rate_poses, replace_pose
+from pipeline.stages.extract.choice import PoseRating, rate_poses, replace_pose
+from pipeline.stages.extract.geometry import fit_controller, fit_geometry
 from pipeline.stages.finding import Finding
 from pipeline.vehicles import (
     CONFIGURED,
@@ -24,12 +26,15 @@ from pipeline.vehicles import (
     DriveForm,
     DriveSource,
     PoseSource,
+    Recognized,
     Vehicle,
+    apply_parameters,
     choose_sources,
     find_alike,
     find_preset,
     list_contradictions,
-    read_description,
+    make_vehicle,
+    read_frames,
     recognize_vehicle,
     resolve_vehicle,
 )
@@ -41,7 +46,7 @@ if TYPE_CHECKING:
 
     from pipeline.logs import LogData, LogIndex
     from pipeline.store import JSON
-    from pipeline.vehicles import Configuration, Description, Recognized, Sources, VehicleSource
+    from pipeline.vehicles import Configuration, Controller, Sources, VehicleSource
 
 UNKNOWN_VEHICLE = "unknown"
 _STAND_IN_RADIUS_M = 0.1
@@ -123,8 +128,14 @@ def choose(
         *list_topics(configuration.wheels),
     ]
     told = recognize_vehicle(
-        index.channels, index.metadata, _find_description(index), [topic for topic in named if topic]
+        index.channels, index.metadata, find_description(index), [topic for topic in named if topic]
     )
+    controller = find_controller(index)
+    known: dict[str, float] = {}
+    if told is None:
+        told, known = _recognize_geometry(index, configuration, controller)
+    elif controller is not None:
+        told = apply_parameters(told, controller)
     problem: ConfigurationError | None = None
     try:
         vehicle, source = _name_vehicle(index, configuration, overrides, told)
@@ -133,7 +144,7 @@ def choose(
             raise
         problem, vehicle, source = error, _stand_in(index, configuration), "fitted"
     sources = choose_sources(index.channels, configuration, vehicle, where=where)
-    vehicle = _apply_vendor_controller(vehicle, sources, configuration)
+    vehicle = _apply_controller(vehicle, sources, configuration, controller)
     findings = [
         Finding("vehicle_choice", "info", note, where="vehicle") for note in (told.notes if told else ())
     ]
@@ -149,33 +160,14 @@ def choose(
     if rivals or fits or _may_be_odometry(sources.pose):
         chosen = _compare(chosen, index, configuration, rivals, sha256)
     # What a log lacks altogether is said before what is not known of its vehicle.
-    return chosen if problem is None or not fits else _fit_vehicle(chosen, configuration, problem, where)
+    if problem is None or not fits:
+        return chosen
+    return _fit_vehicle(chosen, configuration, problem, known, where)
 
 
 def _may_be_odometry(pose: PoseSource | None) -> bool:
     """Whether only its content can tell a pose from an odometry of the wheels."""
     return pose is not None and pose.reason != CONFIGURED and not LOCALIZED.search(pose.topic.lower())
-
-
-def _find_description(index: LogIndex) -> Description | None:
-    topics = [
-        channel.topic
-        for channel in index.channels
-        if channel.message_count != 0 and channel.topic.endswith("robot_description")
-    ]
-    for topic in topics:
-        try:
-            data = read_topics(index, [Wanted(topic, ("data",))], sha256="unused")
-        except LogError:
-            continue
-        for columns in data.topics:
-            texts = columns.fields.get("data")
-            found = (
-                read_description(texts.to_list()[-1]) if isinstance(texts, Strings) and len(texts) else None
-            )
-            if found is not None:
-                return found
-    return None
 
 
 def _name_vehicle(
@@ -207,14 +199,37 @@ def _stand_in(index: LogIndex, configuration: Configuration) -> Vehicle:
     )
 
 
-def _apply_vendor_controller(vehicle: Vehicle, sources: Sources, configuration: Configuration) -> Vehicle:
-    """The vendor's track multiplier where its own controller received the command."""
+def _recognize_geometry(
+    index: LogIndex, configuration: Configuration, controller: Controller | None
+) -> tuple[Recognized | None, dict[str, float]]:
+    """The vehicle that frames of wheels and parameters of a controller describe, and what they say."""
+    geometry = {} if controller is None else controller.geometry
+    section, recorded = configuration.vehicle, find_preset(index.deployment.get("vehicle") or "")
+    if section.preset is not None or section.wheel_radius_m is not None or recorded is not None:
+        return None, geometry
+    kind, framed = read_frames(find_static_frames(index))
+    known = {**framed, **geometry}
+    if controller is not None and controller.kind != "differential":
+        kind = controller.kind
+    name = "robot" if controller is None else controller.name
+    vehicle = make_vehicle(name, kind, known)
+    if vehicle is None:
+        return None, known
+    return Recognized(vehicle, "parameters" if geometry else "transforms"), known
+
+
+def _apply_controller(
+    vehicle: Vehicle, sources: Sources, configuration: Configuration, controller: Controller | None
+) -> Vehicle:
+    """The recorded track multiplier, or the vendor's where its own controller received the command."""
     command = sources.command
     if command is None or configuration.vehicle.controller_track_multiplier is not None:
         return vehicle
-    if not command.signals[0].topic.endswith(tuple(vehicle.controller.topics)):
-        return vehicle
-    multiplier = vehicle.controller.track_multiplier
+    multiplier = None if controller is None else controller.values.get("controller_track_multiplier")
+    if multiplier is None:
+        if not command.signals[0].topic.endswith(tuple(vehicle.controller.topics)):
+            return vehicle
+        multiplier = vehicle.controller.track_multiplier
     return msgspec.structs.replace(vehicle, controller_track_multiplier=multiplier)
 
 
@@ -253,9 +268,21 @@ def _compare(
 
 
 def _fit_vehicle(
-    chosen: Choice, configuration: Configuration, problem: ConfigurationError, where: str
+    chosen: Choice,
+    configuration: Configuration,
+    problem: ConfigurationError,
+    recorded: Mapping[str, float],
+    where: str,
 ) -> Choice:
-    """The vehicle that nothing tells, as wheels and pose show it."""
+    """The vehicle that nothing tells, as command, wheels and pose show it.
+
+    Args:
+        chosen: with a stand-in of unit geometry, and the columns that were read.
+        configuration: what the user says of the vehicle.
+        problem: raised where the log does not show enough.
+        recorded: what of the geometry the log says, which counts.
+        where: the log.
+    """
     sources, vehicle, data = chosen.sources, chosen.vehicle, chosen.data
     drives = [drive for drive in (sources.wheels, sources.command) if drive is not None]
     # Body motion is the same whatever the wheels are.
@@ -270,12 +297,19 @@ def _fit_vehicle(
             "slip does not depend on wheel radius and track width"
         )
     else:
-        measured = replace(sources, wheels=drive, command=None, imu=None, interval=None)
+        asked = sources.command if drive is not sources.command else None
+        measured = replace(sources, wheels=drive, command=asked, imu=None, interval=None)
         made = extract_tables(data, measured, configuration, vehicle, where=where)
         fitted = fit_geometry(made.tables["wheels"], made.tables["poses"], vehicle.kind)
         if fitted is None:
             raise problem
-        values, (name, text) = fitted, _describe_fit(fitted)
+        controller = fit_controller(made.tables["commands"], made.tables["wheels"], fitted)
+        framed = read_frames(TransformBuffer(data.topics))[1]
+        told = {key: value for key, value in {**framed, **recorded}.items() if key in fitted}
+        values = {**fitted, **(controller or {}), **told}
+        name, text = _describe_fit(values, by_controller=controller is not None)
+        if told:
+            text += f"; {' and '.join(told)} as recorded"
     section = msgspec.structs.asdict(configuration.vehicle)
     given = {key: value for key, value in section.items() if value is not None and key != "preset"}
     known = {"name": "fitted vehicle", "id": name, "track_width_m": None, "wheelbase_m": None, **values}
@@ -286,7 +320,7 @@ def _fit_vehicle(
     return replace(chosen, vehicle=vehicle, vehicle_source="fitted", findings=findings)
 
 
-def _describe_fit(fitted: Mapping[str, float]) -> tuple[str, str]:
+def _describe_fit(fitted: Mapping[str, float], *, by_controller: bool) -> tuple[str, str]:
     """A name, the same for the same geometry, and what is said of it."""
     if "wheelbase_m" in fitted:
         return f"fitted_{1e3 * fitted['wheelbase_m']:.0f}", (
@@ -301,6 +335,11 @@ def _describe_fit(fitted: Mapping[str, float]) -> tuple[str, str]:
         else "--wheel-radius and --track-width give others"
     )
     name = alike.id if alike else f"{1e3 * radius:.0f}_{1e3 * track:.0f}"
+    if by_controller:
+        return f"fitted_{name}", (
+            "the log does not say which vehicle it is of: its controller turns commands into wheel speeds by "
+            f"a wheel radius of {radius:.3g} m and a track of {track:.3g} m, which were taken ({guess})"
+        )
     return f"fitted_{name}", (
         f"the log does not say which vehicle it is of: a wheel radius of {radius:.3g} m and an effective "
         f"track of {track:.3g} m were fitted, so that neither can be missing from the model ({guess})"

@@ -15,6 +15,8 @@ _FEWEST_POINTS = 4
 _BLOCK = 4096
 _SHORTEST_HOLD = 0.5
 _PERIODS = 5.0
+_SHORTEST_PERIOD = 1e-3
+"""Samples that share a stamp are taken to come a millisecond apart."""
 
 
 def make_grid(start: float, end: float, rate: float) -> Floats:
@@ -36,6 +38,16 @@ def nearest_indices(at: Floats, times: Floats) -> Indices:
     after = np.minimum(after, times.size - 1)
     before = np.maximum(after - 1, 0)
     return np.where(times[after] - at < at - times[before], after, before).astype(np.int64)
+
+
+def count_steps(times: Floats, span: float) -> int:
+    """How many samples make a span of time, at least one.
+
+    Args:
+        times: increasing [s], shape (n,), n >= 2.
+        span: [s].
+    """
+    return max(round(span / max(float(np.median(np.diff(times))), _SHORTEST_PERIOD)), 1)
 
 
 def usual_hold(stamps: Floats) -> float:

@@ -34,16 +34,29 @@ FIELDS: Final[dict[str, str]] = {
     "geometry_msgs/TwistWithCovarianceStamped": f"{_HEADER}; geometry_msgs/TwistWithCovariance twist",
     "geometry_msgs/Vector3": "float64 x; float64 y; float64 z",
     "geometry_msgs/Vector3Stamped": f"{_HEADER}; geometry_msgs/Vector3 vector",
+    "geometry_msgs/Wrench": "geometry_msgs/Vector3 force; geometry_msgs/Vector3 torque",
     "nav_msgs/Odometry": f"{_HEADER}; string child_frame_id; geometry_msgs/PoseWithCovariance pose; "
     "geometry_msgs/TwistWithCovariance twist",
     "nav_msgs/Path": f"{_HEADER}; geometry_msgs/PoseStamped[] poses",
     "rcl_interfaces/Log": "builtin_interfaces/Time stamp; uint8 level; string name; string msg; string file; "
     "string function; uint32 line",
+    "rcl_interfaces/Parameter": "string name; rcl_interfaces/ParameterValue value",
+    "rcl_interfaces/ParameterEvent": "builtin_interfaces/Time stamp; string node; "
+    "rcl_interfaces/Parameter[] new_parameters; rcl_interfaces/Parameter[] changed_parameters; "
+    "rcl_interfaces/Parameter[] deleted_parameters",
+    "rcl_interfaces/ParameterValue": "uint8 type; bool bool_value; int64 integer_value; "
+    "float64 double_value; string string_value; uint8[] byte_array_value; bool[] bool_array_value; "
+    "int64[] integer_array_value; float64[] double_array_value; string[] string_array_value",
     "rosgraph_msgs/Clock": "builtin_interfaces/Time clock",
     "sensor_msgs/Imu": f"{_HEADER}; geometry_msgs/Quaternion orientation; "
     "float64[9] orientation_covariance; geometry_msgs/Vector3 angular_velocity; "
     "float64[9] angular_velocity_covariance; geometry_msgs/Vector3 linear_acceleration; "
     "float64[9] linear_acceleration_covariance",
+    "sensor_msgs/MultiDOFJointState": f"{_HEADER}; string[] joint_names; "
+    "geometry_msgs/Transform[] transforms; geometry_msgs/Twist[] twist; geometry_msgs/Wrench[] wrench",
+    "sensor_msgs/NavSatFix": f"{_HEADER}; sensor_msgs/NavSatStatus status; float64 latitude; "
+    "float64 longitude; float64 altitude; float64[9] position_covariance; uint8 position_covariance_type",
+    "sensor_msgs/NavSatStatus": "int8 status; uint16 service",
     "sensor_msgs/JointState": f"{_HEADER}; string[] name; float64[] position; float64[] velocity; "
     "float64[] effort",
     "std_msgs/Bool": "bool data",
@@ -72,17 +85,20 @@ FIELDS: Final[dict[str, str]] = {
     "bool is_defined_steering_tire_rotation_rate",
     "autoware_control_msgs/Longitudinal": "builtin_interfaces/Time stamp; "
     "builtin_interfaces/Time control_time; "
-    ""
     "float32 velocity; float32 acceleration; float32 jerk; bool is_defined_acceleration; "
     "bool is_defined_jerk",
     "autoware_vehicle_msgs/SteeringReport": "builtin_interfaces/Time stamp; float32 steering_tire_angle",
     "autoware_vehicle_msgs/VelocityReport": f"{_HEADER}; float32 longitudinal_velocity; "
     "float32 lateral_velocity; float32 heading_rate",
+    "control_msgs/DynamicJointState": f"{_HEADER}; string[] joint_names; "
+    "control_msgs/InterfaceValue[] interface_values",
+    "control_msgs/InterfaceValue": "string[] interface_names; float64[] values",
     "control_msgs/SteeringControllerStatus": f"{_HEADER}; float64[] traction_wheels_position; "
     "float64[] traction_wheels_velocity; float64[] steer_positions; float64[] traction_command; "
     "float64[] steering_angle_command",
     "duckietown_msgs/WheelEncoderStamped": f"{_HEADER}; int32 data; uint16 resolution; uint8 type",
     "duckietown_msgs/WheelsCmdStamped": f"{_HEADER}; float32 vel_left; float32 vel_right",
+    "gazebo_msgs/ModelStates": "string[] name; geometry_msgs/Pose[] pose; geometry_msgs/Twist[] twist",
     "hunter_msgs/HunterActuatorState": "uint8 motor_id; int16 rpm; float64 current; int32 pulse_count; "
     "float32 driver_voltage; float32 driver_temperature; int8 motor_temperature; uint8 driver_state",
     "hunter_msgs/HunterStatus": f"{_HEADER}; float64 linear_velocity; float64 steering_angle; "

@@ -122,7 +122,7 @@ def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out 
 
     def judge(delay: float) -> tuple[float, float, float]:
         gyro = np.interp(end - delay, times, angle) - np.interp(start - delay, times, angle)
-        return _fit_robustly(gyro, end - start, turned)
+        return fit_turning(gyro, end - start, turned)
 
     coarse = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 1e-9, 5 * _DELAY_STEP)
     best = float(coarse[np.argmin([judge(float(d))[2] for d in coarse])])
@@ -208,8 +208,14 @@ def mark_barred(run: MotionRun, times: Floats) -> NDArray[np.bool_]:
     return has_barred(run.barred, times - 0.05, times + 0.05)
 
 
-def _fit_robustly(gyro: Floats, span: Floats, turned: Floats) -> tuple[float, float, float]:
-    """Scale, bias and robust spread of turned = scale * gyro + bias * span."""
+def fit_turning(gyro: Floats, span: Floats, turned: Floats) -> tuple[float, float, float]:
+    """Scale, bias [rad/s] and robust spread [rad] of turned = scale * gyro + bias * span.
+
+    Args:
+        gyro: what a sensor turned in every window [rad], shape (n,).
+        span: length of every window [s], shape (n,).
+        turned: what the vehicle turned [rad], shape (n,).
+    """
     keep = np.ones(gyro.size, dtype=bool)
     scale = bias = spread = 0.0
     for _ in range(4):

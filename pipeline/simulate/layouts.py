@@ -18,7 +18,7 @@ CommandForm = Literal[
     "joint_state", "float_sides", "twist", "twist_stamped", "ackermann", "float_speed_steering"
 ]
 WheelForm = Literal["joint_state", "float_sides", "ackermann", "float_speed_steering"]
-PoseForm = Literal["odometry", "pose_stamped", "pose_covariance", "tf"]
+PoseContent = Literal["odometry", "pose_stamped", "pose_covariance", "tf"]
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class WheelTopic:
 class PoseTopic:
     """Topic of the pose."""
 
-    form: PoseForm
+    form: PoseContent
     topic: str
 
 

@@ -12,6 +12,8 @@ from pipeline.simulate.platforms import (
     Fields,
     Platform,
     describe,
+    fix,
+    ground_velocity,
     imu,
     joints,
     odometry,
@@ -91,6 +93,8 @@ def _husarion(name: str, vehicle: Vehicle) -> Platform:
             odometry(f"/{name}/odometry/wheels", "odometry", f"{name}/odom", f"{name}/base_link"),
             odometry(f"/{name}/odometry/filtered", "filter", f"{name}/odom", f"{name}/base_link"),
             odometry("/kiss/odometry", "localization", "odom_lidar", "base_link"),
+            fix(f"/{name}/gps/fix"),
+            ground_velocity(f"/{name}/gps/vel"),
             imu(f"/{name}/imu/data"),
         ),
     )
@@ -384,7 +388,6 @@ PLATFORMS: dict[str, Platform] = {
                 },
             ),
         ),
-        geometry=False,
     ),
     # duckietown/dt-ros-commons, dt-car-interface
     "duckiebot": Platform(

@@ -24,12 +24,10 @@ class Platform:
     Attributes:
         vehicle: geometry as the vendor states it.
         topics: everything in a log.
-        geometry: whether the log says what the vehicle is; else a user has to say it.
     """
 
     vehicle: Vehicle
     topics: tuple[Published, ...]
-    geometry: bool = True
 
     @property
     def layout(self) -> Layout:
@@ -77,11 +75,7 @@ def transform(topic: str, source: Source, parent: str, child: str) -> Published:
 
 def joints(topic: str, template: str, places: tuple[str, ...], fields: str = "both") -> Published:
     """Joint states of the wheels; ``fields`` may be ``position`` alone."""
-    names = [template.format(place.removeprefix("steer_")) for place in places]
-    names = [
-        _steering_name(name) if place.startswith("steer") else name
-        for name, place in zip(names, places, strict=True)
-    ]
+    names = [_name_joint(template, place) for place in places]
     turned = tuple(Q("steering") if p.startswith("steer") else Q(f"{_side(p)}_angle") for p in places)
     rolling = tuple(Q("zero") if p.startswith("steer") else Q(_side(p)) for p in places)
     values: Fields = {"name": names, "position": turned}
@@ -97,19 +91,34 @@ def _side(place: str) -> str:
     return place.rsplit("_", 1)[-1]
 
 
-def _steering_name(name: str) -> str:
-    return name.replace("wheel", "steering")
+def _name_joint(template: str, place: str) -> str:
+    """Name of the wheel joint of a place, or of its steering joint."""
+    name = template.format(place.removeprefix("steer_"))
+    return name.replace("wheel", "steering") if place.startswith("steer") else name
 
 
-def imu(topic: str) -> Published:
-    """An inertial unit."""
-    fields: Fields = {
-        "header.frame_id": "imu_link",
-        "orientation.w": 1.0,
-    }
+def imu(topic: str, *, attitude: bool = False) -> Published:
+    """An inertial unit, perhaps with an attitude."""
+    fields: Fields = {"header.frame_id": "imu_link", "orientation.w": 1.0}
+    if attitude:
+        fields |= {f"orientation.{axis}": Q(f"attitude_{axis}") for axis in _XYZW}
     fields |= {f"angular_velocity.{axis}": Q(f"rate_{axis}") for axis in _XYZ}
     fields |= {f"linear_acceleration.{axis}": Q(f"force_{axis}") for axis in _XYZ}
     return Published(topic, "sensor_msgs/msg/Imu", "imu", fields)
+
+
+def fix(topic: str, every: int = 2) -> Published:
+    """Fixes of a receiver of satellites."""
+    fields: Fields = {name: Q(name) for name in ("latitude", "longitude", "altitude")}
+    fields |= {"header.frame_id": "gps_link", "status.status": Q("fixed")}
+    return Published(topic, "sensor_msgs/msg/NavSatFix", "satellites", fields, every=every)
+
+
+def ground_velocity(topic: str, every: int = 2) -> Published:
+    """Velocities over ground, as nmea_navsat_driver gives them: east, north."""
+    fields: Fields = {"twist.linear.x": Q("east_speed"), "twist.linear.y": Q("north_speed")}
+    fields["header.frame_id"] = "gps_link"
+    return Published(topic, "geometry_msgs/msg/TwistStamped", "satellites", fields, every=every)
 
 
 def pose_with_covariance(topic: str, every: int) -> Published:
@@ -124,11 +133,5 @@ def pose_with_covariance(topic: str, every: int) -> Published:
 
 def describe(topic: str, name: str, vehicle: Vehicle, template: str, places: tuple[str, ...]) -> Published:
     """A robot description."""
-    named = {
-        place: _steering_name(template.format(place.removeprefix("steer_")))
-        if place.startswith("steer")
-        else template.format(place)
-        for place in places
-    }
-    text = describe_robot(name, vehicle, named)
+    text = describe_robot(name, vehicle, {place: _name_joint(template, place) for place in places})
     return Published(topic, "std_msgs/msg/String", "once", {"data": text}, stamp="none")

@@ -17,6 +17,7 @@ from pipeline.core.rigid import (
 )
 from pipeline.simulate.drivetrain import apply_ideal_model, invert_ideal_model
 from pipeline.simulate.errors import SimulateError
+from pipeline.simulate.geodesy import to_earth
 from pipeline.simulate.messages import Sheet
 from pipeline.simulate.programs import make_commands
 from pipeline.simulate.scenario import Program
@@ -32,11 +33,24 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Series = dict[str, Floats]
 Source = Literal[
-    "command", "wish", "wheels", "odometry", "filter", "localization", "correction", "imu", "once"
+    "command",
+    "wish",
+    "wheels",
+    "odometry",
+    "filter",
+    "localization",
+    "satellites",
+    "correction",
+    "imu",
+    "once",
 ]
 
 _LATE_S = 0.002
 _TURN = 2.0 * np.pi
+_COMPASS_OFF_RAD = 0.7
+"""An attitude is seldom against the true north."""
+_DOPPLER_S = 0.05
+_DOPPLER_NOISE_MPS = 0.03
 _ENU_IN_NED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 _FRD_IN_FLU = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -58,7 +72,8 @@ class Published:
     Attributes:
         topic, type_name: where and what.
         source: whose times and quantities it has: ``command``; ``wheels``; ``odometry`` integrated from them,
-            ``filter`` the same with the gyro's heading; ``localization``; ``correction``, the transform from
+            ``filter`` the same with the gyro's heading; ``localization``; ``satellites``, its place on Earth
+            and the velocity of its sensor over ground; ``correction``, the transform from
             the localization's frame to the odometry's; ``imu``; ``once`` at the start; ``wish``, a body
             command that the controller never gets.
         fields: by field path a quantity, several for an array, or a constant.
@@ -177,6 +192,27 @@ def _of_localization(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     return run.poses.stamp_s, run.poses.log_s, series
 
 
+def _of_satellites(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    """What a receiver says whose antenna is where the localization's sensor is."""
+    poses, sensor, path = run.poses, run.scenario.pose, run.truth.path
+    latitude, longitude, altitude = to_earth(poses.in_map()[0])
+    arm = np.zeros(3)
+    if sensor.child_frame != "base_link":
+        arm = np.array([sensor.mount_x_m, sensor.mount_y_m, 0.0])
+    before, after = (
+        place + rotate(turn, np.broadcast_to(arm, place.shape))
+        for place, turn in (
+            interpolate_poses(poses.sampled_s + by, path.time_s, path.position, path.quaternion)
+            for by in (-_DOPPLER_S, _DOPPLER_S)
+        )
+    )
+    noise = open_stream(run.scenario.seed, "satellites").standard_normal((poses.stamp_s.size, 2))
+    velocity = (after - before)[:, :2] / (2.0 * _DOPPLER_S) + _DOPPLER_NOISE_MPS * noise
+    series = {"latitude": latitude, "longitude": longitude, "altitude": altitude}
+    series |= {"east_speed": velocity[:, 0], "north_speed": velocity[:, 1], "fixed": np.zeros_like(latitude)}
+    return poses.stamp_s, poses.log_s, series
+
+
 def _of_correction(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     """The localization over the odometry at the odometry's stamps, as a matcher of every scan gives it."""
     stamp, _, drift = _of_odometry(run)
@@ -197,6 +233,11 @@ def _of_imu(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
         raise _missing("an inertial unit")
     series = {f"rate_{axis}": run.imu.rates[:, i] for i, axis in enumerate("xyz")}
     series |= {f"force_{axis}": run.imu.accelerations[:, i] for i, axis in enumerate("xyz")}
+    path = run.truth.path
+    _, turn = interpolate_poses(run.imu.time_s, path.time_s, path.position, path.quaternion)
+    start = np.broadcast_to(quaternions_from_yaw(np.array([_COMPASS_OFF_RAD])), turn.shape)
+    turn = multiply_quaternions(start, turn)
+    series |= {f"attitude_{axis}": turn[:, i] for i, axis in enumerate("xyzw")}
     return run.imu.time_s, run.imu.time_s + _LATE_S, series
 
 
@@ -226,6 +267,7 @@ _SOURCES: dict[Source, Callable[[SimulatedRun], tuple[Floats, Floats, Series]]] 
     "odometry": _of_odometry,
     "filter": _of_filter,
     "localization": _of_localization,
+    "satellites": _of_satellites,
     "correction": _of_correction,
     "imu": _of_imu,
     "once": _once,

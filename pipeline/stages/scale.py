@@ -6,13 +6,13 @@ is one: rpm for rad/s, degrees, millimetres.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.stages.finding import Finding
+from pipeline.vehicles import list_factors
 
 if TYPE_CHECKING:
     from pipeline.stages.samples import Samples
@@ -20,11 +20,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-_UNITS: Final = {
-    "rpm": 2.0 * math.pi / 60.0,
-    "deg/s": math.pi / 180.0,
-    "mm/s": 1e-3,
-}
 _UNIT_NEAR: Final = 0.2
 """A gain within so much of a unit's is taken for it; slip of ground and a radius differ less."""
 _LEAST: Final = 0.55
@@ -52,7 +47,7 @@ def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     spread = 1.4826 * float(np.median(np.abs(ratio - gain)))
     if gain <= 0.0 or spread > _STEADY * gain or _LEAST < gain < _MOST:
         return []
-    for unit, factor in _UNITS.items():
+    for unit, factor in list_factors("rad/s", "m/s").items():
         if abs(gain / factor - 1.0) < _UNIT_NEAR:
             fastest = float(np.max(np.abs(driven[known])))
             text = (

@@ -65,7 +65,7 @@ def _share_beside_wheels(
     None where there is nothing to share.
     """
     times = samples.times
-    span = max(round(_SPAN / max(float(np.median(np.diff(times))), 1e-3)), 1)
+    span = timegrid.count_steps(times, _SPAN)
     first = np.arange(0, times.size - span, span)
     last = first + span
     counted = np.concatenate(([0], np.cumsum(known)))

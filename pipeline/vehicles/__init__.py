@@ -7,36 +7,42 @@ chosen by type and name, with a reason that is printed.
 from pipeline.vehicles.configuration import Configuration, DriveSection
 from pipeline.vehicles.description import Description, read_description
 from pipeline.vehicles.errors import ConfigurationError
+from pipeline.vehicles.frames import read_frames
 from pipeline.vehicles.loading import list_configuration_files, load_configuration
+from pipeline.vehicles.parameters import Controller, apply_parameters, list_metadata, read_parameters
 from pipeline.vehicles.presets import Vehicle, find_preset, list_presets, resolve_vehicle
 from pipeline.vehicles.recognition import (
     Recognized,
     VehicleSource,
     find_alike,
     list_contradictions,
+    make_vehicle,
     recognize_vehicle,
 )
 from pipeline.vehicles.sources import (
     CONFIGURED,
     DriveForm,
     DriveSource,
+    PoseContent,
     PoseSource,
     Signal,
     Sources,
     TopicSource,
 )
 from pipeline.vehicles.topics import DEFAULT_INTERVAL, choose_sources
-from pipeline.vehicles.units import convert_unit
+from pipeline.vehicles.units import convert_unit, list_factors
 
 __all__ = [
     "CONFIGURED",
     "DEFAULT_INTERVAL",
     "Configuration",
     "ConfigurationError",
+    "Controller",
     "Description",
     "DriveForm",
     "DriveSection",
     "DriveSource",
+    "PoseContent",
     "PoseSource",
     "Recognized",
     "Signal",
@@ -44,15 +50,21 @@ __all__ = [
     "TopicSource",
     "Vehicle",
     "VehicleSource",
+    "apply_parameters",
     "choose_sources",
     "convert_unit",
     "find_alike",
     "find_preset",
     "list_configuration_files",
     "list_contradictions",
+    "list_factors",
+    "list_metadata",
     "list_presets",
     "load_configuration",
+    "make_vehicle",
     "read_description",
+    "read_frames",
+    "read_parameters",
     "recognize_vehicle",
     "resolve_vehicle",
 ]

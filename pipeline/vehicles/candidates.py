@@ -35,6 +35,7 @@ _UPSTREAM = re.compile(
     r"joy|teleop|nav|web|key|interactive|marker|plan|raw|key_vel|smoothed|manual|autonomous|safe|unsmoothed"
 )
 _EXECUTED = re.compile(r"executed|cmd_vel_out|limited")
+_SATELLITES = re.compile(r"gps|gnss|navsat|nmea|rtk|ublox|septentrio|novatel|fix[_/]?vel")
 _FORMS = {"sides": DriveForm.SIDES, "body": DriveForm.BODY, "steering": DriveForm.STEERING}
 
 Ranked = tuple[float, DriveSource]
@@ -50,6 +51,22 @@ class Topics:
         """Topics of one number."""
         found = {topic: find_type(kind).number for topic, kind in self.types.items()}
         return {topic: number for topic, number in found.items() if number is not None}
+
+    def ground_velocities(self) -> list[str]:
+        """Topics of velocities east and north, by type and name: of a receiver, or beside its fixes."""
+        spaces = {
+            topic.rpartition("/")[0] for topic, kind in self.types.items() if find_type(kind).fix is not None
+        }
+        return [
+            topic
+            for topic, kind in self.types.items()
+            if find_type(kind).ground_velocity is not None
+            and not COMMANDED.search(topic.lower())
+            and (
+                _SATELLITES.search(topic.lower())
+                or (topic.endswith(("/vel", "/velocity")) and topic.rpartition("/")[0] in spaces)
+            )
+        ]
 
     def list_drives(self, *, commanded: bool, steered: bool) -> list[Ranked]:
         """Candidates with their rank.
@@ -73,6 +90,7 @@ class Topics:
         return found
 
     def _single_topics(self, *, commanded: bool, steered: bool) -> Iterator[Ranked]:
+        measured = self.ground_velocities()
         for topic, kind in self.types.items():
             known = find_type(kind)
             name = topic.lower()
@@ -80,10 +98,12 @@ class Topics:
             if known.joints is not None and says_command == commanded:
                 word = "says command" if says_command else "does not say command"
                 reason = f"{kind.rsplit('/', 1)[-1]} whose name {word}"
-                yield (2.0 if steered else 3.0), DriveSource(DriveForm.JOINTS, (Signal(topic),), reason)
+                rank = (2.0 if steered else 3.0) - 0.1 * bool(known.joints.interfaces)
+                yield rank, DriveSource(DriveForm.JOINTS, (Signal(topic),), reason)
             drive = known.drive
             if (
                 drive is None
+                or topic in measured
                 or (drive.form == "steering" and not steered)
                 or (drive.form == "sides" and steered)
             ):

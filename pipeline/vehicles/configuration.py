@@ -99,9 +99,17 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[pose]``: a pose topic, or a pair of frames out of the transforms."""
+    """``[pose]``: a pose topic, or a pair of frames out of the transforms.
+
+    Attributes:
+        topic: poses, fixes of satellites, or velocities over ground.
+        name: model, link or joint, where a message of the topic holds the poses of several.
+        frames: parent and child.
+        time: which of the message's times to use.
+    """
 
     topic: str | None = None
+    name: str | None = None
     frames: Annotated[list[str], msgspec.Meta(min_length=2, max_length=2)] | None = None
     time: Clock | None = None
 

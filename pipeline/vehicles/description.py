@@ -16,6 +16,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.core import rigid
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -122,7 +124,7 @@ def _read_joint(element: ET.Element) -> _Joint | None:
         return None
     try:
         place = _numbers(origin, "xyz", (0.0, 0.0, 0.0))
-        turn = _rotation(_numbers(origin, "rpy", (0.0, 0.0, 0.0)))
+        turn = rigid.quaternions_from_euler(*_numbers(origin, "rpy", (0.0, 0.0, 0.0)))
         along = _numbers(axis, "xyz", (1.0, 0.0, 0.0))
     except ValueError:
         return None
@@ -138,17 +140,6 @@ def _numbers(element: ET.Element | None, name: str, usual: tuple[float, float, f
     if values.shape != (3,) or not np.isfinite(values).all():
         raise ValueError(name)
     return values
-
-
-def _rotation(rpy: Floats) -> Floats:
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(angle), math.sin(angle)) for angle in rpy)
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
 
 
 def _find_base(joints: Mapping[str, _Joint]) -> str:
@@ -168,10 +159,11 @@ def _place_in(base: str, joint: _Joint, joints: Mapping[str, _Joint]) -> tuple[F
         if above is None or frame in seen:
             return None
         seen.add(frame)
-        place, turn = above.place + above.turn @ place, above.turn @ turn
+        place = above.place + rigid.rotate(above.turn, place)
+        turn = rigid.multiply_quaternions(above.turn, turn)
         frame = above.parent
     length = float(np.linalg.norm(joint.axis))
-    return place, turn @ joint.axis / (length or 1.0)
+    return place, rigid.rotate(turn, joint.axis) / (length or 1.0)
 
 
 def _read_radius(link: ET.Element | None) -> float | None:

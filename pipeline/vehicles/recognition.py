@@ -21,7 +21,15 @@ if TYPE_CHECKING:
     from pipeline.vehicles.description import Description
 
 VehicleSource = Literal[
-    "flag", "configuration", "metadata", "robot_description", "namespace", "message_types", "fitted"
+    "flag",
+    "configuration",
+    "metadata",
+    "robot_description",
+    "namespace",
+    "message_types",
+    "parameters",
+    "transforms",
+    "fitted",
 ]
 _DIFFERS = 0.1
 _OTHER_TRACK = 0.25
@@ -103,23 +111,26 @@ def _compare(preset: Vehicle, source: VehicleSource, description: Description | 
 
 def _build(description: Description) -> Recognized | None:
     """A vehicle of a description alone, where it is complete."""
-    name = description.name or "robot"
     values = {
-        "id": re.sub(r"\W+", "_", name.lower()),
-        "name": name,
-        "kind": description.kind,
         "wheel_radius_m": description.wheel_radius_m,
         "track_width_m": description.track_width_m,
         "wheelbase_m": description.wheelbase_m,
         "base_to_rear_axle_m": description.base_to_rear_axle_m,
     }
+    vehicle = make_vehicle(description.name or "robot", description.kind, values)
+    return None if vehicle is None else Recognized(vehicle, "robot_description")
+
+
+def make_vehicle(name: str, kind: str, geometry: Mapping[str, float | None]) -> Vehicle | None:
+    """A vehicle of that name and geometry; None where its kind needs more."""
+    name = name.strip("/")
+    values = {"id": re.sub(r"\W+", "_", name.lower()), "name": name, "kind": kind, **geometry}
     try:
         vehicle = msgspec.convert(values, Vehicle)
     except msgspec.ValidationError:
         return None
     required = [quantity.name for quantity in vehicle.kinematics.geometry if quantity.required]
-    complete = all(getattr(vehicle, each) is not None for each in required)
-    return Recognized(vehicle, "robot_description") if complete else None
+    return vehicle if all(getattr(vehicle, each) is not None for each in required) else None
 
 
 def find_alike(radius_m: float, track_m: float) -> Vehicle | None:

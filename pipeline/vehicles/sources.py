@@ -78,14 +78,35 @@ class DriveSource:
         return self.name or ", ".join(dict.fromkeys(str(signal) for signal in self.signals))
 
 
+class PoseContent(Enum):
+    """What a topic of poses holds."""
+
+    POSE = "poses"
+    FIX = "places on Earth, without a heading"
+    VELOCITY = "velocities over ground, without a place or a heading"
+
+
 @dataclass(frozen=True)
 class PoseSource:
-    """Source of poses: a topic, or the transforms (then ``frames`` may name parent and child)."""
+    """Source of poses: a topic, or the transforms (then ``frames`` may name parent and child).
+
+    Attributes:
+        topic: its name.
+        reason: why it was chosen.
+        from_transforms: whether it holds transforms.
+        frames: parent and child among the transforms.
+        content: what it holds.
+        velocity: topic with the velocities over ground that belong to a fix.
+        name: of the body, where a message holds the poses of several.
+    """
 
     topic: str
     reason: str
     from_transforms: bool = False
     frames: tuple[str, str] | None = None
+    content: PoseContent = PoseContent.POSE
+    velocity: str = ""
+    name: str = ""
 
     def __str__(self) -> str:
         return f"{self.topic} ({' -> '.join(self.frames)})" if self.frames else self.topic

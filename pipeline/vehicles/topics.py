@@ -7,7 +7,9 @@ Where a log holds several robots, all roles are filled from the namespace of one
 
 from __future__ import annotations
 
+import os.path
 import re
+from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 from pipeline.vehicles.candidates import DEAD_RECKONED, LOCALIZED, Topics
@@ -18,6 +20,7 @@ from pipeline.vehicles.sources import (
     CONFIGURED,
     DriveForm,
     DriveSource,
+    PoseContent,
     PoseSource,
     Signal,
     Sources,
@@ -28,7 +31,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from pipeline.logs import ChannelInfo
-    from pipeline.vehicles.configuration import Configuration, DriveSection, IntervalSection
+    from pipeline.vehicles.configuration import (
+        Configuration,
+        DriveSection,
+        IntervalSection,
+        PoseSection,
+    )
     from pipeline.vehicles.presets import Vehicle
 
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
@@ -60,7 +68,7 @@ def choose_sources(
     sources = Sources(
         command=chooser.choose_drive(configuration.command, commanded=True),
         wheels=chooser.choose_drive(configuration.wheels, commanded=False),
-        pose=chooser.choose_pose(configuration.pose.topic, configuration.pose.frames),
+        pose=chooser.choose_pose(configuration.pose),
         imu=chooser.choose_imu(configuration.imu.topic),
         interval=chooser.choose_interval(configuration),
         notes=tuple(chooser.notes),
@@ -93,6 +101,8 @@ class _Chooser:
         }
         poses = {topic for topic in self.with_part("pose") if self._rank_pose(topic) is not None}
         poses |= {topic for topic in self.of_type(*TRANSFORM_TYPES) if "static" not in topic}
+        poses |= {*self.with_part("fix"), *numbers.ground_velocities()}
+        drives -= set(numbers.ground_velocities())
         robots = find_robots(drives, poses)
         named = (*list_topics(configuration.command), *list_topics(configuration.wheels))
         named = tuple(filter(None, (*named, configuration.pose.topic, configuration.imu.topic)))
@@ -196,8 +206,9 @@ class _Chooser:
             return DriveSource(found[0].form, found[0].signals, reason, found[0].name)
         return None
 
-    def choose_pose(self, topic: str | None, frames: list[str] | None) -> PoseSource | None:
+    def choose_pose(self, section: PoseSection) -> PoseSource | None:
         """The localization: configured, else the best named one, else transforms, else any odometry."""
+        topic, frames = section.topic, section.frames
         transforms = self._dynamic_transforms(is_configured=bool(frames))
         if frames:
             if not transforms:
@@ -212,24 +223,50 @@ class _Chooser:
             name = self.require(topic, "pose").topic
             if self.types[name] in TRANSFORM_TYPES:
                 return PoseSource(name, CONFIGURED, from_transforms=True)
-            if find_type(self.types[name]).pose is None:
-                raise ConfigurationError(
-                    "type_not_usable",
-                    f"the topic {name!r} of type {self.types[name]} cannot serve as pose",
-                    where=self.where,
-                    hint=f"Use one of: {', '.join(list_types('pose'))}; or pose.frames.",
-                )
-            return PoseSource(name, CONFIGURED)
+            kind = find_type(self.types[name])
+            if kind.pose is not None:
+                return PoseSource(name, CONFIGURED, name=section.name or "")
+            if kind.fix is not None or kind.ground_velocity is not None:
+                return self._by_satellites(name, CONFIGURED)
+            raise ConfigurationError(
+                "type_not_usable",
+                f"the topic {name!r} of type {self.types[name]} cannot serve as pose",
+                where=self.where,
+                hint=f"Use one of: {', '.join((*list_types('pose'), *list_types('fix')))}; or pose.frames.",
+            )
         candidates = [
-            ranked for name in self.with_part("pose") if (ranked := self._rank_pose(name)) is not None
+            (ranked[0], replace(ranked[1], name=section.name or ""))
+            for name in self.with_part("pose")
+            if (ranked := self._rank_pose(name)) is not None
+        ]
+        candidates += [
+            (1.2, self._by_satellites(name, "fixes of satellites")) for name in self.with_part("fix")
+        ]
+        candidates += [
+            (1.1, self._by_satellites(name, "velocities over ground")) for name in self._ground_velocities()
         ]
         if transforms:
             candidates.append((2.5, PoseSource(transforms, "the chain of transforms", from_transforms=True)))
         return self._best(candidates, self.vehicle.topics.pose, "pose")
 
+    def _ground_velocities(self) -> list[str]:
+        own = self.of_type(*self.types.values())
+        return Topics({topic: self.types[topic] for topic in own}).ground_velocities()
+
+    def _by_satellites(self, topic: str, reason: str) -> PoseSource:
+        """Fixes with the velocities published beside them, or velocities alone."""
+        if find_type(self.types[topic]).fix is None:
+            return PoseSource(topic, reason, content=PoseContent.VELOCITY)
+        beside = self._ground_velocities()
+        shared = [len(os.path.commonpath((topic, each))) for each in beside]
+        nearest = beside[shared.index(max(shared))] if beside else ""
+        return PoseSource(topic, reason, content=PoseContent.FIX, velocity=nearest)
+
     def _dynamic_transforms(self, *, is_configured: bool) -> str:
         found = [
-            name for name, kind in self.types.items() if kind in TRANSFORM_TYPES and "static" not in name
+            name
+            for name, kind in self.types.items()
+            if kind in TRANSFORM_TYPES and name.rsplit("/", 1)[-1] == "tf"
         ]
         own = [name for name in found if name.startswith(self._robot or "")]
         # Transforms of all robots at once serve where frames are named, and only there.

@@ -23,6 +23,15 @@ _KNOWN: Final[Mapping[str, tuple[float, str]]] = {
 }
 
 
+def list_factors(*made: str) -> dict[str, float]:
+    """Units that are no SI units, and what one of each is in SI.
+
+    Args:
+        made: SI units that they come to.
+    """
+    return {unit: factor for unit, (factor, si) in _KNOWN.items() if si in made and unit != si}
+
+
 def convert_unit(unit: str, own: Mapping[str, OwnUnit], *, where: str) -> tuple[float, float, str]:
     """Scale, offset and unit that turn raw numbers into SI: value = scale * (raw - offset).
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from platforms import give_geometry, hidden_effects, try_platform
+from platforms import hidden_effects, try_platform
 
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.choice import Choice, choose
@@ -84,7 +84,7 @@ EXPECTED: dict[str, tuple[str, str, str, str, str]] = {
         "f1tenth",
         "message_types",
     ),
-    "px4_rover": (PX4, "/fmu/out/wheel_encoders", "/fmu/out/vehicle_odometry", "vehicle", "flag"),
+    "px4_rover": (PX4, "/fmu/out/wheel_encoders", "/fmu/out/vehicle_odometry", "fitted_110_450", "fitted"),
     "duckiebot": (
         "/autobot01/wheels_driver_node/wheels_cmd_executed",
         TICKS,
@@ -108,8 +108,7 @@ def record(name: str, folder: Path, duration_s: float = 20.0) -> Choice:
     platform = PLATFORMS[name]
     effects = hidden_effects(platform)
     log = simulate_case(None, effects, out=folder / "run.mcap", seed=5, duration_s=duration_s, platform=name)
-    geometry = give_geometry(platform)
-    return choose(open_log(log), load_configuration(log, overrides=geometry), geometry)
+    return choose(open_log(log), load_configuration(log), {})
 
 
 @pytest.mark.parametrize("name", PLATFORMS)

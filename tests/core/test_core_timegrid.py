@@ -101,3 +101,10 @@ def test_interpolation_holds_its_ends() -> None:
     values = np.array([[0.0, 1.0], [2.0, 3.0]])
     found = timegrid.interpolate_linearly(np.array([-1.0, 0.5, 9.0]), np.array([0.0, 1.0]), values)
     assert found.tolist() == [[0.0, 1.0], [1.0, 2.0], [2.0, 3.0]]
+
+
+@pytest.mark.parametrize(("rate", "steps"), [(20.0, 10), (1.0, 1), (1e6, 500)])
+def test_steps_of_a_span_are_at_least_one_and_shared_stamps_are_a_millisecond_apart(
+    rate: float, steps: int
+) -> None:
+    assert timegrid.count_steps(np.arange(20) / rate, 0.5) == steps

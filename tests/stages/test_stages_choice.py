@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from msgspec import structs
 from stage_logs import FIELD, PLAIN, TakeThrough
@@ -17,6 +18,7 @@ from pipeline.simulate.cases import make_scenario
 from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.extract.clocks import Recorded, align_clocks
 from pipeline.stages.extract.drive import read_joints, read_pair, unwrap_counter
+from pipeline.stages.extract.geometry import fit_controller
 from pipeline.stages.extract.reading import read_pose_topic
 from pipeline.vehicles import Configuration, DriveForm, DriveSection, find_preset, load_configuration
 
@@ -85,13 +87,40 @@ def test_what_needs_no_comparison_is_not_read(tmp_path: Path) -> None:
     assert chosen.data is None
 
 
-def test_an_unknown_vehicle_gets_the_geometry_that_its_motion_shows(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("layout", "track", "said"),
+    [
+        ("tf", 0.16, "its controller turns commands into wheel speeds"),
+        ("wheel_float", 0.16 * 1.5, "an effective track"),
+    ],
+    ids=["body commands", "wheel commands"],
+)
+def test_an_unknown_vehicle_gets_the_geometry_of_its_controller_or_of_its_motion(
+    tmp_path: Path, layout: str, track: float, said: str
+) -> None:
     scenario = make_scenario(None, {"effective_track": 1.5}, seed=2, duration_s=60.0, vehicle="turtlebot3")
-    chosen = look(record(replace(scenario, recording=Recording("tf", deployment="absent")), tmp_path))
+    chosen = look(record(replace(scenario, recording=Recording(layout, deployment="absent")), tmp_path))
     assert chosen.vehicle_source == "fitted"
     assert chosen.vehicle.wheel_radius_m == pytest.approx(0.033, rel=0.02)
-    assert chosen.vehicle.track_width_m == pytest.approx(0.16 * 1.5, rel=0.03)
-    assert {finding.id for finding in chosen.findings} == {"vehicle_fitted"}
+    assert chosen.vehicle.track_width_m == pytest.approx(track, rel=0.03)
+    (finding,) = chosen.findings
+    assert finding.id == "vehicle_fitted"
+    assert said in finding.text
+
+
+def test_commands_on_another_scale_than_the_motion_give_no_geometry() -> None:
+    times = np.arange(0.0, 60.0, 0.1)
+    forward, turning = np.sin(0.3 * times), np.cos(0.2 * times)
+    sides = {side: (forward + sign * 0.2 * turning) / 0.1 for side, sign in (("left", -1), ("right", 1))}
+    wheels, by_pose = pl.DataFrame({"t": times, **sides}), {"wheel_radius_m": 0.095, "track_width_m": 0.6}
+    told = [
+        fit_controller(
+            pl.DataFrame({"t": times, "body_x": by * forward, "body_w": by * turning}), wheels, by_pose
+        )
+        for by in (1.0, 3.0)
+    ]
+    assert told[0] == pytest.approx({"wheel_radius_m": 0.1, "track_width_m": 0.4}, rel=0.02)
+    assert told[1] is None
 
 
 def test_body_commands_alone_need_no_vehicle(tmp_path: Path) -> None:

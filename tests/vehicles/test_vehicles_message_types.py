@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from pipeline.logs import bundled_types, field_names
 from pipeline.vehicles import ConfigurationError, Signal, convert_unit, find_preset
 from pipeline.vehicles.message_types import MessageType, find_type, list_types
 
-PARTS = ("drive", "number", "joints", "pose", "imu")
+PARTS = ("drive", "number", "joints", "pose", "fix", "ground_velocity", "imu")
 KNOWN = sorted({kind for part in PARTS for kind in list_types(part)})
 BUNDLED = {name.replace("/msg/", "/") for name in bundled_types()}
 
@@ -20,7 +22,15 @@ def list_paths(kind: MessageType) -> list[str]:
     if kind.number is not None:
         paths += [kind.number.field, *filter(None, [kind.number.per_turn])]
     if kind.joints is not None:
-        paths += [kind.joints.names, kind.joints.velocity, kind.joints.position]
+        plain = [kind.joints.velocity, kind.joints.position]
+        inner = [kind.joints.interfaces, kind.joints.values]
+        paths += [kind.joints.names, *(inner if kind.joints.interfaces else plain)]
+    if kind.fix is not None:
+        paths += [kind.fix.latitude, kind.fix.longitude, kind.fix.altitude, kind.fix.status]
+    if kind.ground_velocity is not None:
+        paths += [kind.ground_velocity.east, kind.ground_velocity.north]
+    if kind.pose is not None:
+        paths += filter(None, [kind.pose.parent, kind.pose.child, kind.pose.names])
     for vectors in (
         kind.pose and (kind.pose.position, kind.pose.orientation),
         kind.imu and (kind.imu.rate, kind.imu.force),
@@ -33,7 +43,8 @@ def list_paths(kind: MessageType) -> list[str]:
 @pytest.mark.parametrize("name", [name for name in KNOWN if name in BUNDLED])
 def test_every_field_is_one_of_the_type(name: str) -> None:
     leaves = field_names(name)
-    wrong = [path for path in list_paths(find_type(name)) if path.split("[")[0] not in leaves]
+    indexed = re.compile(r"\[\d+\]$")
+    wrong = [path for path in list_paths(find_type(name)) if indexed.sub("", path) not in leaves]
     assert wrong == []
 
 

@@ -17,15 +17,18 @@ from numpy.typing import NDArray
 
 from pipeline.core import rigid, timegrid
 from pipeline.core.errors import SlipError
+from pipeline.stages.extract.course import estimate_noise
+from pipeline.stages.extract.drive import read_speed
 from pipeline.stages.extract.tables import extract_tables
 from pipeline.stages.trust import measure_rest
-from pipeline.vehicles import PoseSource
+from pipeline.vehicles import PoseContent, PoseSource
 from pipeline.vehicles.candidates import DEAD_RECKONED, FILTERED, LOCALIZED
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.logs import LogData
+    from pipeline.stages.finding import Finding
     from pipeline.vehicles import Configuration, Sources, Vehicle
 
 Floats = NDArray[np.float64]
@@ -50,6 +53,8 @@ _STILL_M: Final = 1e-4
 _TURNS_RAD: Final = 0.2
 _DRIVES_M: Final = 1.0
 _FEWEST: Final = 20
+_NOISY_MPS: Final = 0.1
+"""Noise of the speed over half a second above which a receiver's velocities tell more than its positions."""
 
 
 @dataclass(frozen=True)
@@ -130,21 +135,27 @@ def _rate(
         return replace(bare, refused=f"only {poses.height} new poses")
     time = poses["t"].to_numpy()
     position = np.stack([poses[axis].to_numpy() for axis in "xy"], axis=1)
-    yaw = np.unwrap(_yaw_of(np.stack([poses[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))
+    yaw = np.unwrap(yaw_of(np.stack([poses[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))
     length = max(_span_of(table) for table in made.tables.values())
     period = float(np.median(np.diff(time)))
     rate = 1.0 / period if period > 0.0 else 0.0
     coverage = min(float(np.minimum(np.diff(time), 2.0 * period).sum()) / length, 1.0)
     wheels = made.tables["wheels"]
     reach, turned = np.ptp(position, axis=0).max(), np.ptp(yaw)
-    path = _path_of(wheels, vehicle)
+    rolled = read_speed(wheels, vehicle)
+    path = None if rolled is None else (rolled[0], timegrid.integrate_rate(*rolled))
     drove = path is not None and float(np.abs(np.diff(path[1])).sum()) > _DRIVES_M
     if reach < _STILL_M and (turned > _TURNS_RAD or drove):
         living = "its heading turns" if turned > _TURNS_RAD else "the wheels drive"
         return replace(bare, rate_hz=rate, refused=f"its position never changes while {living}")
     share, sideways = _compare_with_wheels(time, position, yaw, path)
     from_wheels = share is not None and share < _FROM_WHEELS and sideways < _SIDEWAYS_MPS
-    score, reasons = _score_frame(str(pose), parent)
+    if pose.content is PoseContent.POSE:
+        score, reasons = _score_frame(str(pose), parent)
+    else:
+        # Satellites know nothing of wheels, and a heading that is the course never moves sideways.
+        from_wheels = False
+        score, reasons = _score_satellites(pose, time, position, made.findings)
     if from_wheels:
         score -= 10.0
         reasons = ["it is computed from the wheels"]
@@ -196,19 +207,23 @@ def _score_frame(name: str, parent: str) -> tuple[float, list[str]]:
     return score, reasons
 
 
-def _path_of(wheels: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats] | None:
-    """Times [s] of the wheels' messages and the way [m] they rolled since the first; None without wheels."""
-    if wheels.height < _FEWEST:
-        return None
-    if wheels["speed"].null_count() < wheels.height:
-        speed = wheels["speed"].to_numpy()
+def _score_satellites(
+    pose: PoseSource, time: Floats, position: Floats, findings: Sequence[Finding]
+) -> tuple[float, list[str]]:
+    """What poses of satellites are worth: below a localization that has a heading of its own."""
+    score, reasons = 2.0, [pose.content.value]
+    if pose.content is PoseContent.VELOCITY:
+        score -= 0.2
+    if any(finding.id == "heading_from_course" for finding in findings):
+        score -= 0.5
+        reasons.append("its heading is its course")
     else:
-        speed = 0.5 * vehicle.wheel_radius_m * (wheels["left"] + wheels["right"]).to_numpy()
-    known = np.isfinite(speed)
-    time = wheels["t"].to_numpy()[known]
-    if time.size < _FEWEST:
-        return None
-    return time, timegrid.integrate_rate(time, speed[known])
+        reasons.append("its heading is the IMU's, put on its course")
+    noise = estimate_noise(position[:, :2]) / np.sqrt(timegrid.count_steps(time, _SPAN_S)) / _SPAN_S
+    if noise > _NOISY_MPS:
+        score -= 0.5
+        reasons.append(f"noisy: {noise:.2g} m/s over half a second")
+    return score, reasons
 
 
 def _compare_with_wheels(
@@ -225,13 +240,12 @@ def _compare_with_wheels(
     time, position, yaw = time[inside], position[inside], yaw[inside]
     if time.size < _FEWEST:
         return None, np.inf
-    span = max(round(_SPAN_S / max(float(np.median(np.diff(time))), 1e-3)), 1)
-    ends = np.arange(0, time.size, span)
-    way, _ = _split_chords(position[ends], yaw[ends])
+    ends = np.arange(0, time.size, timegrid.count_steps(time, _SPAN_S))
+    way, _ = split_chords(position[ends], yaw[ends])
     rolled = np.interp(time[ends], *path)
     rate = np.gradient(path[1], path[0] + np.arange(path[0].size) * 1e-12)
     share = measure_rest(way, np.diff(rolled), np.diff(np.interp(time[ends], path[0], rate)))
-    ahead, aside = _split_chords(position, yaw)
+    ahead, aside = split_chords(position, yaw)
     turned = ahead * np.diff(yaw)
     gain = float(turned @ aside) / max(float(turned @ turned), 1e-12)
     elapsed = np.maximum(np.diff(time), 1e-3)
@@ -240,7 +254,8 @@ def _compare_with_wheels(
     return share, float(np.median(sideways)) if sideways.size else np.inf
 
 
-def _yaw_of(quaternion: Floats) -> Floats:
+def yaw_of(quaternion: Floats) -> Floats:
+    """Headings [rad], shape (n,), of unit quaternions (n, 4)."""
     return rigid.euler_from_quaternions(quaternion)[2]
 
 
@@ -253,14 +268,13 @@ def _compare_with_gyro(time: Floats, yaw: Floats, imu: pl.DataFrame) -> float | 
     time, yaw = time[inside], yaw[inside]
     if time.size < _FEWEST:
         return None
-    span = max(round(_SPAN_S / max(float(np.median(np.diff(time))), 1e-3)), 1)
-    ends = np.arange(0, time.size, span)
+    ends = np.arange(0, time.size, timegrid.count_steps(time, _SPAN_S))
     rate = np.nan_to_num(imu["rate_z"].to_numpy())
     turned = np.diff(np.interp(time[ends], clock, timegrid.integrate_rate(clock, rate)))
     return measure_rest(np.diff(yaw[ends]), turned, np.diff(time[ends]))
 
 
-def _split_chords(position: Floats, yaw: Floats) -> tuple[Floats, Floats]:
+def split_chords(position: Floats, yaw: Floats) -> tuple[Floats, Floats]:
     """Way ahead along the arc, and aside, between neighbouring poses [m]."""
     turned = np.diff(yaw)
     middle = yaw[:-1] + 0.5 * turned
@@ -268,56 +282,6 @@ def _split_chords(position: Floats, yaw: Floats) -> tuple[Floats, Floats]:
     ahead = step[:, 0] * np.cos(middle) + step[:, 1] * np.sin(middle)
     aside = step[:, 1] * np.cos(middle) - step[:, 0] * np.sin(middle)
     return ahead / np.sinc(turned / (2.0 * np.pi)), aside
-
-
-def fit_geometry(wheels: pl.DataFrame, poses: pl.DataFrame, kind: str) -> dict[str, float] | None:
-    """Geometry of an unknown vehicle, as its poses show it.
-
-    Args:
-        wheels: measured with a stand-in of unit radius, track width and wheelbase.
-        poses: of the localization.
-        kind: of vehicle.
-
-    Returns:
-        Wheel radius and effective track width [m], or the wheelbase of a car; None where it does not drive
-        enough to tell.
-    """
-    fresh = poses.filter(~pl.col("held") & pl.col("x").is_finite() & pl.col("q_w").is_finite())
-    if fresh.height < _FEWEST or wheels.height < _FEWEST:
-        return None
-    time = fresh["t"].to_numpy()
-    span = max(round(_SPAN_S / max(float(np.median(np.diff(time))), 1e-3)), 1)
-    ends = np.arange(0, time.size, span)
-    position = np.stack([fresh[axis].to_numpy() for axis in "xy"], axis=1)[ends]
-    yaw = np.unwrap(_yaw_of(np.stack([fresh[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))[ends]
-    way, _ = _split_chords(position, yaw)
-    clock = wheels["t"].to_numpy()
-
-    def integral(rate: Floats) -> Floats:
-        return np.diff(np.interp(time[ends], clock, timegrid.integrate_rate(clock, np.nan_to_num(rate))))
-
-    if kind == "ackermann":
-        speed, steering = wheels["speed"].to_numpy(), wheels["steering"].to_numpy()
-        scale = _median_gain(way, integral(speed))
-        bent = _median_gain(np.diff(yaw), integral(speed * np.tan(steering)))
-        return None if not scale or not bent else {"wheelbase_m": 1.0 / bent}
-    left, right = wheels["left"].to_numpy(), wheels["right"].to_numpy()
-    radius = _median_gain(way, integral(0.5 * (left + right)))
-    over = _median_gain(np.diff(yaw), integral(right - left))
-    if not radius or not over or radius <= 0.0 or over <= 0.0:
-        return None
-    return {"wheel_radius_m": radius, "track_width_m": radius / over}
-
-
-def _median_gain(moved: Floats, driven: Floats) -> float | None:
-    """Weighted median of moved over driven; None where hardly anything was driven."""
-    live = np.abs(driven) > 0.1 * float(np.max(np.abs(driven), initial=0.0))
-    if live.sum() < _FEWEST:
-        return None
-    ratio, weight = moved[live] / driven[live], np.abs(driven[live])
-    order = np.argsort(ratio)
-    total = np.cumsum(weight[order])
-    return float(ratio[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
 def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:

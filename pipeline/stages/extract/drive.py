@@ -14,13 +14,14 @@ from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract import reading
 from pipeline.stages.finding import Finding
-from pipeline.vehicles import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit
+from pipeline.vehicles import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit, list_factors
+from pipeline.vehicles.message_types import find_type
 from pipeline.vehicles.presets import OwnUnit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.vehicles.configuration import Unit
+    import polars as pl
 
 Floats = NDArray[np.float64]
 
@@ -32,11 +33,11 @@ _USUAL_UNITS = {
     DriveForm.BODY: ("m/s", "rad/s"),
     DriveForm.STEERING: ("m/s", "rad"),
 }
-_UNIT_GAINS: dict[Unit, float] = {"rpm": 60.0 / (2.0 * np.pi), "deg/s": 180.0 / np.pi}
 _UNIT_NEAR = 0.1
 _LIVE = 0.2
 _STILL_RADPS = 0.05
 _FEWEST_LIVE = 50
+_FEWEST = 20
 _COUNTERS = (2.0**16, 2.0**32)
 """After so many ticks counters of encoders begin again."""
 
@@ -67,7 +68,7 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     """Joint states: wheels by joint name, averaged a side.
 
     Args:
-        columns: a JointState topic with `name`, `velocity`, `position`.
+        columns: a topic of a type that has wheels by name.
         times: time of each message [s].
         section: joint names, unit, sign.
         vehicle: whose wheel radius turns a speed in m/s into rad/s.
@@ -75,11 +76,7 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     Raises:
         StageError: no joint can be told to be on a side, or there is neither velocity nor position.
     """
-    names = columns.fields["name"]
-    if not isinstance(names, RaggedStrings):
-        raise _no_wheels(columns.topic, ())
-    velocity = _joint_matrix(columns.fields["velocity"], names)
-    position = _joint_matrix(columns.fields["position"], names)
+    velocity, position = _read_series(columns)
     joints = sorted(set(velocity) | set(position))
     rolling = [
         joint for joint in joints if joint != section.steering_joint and not _STEERS.search(joint.lower())
@@ -127,7 +124,7 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     return Drive(left=sides[0], right=sides[1], findings=tuple(found))
 
 
-def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> Unit | None:
+def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> str | None:
     """Unit of velocities that are not what the positions beside them turn in rad/s; None where they are.
 
     Only a gain that is a unit's, and the same throughout, tells one.
@@ -144,8 +141,8 @@ def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> U
         if float(np.median(np.abs(ratio - gain))) > _UNIT_NEAR * abs(gain):
             return None
         gains.append(gain)
-    for unit, gain in _UNIT_GAINS.items():
-        if gains and all(abs(one / gain - 1.0) < _UNIT_NEAR for one in gains):
+    for unit, factor in list_factors("rad/s").items():
+        if gains and all(abs(one * factor - 1.0) < _UNIT_NEAR for one in gains):
             return unit
     return None
 
@@ -163,6 +160,52 @@ def _mean_steering(position: Mapping[str, Floats], configured: str | None, topic
         )
     mean: Floats = np.mean(found, axis=0)
     return mean
+
+
+def _read_series(columns: TopicColumns) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """Velocities and positions by joint name."""
+    joints = find_type(columns.type_name).joints
+    names = None if joints is None else columns.fields[joints.names]
+    if joints is None or not isinstance(names, RaggedStrings):
+        raise _no_wheels(columns.topic, ())
+    if not joints.interfaces:
+        velocity, position = (
+            _joint_matrix(columns.fields[field], names) for field in (joints.velocity, joints.position)
+        )
+        return velocity, position
+    interfaces, values = columns.fields[joints.interfaces], columns.fields[joints.values]
+    if not isinstance(interfaces, RaggedStrings) or not isinstance(values, Ragged):
+        raise _no_wheels(columns.topic, names.values)
+    table = _read_interfaces(names, interfaces, values)
+    if table is None:
+        raise _no_wheels(columns.topic, names.values)
+    velocity, position = (
+        {joint: series for (joint, each), series in table.items() if each == quantity}
+        for quantity in (joints.velocity, joints.position)
+    )
+    return velocity, position
+
+
+def _read_interfaces(
+    names: RaggedStrings, interfaces: RaggedStrings, values: Ragged
+) -> dict[tuple[str, str], Floats] | None:
+    """Series by joint and quantity; None unless all messages have the same joints with the same quantities.
+
+    The names of quantities stand end to end, those of one joint after those of another. No joint has a name
+    twice, so that they repeat once a joint only where all joints have the same ones.
+    """
+    joints, quantities, numbers = names.fixed(), interfaces.fixed(), values.fixed()
+    if joints is None or quantities is None or numbers is None or not joints.size:
+        return None
+    alike = (joints == joints[0]).all() and (quantities == quantities[0]).all()
+    each, rest = divmod(quantities.shape[1], joints.shape[1])
+    if not alike or rest or quantities.shape != numbers.shape:
+        return None
+    blocks = quantities[0].reshape(joints.shape[1], each)
+    if (blocks != blocks[0]).any() or np.unique(blocks[0]).size != each:
+        return None
+    keys = [(joint, quantity) for joint in names.row(0) for quantity in interfaces.row(0)[:each]]
+    return {key: numbers[:, place].astype(np.float64) for place, key in enumerate(keys)}
 
 
 def _joint_matrix(values: object, names: RaggedStrings) -> dict[str, Floats]:
@@ -238,7 +281,10 @@ def read_signal(
         ConfigurationError: ``unit_unknown``.
     """
     signal = source.signals[number]
-    raw = np.mean([reading.numbers(columns, path) for path in signal.fields()], axis=0) * signal.sign
+    paths = [reading.numbers(columns, path) for path in signal.fields()]
+    # A controller of one wheel has no second: an element that no message has is none to average.
+    there = [values for values in paths if np.isfinite(values).any()] or paths
+    raw = np.mean(there, axis=0) * signal.sign
     own = dict(vehicle.units)
     per_turn = section.per_turn
     if per_turn is None and signal.per_turn:
@@ -327,3 +373,20 @@ def read_steering(speed: Floats, steering: Floats, vehicle: Vehicle) -> Drive:
             hint='Set vehicle.kind = "ackermann" and vehicle.wheelbase_m.',
         )
     return Drive(speed=speed, steering=steering)
+
+
+def read_speed(table: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats] | None:
+    """Times [s] and speed ahead [m/s] of a table of wheels or commands; None where it has too few.
+
+    Args:
+        table: `wheels` or `commands`.
+        vehicle: whose wheel radius turns wheel speeds into one.
+    """
+    if table.height < _FEWEST:
+        return None
+    if table["speed"].null_count() < table.height:
+        speed = table["speed"].to_numpy()
+    else:
+        speed = 0.5 * vehicle.wheel_radius_m * (table["left"] + table["right"]).to_numpy()
+    known = np.isfinite(speed)
+    return (table["t"].to_numpy()[known], speed[known]) if known.sum() >= _FEWEST else None

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.core import rigid
 from pipeline.logs import Strings, TopicColumns, Wanted, wanted_transforms
 from pipeline.stages.errors import StageError
-from pipeline.vehicles import DriveForm, DriveSource, PoseSource, Signal, Sources
+from pipeline.vehicles import DriveForm, DriveSource, PoseContent, PoseSource, Signal, Sources
 from pipeline.vehicles.message_types import find_type, plain_type
 from pipeline.vehicles.topics import TRANSFORM_TYPES
 
@@ -23,6 +23,8 @@ Floats = NDArray[np.float64]
 _LONGEST_NAME = 200
 _NANOSECONDS = 1_000_000_000
 _NED_IN_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+_FRAME = "header.frame_id"
+_POLE_DEG = 90.0
 _FLU_IN_FRD = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -36,7 +38,12 @@ def drive_fields(source: DriveSource, types: dict[str, str]) -> list[Signal]:
     if source.form is DriveForm.JOINTS:
         topic = source.signals[0].topic
         joints = find_type(types[topic]).joints
-        names = () if joints is None else (joints.names, joints.velocity, joints.position)
+        if joints is None:
+            return []
+        values = (
+            (joints.interfaces, joints.values) if joints.interfaces else (joints.velocity, joints.position)
+        )
+        names = (joints.names, *values)
         return [Signal(topic, name) for name in names]
     fields = [Signal(signal.topic, path) for signal in source.signals for path in signal.fields()]
     fields += [Signal(signal.topic, signal.per_turn) for signal in source.signals if signal.per_turn]
@@ -61,16 +68,22 @@ def sideways_field(source: DriveSource, types: Mapping[str, str]) -> Signal | No
 
 def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:
     """Every field that poses of a topic need; none where they come from transforms."""
-    pose = None if source.from_transforms else find_type(types[source.topic]).pose
-    if pose is None:
+    if source.from_transforms:
         return []
-    names = [
-        *axis_fields(pose.position, "xyz"),
-        *axis_fields(pose.orientation, "xyzw"),
-        pose.parent,
-        pose.child,
-    ]
-    return [Signal(source.topic, name) for name in names if name]
+    kind = find_type(types[source.topic])
+    if source.content is PoseContent.POSE and kind.pose is not None:
+        axes = (*axis_fields(kind.pose.position, "xyz"), *axis_fields(kind.pose.orientation, "xyzw"))
+        named = (*axes, kind.pose.parent, kind.pose.child, kind.pose.names)
+        return [Signal(source.topic, name) for name in named if name]
+    fields = [Signal(source.topic, _FRAME)]
+    if kind.fix is not None:
+        names = (kind.fix.latitude, kind.fix.longitude, kind.fix.altitude, kind.fix.status)
+        fields += [Signal(source.topic, name) for name in names]
+    for topic in (source.topic, source.velocity):
+        velocity = find_type(types.get(topic, "")).ground_velocity
+        if velocity is not None:
+            fields += [Signal(topic, velocity.east), Signal(topic, velocity.north)]
+    return fields
 
 
 def list_wanted(
@@ -95,6 +108,8 @@ def list_wanted(
         imu = find_type(types[sources.imu.topic]).imu
         if imu is not None:
             names = [*axis_fields(imu.rate, "xyz"), *axis_fields(imu.force, "xyz")]
+            if imu.orientation and any(_is_by_satellites(source) for source in every):
+                names += axis_fields(imu.orientation, "xyzw")
             signals += [Signal(sources.imu.topic, name) for name in names]
     if sources.interval is not None:
         signals.append(Signal(sources.interval.topic, "data"))
@@ -105,6 +120,10 @@ def list_wanted(
             fields.append(signal.field)
     wanted = [Wanted(topic, (*fields, *_stamp_fields(types[topic]))) for topic, fields in by_topic.items()]
     return wanted + _list_wanted_transforms(every, types)
+
+
+def _is_by_satellites(source: DriveSource | PoseSource) -> bool:
+    return isinstance(source, PoseSource) and source.content is not PoseContent.POSE
 
 
 def _stamp_fields(kind: str) -> tuple[str, ...]:
@@ -149,6 +168,10 @@ class PoseArrays:
     parent: str
     child: str
 
+    def take(self, rows: NDArray[np.int64]) -> PoseArrays:
+        """Some of them, in that order."""
+        return replace(self, position=self.position[rows], quaternion=self.quaternion[rows])
+
 
 def read_pose_topic(columns: TopicColumns) -> PoseArrays:
     """Poses of a topic whose type has a pose, axes ahead, left, up."""
@@ -167,6 +190,46 @@ def read_pose_topic(columns: TopicColumns) -> PoseArrays:
         first_text(columns, pose.child) if pose.child else "",
     )
     return _turn_axes(arrays) if pose.convention == "ned_frd" else arrays
+
+
+def read_fixes(columns: TopicColumns) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+    """Latitude and longitude [deg], altitude [m] and whether there is a fix at all, each (n,)."""
+    fix = find_type(columns.type_name).fix
+    if fix is None:
+        raise StageError(
+            "no_pose",
+            f"{columns.type_name} holds no fix",
+            where=columns.topic,
+            hint="Name another pose.topic.",
+        )
+    latitude, longitude, altitude, status = (
+        numbers(columns, name) for name in (fix.latitude, fix.longitude, fix.altitude, fix.status)
+    )
+    # A receiver without a fix may say zero and zero, in the Gulf of Guinea.
+    there = (np.abs(latitude) <= _POLE_DEG) & (np.abs(longitude) <= 4.0 * _POLE_DEG)
+    there &= (latitude != 0.0) | (longitude != 0.0)
+    return latitude, longitude, altitude, there & (status >= 0.0)
+
+
+def read_ground_velocity(columns: TopicColumns) -> Floats:
+    """Velocities over ground as published [m/s], shape (n, 2)."""
+    velocity = find_type(columns.type_name).ground_velocity
+    names = () if velocity is None else (velocity.east, velocity.north)
+    return np.stack([numbers(columns, name) for name in names], axis=-1)
+
+
+def read_attitude(columns: TopicColumns) -> Floats | None:
+    """Quaternions (n, 4) of an IMU that gives them; None where it does not, or they were not read."""
+    imu = find_type(columns.type_name).imu
+    names = axis_fields(imu.orientation, "xyzw") if imu is not None and imu.orientation else []
+    if not names or any(name not in columns.fields for name in names):
+        return None
+    return np.stack([numbers(columns, name) for name in names], axis=-1)
+
+
+def frame_of(columns: TopicColumns) -> str:
+    """Frame in the headers of a topic; empty where there is none."""
+    return first_text(columns, _FRAME)
 
 
 def _turn_axes(arrays: PoseArrays) -> PoseArrays:

@@ -7,6 +7,7 @@ written all the same: the store moves them to quarantine, where they can be look
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +19,7 @@ from pipeline.logs import join_channels
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract import localization, reading
 from pipeline.stages.extract.absurd import remove_absurd
+from pipeline.stages.extract.bodies import read_bodies
 from pipeline.stages.extract.clocks import Recorded, TopicClock, align_clocks
 from pipeline.stages.extract.drive import (
     Drive,
@@ -26,12 +28,15 @@ from pipeline.stages.extract.drive import (
     read_joints,
     read_pair,
     read_signal,
+    read_speed,
 )
 from pipeline.stages.extract.intervals import Span, find_spans_given, find_spans_of_state, is_inside
+from pipeline.stages.extract.satellite import Receiver, locate_vehicle
 from pipeline.stages.extract.transforms import (
     chain_poses,
     describe_chain,
     describe_frame,
+    find_antenna,
     is_transforms,
     to_base_link,
 )
@@ -42,14 +47,16 @@ from pipeline.vehicles import (
     DriveForm,
     DriveSection,
     DriveSource,
+    PoseContent,
     PoseSource,
     Sources,
     Vehicle,
 )
 from pipeline.vehicles.configuration import IntervalSection
+from pipeline.vehicles.message_types import find_type
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from pipeline.logs import LogData, TopicColumns
 
@@ -126,12 +133,11 @@ class _Extraction:
 
     def run(self) -> Extracted:
         """All four tables."""
-        spans = self._find_spans()
         tables = {
-            "poses": self._poses(spans),
-            "commands": self._drive_table(self.sources.command, self.configuration.command, spans, held=True),
-            "wheels": self._wheel_table(spans),
-            "imu": self._imu(spans),
+            "poses": self._poses(),
+            "commands": self._commands,
+            "wheels": self._wheels,
+            "imu": self._imu(),
         }
         clocks: dict[str, dict[str, str | float]] = {
             clock.topic: {"clock": clock.clock, "latency_s": round(clock.latency_s, 6)}
@@ -216,7 +222,8 @@ class _Extraction:
             self.findings.append(Finding("duplicate_stamps", "warning", text, where=topic, count=twice))
         return usable[np.argsort(stamp, kind="stable")]
 
-    def _find_spans(self) -> list[Span] | None:
+    @cached_property
+    def _spans(self) -> list[Span] | None:
         """Spans in which commands are live; None when nothing restricts them."""
         sections = self.configuration.interval
         spans = find_spans_given(sections, self.where)
@@ -249,8 +256,8 @@ class _Extraction:
             )
         return spans
 
-    def _poses(self, spans: Sequence[Span] | None) -> pl.DataFrame:
-        source = self.sources.pose
+    def _poses(self) -> pl.DataFrame:
+        source, spans = self.sources.pose, self._spans
         if source is None:
             return pl.DataFrame()
         stamp, log_time, arrays, breaks = self._recorded_poses(source)
@@ -273,35 +280,68 @@ class _Extraction:
     def _recorded_poses(self, source: PoseSource) -> tuple[Stamps, Stamps, reading.PoseArrays, Flags]:
         """Stamps, log times and poses of base_link in time order, and where their clock jumped."""
         topic = source.topic
-        clock = self.clocks.get(topic)
-        if self.chain is not None:
-            recorded = reading.PoseArrays(
-                self.chain.position, self.chain.quaternion, self.chain.parent, self.chain.child
-            )
-            log_times = self.chain.log_time
-            self.findings += describe_chain(self.chain, topic)
-        else:
-            columns = self.columns.get(topic)
-            if columns is None:
-                raise self._nothing("pose", topic)
-            recorded, log_times = reading.read_pose_topic(columns), columns.log_time
+        clock, columns = self.clocks.get(topic), self.columns.get(topic)
         if clock is None or not clock.usable.any():
             raise self._nothing("pose", topic)
-        self.frames = (recorded.parent, recorded.child)
-        if self.chain is None:
-            self.findings += describe_frame(topic, recorded.parent)
-        order = self._order(clock)
+        if self.chain is not None:
+            chain, order = self.chain, self._order(clock)
+            arrays = reading.PoseArrays(chain.position, chain.quaternion, chain.parent, chain.child)
+            arrays, log_times = arrays.take(order), chain.log_time
+            self.findings += describe_chain(chain, topic)
+        elif columns is None:
+            raise self._nothing("pose", topic)
+        elif source.content is PoseContent.POSE:
+            arrays, log_times = self._read_poses(source, columns), columns.log_time
+            self.findings += describe_frame(topic, arrays.parent)
+            order = self._order(clock)
+            arrays = arrays.take(order)
+        else:
+            order, arrays = self._locate_vehicle(source)
+            log_times = columns.log_time
+        self.frames = (arrays.parent, arrays.child)
         stamp, log_time = clock.stamp[order], log_times[order]
         breaks = np.zeros(order.size, dtype=bool)
         for jump in clock.breaks:
             breaks[np.flatnonzero(log_time >= jump)[:1]] = True
-        arrays = reading.PoseArrays(
-            recorded.position[order], recorded.quaternion[order], recorded.parent, recorded.child
-        )
-        if self.chain is None:
+        if self.chain is None and source.content is PoseContent.POSE:
             arrays, more = to_base_link(arrays, self.data.topics, topic)
             self.findings += more
         return stamp, log_time, arrays, breaks
+
+    def _read_poses(self, source: PoseSource, columns: TopicColumns) -> reading.PoseArrays:
+        pose = find_type(columns.type_name).pose
+        if pose is None or not pose.names:
+            return reading.read_pose_topic(columns)
+        arrays, name = read_bodies(columns, pose, source.name, self.vehicle)
+        text = f"of the bodies of {source.topic}, {name!r} is the vehicle"
+        self.findings.append(Finding("body_chosen", "info", text, where=source.topic))
+        return arrays
+
+    def _locate_vehicle(self, source: PoseSource) -> tuple[NDArray[np.int64], reading.PoseArrays]:
+        """Messages of a receiver of satellites that give a pose, in time, and these poses."""
+        receiver, beside, imu = (
+            self._timed(topic)
+            for topic in (source.topic, source.velocity, self.sources.imu.topic if self.sources.imu else "")
+        )
+        if receiver is None:
+            raise self._nothing("pose", source.topic)
+        drives = (read_speed(table, self.vehicle) for table in (self._wheels, self._commands))
+        ahead = next((drive for drive in drives if drive is not None), None)
+        lever, more = find_antenna(self.data.topics, reading.frame_of(receiver.columns), source.topic)
+        made = locate_vehicle(receiver, beside, imu, ahead, lever)
+        self.findings += [*more, *made.findings]
+        if not made.rows.size:
+            raise self._nothing("pose", source.topic)
+        return made.rows, made.arrays
+
+    def _timed(self, topic: str) -> Receiver | None:
+        found = self._ordered(topic)
+        if found is None:
+            return None
+        columns, clock, order = found
+        # What shares its stamp with another has no place on a track.
+        order = order[np.diff(clock.stamp[order], prepend=np.iinfo(np.int64).min) > 0]
+        return Receiver(columns, self._seconds(clock.stamp), order)
 
     def _time_columns(self, times: Floats, stamp: Stamps, log_time: Stamps) -> dict[str, NDArray[np.generic]]:
         return {"t": times, "stamp": stamp, "log_time": log_time}
@@ -320,9 +360,11 @@ class _Extraction:
             hint=f"Choose another with {role}.topic in run.toml; `slip inspect` lists what there is.",
         )
 
-    def _drive_table(
-        self, source: DriveSource | None, section: DriveSection, spans: Sequence[Span] | None, *, held: bool
-    ) -> pl.DataFrame:
+    @cached_property
+    def _commands(self) -> pl.DataFrame:
+        return self._drive_table(self.sources.command, self.configuration.command, held=True)
+
+    def _drive_table(self, source: DriveSource | None, section: DriveSection, *, held: bool) -> pl.DataFrame:
         if source is None:
             return pl.DataFrame()
         if source.form is DriveForm.JOINTS:
@@ -346,16 +388,17 @@ class _Extraction:
         }
         absent = [name for name in values if getattr(drive, name) is None]
         frame = pl.DataFrame(
-            {**self._time_columns(times, stamp, log_time), **values, "active": is_inside(times, spans)}
+            {**self._time_columns(times, stamp, log_time), **values, "active": is_inside(times, self._spans)}
         )
         return frame.with_columns(pl.lit(None, dtype=pl.Float64).alias(name) for name in absent)
 
-    def _wheel_table(self, spans: Sequence[Span] | None) -> pl.DataFrame:
+    @cached_property
+    def _wheels(self) -> pl.DataFrame:
         """Measured wheels; where nobody named their topic, one without wheels is left out."""
         source = self.sources.wheels
         section = self.configuration.wheels
         try:
-            return self._drive_table(source, section, spans, held=False)
+            return self._drive_table(source, section, held=False)
         except SlipError as error:
             if source is None or section != DriveSection():
                 raise
@@ -410,7 +453,7 @@ class _Extraction:
         at = [np.searchsorted(stamps, union, side="right") - 1 for stamps in (first, second)]
         return union, log_time, (a[at[0]], b[at[1]])
 
-    def _imu(self, spans: Sequence[Span] | None) -> pl.DataFrame:
+    def _imu(self) -> pl.DataFrame:
         source = self.sources.imu
         found = self._ordered(source.topic) if source else None
         if found is None:
@@ -423,7 +466,7 @@ class _Extraction:
                 **self._time_columns(times, clock.stamp[order], columns.log_time[order]),
                 **{f"rate_{axis}": rates[order, i] for i, axis in enumerate("xyz")},
                 **{f"acceleration_{axis}": forces[order, i] for i, axis in enumerate("xyz")},
-                "active": is_inside(times, spans),
+                "active": is_inside(times, self._spans),
             }
         )
 

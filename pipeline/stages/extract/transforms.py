@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core import rigid
 from pipeline.logs import LogError, TopicColumns, TransformBuffer, TransformSeries
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract.localization import move_to_base, normalize_quaternions
@@ -17,6 +18,8 @@ from pipeline.vehicles.topics import TRANSFORM_TYPES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from numpy.typing import NDArray
 
     from pipeline.vehicles import PoseSource
 
@@ -116,13 +119,8 @@ def to_base_link(
     child = arrays.child.lstrip("/")
     if not child or child.rsplit("/", 1)[-1] in _BASES:
         return arrays, []
-    buffer = TransformBuffer([columns for columns in topics if is_transforms(columns)])
-    base = next((frame for frame in buffer.frames() if frame.rsplit("/", 1)[-1] == _BASES[0]), "")
-    try:
-        offset = buffer.lookup_series(child, base, at=np.zeros(1, dtype=np.int64)) if base else None
-    except LogError:
-        offset = None
-    if offset is None or offset.position.shape[0] == 0:
+    base, offset = _find_base(topics, child)
+    if offset is None:
         text = (
             f"{topic} gives poses of {child!r}, and no static transform leads from there to base_link: "
             "they were taken as poses of base_link (a lever arm would look like lateral slip in turns)"
@@ -137,3 +135,38 @@ def to_base_link(
     text = f"{topic} gives poses of {child!r}: moved to base_link through the static transforms"
     moved = PoseArrays(position, quaternion, arrays.parent, base)
     return moved, [Finding("child_frame", "info", text, where=topic)]
+
+
+def find_antenna(
+    topics: Sequence[TopicColumns], frame: str, topic: str
+) -> tuple[NDArray[np.float64], list[Finding]]:
+    """Place of an antenna in base_link [m], shape (3,); zero where no static transform says it.
+
+    Args:
+        topics: all topics that were read.
+        frame: of the antenna, in the headers of its topic.
+        topic: that topic.
+    """
+    _, offset = _find_base(topics, frame.lstrip("/"))
+    if offset is None:
+        text = (
+            f"no static transform places the antenna of {topic} ({frame or 'no frame'}) on the vehicle: "
+            "it was taken to be at base_link (a lever arm would look like lateral slip in turns)"
+        )
+        return np.zeros(3), [Finding("child_frame", "warning", text, where=topic)]
+    lever = -rigid.rotate(rigid.invert_quaternions(offset.quaternion), offset.position)[0]
+    text = (
+        f"{topic} is of an antenna {lever[0]:.2g} m ahead and {lever[1]:.2g} m left of base_link: moved there"
+    )
+    return lever, [Finding("child_frame", "info", text, where=topic)]
+
+
+def _find_base(topics: Sequence[TopicColumns], child: str) -> tuple[str, TransformSeries | None]:
+    """The base's frame and its pose in a frame of the vehicle; None where no static transform leads there."""
+    buffer = TransformBuffer([columns for columns in topics if is_transforms(columns)])
+    base = next((frame for frame in buffer.frames() if frame.rsplit("/", 1)[-1] == _BASES[0]), "")
+    try:
+        offset = buffer.lookup_series(child, base, at=np.zeros(1, dtype=np.int64)) if base else None
+    except LogError:
+        offset = None
+    return base, offset if offset is not None and offset.position.shape[0] else None

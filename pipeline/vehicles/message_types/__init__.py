@@ -7,6 +7,7 @@ of
   or ``steering`` (speed, steering angle); fields joined by ``+`` are averaged;
 - ``number``: one field; what it is of says ``quantity`` or the topic's name;
 - ``joints``, ``pose``, ``imu``: fields of wheels by name, of a pose, of a gyro;
+- ``fix``, ``ground_velocity``: a place on Earth, a velocity east and north;
 - ``stamp``: when the data were taken, where there is no header.
 
 ``pairs`` lists topics that belong together by name.
@@ -58,28 +59,66 @@ class NumberField(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class JointFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Wheels by name."""
+    """Wheels by name.
+
+    Attributes:
+        names: of the joints.
+        velocity, position: a value a joint; where ``interfaces`` is given, the names of these quantities.
+        interfaces: names of the quantities of every joint, one joint after the other.
+        values: the quantities.
+    """
 
     names: str
     velocity: str
     position: str
+    interfaces: str = ""
+    values: str = ""
 
 
 class PoseFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A pose: structures with x, y, z(, w), or their fields one by one, the quaternion's w last."""
+    """A pose: structures with x, y, z(, w), or their fields one by one, the quaternion's w last.
+
+    Attributes:
+        position: [m].
+        orientation: quaternion.
+        parent: field with the name of the frame it is given in.
+        child: field with the name of the frame it places.
+        names: field with the names of several bodies; position and orientation are sequences of as many.
+        fixed: name of the frame where no field says it.
+        convention: axes of the frames.
+    """
 
     position: str | list[str]
     orientation: str | list[str]
     parent: str = ""
     child: str = ""
+    names: str = ""
+    fixed: str = ""
     convention: Convention = "flu"
 
 
+class FixFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A place on Earth [deg], [m]; a status below zero is no fix."""
+
+    latitude: str
+    longitude: str
+    altitude: str
+    status: str
+
+
+class GroundVelocityFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A velocity east and north [m/s], on topics whose names say that satellites told it."""
+
+    east: str
+    north: str
+
+
 class ImuFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Angular velocity [rad/s] and specific force [m/s^2]."""
+    """Angular velocity [rad/s] and specific force [m/s^2]; perhaps an attitude."""
 
     rate: str | list[str]
     force: str | list[str]
+    orientation: str = ""
     convention: Convention = "flu"
 
 
@@ -97,6 +136,8 @@ class MessageType(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     number: NumberField | None = None
     joints: JointFields | None = None
     pose: PoseFields | None = None
+    fix: FixFields | None = None
+    ground_velocity: GroundVelocityFields | None = None
     imu: ImuFields | None = None
     stamp: StampField | None = None
 

@@ -1,0 +1,224 @@
+"""Poses of satellite navigation: places on a plane, and a heading that is never pretended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from stage_logs import PLAIN, Taken, TakeThrough, rms, slope
+
+from pipeline.logs import TopicColumns
+from pipeline.simulate import Imu, Layout, PoseSensor, PoseTopic, Scenario
+from pipeline.simulate.geodesy import to_earth
+from pipeline.simulate.platforms import fix, ground_velocity, imu, joints, twist
+from pipeline.simulate.published import Published
+from pipeline.stages.extract.course import follow_track, read_over_ground
+from pipeline.stages.extract.satellite import Receiver, locate_vehicle, to_local_plane
+from pipeline.vehicles import PoseContent
+from pipeline.vehicles.candidates import Topics
+
+FOUR = ("front_left", "front_right", "rear_left", "rear_right")
+SKIDDING = replace(
+    PLAIN,
+    duration_s=90.0,
+    pose=PoseSensor(noise_m=0.005),
+    effects={"drive_lag": 0.3, "effective_track": 1.5, "lateral_skid": 0.08},
+)
+ANTENNA = Published(
+    "/tf_static",
+    "tf2_msgs/msg/TFMessage",
+    "once",
+    {
+        "transforms[].header.frame_id": "base_link",
+        "transforms[].child_frame_id": "gps_link",
+        "transforms[].transform.translation.x": 0.4,
+        "transforms[].transform.rotation.w": 1.0,
+    },
+)
+
+
+def publishing(scenario: Scenario, *topics: Published) -> Scenario:
+    """A scenario that publishes a twist, joint states and some topics."""
+    drive = (twist("/cmd_vel", stamped=True), joints("/joint_states", "{}_wheel_joint", FOUR))
+    layout = Layout("differential", (), (), PoseTopic("odometry", ""), topics=(*drive, *topics))
+    return replace(scenario, recording=replace(scenario.recording, layout=layout))
+
+
+def lateral_skid(taken: Taken) -> float:
+    """c of v_y = -c v w."""
+    table = taken.velocities.select("v_x", "v_y", "v_w").drop_nulls()
+    return -slope(table["v_x"] * table["v_w"], table["v_y"])
+
+
+def test_a_fix_is_placed_where_a_surveyor_would() -> None:
+    # A thousandth of a degree at the equator: 110.574 m of a meridian, 111.320 m of the equator.
+    degrees = np.array([0.0, 1e-3, 0.0])
+    placed = to_local_plane(degrees, degrees[[0, 2, 1]], np.array([np.nan, np.nan, np.nan]))
+    np.testing.assert_allclose(placed[:, :2], [[0.0, 0.0], [0.0, 110.574], [111.320, 0.0]], atol=1e-3)
+
+
+def test_places_of_the_simulated_earth_come_back() -> None:
+    places = np.random.default_rng(1).uniform(-2e3, 2e3, (50, 3)) * [1.0, 1.0, 0.01]
+    places[0] = 0.0
+    np.testing.assert_allclose(to_local_plane(*to_earth(places)), places, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("topics", "sign"),
+    [
+        ((fix("/gps/fix"), imu("/imu")), 1.0),
+        ((ground_velocity("/gps/vel"), imu("/imu")), -1.0),
+        ((fix("/fix"), ground_velocity("/vel"), ANTENNA, imu("/imu", attitude=True)), 1.0),
+    ],
+    ids=["fixes", "velocities and a gyro upside down", "both, an antenna ahead and an attitude"],
+)
+def test_with_an_imu_sideways_slip_is_seen(
+    drive: TakeThrough, topics: tuple[Published, ...], sign: float
+) -> None:
+    ahead = PoseSensor(noise_m=0.005, child_frame="gps_link", mount_x_m=0.4)
+    sensor = ahead if ANTENNA in topics else SKIDDING.pose
+    taken = drive(publishing(replace(SKIDDING, pose=sensor, imu=Imu(sign=sign)), *topics))
+    assert lateral_skid(taken) == pytest.approx(0.08, abs=0.02)
+    assert taken.velocities["segment"].n_unique() == 1
+    assert "heading_from_imu" in taken.ids()
+    assert "heading_from_course" not in taken.ids()
+
+
+def test_without_an_imu_the_course_is_the_heading_and_that_is_said(drive: TakeThrough) -> None:
+    taken = drive(publishing(SKIDDING, fix("/gps/fix"), ground_velocity("/gps/vel")))
+    said = taken.finding("heading_from_course")
+    assert said.severity == "warning"
+    assert "sideways slip cannot be seen" in said.text
+    # Two seconds at either end and some of the steps stand, and a standing vehicle has no course.
+    assert said.value is not None
+    assert 0.04 < said.value < 0.4
+    assert abs(lateral_skid(taken)) < 0.02
+    moving = taken.slip("measured").filter(~pl.col("transitory") & (pl.col("v_x").abs() > 0.3))
+    assert moving.height > 300
+    assert rms(moving["g_x"]) < 0.05
+
+
+@pytest.mark.parametrize("turns", [True, False], ids=["with a gyro", "without"])
+def test_driving_backwards_turns_no_heading_round(drive: TakeThrough, turns: bool) -> None:  # noqa: FBT001
+    topics = (fix("/gps/fix"), *((imu("/imu"),) if turns else ()))
+    taken = drive(publishing(SKIDDING, *topics))
+    ideal = taken.slip("measured").filter(~pl.col("transitory"))
+    backwards = ideal.filter(pl.col("f_x") < -0.3)
+    assert backwards.height > 100
+    assert float(backwards["v_x"].median()) < -0.25  # type: ignore[arg-type]
+    assert slope(ideal["f_x"], ideal["v_x"]) == pytest.approx(1.0, abs=0.05)
+
+
+def receive(change: Callable[[dict[str, np.ndarray]], object]) -> Receiver:
+    """A minute of fixes at 5 Hz of a vehicle that drives north-east, changed."""
+    times = np.arange(300) / 5.0
+    way = np.stack((times, times, np.zeros_like(times)), axis=-1)
+    latitude, longitude, altitude = to_earth(way)
+    status = np.zeros(times.size)
+    fields = {"latitude": latitude, "longitude": longitude, "altitude": altitude, "status.status": status}
+    change(fields)
+    stamps = (times * 1e9).astype(np.int64)
+    columns = TopicColumns("/fix", 1, "sensor_msgs/msg/NavSatFix", stamps, stamps, stamps, fields, ())
+    return Receiver(columns, times, np.arange(times.size))
+
+
+@pytest.mark.parametrize(
+    ("change", "lost"),
+    [
+        (lambda fields: fields["status.status"].__setitem__(slice(50, 80), -1.0), 30),
+        (lambda fields: [fields[name].__setitem__(7, 0.0) for name in ("latitude", "longitude")], 1),
+        (lambda fields: fields["latitude"].__setitem__(slice(0, 5), np.nan), 5),
+        (lambda fields: fields["latitude"].__setitem__(3, 1e9), 1),
+    ],
+    ids=["a status below zero", "zero and zero", "no number", "beyond the pole"],
+)
+def test_what_is_no_fix_is_left_out_and_counted(change: Callable[..., object], lost: int) -> None:
+    made = locate_vehicle(receive(change), None, None, None, np.zeros(3))
+    (said,) = [finding for finding in made.findings if finding.id == "no_fix"]
+    assert said.count == lost
+    assert made.rows.size == 300 - lost
+    assert np.isfinite(made.arrays.position).all()
+
+
+def test_an_altitude_that_is_not_known_moves_nothing_sideways() -> None:
+    made = locate_vehicle(
+        receive(lambda fields: fields["altitude"].fill(np.nan)), None, None, None, np.zeros(3)
+    )
+    moved = np.diff(made.arrays.position[:, :2], axis=0)
+    np.testing.assert_allclose(moved, 0.2, rtol=1e-3)
+    yaw = 2.0 * np.arctan2(made.arrays.quaternion[:, 2], made.arrays.quaternion[:, 3])
+    np.testing.assert_allclose(yaw, np.pi / 4.0, atol=1e-2)
+    assert "direction_assumed" in {finding.id for finding in made.findings}
+
+
+@pytest.mark.parametrize("count", [0, 1, 30])
+def test_a_log_with_hardly_a_fix_has_no_pose_and_no_crash(count: int) -> None:
+    whole = receive(lambda _: None)
+    few = replace(whole, order=whole.order[:count])
+    stamps = whole.columns.log_time[:0]
+    silent = TopicColumns("/imu", 2, "sensor_msgs/msg/Imu", stamps, stamps, stamps, {}, ())
+    made = locate_vehicle(few, None, Receiver(silent, np.zeros(0), whole.order[:0]), None, np.zeros(3))
+    assert made.rows.size == (count if count == 30 else 0)
+    assert made.arrays.position.shape == (made.rows.size, 3)
+
+
+def test_a_topic_that_repeats_its_fixes_counts_each_once() -> None:
+    def hold(fields: dict[str, np.ndarray]) -> None:
+        for values in fields.values():
+            values[1::2] = values[::2]
+
+    made = locate_vehicle(receive(hold), None, None, None, np.zeros(3))
+    assert made.rows.size == 150
+
+
+def test_velocities_that_give_north_first_are_recognized_and_those_of_the_body_refused() -> None:
+    times = np.arange(600) / 10.0
+    heading = 0.2 * times
+    east, north = np.cos(heading), np.sin(heading)
+    place = np.stack((np.sin(heading) / 0.2, -np.cos(heading) / 0.2, np.zeros_like(times)), axis=-1)
+    plain = np.stack((east, north), axis=-1)
+    for published in (plain, plain[:, ::-1]):
+        read = read_over_ground(times, place, times, published)
+        np.testing.assert_array_equal(read, plain)
+    body = np.stack((np.ones_like(times), np.zeros_like(times)), axis=-1)
+    assert read_over_ground(times, place, times, body) is None
+
+
+def test_about_a_change_of_direction_the_course_is_not_known() -> None:
+    times = np.arange(400) / 20.0
+    speed = np.where(times < 10.0, 0.5, -0.5)
+    place = np.stack((10.0 - np.abs(times - 10.0), np.zeros_like(times), np.zeros_like(times)), axis=-1) * 0.5
+    course = follow_track(times, place, (times, speed))
+    angle, known = course.angles()
+    np.testing.assert_allclose(np.cos(angle[known]), 1.0, atol=1e-3)
+    assert not known[np.abs(times - 10.0) < 0.5].any()
+    assert known[np.abs(times - 10.0) > 1.5].all()
+
+
+@pytest.mark.parametrize(
+    ("types", "found"),
+    [
+        ({"/panther/gps/vel": "geometry_msgs/TwistStamped"}, ["/panther/gps/vel"]),
+        ({"/vel": "geometry_msgs/TwistStamped", "/fix": "sensor_msgs/NavSatFix"}, ["/vel"]),
+        ({"/vel": "geometry_msgs/TwistStamped"}, []),
+        ({"/ublox/fix_velocity": "geometry_msgs/TwistWithCovarianceStamped"}, ["/ublox/fix_velocity"]),
+        ({"/gps_guidance/cmd_vel": "geometry_msgs/TwistStamped"}, []),
+    ],
+)
+def test_a_velocity_over_ground_is_no_command(types: dict[str, str], found: list[str]) -> None:
+    topics = Topics(types)
+    assert topics.ground_velocities() == found
+    commands = {str(source) for _, source in topics.list_drives(commanded=True, steered=False)}
+    assert commands.isdisjoint(found)
+
+
+def test_fixes_take_the_velocities_beside_them(drive: TakeThrough, tmp_path: Path) -> None:
+    del tmp_path
+    short = replace(SKIDDING, duration_s=20.0)
+    pose = drive(publishing(short, fix("/gps/fix"), ground_velocity("/gps/vel"))).sources.pose
+    assert pose is not None
+    assert (pose.topic, pose.velocity, pose.content) == ("/gps/fix", "/gps/vel", PoseContent.FIX)
