@@ -53,6 +53,7 @@ class Excitation(enum.Enum):
     SMALL = "commands near zero"
     LONG = "a run of several minutes"
     STEERING = "steering to both sides"
+    SIDEWAYS = "driving sideways"
 
 
 class Search(enum.Enum):
@@ -159,8 +160,12 @@ class Part:
     factor: float
 
 
-DIFFERENTIAL = ("differential",)
 ACKERMANN = ("ackermann",)
+SIDEWAYS = ("mecanum", "omni")
+SIDES = ("differential", *SIDEWAYS)
+"""Vehicles that turn by a difference of speed between their sides."""
+WHEELED = ("differential", "ackermann", "mecanum")
+"""Vehicles whose single wheels are known."""
 ANY = list_kinds()
 
 

@@ -69,6 +69,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         topic: JointState, body command (Twist, TwistStamped) or AckermannDrive(Stamped).
         left: joint names of the left side.
         right: joint names of the right side.
+        front: joint names of the front wheels (mecanum).
         left_topic: topic of the left side.
         right_topic: topic of the right side.
         speed_topic: speed, or forward speed of a body command when ``yaw_rate_topic`` is given.
@@ -85,6 +86,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     topic: str | None = None
     left: list[str] | None = None
     right: list[str] | None = None
+    front: list[str] | None = None
     left_topic: str | None = None
     right_topic: str | None = None
     speed_topic: str | None = None

@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.models.effect import (
     DATA_SHEET,
-    DIFFERENTIAL,
+    SIDES,
     NAN,
     DriveEffect,
     Excitation,
@@ -43,7 +43,7 @@ class TurnDroop(DriveEffect):
 
     id = "turn_droop"
     rank = 40
-    kinds = DIFFERENTIAL
+    kinds = SIDES
     parameters = (
         Parameter(
             "threshold",

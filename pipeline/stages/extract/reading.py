@@ -51,7 +51,7 @@ def is_of_base(source: DriveSource, types: Mapping[str, str]) -> bool:
 
 
 def sideways_field(source: DriveSource, types: Mapping[str, str]) -> Signal | None:
-    """Where a body command of a known type asks for sideways motion."""
+    """Where a body motion of a known type says how it goes sideways."""
     topic = source.signals[0].topic
     drive = find_type(types[topic]).drive
     if source.form is not DriveForm.BODY or not source.name or drive is None or not drive.sideways:

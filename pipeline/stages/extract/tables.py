@@ -45,6 +45,7 @@ from pipeline.vehicles import (
     PoseSource,
     Sources,
     Vehicle,
+    list_presets,
 )
 from pipeline.vehicles.configuration import IntervalSection
 
@@ -334,14 +335,16 @@ class _Extraction:
             stamp, log_time, (first, second) = self._read_pair(source, section, held=held)
             topic = source.signals[0].topic
             nominal = not held and reading.is_of_base(source, {topic: self.columns[topic].type_name})
-            drive = read_pair(source.form, first, second, section, self.vehicle, nominal=nominal)
-            self.findings += self._check_sideways(source)
+            sideways = self._read_sideways(source, held=held)
+            drive = read_pair(
+                source.form, first, second, section, self.vehicle, nominal=nominal, sideways=sideways
+            )
         self.findings += drive.findings
         times = self._seconds(stamp)
         empty = np.full(times.size, np.nan)
         values = {
             name: empty if (series := getattr(drive, name)) is None else series
-            for name in ("left", "right", "speed", "steering", "body_x", "body_w")
+            for name in Drive.list_signals()
             if held or not name.startswith("body")
         }
         absent = [name for name in values if getattr(drive, name) is None]
@@ -369,20 +372,40 @@ class _Extraction:
             raise self._nothing("command" if held else "wheels", topic)
         return found
 
-    def _check_sideways(self, source: DriveSource) -> list[Finding]:
-        """Commands that no vehicle of this kind can follow: it moves along its wheels alone."""
+    def _read_sideways(self, source: DriveSource, *, held: bool) -> Floats | None:
+        """Speed to the left of a body motion [m/s], in the order of `_read_pair`; None where it has none.
+
+        Raises:
+            StageError: ``no_sideways``, the vehicle moves sideways and a measured body motion does not say how.
+        """
         topic = source.signals[0].topic
-        columns = self.columns[topic]
-        signal = reading.sideways_field(source, {topic: columns.type_name})
+        signal = reading.sideways_field(source, {topic: self.columns[topic].type_name})
+        moves = self.vehicle.kinematics.has_inputs("sideways")
         if signal is None:
-            return []
-        share = float(np.mean(np.abs(reading.numbers(columns, signal.field)) > _SIDEWAYS_MPS))
+            if moves and not held:
+                raise StageError(
+                    "no_sideways",
+                    f"{source} does not say how {self.vehicle.name} moves sideways",
+                    where=topic,
+                    hint="Configure an odometry, or a JointState of all wheels.",
+                )
+            return None
+        columns, _, order = self._require(topic, held=held)
+        sideways = reading.numbers(columns, signal.field)[order]
+        if not moves and held:
+            self.findings += self._check_sideways(sideways, topic)
+        return sideways if moves else None
+
+    def _check_sideways(self, sideways: Floats, topic: str) -> list[Finding]:
+        """Commands that no vehicle of this kind can follow: it moves along its wheels alone."""
+        share = float(np.mean(np.abs(sideways) > _SIDEWAYS_MPS))
         if share < _SIDEWAYS_SHARE:
             return []
         text = (
             f"{share:.0%} of the commands of {topic} ask for sideways motion, which {self.vehicle.name} "
-            f"({self.vehicle.kind}) cannot do: mecanum and other omnidirectional drives have no model here, "
-            "and that motion is left out"
+            f"({self.vehicle.kind}) cannot do, and that motion is left out: are its wheels mecanum or omni "
+            'wheels? Then [vehicle] kind = "mecanum" (wheelbase_m is needed) or "omni" in run.toml, or --vehicle '
+            f"with one of {', '.join(p.id for p in list_presets() if p.kinematics.has_inputs('sideways'))}"
         )
         return [Finding("sideways_command", "error", text, where=topic, value=share)]
 
@@ -432,6 +455,6 @@ def _take(drive: Drive, order: NDArray[np.int64]) -> Drive:
     """A drive's signals in another order."""
     series = {
         name: None if (values := getattr(drive, name)) is None else values[order]
-        for name in ("left", "right", "speed", "steering", "body_x", "body_w")
+        for name in Drive.list_signals()
     }
     return Drive(**series, findings=drive.findings)

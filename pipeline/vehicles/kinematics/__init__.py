@@ -76,6 +76,10 @@ class Kinematics(ABC):
         del vehicle
         return 0.0
 
+    def turning_width_m(self, vehicle: Vehicle) -> float:
+        """Over which a difference of speed between the sides turns the vehicle [m]; one where it is not known."""
+        return vehicle.track_width_m or 1.0
+
     def has_inputs(self, *names: str) -> bool:
         """Whether the drive is told all of these."""
         return set(names) <= {quantity.name for quantity in self.inputs}
