@@ -17,6 +17,7 @@ import msgspec
 from pipeline.logs import LogError, Strings, Wanted, read_topics
 from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.extract.choice import PoseRating, fit_geometry, rate_poses, replace_pose
+from pipeline.stages.extract.reading import find_sideways_share
 from pipeline.stages.finding import Finding
 from pipeline.vehicles import (
     CONFIGURED,
@@ -262,6 +263,9 @@ def _fit_vehicle(
     drive = next((one for one in drives if one.form is not DriveForm.BODY), None)
     if not drives or data is None:
         raise problem
+    if configuration.vehicle.kind is None and find_sideways_share(data.topics, sources.command):
+        # Where rollers stand on which wheels nobody says: body motion is all that can be told.
+        vehicle, drive = msgspec.structs.replace(vehicle, kind="omni"), None
     if drive is None:
         values: dict[str, float] = {"wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": _STAND_IN_TRACK_M}
         name = "fitted_body"
@@ -269,6 +273,8 @@ def _fit_vehicle(
             "no vehicle is named and none is needed: the drive is told and measured as body motion, whose "
             "slip does not depend on wheel radius and track width"
         )
+        if vehicle.kind == "omni":
+            text += " (it is asked to move sideways: as mecanum wheels their joints are read with --vehicle)"
     else:
         measured = replace(sources, wheels=drive, command=None, imu=None, interval=None)
         made = extract_tables(data, measured, configuration, vehicle, where=where)

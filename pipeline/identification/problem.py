@@ -95,7 +95,7 @@ class Problem:
             self.whole = BodyPart(self.comparisons)
             self.parts = (
                 BodyPart(measured, delays, whole=False),
-                WheelPart(self.comparisons, measured, speed=self.largest.speed, turn=self.largest.turn),
+                WheelPart(self.comparisons, measured, self.largest),
             )
 
     def _compare(self, source: Input) -> tuple[Comparison, ...]:

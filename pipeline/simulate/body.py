@@ -99,7 +99,9 @@ def _roll_wheels(drive: Drive, vehicle: Vehicle, effects: Effects) -> tuple[Floa
     s0 = np.zeros_like(v0)
     if drive.corners is not None:
         radii = {place: radius * (1.0 + uneven * (1 if "right" in place else -1)) for place in drive.corners}
-        rims = {place: radii[place] / vehicle.wheel_radius_m * wheel for place, wheel in drive.corners.items()}
+        rims = {
+            place: radii[place] / vehicle.wheel_radius_m * wheel for place, wheel in drive.corners.items()
+        }
         v0, s0, w0 = move_by_corners(vehicle, rims)
         s0, w0 = s0 * effects.value("lateral_scale", "k"), w0 / effects.value("effective_track", "k")
     elif vehicle.kind == "ackermann":

@@ -137,7 +137,9 @@ def _write_wheels(run: SimulatedRun, layout: Layout, topic: WheelTopic) -> list[
         turning = [wheels.left if side == "left" else wheels.right for side in sides]
         if wheels.corners is not None and wheels.corner_angles is not None:
             # The same order as the names.
-            turned, turning = ([by[place] for place in CORNERS] for by in (wheels.corner_angles, wheels.corners))
+            turned, turning = (
+                [by[place] for place in CORNERS] for by in (wheels.corner_angles, wheels.corners)
+            )
     fields: dict[str, Field] = {"name": names}
     if encoders.report != "velocity" or vehicle.kind == "ackermann":
         fields["position"] = np.stack(turned, axis=1)

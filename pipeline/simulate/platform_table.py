@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 from pipeline.simulate.errors import unknown_name
+from pipeline.simulate.mecanum_table import MECANUM_PLATFORMS
 from pipeline.simulate.platforms import (
     Fields,
     Platform,
@@ -139,6 +140,7 @@ _ROSBOT = _vehicle("rosbot", 0.0425, 0.186, 0.17, 0.9, 2.0, 1.45)
 _WHEELED = "{}_wheel_joint"
 
 PLATFORMS: dict[str, Platform] = {
+    **MECANUM_PLATFORMS,
     "husky_a200": _clearpath("a200", _A200),
     "jackal": _clearpath("j100", _J100),
     "warthog": _clearpath("w200", _W200),

@@ -77,9 +77,7 @@ VEHICLES: dict[str, Vehicle] = {
     "turtlebot3": Vehicle(
         "turtlebot3_burger", "differential", 0.033, 0.16, 0.08, 0.22, max_turn_radps=2.0, wheels_per_side=1
     ),
-    "youbot": Vehicle(
-        "youbot", "mecanum", 0.0475, 0.3, 0.47, 0.8, max_turn_radps=1.2, max_sideways_mps=0.8
-    ),
+    "youbot": Vehicle("youbot", "mecanum", 0.0475, 0.3, 0.47, 0.8, max_turn_radps=1.2, max_sideways_mps=0.8),
     "omni": Vehicle("omni_base", "omni", 0.05, 0.36, 0.36, 0.8, max_turn_radps=1.5, max_sideways_mps=0.8),
     "car": Vehicle("ackermann_car", "ackermann", 0.31, 1.5, 2.6, 8.0, max_steering_rad=0.5),
 }

@@ -76,14 +76,20 @@ def recognize_vehicle(
 
 
 def _find_platform(words: Iterable[str]) -> Vehicle | None:
-    """The platform that words name; None where they name several."""
+    """The platform that words name, of words within each other the longest; None where they name several."""
     found: dict[str, Vehicle] = {}
     for preset in list_presets():
         for word in preset.recognized_by:
             pattern = re.compile(rf"(^|[^a-z0-9]){re.escape(word)}([^a-z]|$)")
             if any(pattern.search(text.lower()) for text in words):
-                found[preset.id] = preset
-    return next(iter(found.values())) if len(found) == 1 else None
+                found[word] = preset
+    longest = {
+        word: preset
+        for word, preset in found.items()
+        if not any(word in other for other in found if other != word)
+    }
+    presets = {preset.id: preset for preset in longest.values()}
+    return next(iter(presets.values())) if len(presets) == 1 else None
 
 
 def _compare(preset: Vehicle, source: VehicleSource, description: Description | None) -> Recognized:

@@ -44,7 +44,9 @@ class LateralScale(KinematicEffect):
             "sideways speed over that of ideal rollers",
             0.8,
             least=Least(0.01, DATA_SHEET),
-            plausible=Plausible(0.3, 1.2, "wider than the lateral multipliers of 1 to 2 of competition robots"),
+            plausible=Plausible(
+                0.3, 1.2, "wider than the lateral multipliers of 1 to 2 of competition robots"
+            ),
         ),
     )
     needs = (Excitation.SIDEWAYS,)

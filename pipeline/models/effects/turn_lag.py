@@ -79,9 +79,7 @@ class TurnLag(DriveEffect):
         sideways = wheels.sideways
         if sideways is not None:
             sideways = lag_signal(sideways, fast, step, resets, resets.start[:, 2])
-        return replace(
-            wheels, left=mean - 0.5 * difference, right=mean + 0.5 * difference, sideways=sideways
-        )
+        return replace(wheels, left=mean - 0.5 * difference, right=mean + 0.5 * difference, sideways=sideways)
 
     def is_degenerate(self, evidence: Evidence) -> bool:
         """With equal time constants it is a drive lag."""

@@ -198,9 +198,7 @@ def _find_direction(asked: Vectors) -> Vectors:
     return asked / np.where(size > 0.0, size, 1.0)
 
 
-def _is_settled(
-    label: NDArray[np.int64], asked: Vectors, samples: NDArray[np.int64], times: Floats
-) -> Flags:
+def _is_settled(label: NDArray[np.int64], asked: Vectors, samples: NDArray[np.int64], times: Floats) -> Flags:
     """Whether the drive hardly changed in a stretch and in the one right before it."""
     count = samples.size
     mean = _sum_vectors_by(label, asked, count) / np.maximum(samples, 1)

@@ -138,7 +138,7 @@ def _rate(
     wheels = made.tables["wheels"]
     reach, turned = np.ptp(position, axis=0).max(), np.ptp(yaw)
     path = _path_of(wheels, vehicle)
-    drove = path is not None and float(np.abs(np.diff(path[1])).sum()) > _DRIVES_M
+    drove = path is not None and float(np.hypot(*np.diff(path[1:])).sum()) > _DRIVES_M
     if reach < _STILL_M and (turned > _TURNS_RAD or drove):
         living = "its heading turns" if turned > _TURNS_RAD else "the wheels drive"
         return replace(bare, rate_hz=rate, refused=f"its position never changes while {living}")
@@ -196,25 +196,28 @@ def _score_frame(name: str, parent: str) -> tuple[float, list[str]]:
     return score, reasons
 
 
-def _path_of(wheels: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats] | None:
-    """Times [s] of the wheels' messages and the way [m] they rolled since the first; None without wheels."""
+def _path_of(wheels: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats, Floats] | None:
+    """Times [s] of the wheels' messages and the ways [m] they rolled ahead and aside since; None without wheels."""
     if wheels.height < _FEWEST:
         return None
     if wheels["speed"].null_count() < wheels.height:
         speed = wheels["speed"].to_numpy()
     else:
         speed = 0.5 * vehicle.wheel_radius_m * (wheels["left"] + wheels["right"]).to_numpy()
-    known = np.isfinite(speed)
+    aside = np.zeros_like(speed)
+    if vehicle.kinematics.has_inputs("sideways"):
+        aside = vehicle.wheel_radius_m * wheels["sideways"].cast(pl.Float64).to_numpy()
+    known = np.isfinite(speed) & np.isfinite(aside)
     time = wheels["t"].to_numpy()[known]
     if time.size < _FEWEST:
         return None
-    return time, timegrid.integrate_rate(time, speed[known])
+    return time, timegrid.integrate_rate(time, speed[known]), timegrid.integrate_rate(time, aside[known])
 
 
 def _compare_with_wheels(
-    time: Floats, position: Floats, yaw: Floats, path: tuple[Floats, Floats] | None
+    time: Floats, position: Floats, yaw: Floats, path: tuple[Floats, Floats, Floats] | None
 ) -> tuple[float | None, float]:
-    """Share of a pose's way that the wheels do not account for, and its median sideways speed [m/s].
+    """Share of a pose's way that the wheels do not account for, and its median sideways speed beside theirs [m/s].
 
     Any gain is allowed, and a small delay. What a coarse integration makes of a turn is no sideways motion:
     it is proportional to way times turn.
@@ -228,10 +231,11 @@ def _compare_with_wheels(
     span = max(round(_SPAN_S / max(float(np.median(np.diff(time))), 1e-3)), 1)
     ends = np.arange(0, time.size, span)
     way, _ = _split_chords(position[ends], yaw[ends])
-    rolled = np.interp(time[ends], *path)
+    rolled = np.interp(time[ends], *path[:2])
     rate = np.gradient(path[1], path[0] + np.arange(path[0].size) * 1e-12)
     share = measure_rest(way, np.diff(rolled), np.diff(np.interp(time[ends], path[0], rate)))
     ahead, aside = _split_chords(position, yaw)
+    aside = aside - np.diff(np.interp(time, path[0], path[2]))
     turned = ahead * np.diff(yaw)
     gain = float(turned @ aside) / max(float(turned @ turned), 1e-12)
     elapsed = np.maximum(np.diff(time), 1e-3)

@@ -86,6 +86,14 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     Raises:
         StageError: no joint can be told to be on a side, or there is neither velocity nor position.
     """
+    if not vehicle.kinematics.known_joints:
+        raise StageError(
+            "no_wheels",
+            f"the wheels of {columns.topic} do not say at which angle they stand on {vehicle.name}, which is "
+            f"{vehicle.kind}",
+            where=columns.topic,
+            hint="Configure a topic of body motion: an odometry of the wheels.",
+        )
     names = columns.fields["name"]
     if not isinstance(names, RaggedStrings):
         raise _no_wheels(columns.topic, ())
@@ -364,9 +372,7 @@ def read_sides(left: Floats, right: Floats, vehicle: Vehicle) -> Drive:
     return Drive(left=left, right=right)
 
 
-def read_body(
-    forward: Floats, yaw_rate: Floats, vehicle: Vehicle, sideways: Floats | None = None
-) -> Drive:
+def read_body(forward: Floats, yaw_rate: Floats, vehicle: Vehicle, sideways: Floats | None = None) -> Drive:
     """A body command, turned into the drive's by the vehicle's ideal inverse."""
     aside = np.zeros_like(forward) if sideways is None else sideways
     inputs = vehicle.kinematics.inverse((forward, aside, yaw_rate), vehicle)

@@ -58,9 +58,6 @@ Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-_SIDEWAYS_MPS = 0.02
-_SIDEWAYS_SHARE = 0.01
-"""A hundredth of the commands is no slip of a joystick."""
 _DEFAULT_SECTION = IntervalSection(topic=DEFAULT_INTERVAL[0], equals=DEFAULT_INTERVAL[1])
 
 
@@ -398,8 +395,8 @@ class _Extraction:
 
     def _check_sideways(self, sideways: Floats, topic: str) -> list[Finding]:
         """Commands that no vehicle of this kind can follow: it moves along its wheels alone."""
-        share = float(np.mean(np.abs(sideways) > _SIDEWAYS_MPS))
-        if share < _SIDEWAYS_SHARE:
+        share = reading.asks_sideways(sideways)
+        if share == 0.0:
             return []
         text = (
             f"{share:.0%} of the commands of {topic} ask for sideways motion, which {self.vehicle.name} "

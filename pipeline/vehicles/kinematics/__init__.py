@@ -54,10 +54,12 @@ class Kinematics(ABC):
     Attributes:
         inputs: what the drive is told, and what its encoders say.
         geometry: what of a vehicle's numbers the kind uses.
+        known_joints: whether single wheels, told apart by their names, tell the inputs.
     """
 
     inputs: ClassVar[tuple[Quantity, ...]]
     geometry: ClassVar[tuple[Quantity, ...]]
+    known_joints: ClassVar[bool] = True
 
     @abstractmethod
     def forward(self, inputs: Inputs, vehicle: Vehicle) -> Body:

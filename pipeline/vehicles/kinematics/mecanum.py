@@ -28,13 +28,17 @@ class Mecanum(Kinematics):
     inputs = (
         Quantity("left", "rad/s", "mean speed of the left wheels"),
         Quantity("right", "rad/s", "mean speed of the right wheels"),
-        Quantity("sideways", "rad/s", "a quarter of front right and rear left less front left and rear right"),
+        Quantity(
+            "sideways", "rad/s", "a quarter of front right and rear left less front left and rear right"
+        ),
     )
     geometry = (
         Quantity("wheel_radius_m", "m", "r"),
         Quantity("track_width_m", "m", "b, between the middles of the left and right wheels"),
         Quantity("wheelbase_m", "m", "l, between the axles"),
-        Quantity("controller_track_multiplier", "1", "the controller's b + l over the vehicle's", required=False),
+        Quantity(
+            "controller_track_multiplier", "1", "the controller's b + l over the vehicle's", required=False
+        ),
     )
 
     def forward(self, inputs: Inputs, vehicle: Vehicle) -> Body:

@@ -27,6 +27,7 @@ class Omni(Mecanum):
         Quantity("track_width_m", "m", "b, diameter of the circle through the wheels"),
         Quantity("controller_track_multiplier", "1", "the controller's diameter over b", required=False),
     )
+    known_joints = False
 
     def turning_width_m(self, vehicle: Vehicle) -> float:
         """The diameter of the circle."""
