@@ -92,8 +92,8 @@ class Part(ABC):
         """Ideal velocity of the input averaged over windows, now and up to 2 s earlier.
 
         Returns:
-            f_x, f_w, and f_y of a vehicle that moves sideways (see `IDEAL_CHANNELS`), shape (n, lags, 2 or 3);
-            lags a quarter of a second apart.
+            f_x, f_w, and f_y of a vehicle that moves sideways (see `IDEAL_CHANNELS`), lags a quarter of a
+            second apart, shape (n, lags, 2 or 3).
         """
         return np.concatenate([average_lags(c, c.predict_velocity((), _NO_DELAY)) for c in self.comparisons])
 

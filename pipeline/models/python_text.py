@@ -213,6 +213,13 @@ def write_function(model: Model) -> str:
 
 
 def _write_head(vehicle: Vehicle, delay: float) -> str:
+    if vehicle.kinematics.has_inputs("sideways"):
+        raise MotionError(
+            "not_exportable",
+            f"{vehicle.name} is {vehicle.kind}, and the Python function knows no sideways motion",
+            where=vehicle.id,
+            hint="Export --to json.",
+        )
     text = _HEAD
     for key, number in (
         ("radius", vehicle.wheel_radius_m),

@@ -107,9 +107,7 @@ class Drive(Protocol):
 
 
 def split_wheels(drive: Drive) -> list[Floats]:
-    """Speeds of the wheels [rad/s]: left and right; of four mecanum wheels front left, front right, rear left
-    and rear right.
-    """
+    """Speeds of the wheels [rad/s]: left, right; or front left, front right, rear left, rear right."""
     left, right, sideways = drive.left, drive.right, drive.sideways
     if sideways is None:
         return [left, right]

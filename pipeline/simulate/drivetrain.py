@@ -29,8 +29,8 @@ class Drive:
 
     Attributes:
         step_s: cell width [s].
-        left, right: true wheel speeds [rad/s], shape (n,); equal on a car, whose rear axle they are; means of a
-            side on mecanum wheels.
+        left, right: true wheel speeds [rad/s], shape (n,); equal on a car, whose rear axle they are; means of
+            a side on mecanum wheels.
         steering: true steering angle [rad], shape (n,); zero on a differential vehicle.
         corners: true speeds of mecanum wheels by place; on omni wheels those of wheels at the corners of the
             same body motion; None on a vehicle that cannot move sideways.
@@ -143,7 +143,7 @@ def drive_wheels(
 def _join_corners(corners: dict[str, Floats], effects: Effects, step_s: float) -> Drive:
     """Four wheels whose sides are coupled as those of any vehicle: what is sideways lags like the mean."""
     sides = [0.5 * (corners[f"front_{side}"] + corners[f"rear_{side}"]) for side in ("left", "right")]
-    left, right = _couple_sides(*sides, effects, step_s)
+    left, right = _couple_sides(sides[0], sides[1], effects, step_s)
     rest = {place: corners[place] - sides[place.endswith("right")] for place in CORNERS}
     slow = effects.value("turn_lag", "tau_mean")
     if slow > 0.0:

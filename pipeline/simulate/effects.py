@@ -173,7 +173,7 @@ def resolve_effects(asked: Mapping[str, Mapping[str, float] | float], kind: Kind
         if kind not in spec.kinds:
             raise SimulateError(
                 "wrong_vehicle",
-                f"{name} exists on {spec.kinds[0]} vehicles only, this one is {kind}",
+                f"{name} exists on {' or '.join(spec.kinds)} vehicles only, this one is {kind}",
                 where=name,
                 hint="Choose another vehicle or another effect",
             )

@@ -44,8 +44,8 @@ class WheelReadings:
         left, right: wheel speeds [rad/s], shape (n,).
         left_angle, right_angle: turned angles [rad], shape (n,).
         steering: steering angle [rad], shape (n,).
-        corners, corner_angles: speeds [rad/s] and angles [rad] of four wheels that move the vehicle sideways, by
-            place; None on a vehicle that cannot.
+        corners, corner_angles: speeds [rad/s] and angles [rad] of four wheels that move the vehicle sideways,
+            by place; None on a vehicle that cannot.
     """
 
     time_s: Floats
@@ -93,11 +93,12 @@ def read_encoders(encoders: Encoders, drive: Drive, *, duration_s: float, seed: 
             speeds[place] = encoders.gain * (np.interp(at, middle, wheel) + more)
             turned = integrate_cells(wheel, step_s=drive.step_s)
             angles[place] = encoders.gain * np.interp(at, edges, turned)
-        sides = [
+        (left, right), (left_angle, right_angle) = (
             [0.5 * (readings[f"front_{side}"] + readings[f"rear_{side}"]) for side in ("left", "right")]
             for readings in (speeds, angles)
-        ]
-        return WheelReadings(time, *sides[0], *sides[1], np.zeros_like(time), speeds, angles)
+        )
+        straight = np.zeros_like(time)
+        return WheelReadings(time, left, right, left_angle, right_angle, straight, speeds, angles)
     return WheelReadings(
         time,
         encoders.gain * (np.interp(at, middle, drive.left) + noise[0]),

@@ -20,7 +20,7 @@ class Vehicle:
     Attributes:
         name: how it calls itself in the log's deployment record.
         kind: ``differential`` (wheels or tracks a side), ``ackermann`` (steered front axle, base_link on
-            the rear axle), ``mecanum`` (four wheels) or ``omni`` (wheels on a circle of diameter track_width_m).
+            the rear axle), ``mecanum`` (four wheels) or ``omni`` (wheels on a circle of that diameter).
         wheel_radius_m: nominal radius.
         track_width_m: nominal distance between left and right wheels.
         wheelbase_m: distance between the axles; matters for ``ackermann`` and ``mecanum``.

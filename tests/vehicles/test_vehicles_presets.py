@@ -12,8 +12,8 @@ PRESETS = list_presets()
 
 @pytest.mark.parametrize("vehicle", PRESETS, ids=lambda vehicle: vehicle.id)
 def test_a_preset_has_the_geometry_of_its_ideal_model(vehicle: Vehicle) -> None:
-    needed = vehicle.track_width_m if vehicle.kind == "differential" else vehicle.wheelbase_m
-    assert needed is not None
+    needed = [quantity.name for quantity in vehicle.kinematics.geometry if quantity.required]
+    assert all(getattr(vehicle, name) for name in needed)
     assert 0.01 < vehicle.wheel_radius_m < 1.0
 
 

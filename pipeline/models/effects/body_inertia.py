@@ -2,8 +2,8 @@
 
     dv_x/dt = (v0 - v_x)/tau + v_y*w,  dv_y/dt = -v_y/tau - v_x*w,  dw/dt = (w0 - w)/tau
 
-tau [s], 0.2 to 1 on ice. A vehicle that drives sideways at s0 has (s0 - v_y)/tau in the second equation. Change
-speed while turning.
+tau [s], 0.2 to 1 on ice. A vehicle that drives sideways at s0 has (s0 - v_y)/tau in the second equation.
+Change speed while turning.
 
 Source: Newton's law of a body in viscous contact, written in its own turning frame; the ice runs of Samson et
 al. 2024.

@@ -2,8 +2,9 @@
 
     s0 = k * s0
 
-s0 is the speed to the left. k is a plain number: 1 for ideal rollers, less where they turn against friction and slip
-along their axes (0.88 is the usual "lateral multiplier" of 1.14 of competition robots). Drive sideways both ways.
+s0 is the speed to the left. k is a plain number: 1 for ideal rollers, less where they turn against friction
+and slip along their axes; 0.88 is a "lateral multiplier" of 1.14 of competition robots. Drive sideways both
+ways.
 
 Source: Diegel, Badve, Bright, Potgieter and Tlale, ACRA 2002 (losses of mecanum wheels driving sideways).
 """

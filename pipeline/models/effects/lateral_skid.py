@@ -2,8 +2,9 @@
 
     v_y += -c * v0 * w0
 
-A vehicle that drives sideways at s0 slides outward along x as well, by c s0 w0. c [s] grows with speed and falls with grip: 0.02 on tile, 0.15 on ice. Drive turns of both signs at several
-speeds, forward and backward, to tell it from a shifted centre of rotation.
+c [s] grows with speed and falls with grip: 0.02 on tile, 0.15 on ice. A vehicle that drives sideways at s0
+slides outward along x as well, by c s0 w0. Drive turns of both signs at several speeds, forward and
+backward, to tell it from a shifted centre of rotation.
 
 Source: Seegmiller and Kelly, RSS 2014, the centripetal term of the slip model.
 """

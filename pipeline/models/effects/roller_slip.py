@@ -2,10 +2,10 @@
 
     v_y += -k * s0 * abs(s0)
 
-s0 is the speed to the left. k [s/m]: 0.3 loses 15 % at 0.5 m/s. Drive sideways at several speeds, both ways, to tell
-it from a scale that is the same at every speed.
+s0 is the speed to the left. k [s/m]: 0.3 loses 15 % at 0.5 m/s. Drive sideways at several speeds, both ways,
+to tell it from a scale that is the same at every speed.
 
-Source: slip growing with traction, Wong, Theory of Ground Vehicles, chapter 2, on rollers that turn against friction.
+Source: slip growing with traction; see Wong, Theory of Ground Vehicles, chapter 2.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ import numpy as np
 
 from pipeline.models.effect import (
     DATA_SHEET,
-    SIDES,
     NAN,
+    SIDES,
     DriveEffect,
     Excitation,
     Least,

@@ -3,8 +3,9 @@
     D = Omega_r - Omega_l,  M = (Omega_r + Omega_l)/2:
     tau_mean * dM/dt = u_M - M,  tau_diff * dD/dt = u_D - D
 
-What moves a vehicle sideways follows like the mean. tau_mean, tau_diff [s]: friction on the ground brakes turning, so 0.4 and 1.1 to 1.6 s on a Warthog (0.55
-on ice), 0.1 and 0.35 s on a Husky. Change speed and turning separately.
+tau_mean, tau_diff [s]: friction on the ground brakes turning, so 0.4 and 1.1 to 1.6 s on a Warthog (0.55
+on ice), 0.1 and 0.35 s on a Husky. What moves a vehicle sideways follows like the mean. Change speed and
+turning separately.
 
 Source: measured on the DRIVE recordings; the powertrain model of DRIVE, Baril et al. 2024, split in two.
 """

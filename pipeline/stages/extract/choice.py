@@ -197,7 +197,7 @@ def _score_frame(name: str, parent: str) -> tuple[float, list[str]]:
 
 
 def _path_of(wheels: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats, Floats] | None:
-    """Times [s] of the wheels' messages and the ways [m] they rolled ahead and aside since; None without wheels."""
+    """Times [s] of the wheels' messages, ways [m] ahead and aside since the first; None without wheels."""
     if wheels.height < _FEWEST:
         return None
     if wheels["speed"].null_count() < wheels.height:
@@ -217,7 +217,7 @@ def _path_of(wheels: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats, Fl
 def _compare_with_wheels(
     time: Floats, position: Floats, yaw: Floats, path: tuple[Floats, Floats, Floats] | None
 ) -> tuple[float | None, float]:
-    """Share of a pose's way that the wheels do not account for, and its median sideways speed beside theirs [m/s].
+    """Share of a pose's way that is not the wheels', and its median sideways speed beside theirs [m/s].
 
     Any gain is allowed, and a small delay. What a coarse integration makes of a turn is no sideways motion:
     it is proportional to way times turn.

@@ -86,16 +86,8 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     Raises:
         StageError: no joint can be told to be on a side, or there is neither velocity nor position.
     """
-    if not vehicle.kinematics.known_joints:
-        raise StageError(
-            "no_wheels",
-            f"the wheels of {columns.topic} do not say at which angle they stand on {vehicle.name}, which is "
-            f"{vehicle.kind}",
-            where=columns.topic,
-            hint="Configure a topic of body motion: an odometry of the wheels.",
-        )
     names = columns.fields["name"]
-    if not isinstance(names, RaggedStrings):
+    if not isinstance(names, RaggedStrings) or not vehicle.kinematics.known_joints:
         raise _no_wheels(columns.topic, ())
     velocity = _joint_matrix(columns.fields["velocity"], names)
     position = _joint_matrix(columns.fields["position"], names)
@@ -143,10 +135,9 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
         _to_radps(np.mean([velocity[joint] for joint in side], axis=0), section, vehicle)
         for side in (left, right)
     ]
-    sideways = None
-    if vehicle.kinematics.has_inputs("sideways"):
-        wheels = {joint: _to_radps(velocity[joint], section, vehicle) for joint in (*left, *right)}
-        sideways = _mean_sideways(wheels, left, section, columns.topic)
+    speeds = {joint: _to_radps(velocity[joint], section, vehicle) for joint in (*left, *right)}
+    moves = vehicle.kinematics.has_inputs("sideways")
+    sideways = _mean_sideways(speeds, left, section, columns.topic) if moves else None
     return Drive(left=sides[0], right=sides[1], sideways=sideways, findings=tuple(found))
 
 
@@ -365,7 +356,7 @@ def read_sides(left: Floats, right: Floats, vehicle: Vehicle) -> Drive:
     if vehicle.kinematics.has_inputs("sideways"):
         raise StageError(
             "no_sideways",
-            f"a pair of wheel speeds does not say how {vehicle.name}, which is {vehicle.kind}, moves sideways",
+            f"a pair of wheel speeds does not say how {vehicle.name} ({vehicle.kind}) moves sideways",
             where="configuration",
             hint="Configure a topic of body motion with linear.y, or a JointState of all wheels.",
         )

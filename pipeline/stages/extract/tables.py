@@ -373,7 +373,7 @@ class _Extraction:
         """Speed to the left of a body motion [m/s], in the order of `_read_pair`; None where it has none.
 
         Raises:
-            StageError: ``no_sideways``, the vehicle moves sideways and a measured body motion does not say how.
+            StageError: ``no_sideways``, the vehicle moves sideways, and what was measured does not say how.
         """
         topic = source.signals[0].topic
         signal = reading.sideways_field(source, {topic: self.columns[topic].type_name})
@@ -401,7 +401,7 @@ class _Extraction:
         text = (
             f"{share:.0%} of the commands of {topic} ask for sideways motion, which {self.vehicle.name} "
             f"({self.vehicle.kind}) cannot do, and that motion is left out: are its wheels mecanum or omni "
-            'wheels? Then [vehicle] kind = "mecanum" (wheelbase_m is needed) or "omni" in run.toml, or --vehicle '
+            'wheels? Then [vehicle] kind = "mecanum" (with wheelbase_m) or "omni" in run.toml, or --vehicle '
             f"with one of {', '.join(p.id for p in list_presets() if p.kinematics.has_inputs('sideways'))}"
         )
         return [Finding("sideways_command", "error", text, where=topic, value=share)]

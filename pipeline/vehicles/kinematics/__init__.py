@@ -79,7 +79,7 @@ class Kinematics(ABC):
         return 0.0
 
     def turning_width_m(self, vehicle: Vehicle) -> float:
-        """Over which a difference of speed between the sides turns the vehicle [m]; one where it is not known."""
+        """Over which a difference of speed between the sides turns the vehicle [m]; one where unknown."""
         return vehicle.track_width_m or 1.0
 
     def has_inputs(self, *names: str) -> bool:

@@ -3,15 +3,15 @@
     v_x = r (left + right) / 2        v_y = r sideways        v_w = r (right - left) / (b + l)
 
 left and right are the means of a side. With front_left = left - sideways, rear_left = left + sideways,
-front_right = right + sideways and rear_right = right - sideways these are the least-squares motion of any four
-wheel speeds; their fourth combination moves nothing and only rubs.
+front_right = right + sideways and rear_right = right - sideways these are the least-squares motion of any
+four wheel speeds; their fourth combination moves nothing and only rubs.
 
 Source: Muir and Neuman, ICRA 1987; Taheri, Qiao and Ghaeminezhad, IJCA 113(3), 2015.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -32,7 +32,7 @@ class Mecanum(Kinematics):
             "sideways", "rad/s", "a quarter of front right and rear left less front left and rear right"
         ),
     )
-    geometry = (
+    geometry: ClassVar[tuple[Quantity, ...]] = (
         Quantity("wheel_radius_m", "m", "r"),
         Quantity("track_width_m", "m", "b, between the middles of the left and right wheels"),
         Quantity("wheelbase_m", "m", "l, between the axles"),
@@ -58,7 +58,7 @@ class Mecanum(Kinematics):
         return {quantity.name: speed for quantity, speed in zip(self.inputs, speeds, strict=True)}
 
     def turning_width_m(self, vehicle: Vehicle) -> float:
-        """b + l: a wheel's rollers let it turn the vehicle about a lever of (b + l) / 2."""
+        """The sum b + l: a wheel with rollers turns the vehicle about a lever of half of it."""
         return (vehicle.track_width_m or 1.0) + (vehicle.wheelbase_m or 1.0)
 
     def _controller_width_m(self, vehicle: Vehicle) -> float:
