@@ -197,7 +197,7 @@ def _stand_in(index: LogIndex, configuration: Configuration) -> Vehicle:
     """Any vehicle of the kind that the topics are made for; unit geometry makes gains lengths."""
     types = {channel.type_name for channel in index.channels if channel.message_count != 0}
     steered = any(name.startswith(_STEERED) for name in types)
-    kind = configuration.vehicle.kind or ("ackermann" if steered else "differential")
+    kind = str(configuration.vehicle.list_values().get("kind", "ackermann" if steered else "differential"))
     return Vehicle(
         id=UNKNOWN_VEHICLE,
         name="unknown vehicle",
@@ -282,8 +282,7 @@ def _fit_vehicle(
         if fitted is None:
             raise problem
         values, (name, text) = fitted, _describe_fit(fitted)
-    section = msgspec.structs.asdict(configuration.vehicle)
-    given = {key: value for key, value in section.items() if value is not None and key != "preset"}
+    given = {key: value for key, value in configuration.vehicle.list_values().items() if key != "preset"}
     known = {"name": "fitted vehicle", "id": name, "track_width_m": None, "wheelbase_m": None, **values}
     if vehicle.kind == "ackermann":
         known = {**known, "wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": None}

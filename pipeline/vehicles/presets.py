@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from pipeline.vehicles.configuration import Kind, Positive, VehicleSection
+from pipeline.vehicles.configuration import Kind, Positive, RunningGear, VehicleSection
 from pipeline.vehicles.errors import ConfigurationError
 from pipeline.vehicles.kinematics import USUAL_KIND, Kinematics, find_kinematics
 
@@ -54,6 +54,7 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
     Attributes:
         id: name in tables and file names, lower case with underscores.
+        running_gear: what it stands on: tracks move it as the wheels of a differential drive do.
         source: where a preset's numbers were read.
         recognized_by: words of namespaces, hosts and robot descriptions, and packages of message types, that
             tell the platform.
@@ -73,6 +74,7 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     max_yaw_rate_radps: Positive | None = None
     max_steering_rad: Positive | None = None
     controller_track_multiplier: Positive = 1.0
+    running_gear: RunningGear = "wheels"
     aliases: Annotated[list[str], msgspec.Meta(description="other names")] = []
     topics: UsualTopics = UsualTopics()
     source: str = ""
@@ -125,7 +127,7 @@ def resolve_vehicle(
     Raises:
         ConfigurationError: no vehicle is named, the name is unknown, or a value is missing.
     """
-    values = {key: value for key, value in msgspec.structs.asdict(section).items() if value is not None}
+    values = section.list_values()
     named = values.pop("preset", None)
     # A full geometry needs no preset; a vehicle that the log names but nobody knows is then only a name.
     base = find_preset(named or recorded or "")

@@ -375,6 +375,8 @@ class _Extraction:
         Raises:
             StageError: ``no_sideways``, the vehicle moves sideways, and what was measured does not say how.
         """
+        if source.form is not DriveForm.BODY:
+            return None
         topic = source.signals[0].topic
         signal = reading.sideways_field(source, {topic: self.columns[topic].type_name})
         moves = self.vehicle.kinematics.has_inputs("sideways")
