@@ -25,6 +25,7 @@ from pipeline.vehicles import (
     DriveForm,
     DriveSource,
     PoseSource,
+    Sources,
     Vehicle,
     choose_sources,
     find_alike,
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 
     from pipeline.logs import LogData, LogIndex
     from pipeline.store import JSON
-    from pipeline.vehicles import Configuration, Description, Recognized, Sources, VehicleSource
+    from pipeline.vehicles import Configuration, Description, Recognized, VehicleSource
 
 UNKNOWN_VEHICLE = "unknown"
 _STAND_IN_RADIUS_M = 0.1
@@ -134,6 +135,9 @@ def choose(
             raise
         problem, vehicle, source = error, _stand_in(index, configuration), "fitted"
     sources = choose_sources(index.channels, configuration, vehicle, where=where)
+    if source not in {"flag", "configuration"} and _asks_sideways(index, vehicle, sources, sha256):
+        vehicle = find_preset(vehicle.sideways_preset) or vehicle
+        sources = choose_sources(index.channels, configuration, vehicle, where=where)
     vehicle = _apply_vendor_controller(vehicle, sources, configuration)
     findings = [
         Finding("vehicle_choice", "info", note, where="vehicle") for note in (told.notes if told else ())
@@ -206,6 +210,16 @@ def _stand_in(index: LogIndex, configuration: Configuration) -> Vehicle:
         track_width_m=1.0,
         wheelbase_m=1.0,
     )
+
+
+def _asks_sideways(index: LogIndex, vehicle: Vehicle, sources: Sources, sha256: str | None) -> bool:
+    """Whether a platform that has such wheels, too, is commanded to move sideways."""
+    if not vehicle.sideways_preset or sources.command is None:
+        return False
+    command = Sources(sources.command, None, None, None, None)
+    types = {channel.topic: channel.type_name for channel in index.channels}
+    data = read_topics(index, list_wanted(command, types), sha256=sha256 or "unused")
+    return find_sideways_share(data.topics, sources.command) > 0.0
 
 
 def _apply_vendor_controller(vehicle: Vehicle, sources: Sources, configuration: Configuration) -> Vehicle:

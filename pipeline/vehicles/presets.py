@@ -58,6 +58,8 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         source: where a preset's numbers were read.
         recognized_by: words of namespaces, hosts and robot descriptions, and packages of message types, that
             tell the platform.
+        sideways_preset: the same platform on wheels that move it sideways, under the same names: what it is
+            asked tells which it is.
         controller: the vendor's.
         units: of what the platform publishes, by name.
     """
@@ -79,6 +81,7 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     topics: UsualTopics = UsualTopics()
     source: str = ""
     recognized_by: list[str] = []
+    sideways_preset: str = ""
     controller: VendorController = VendorController()
     units: dict[str, OwnUnit] = {}
 

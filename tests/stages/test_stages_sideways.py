@@ -18,7 +18,7 @@ from pipeline.stages.extract.drive import read_joints
 from pipeline.vehicles import DriveSection, find_preset, load_configuration
 
 FINE = replace(EXACT, noise_m=0.002, noise_rad=0.001)
-YOUBOT = replace(PLAIN, vehicle=VEHICLES["youbot"], pose=FINE, duration_s=40.0)
+YOUBOT = replace(PLAIN, vehicle=VEHICLES["youbot"], pose=FINE, duration_s=25.0)
 IDEAL = replace(YOUBOT, effects={})
 
 
