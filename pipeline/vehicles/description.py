@@ -1,8 +1,8 @@
 """Geometry out of a robot description (URDF): wheels, their radii, track width, wheelbase and steering.
 
 A wheel is a continuous joint that turns about the body's lateral axis; a steering joint turns about its
-vertical one and carries a wheel, or says so. Casters are none. Wheels are mecanum wheels where the text speaks
-of such or of rollers. The radius is that of the wheel's cylinder, else the height of its axis over
+vertical one and carries a wheel, or says so. Casters are none. Wheels are mecanum wheels where the text
+speaks of such or of rollers. The radius is that of the wheel's cylinder, else the height of its axis over
 base_footprint.
 """
 

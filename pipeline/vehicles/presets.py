@@ -133,7 +133,7 @@ def resolve_vehicle(
     values = section.list_values()
     named = values.pop("preset", None)
     # A full geometry needs no preset; a vehicle that the log names but nobody knows is then only a name.
-    base = find_preset(named or recorded or "")
+    base = find_preset(str(named or recorded or ""))
     if named and base is None:
         raise ConfigurationError(
             "vehicle_unknown", f"no vehicle preset is called {named!r}", where=where, hint=_how_to_choose()
