@@ -140,7 +140,6 @@ _ROSBOT = _vehicle("rosbot", 0.0425, 0.186, 0.17, 0.9, 2.0, 1.45)
 _WHEELED = "{}_wheel_joint"
 
 PLATFORMS: dict[str, Platform] = {
-    **MECANUM_PLATFORMS,
     "husky_a200": _clearpath("a200", _A200),
     "jackal": _clearpath("j100", _J100),
     "warthog": _clearpath("w200", _W200),
@@ -457,6 +456,7 @@ PLATFORMS: dict[str, Platform] = {
             describe("/robot_description", "linorobot2", _LINO, "{}_wheel_joint", _FOUR),
         ),
     ),
+    **MECANUM_PLATFORMS,
 }
 
 
