@@ -55,8 +55,20 @@ def test_what_is_hidden_in_sideways_driving_is_named(
     found = list_found(summary)
     assert found.keys() == hidden.keys()
     assert found == pytest.approx(hidden, rel=0.05)
+    assert summary["diagnosis"]["explained_share"] > 0.9  # type: ignore[index]
     assert summary["diagnosis"]["unexplained"] is None  # type: ignore[index]
     assert set(summary["by_input"]) == ({"command"} if bare else {"command", "measured"})  # type: ignore[call-overload]
+
+
+def test_an_effect_that_costs_a_settled_heading_a_thousandth_stands_on_the_ladder(tmp_path: Path) -> None:
+    # With the lag taken alone the heading over 2 s is a little better by chance; sideways is nearly all error.
+    hidden = {"lateral_scale": 0.8, "drive_lag": 0.3}
+    log = simulate_case(None, hidden, out=tmp_path / "run.mcap", seed=1, duration_s=180.0, vehicle="youbot")
+    rungs = diagnose(log)["diagnosis"]["ladder"]  # type: ignore[index]
+    assert set(rungs[-1]["effects"]) == hidden.keys()
+    assert rungs[-1]["t_mrmse_m"] < 0.03 * rungs[0]["t_mrmse_m"]
+    for below, rung in zip(rungs[:-1], rungs[1:], strict=True):
+        assert all(rung[key] <= 1.01 * below[key] for key in ("t_mrmse_m", "r_mrmse_rad"))
 
 
 @pytest.mark.parametrize("name", ["panther", "rosbot_xl"])
