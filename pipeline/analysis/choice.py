@@ -236,6 +236,8 @@ def _apply_vendor_controller(vehicle: Vehicle, sources: Sources, configuration: 
 def _check_contradiction(told: Recognized | None, vehicle: Vehicle, source: VehicleSource) -> list[Finding]:
     if told is None or source not in {"flag", "configuration", "metadata"}:
         return []
+    if told.vehicle.sideways_preset == vehicle.id:
+        return []
     differing = list_contradictions(told.vehicle, vehicle)
     if not differing:
         return []

@@ -99,7 +99,7 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
 def _join_rungs(rungs: list[Rung], last: Rung) -> list[Rung]:
     """Rungs with the last one in the place of those that lie below one of its errors by chance.
 
-    Where one error is at its floor already, an effect that takes away most of the other may raise it a little.
+    Where one error is at its floor, an effect that takes away most of the other may raise it a little.
     """
     gains = [
         _read_error(last.errors, name) / max(_read_error(rungs[-1].errors, name), _LEAST_SQUARE)

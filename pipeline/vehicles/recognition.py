@@ -141,7 +141,9 @@ def find_alike(radius_m: float, track_m: float) -> Vehicle | None:
 
 def list_contradictions(told: Vehicle, chosen: Vehicle) -> list[str]:
     """Numbers in which the vehicle that the log tells and the chosen one cannot be the same vehicle."""
-    found = [] if told.kind == chosen.kind else [f"kind {told.kind}, not {chosen.kind}"]
+    # A description of four wheels does not say whether they have rollers; what is commanded does.
+    steered, is_car = (one.kinematics.has_inputs("steering") for one in (told, chosen))
+    found = [] if steered == is_car else [f"kind {told.kind}, not {chosen.kind}"]
     for name, limit in (
         ("wheel_radius_m", _DIFFERS),
         ("track_width_m", _OTHER_TRACK),

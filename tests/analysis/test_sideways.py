@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -61,13 +62,13 @@ def test_what_is_hidden_in_sideways_driving_is_named(
 
 
 def test_an_effect_that_costs_a_settled_heading_a_thousandth_stands_on_the_ladder(tmp_path: Path) -> None:
-    # With the lag taken alone the heading over 2 s is a little better by chance; sideways is nearly all error.
+    # With the lag taken alone the heading over 2 s is a little better by chance; sideways it is all error.
     hidden = {"lateral_scale": 0.8, "drive_lag": 0.3}
     log = simulate_case(None, hidden, out=tmp_path / "run.mcap", seed=1, duration_s=180.0, vehicle="youbot")
     rungs = diagnose(log)["diagnosis"]["ladder"]  # type: ignore[index]
     assert set(rungs[-1]["effects"]) == hidden.keys()
     assert rungs[-1]["t_mrmse_m"] < 0.03 * rungs[0]["t_mrmse_m"]
-    for below, rung in zip(rungs[:-1], rungs[1:], strict=True):
+    for below, rung in pairwise(rungs):
         assert all(rung[key] <= 1.01 * below[key] for key in ("t_mrmse_m", "r_mrmse_rad"))
 
 

@@ -163,6 +163,18 @@ def test_another_vehicle_than_the_logs_is_contradicted() -> None:
     assert list_contradictions(husky, husky) == []
 
 
+def test_four_described_wheels_contradict_a_car_and_no_mecanum_vehicle() -> None:
+    youbot, car = find_preset("youbot"), find_preset("car")
+    assert youbot is not None
+    assert car is not None
+    (text,) = [one.fields["data"] for one in PLATFORMS["youbot"].topics if "description" in one.topic]
+    described = recognize_vehicle([], {}, read_description(str(text).replace("youbot", "my_robot")))
+    assert described is not None
+    assert described.vehicle.kind == "differential"
+    assert list_contradictions(described.vehicle, youbot) == []
+    assert "kind differential, not ackermann" in list_contradictions(described.vehicle, car)
+
+
 def test_of_several_platforms_in_a_log_the_configured_topic_tells_which_is_meant() -> None:
     topics = ("/husky/odom", "/husky/cmd_vel", "/warthog/odom", "/warthog/cmd_vel")
     channels = [
