@@ -138,7 +138,7 @@ def test_every_case_can_be_made() -> None:
 
 @pytest.mark.parametrize(
     ("name", "vehicle"),
-    [pair for pair in product(list_programs(), ("husky", "car")) if pair != ("spins", "car")],
+    [pair for pair in product(list_programs(), ("husky", "car", "youbot")) if pair != ("spins", "car")],
 )
 def test_programs_stay_inside_the_command_space_and_repeat(name: str, vehicle: str) -> None:
     machine = VEHICLES[vehicle]
@@ -153,6 +153,8 @@ def test_programs_stay_inside_the_command_space_and_repeat(name: str, vehicle: s
     assert np.abs(first.speed_mps).max() <= 0.8 * machine.max_speed_mps + 1e-12
     assert np.abs(first.turn).max() <= 0.5 * max(machine.max_turn_radps, machine.max_steering_rad) + 1e-12
     assert first.speed_mps.any() or first.turn.any()
+    assert np.abs(first.sideways).max() <= 0.8 * machine.max_sideways_mps + 1e-12
+    assert (first.sideways_mps is None) == (vehicle != "youbot")
     resting = (first.time_s < 1.9) | (first.time_s > 118.1)
     assert not first.speed_mps[resting].any()
     assert not first.turn[resting].any()
