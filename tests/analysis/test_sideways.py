@@ -45,7 +45,7 @@ def simulate(folder: Path, hidden: Hidden, vehicle: str, seed: int, *, bare: boo
     [
         ("youbot", True, {"lateral_scale": 0.85}),
         ("youbot", False, {"roller_slip": 0.3, "effective_track": 1.25, "drive_lag": 0.3}),
-        ("omni", True, {"lateral_scale": 0.9, "drive_lag": 0.3}),
+        pytest.param("omni", True, {"lateral_scale": 0.9, "drive_lag": 0.3}, marks=pytest.mark.long),
     ],
     ids=["commands only", "four wheels", "omni"],
 )
@@ -90,6 +90,7 @@ def test_a_platform_with_two_sets_of_wheels_is_told_by_what_it_is_asked(
     assert (chosen.vehicle.id, chosen.vehicle_source) == (f"{name}{wheels}", "namespace")
 
 
+@pytest.mark.long
 def test_a_log_without_sideways_commands_is_diagnosed_on_a_mecanum_preset_all_the_same(
     tmp_path: Path,
 ) -> None:
