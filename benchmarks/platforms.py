@@ -16,6 +16,7 @@ from pipeline.simulate import PLATFORMS, Platform, simulate_case
 
 CAR = {"steering_offset": 0.05, "drive_lag": 0.3}
 SIDES = {"effective_track": 1.5, "drive_lag": 0.3}
+MECANUM = {"lateral_scale": 0.85, "effective_track": 1.2, "drive_lag": 0.3}
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Row:
 
 
 def hidden_effects(platform: Platform) -> dict[str, float]:
-    return CAR if platform.vehicle.kind == "ackermann" else SIDES
+    return {"ackermann": CAR, "mecanum": MECANUM}.get(platform.vehicle.kind, SIDES)
 
 
 def try_platform(name: str, folder: Path, *, duration_s: float = 180.0, seed: int = 3) -> Row:

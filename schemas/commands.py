@@ -17,7 +17,7 @@ class Commands(Table):
     """One row a command message, held until the next one or until it is stale."""
 
     NAME: ClassVar[str] = "commands"
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     t = fields.seconds()
     stamp = fields.stamp()
@@ -26,10 +26,19 @@ class Commands(Table):
     right = fields.number("rad/s", "commanded speed of the right wheels", nullable=True)
     speed = fields.body("m/s", "commanded speed (Ackermann)", nullable=True)
     steering = fields.body("rad", "commanded steering angle (Ackermann), left positive", nullable=True)
+    sideways = fields.number(
+        "rad/s", "commanded speed of the wheels that moves to the left (mecanum, omni)", nullable=True
+    )
     body_x = fields.body("m/s", "commanded forward speed where the command is a Twist", nullable=True)
+    body_y = fields.body(
+        "m/s", "commanded speed to the left where the command is a Twist (mecanum, omni)", nullable=True
+    )
     body_w = fields.body("rad/s", "commanded yaw rate where the command is a Twist", nullable=True)
     left_aligned = fields.number("rad/s", "speed of the left wheels after corrections", nullable=True)
     right_aligned = fields.number("rad/s", "speed of the right wheels after corrections", nullable=True)
+    sideways_aligned = fields.number(
+        "rad/s", "speed of the wheels that moves to the left after corrections", nullable=True
+    )
     speed_aligned = fields.body("m/s", "speed after corrections (Ackermann)", nullable=True)
     active = fields.flag("inside an interval in which commands are live")
 

@@ -17,7 +17,7 @@ class Wheels(Table):
     """One row an encoder message."""
 
     NAME: ClassVar[str] = "wheels"
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     t = fields.seconds()
     stamp = fields.stamp()
@@ -26,6 +26,9 @@ class Wheels(Table):
     right = fields.number("rad/s", "measured speed of the right wheels, mean of the side", nullable=True)
     speed = fields.body("m/s", "measured speed (Ackermann)", nullable=True)
     steering = fields.body("rad", "measured steering angle (Ackermann), left positive", nullable=True)
+    sideways = fields.number(
+        "rad/s", "measured speed of the wheels that moves to the left (mecanum, omni)", nullable=True
+    )
     latency = fields.number("s", "how late the encoders are: they speak of t - latency", frame="log clock")
     active = fields.flag("inside an interval in which commands are live")
 

@@ -19,6 +19,7 @@ from pipeline.logs import TransformBuffer, read_topics
 from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.extract.choice import PoseRating, rate_poses, replace_pose
 from pipeline.stages.extract.geometry import fit_controller, fit_geometry
+from pipeline.stages.extract.reading import find_sideways_share
 from pipeline.stages.finding import Finding
 from pipeline.vehicles import (
     CONFIGURED,
@@ -27,6 +28,7 @@ from pipeline.vehicles import (
     DriveSource,
     PoseSource,
     Recognized,
+    Sources,
     Vehicle,
     apply_parameters,
     choose_sources,
@@ -46,7 +48,7 @@ if TYPE_CHECKING:
 
     from pipeline.logs import LogData, LogIndex
     from pipeline.store import JSON
-    from pipeline.vehicles import Configuration, Controller, Sources, VehicleSource
+    from pipeline.vehicles import Configuration, Controller, VehicleSource
 
 UNKNOWN_VEHICLE = "unknown"
 _STAND_IN_RADIUS_M = 0.1
@@ -144,6 +146,9 @@ def choose(
             raise
         problem, vehicle, source = error, _stand_in(index, configuration), "fitted"
     sources = choose_sources(index.channels, configuration, vehicle, where=where)
+    if source not in {"flag", "configuration"} and _asks_sideways(index, vehicle, sources, sha256):
+        vehicle = find_preset(vehicle.sideways_preset) or vehicle
+        sources = choose_sources(index.channels, configuration, vehicle, where=where)
     vehicle = _apply_controller(vehicle, sources, configuration, controller)
     findings = [
         Finding("vehicle_choice", "info", note, where="vehicle") for note in (told.notes if told else ())
@@ -188,7 +193,7 @@ def _stand_in(index: LogIndex, configuration: Configuration) -> Vehicle:
     """Any vehicle of the kind that the topics are made for; unit geometry makes gains lengths."""
     types = {channel.type_name for channel in index.channels if channel.message_count != 0}
     steered = any(name.startswith(_STEERED) for name in types)
-    kind = configuration.vehicle.kind or ("ackermann" if steered else "differential")
+    kind = str(configuration.vehicle.list_values().get("kind", "ackermann" if steered else "differential"))
     return Vehicle(
         id=UNKNOWN_VEHICLE,
         name="unknown vehicle",
@@ -218,6 +223,16 @@ def _recognize_geometry(
     return Recognized(vehicle, "parameters" if geometry else "transforms"), known
 
 
+def _asks_sideways(index: LogIndex, vehicle: Vehicle, sources: Sources, sha256: str | None) -> bool:
+    """Whether a platform that has such wheels, too, is commanded to move sideways."""
+    if not vehicle.sideways_preset or sources.command is None:
+        return False
+    command = Sources(sources.command, None, None, None, None)
+    types = {channel.topic: channel.type_name for channel in index.channels}
+    data = read_topics(index, list_wanted(command, types), sha256=sha256 or "unused")
+    return find_sideways_share(data.topics, sources.command) > 0.0
+
+
 def _apply_controller(
     vehicle: Vehicle, sources: Sources, configuration: Configuration, controller: Controller | None
 ) -> Vehicle:
@@ -235,6 +250,8 @@ def _apply_controller(
 
 def _check_contradiction(told: Recognized | None, vehicle: Vehicle, source: VehicleSource) -> list[Finding]:
     if told is None or source not in {"flag", "configuration", "metadata"}:
+        return []
+    if told.vehicle.sideways_preset == vehicle.id:
         return []
     differing = list_contradictions(told.vehicle, vehicle)
     if not differing:
@@ -289,6 +306,9 @@ def _fit_vehicle(
     drive = next((one for one in drives if one.form is not DriveForm.BODY), None)
     if not drives or data is None:
         raise problem
+    if configuration.vehicle.kind is None and find_sideways_share(data.topics, sources.command):
+        # Where rollers stand on which wheels nobody says: body motion is all that can be told.
+        vehicle, drive = msgspec.structs.replace(vehicle, kind="omni"), None
     if drive is None:
         values: dict[str, float] = {"wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": _STAND_IN_TRACK_M}
         name = "fitted_body"
@@ -296,6 +316,8 @@ def _fit_vehicle(
             "no vehicle is named and none is needed: the drive is told and measured as body motion, whose "
             "slip does not depend on wheel radius and track width"
         )
+        if vehicle.kind == "omni":
+            text += " (it is asked to move sideways: as mecanum wheels their joints are read with --vehicle)"
     else:
         asked = sources.command if drive is not sources.command else None
         measured = replace(sources, wheels=drive, command=asked, imu=None, interval=None)
@@ -310,8 +332,7 @@ def _fit_vehicle(
         name, text = _describe_fit(values, by_controller=controller is not None)
         if told:
             text += f"; {' and '.join(told)} as recorded"
-    section = msgspec.structs.asdict(configuration.vehicle)
-    given = {key: value for key, value in section.items() if value is not None and key != "preset"}
+    given = {key: value for key, value in configuration.vehicle.list_values().items() if key != "preset"}
     known = {"name": "fitted vehicle", "id": name, "track_width_m": None, "wheelbase_m": None, **values}
     if vehicle.kind == "ackermann":
         known = {**known, "wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": None}

@@ -293,7 +293,7 @@ def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:
         return frame.with_columns(pl.lit(0.0).alias("latency"))
     if table == "commands":
         return frame.with_columns(
-            pl.col(name).alias(f"{name}_aligned") for name in ("left", "right", "speed")
+            pl.col(name).alias(f"{name}_aligned") for name in ("left", "right", "sideways", "speed")
         )
     return frame
 

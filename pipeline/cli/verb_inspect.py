@@ -74,6 +74,7 @@ def _as_json(seen: Inspection) -> dict[str, object]:
         "metadata": {name: dict(record) for name, record in index.metadata.items()},
         "topics": [vars(topic) for topic in seen.topics],
         "vehicle": seen.vehicle.id if seen.vehicle else None,
+        "running_gear": seen.vehicle.running_gear if seen.vehicle else None,
         "roles": {
             role: None
             if sources is None or (source := getattr(sources, role)) is None
@@ -111,7 +112,8 @@ def _describe(seen: Inspection) -> list[str]:
     lines += ["", *_describe_topics(seen.topics), ""]
     lines.append(f"vehicle   {seen.vehicle.name if seen.vehicle else 'unknown'}")
     if seen.choice is not None and seen.vehicle is not None:
-        lines[-1] += f"    told by: {seen.choice.vehicle_source.replace('_', ' ')}"
+        gear = ", on tracks" if seen.vehicle.running_gear == "tracks" else ""
+        lines[-1] += f"{gear}    told by: {seen.choice.vehicle_source.replace('_', ' ')}"
     if seen.sources is not None:
         for role in _ROLES:
             source = getattr(seen.sources, role)

@@ -110,6 +110,8 @@ def _list_regions(part: Part, places: Floats) -> list[tuple[str, str, Flags]]:
     lags = part.find_ideal()
     speed, turn = lags[:, 0, 0], lags[:, 0, 1]
     found = _cut_commands(speed, turn)
+    for aside in lags[:, 0, 2:].T:
+        found += _cut_sideways(aside)
     changed = np.abs(lags - lags[:, :1, :]).max(axis=1) > _CHANGE * np.abs(lags).max(axis=(0, 1))
     transitory = changed.any(axis=1)
     found.append(("phase", f"within {_TRANSITORY_S:g} s of a change of command", transitory))
@@ -152,6 +154,20 @@ def _cut_commands(speed: Floats, turn: Floats) -> list[tuple[str, str, Flags]]:
     found.append(("command", "turning on the spot", slow))
     straight = (np.abs(turn) < 0.1 * max(sharp, _STANDING)) & (np.abs(speed) > 0.25 * max(fast, _STANDING))
     found.append(("command", "driving straight", straight))
+    return found
+
+
+def _cut_sideways(aside: Floats) -> list[tuple[str, str, Flags]]:
+    """Regions of the command space by the sign and size of sideways motion."""
+    fast = float(np.abs(aside).max())
+    if fast <= _STANDING:
+        return []
+    found: list[tuple[str, str, Flags]] = []
+    for share in (0.25, 0.5):
+        least = share * fast
+        found.append(("command", f"driving to the left faster than {least:.2g} m/s", aside > least))
+        found.append(("command", f"driving to the right faster than {least:.2g} m/s", -aside > least))
+        found.append(("command", f"driving sideways faster than {least:.2g} m/s", np.abs(aside) > least))
     return found
 
 

@@ -33,6 +33,7 @@ MANOEUVRES: Mapping[Excitation, str] = {
     Excitation.SMALL: "ask for very small speeds, and for very small turns while driving",
     Excitation.LONG: "drive for ten minutes, the same manoeuvres at the start and at the end",
     Excitation.STEERING: "steer to both sides at several speeds",
+    Excitation.SIDEWAYS: "drive sideways both ways, at several speeds",
 }
 
 

@@ -61,6 +61,17 @@ _SHAPES: Mapping[str, tuple[str, str]] = {
     "turn_world_sin": ("w0 * sin(yaw)", "rad/s"),
     "turn_world_cos": ("w0 * cos(yaw)", "rad/s"),
 }
+_SIDEWAYS_SHAPES: Mapping[str, tuple[str, str]] = {
+    "sideways_gain": ("s0", "m/s"),
+    "sideways_speed": ("abs(s0)", "m/s"),
+    "sideways_squared": ("s0 * abs(s0)", "m^2/s^2"),
+    "sideways_curve": ("s0 * w0", "m/s^2"),
+    "sideways_turning": ("s0 * abs(w0)", "m/s^2"),
+    "diagonal": ("v0 * abs(s0)", "m^2/s^2"),
+    "diagonal_aside": ("s0 * abs(v0)", "m^2/s^2"),
+    "sign_sideways": ("sign(s0)", "1"),
+    "push_aside": ("s0_rate", "m/s^2"),
+}
 _UNITS = {"v_x": "m/s", "v_y": "m/s", "v_w": "rad/s"}
 _FIXED: Mapping[str, Parameter] = {
     "u": Parameter("u", "m/s", (0.01, 1.0), 0.1, "speed below which it fades", 0.1),
@@ -71,6 +82,7 @@ _KNOWN = frozenset(
     {
         ("v_x", "gain"), ("v_x", "turn_gain"), ("v_w", "turn_gain"), ("v_w", "gain"), ("v_y", "gain"),
         ("v_y", "turn_gain"), ("v_y", "curve"), ("v_x", "push_ahead"), ("v_w", "push_around"),
+        ("v_y", "sideways_gain"), ("v_y", "sideways_squared"), ("v_y", "push_aside"),
     }
 )  # fmt: skip
 
@@ -96,12 +108,13 @@ def _parse(term: Term) -> FormulaEffect:
     return FormulaEffect(term.id, {term.channel: term.text}, term.parameters, fixed=fixed)
 
 
-def list_terms() -> tuple[Term, ...]:
-    """All terms that do not depend on where the vehicle is."""
+def list_terms(*, sideways: bool = False) -> tuple[Term, ...]:
+    """All terms that do not depend on where the vehicle is; ``sideways`` of one that drives so, too."""
+    shapes = {**_SHAPES, **_SIDEWAYS_SHAPES} if sideways else _SHAPES
     return tuple(
         _make_term(channel, name, text, unit)
         for channel in CHANNELS
-        for name, (text, unit) in _SHAPES.items()
+        for name, (text, unit) in shapes.items()
         if (channel, name) not in _KNOWN
     )
 

@@ -108,8 +108,8 @@ def _find_lasting(way: Explored) -> tuple[float, Unexplained] | None:
 def _measure_asked(way: Explored) -> Floats:
     """Motion that was asked for, rms of x, y, w; sideways it is measured by the way forward."""
     ideal = way.search.selection.part.find_ideal()[:, 0, :]
-    forward, turning = np.sqrt((ideal**2).mean(axis=0)).tolist()
-    asked: Floats = np.maximum(np.array([forward, forward, turning]), 1e-9)
+    forward, turning, *sideways = np.sqrt((ideal**2).mean(axis=0)).tolist()
+    asked: Floats = np.maximum(np.array([forward, max([forward, *sideways]), turning]), 1e-9)
     return asked
 
 

@@ -13,6 +13,7 @@ from pipeline.diagnosis.plausibility import is_nameable
 from pipeline.diagnosis.verdict import LEAST_GAIN, Verdict, compare
 from pipeline.identification.fit import PartFit, fit_part
 from pipeline.identification.folds import hold_out_part, make_folds
+from pipeline.identification.parts import IDEAL_CHANNELS
 from pipeline.identification.proposals import propose
 from pipeline.identification.weights import Weights, make_weights, measure_spread
 
@@ -138,7 +139,7 @@ class Selection:
         if self.least_share == 0.0:
             return True
         asked = (self.part.find_ideal()[:, 0, :] ** 2).mean(axis=0)
-        fall = (before.held**2 - after.held**2).mean(axis=0)[[0, 2]]
+        fall = (before.held**2 - after.held**2).mean(axis=0)[list(IDEAL_CHANNELS[: asked.size])]
         return bool((fall > self.least_share**2 * asked).any())
 
     def adapt(self, tested: CandidateModel) -> CandidateModel:

@@ -67,7 +67,8 @@ def search_formula(
         The model with up to three terms, and without effects that only stood for them.
     """
     waves = (*list_waves(selection, final, places), *list_waves(selection, start, places, "_first"))
-    terms = (*list_terms(), *waves)
+    sideways = selection.part.find_ideal().shape[2] > len(("x", "w"))
+    terms = (*list_terms(sideways=sideways), *waves)
     wide = selection.widen((*selection.candidates, *terms))
     narrow = {effect.id for effect in selection.candidates}
     current = final
@@ -169,17 +170,19 @@ def _describe(comparison: Comparison) -> tuple[Floats, tuple[str, ...]]:
     around, cells = comparison.context, comparison.cells
     velocity = comparison.predict_velocity((), Timing())
     at = comparison.windows.times.mean(axis=1)
+    vehicle = around.vehicle
     columns: dict[str, Floats] = {}
     for late in _LAGS_S:
         columns[f"v_x {late:g} s ago"] = np.interp(at - late, around.times, velocity.x)
         columns[f"v_w {late:g} s ago"] = np.interp(at - late, around.times, velocity.w)
+        if vehicle.kinematics.has_inputs("sideways"):
+            columns[f"v_y {late:g} s ago"] = np.interp(at - late, around.times, velocity.y)
     yaw = np.interp(at, around.times, around.attitude[:, 2])
     columns |= {"sin yaw": np.sin(yaw), "cos yaw": np.cos(yaw)}
     columns |= {"sin 2 yaw": np.sin(2.0 * yaw), "cos 2 yaw": np.cos(2.0 * yaw)}
     for place, name in enumerate(("roll", "pitch")):
         columns[name] = np.interp(at, around.times, around.attitude[:, place])
     columns |= {"x": find_places(comparison)[:, 0], "y": find_places(comparison)[:, 1]}
-    vehicle = around.vehicle
     half = 0.5 * around.track_m * velocity.w if vehicle.kind == "differential" else 0.0 * velocity.w
     for name, rim in (("left", velocity.x - half), ("right", velocity.x + half)):
         angle = np.cumsum(rim) * cells.step_s / vehicle.wheel_radius_m

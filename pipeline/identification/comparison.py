@@ -309,7 +309,7 @@ class Comparison:
         _, velocity = self._measure_velocity(first, last)
         # What was seen over the first moments counts from their end on: nothing scored before has used it.
         known = (self._locate_nodes(last), velocity)
-        unknown = np.full((cells.first.size, 2), np.nan)
+        unknown = np.full((cells.first.size, 3), np.nan)
         spans = Resets(cells.span, cells.first, cells.first, unknown)
         return RunContext(
             vehicle=vehicle,
@@ -334,7 +334,7 @@ class Comparison:
         number = np.searchsorted(first, np.arange(cells.times.size), side="right") - 1
         wheels = base.wheels
         if self.run.wheels is not None:
-            wheels = Resets(number, first, first, np.full((first.size, 2), np.nan))
+            wheels = Resets(number, first, first, np.full((first.size, 3), np.nan))
         at, velocity = self._measure_velocity(before, origin)
         good = np.isfinite(velocity).all(axis=1)
         at = np.concatenate((base.body.at, at[good]))

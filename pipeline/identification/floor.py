@@ -101,10 +101,13 @@ def _remove_predictable(problem: Problem, residuals: Floats, known: Flags) -> Fl
 
 
 def _measure_speed(comparison: Comparison) -> Floats:
-    """Forward speed of the input at the middle of every window [m/s], shape (n,)."""
+    """Speed of the input at the middle of every window [m/s], shape (n,)."""
     velocity = comparison.predict_velocity((), Timing())
-    middle = comparison.windows.times.mean(axis=1)
-    return np.asarray(np.interp(middle, comparison.context.times, velocity.x), dtype=np.float64)
+    middle, times = comparison.windows.times.mean(axis=1), comparison.context.times
+    along = np.asarray(np.interp(middle, times, velocity.x), dtype=np.float64)
+    if not comparison.context.vehicle.kinematics.has_inputs("sideways"):
+        return along
+    return np.asarray(np.hypot(along, np.interp(middle, times, velocity.y)), dtype=np.float64)
 
 
 def describe_inputs(comparison: Comparison) -> Floats:
@@ -138,6 +141,23 @@ def describe_inputs(comparison: Comparison) -> Floats:
     columns += [np.sin(look(around.attitude[:, i], 0.0)) * moving for i in (0, 1)]
     since = middle / max(around.duration_s, 1e-9)
     columns += [since * v, since * w]
+    if around.vehicle.kinematics.has_inputs("sideways"):
+        aside = _average(velocity.y, around.step_s)
+        s = look(aside, 0.0)
+        columns += [
+            s,
+            s * w,
+            s * np.abs(s),
+            s * np.abs(w),
+            s * np.abs(v),
+            v * np.abs(s),
+            np.sign(s),
+            np.abs(s),
+        ]
+        columns += [s**3, s**2 * w, since * s]
+        for late in _LAGS_S:
+            one, two = look(aside, late), look(around_w, late)
+            columns += [one, one * two]
     return np.column_stack(columns)
 
 

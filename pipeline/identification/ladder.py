@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf, nan
+from math import inf, nan, prod
 from typing import TYPE_CHECKING, Final
 
 from pipeline.identification.fit import Fitted, fit_model
@@ -23,6 +23,8 @@ CHANCE = 1e-2
 ERRORS_OVER_2S: Final = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
 """By name in `Errors` and in JSON: of what, and the unit."""
 _LEAST_SQUARE = 1e-24
+_WORTH_JOINING = 0.5
+"""Product of the ratios of both errors over 2 s: far below what one of them may rise by."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +89,26 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
         del hoped[name]
         if not list_rises(rungs[-1].errors, last.errors, CHANCE):
             rungs.append(last)
+    if last is not rungs[-1]:
+        rungs = _join_rungs(rungs, last)
     # What was taken since the last rung has not made up for the error that it raised.
     left = tuple(effect.id for effect in problem.active_effects(model) if effect.id not in rungs[-1].effects)
     return Ladder(tuple(rungs), left)
+
+
+def _join_rungs(rungs: list[Rung], last: Rung) -> list[Rung]:
+    """Rungs with the last one in the place of those that lie below one of its errors by chance.
+
+    Where one error is at its floor, an effect that takes away most of the other may raise it a little.
+    """
+    gains = [
+        _read_error(last.errors, name) / max(_read_error(rungs[-1].errors, name), _LEAST_SQUARE)
+        for name in ERRORS_OVER_2S
+    ]
+    if not prod(gains) < _WORTH_JOINING:
+        return rungs
+    kept = [n for n, rung in enumerate(rungs) if not list_rises(rung.errors, last.errors, CHANCE)]
+    return [*rungs[: kept[-1] + 1], last] if kept else rungs
 
 
 def _take_next(

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from pipeline.identification.comparison import Comparison
     from pipeline.identification.state import DelayName, Free
     from pipeline.models.effect import Effect
+    from pipeline.models.evidence import Largest
     from pipeline.runs.signals import Velocity
 
 Floats = NDArray[np.float64]
@@ -31,6 +32,8 @@ Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 UNIT_S = 10.0
+IDEAL_CHANNELS = (0, 2, 1)
+"""Which of x, y, w the columns of `Part.find_ideal` are."""
 _NO_DELAY = Timing()
 _LEAST_SPREAD = 2e-4
 _STANDING = 0.02
@@ -86,10 +89,11 @@ class Part(ABC):
         return np.concatenate([self.find_run_residuals(state, run) for run in range(len(self.comparisons))])
 
     def find_ideal(self) -> Floats:
-        """Ideal velocity of the input (f_x, f_w) averaged over windows, now and up to 2 s earlier.
+        """Ideal velocity of the input averaged over windows, now and up to 2 s earlier.
 
         Returns:
-            shape (n, lags, 2), lags a quarter of a second apart.
+            f_x, f_w, and f_y of a vehicle that moves sideways (see `IDEAL_CHANNELS`), lags a quarter of a
+            second apart, shape (n, lags, 2 or 3).
         """
         return np.concatenate([average_lags(c, c.predict_velocity((), _NO_DELAY)) for c in self.comparisons])
 
@@ -177,17 +181,17 @@ class WheelPart(Part):
     Args:
         commanded: runs fed with commands.
         measured: the same runs fed with measured wheels.
-        speed, turn: largest that were asked for [m/s, rad/s].
+        largest: what was asked for.
     """
 
-    channels = (0, 2)
     way = "from the command to the wheels"
 
     def __init__(
-        self, commanded: Sequence[Comparison], measured: Sequence[Comparison], *, speed: float, turn: float
+        self, commanded: Sequence[Comparison], measured: Sequence[Comparison], largest: Largest
     ) -> None:
         super().__init__(commanded)
-        self.least = np.array([speed, 1.0, turn]) * _LEAST_SHARE
+        self.channels = (0, 1, 2) if largest.sideways > 0.0 else (0, 2)
+        self.least = np.array([largest.speed, largest.sideways or 1.0, largest.turn]) * _LEAST_SHARE
         self.measured = tuple(measured)
         self._seen: dict[tuple[int, float], Floats] = {}
         self._spans = [locate_windows(comparison) for comparison in self.comparisons]
@@ -226,7 +230,7 @@ def number_units(run: Integers, times: Floats, length: float = UNIT_S) -> Intege
 
 
 def find_live(ideal: Floats) -> Flags:
-    """Whether any of the ideal velocities (n, lags, 2) is more than 2 % of the largest."""
+    """Whether any of the ideal velocities of `Part.find_ideal` is more than 2 % of the largest."""
     size = np.abs(ideal)
     live: Flags = (size > _STANDING * size.max(axis=(0, 1))).any(axis=(1, 2))
     return live
@@ -274,7 +278,10 @@ def average_windows(comparison: Comparison, velocity: Velocity, spans: Spans) ->
 
 
 def average_lags(comparison: Comparison, velocity: Velocity, lags: int = 9) -> Floats:
-    """Means of (x, w) over windows now and earlier, shape (n, lags, 2)."""
+    """Means of (x, w), or (x, w, y) of a vehicle that moves sideways, over windows now and earlier."""
+    signals = [velocity.x, velocity.w]
+    if comparison.context.vehicle.kinematics.has_inputs("sideways"):
+        signals.append(velocity.y)
     spans = [locate_windows(comparison, 0.25 * lag) for lag in range(lags)]
-    means = [[one.average(comparison, signal) for signal in (velocity.x, velocity.w)] for one in spans]
+    means = [[one.average(comparison, signal) for signal in signals] for one in spans]
     return np.moveaxis(np.asarray(means), (0, 1, 2), (1, 2, 0))

@@ -18,7 +18,7 @@ from pipeline.models.evidence import Largest
 from pipeline.models.forward import Timing
 from pipeline.runs.errors import MotionError
 from pipeline.runs.heading import HeadingSource
-from pipeline.runs.signals import name_inputs
+from pipeline.runs.signals import find_fastest_wheel, name_inputs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -95,7 +95,7 @@ class Problem:
             self.whole = BodyPart(self.comparisons)
             self.parts = (
                 BodyPart(measured, delays, whole=False),
-                WheelPart(self.comparisons, measured, speed=self.largest.speed, turn=self.largest.turn),
+                WheelPart(self.comparisons, measured, self.largest),
             )
 
     def _compare(self, source: Input) -> tuple[Comparison, ...]:
@@ -169,19 +169,22 @@ class Problem:
 
 def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
     """What was asked for in runs, of the command where there is one."""
-    speed = turn = wheel = difference = 0.0
+    speed = aside = turn = wheel = difference = 0.0
     for run in runs:
         series = run.commands or run.wheels
         if series is None:
             continue
-        forward, _, around = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
+        forward, sideways, around = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
         speed, turn = max(speed, float(np.abs(forward).max())), max(turn, float(np.abs(around).max()))
-        wheel = max(wheel, float(np.abs(series.left).max()), float(np.abs(series.right).max()))
+        if series.sideways is not None:
+            aside = max(aside, float(np.abs(sideways).max()))
+        wheel = max(wheel, float(find_fastest_wheel(series).max()))
         difference = max(difference, float(np.abs(series.right - series.left).max()))
     moments = np.concatenate([run.track.times[run.track.active] for run in runs])
     places = np.concatenate([run.track.place[run.track.active, 0] for run in runs])
     shares = np.linspace(0.0, 1.0, 11)
     if places.size == 0:
-        return Largest(speed, turn, wheel, max(difference, 1e-6), np.zeros(11), np.zeros(11))
-    tenths = np.quantile(moments, shares), np.quantile(places, shares)
-    return Largest(speed, turn, wheel, max(difference, 1e-6), *tenths)
+        tenths = np.zeros(11), np.zeros(11)
+    else:
+        tenths = np.quantile(moments, shares), np.quantile(places, shares)
+    return Largest(speed, turn, wheel, max(difference, 1e-6), *tenths, sideways=aside)

@@ -135,4 +135,20 @@ def _make_features(part: Part) -> Floats:
         np.abs(forward[:, 0]),
         np.abs(turning[:, 0]),
     ]
-    return np.column_stack((forward, turning, products[:, [0, 1, 2, 4, 6]], *now))
+    columns = [forward, turning, products[:, [0, 1, 2, 4, 6]], *now]
+    for sideways in np.moveaxis(lags[:, :, 2:], 2, 0):
+        across = sideways * turning
+        first = sideways[:, 0]
+        columns += [
+            sideways,
+            across[:, [0, 1, 2, 4, 6]],
+            first * np.abs(first),
+            first * np.abs(turning[:, 0]),
+        ]
+        columns += [
+            first * np.abs(forward[:, 0]),
+            np.abs(first) * forward[:, 0],
+            np.sign(first),
+            np.abs(first),
+        ]
+    return np.column_stack(columns)

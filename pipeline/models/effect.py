@@ -36,11 +36,13 @@ __all__ = [  # what a file of an effect needs
     "ACKERMANN",
     "ANY",
     "DATA_SHEET",
-    "DIFFERENTIAL",
     "INF",
     "MOUNTING",
     "NAN",
+    "SIDES",
+    "SIDEWAYS",
     "STAMPS",
+    "WHEELED",
     "AddedEffect",
     "BodyEffect",
     "Column",
@@ -88,8 +90,12 @@ class Late(enum.Enum):
     BODY = "the body follows its wheels late, which hides a delay of the encoders"
 
 
-DIFFERENTIAL = ("differential",)
 ACKERMANN = ("ackermann",)
+SIDEWAYS = ("mecanum", "omni")
+SIDES = ("differential", *SIDEWAYS)
+"""Vehicles that turn by a difference of speed between their sides."""
+WHEELED = ("differential", "ackermann", "mecanum")
+"""Vehicles whose single wheels are known."""
 ANY = list_kinds()
 
 

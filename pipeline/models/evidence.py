@@ -30,6 +30,7 @@ class Largest:
         difference: of the wheel speeds [rad/s].
         moments: times [s] before which the tenths of the driving lie, shape (11,).
         places: x [m] in the map below which the tenths of the run lie, shape (11,).
+        sideways: speed to the left or right [m/s].
     """
 
     speed: float
@@ -38,16 +39,22 @@ class Largest:
     difference: float
     moments: Floats
     places: Floats
+    sideways: float = 0.0
+
+    @property
+    def fastest(self) -> float:
+        """Largest speed [m/s], ahead or to a side."""
+        return max(self.speed, self.sideways)
 
     @property
     def moves_both_ways(self) -> bool:
         """Whether a run both drives and turns."""
-        return min(self.speed, self.turn) > _STANDING
+        return min(self.fastest, self.turn) > _STANDING
 
     @property
     def is_one_motion(self) -> bool:
         """Driven straight only, or turned on the spot only."""
-        return min(self.speed, self.turn) < _NEVER * max(self.speed, self.turn)
+        return min(self.fastest, self.turn) < _NEVER * max(self.fastest, self.turn)
 
     @property
     def travels(self) -> bool:

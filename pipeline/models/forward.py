@@ -104,7 +104,7 @@ class Forward:
             resets = self.around.wheels
             at = self.around.times[resets.first] - 0.5 * self.around.step_s
             seen = self._encoders.interpolate(at, delay_s)
-            resets = replace(resets, start=np.column_stack((seen.left, seen.right)))
+            resets = replace(resets, start=seen.stack())
             self._known[delay_s] = replace(self.around, wheels=resets)
             if len(self._known) > _REMEMBERED:
                 self._known.popitem(last=False)
@@ -122,10 +122,9 @@ class Forward:
         return made
 
     def _hold(self, effects: Sequence[Effect], delay_s: float) -> Wheels:
-        first = np.full((self.cells.first.size, 2), np.nan)
+        first = np.full((self.cells.first.size, 3), np.nan)
         if self._encoders is not None:
-            seen = self._encoders.interpolate(self.cells.starts, delay_s)
-            first = np.column_stack((seen.left, seen.right))
+            first = self._encoders.interpolate(self.cells.starts, delay_s).stack()
         commands = begin_spans(self.series, self.cells, first)
         for effect in effects:
             commands = cast("CommandEffect", effect).change_commands(commands, self.around)
@@ -178,7 +177,7 @@ class Forward:
     def _move_body(self, rolling: Rolling, effects: Sequence[Effect]) -> Velocity:
         for effect in effects:
             return cast("BodyEffect", effect).move_body(rolling, self.around)
-        return Velocity(rolling.v0, np.zeros_like(rolling.v0), rolling.w0)
+        return rolling.velocity
 
 
 def replace_context(forward: Forward, around: RunContext) -> Forward:

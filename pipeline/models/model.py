@@ -42,7 +42,7 @@ class Model:
             if self.vehicle.kind not in effect.kinds:
                 raise MotionError(
                     "wrong_vehicle",
-                    f"{effect.id} exists on {effect.kinds[0]} vehicles only; {self.vehicle.id} is "
+                    f"{effect.id} exists on {' or '.join(effect.kinds)} vehicles only; {self.vehicle.id} is "
                     f"{self.vehicle.kind}",
                     where=effect.id,
                     hint="Choose another effect.",

@@ -24,6 +24,7 @@ class Excitation(enum.Enum):
     SMALL = "commands near zero"
     LONG = "a run of several minutes"
     STEERING = "steering to both sides"
+    SIDEWAYS = "driving sideways"
 
 
 class Search(enum.Enum):

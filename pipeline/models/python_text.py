@@ -111,6 +111,13 @@ def _write_step(effect: Effect, kind: str) -> str:
 
 def _write_head(model: Model) -> str:
     vehicle, text = model.vehicle, _HEAD
+    if vehicle.kinematics.has_inputs("sideways"):
+        raise MotionError(
+            "not_exportable",
+            f"{vehicle.name} is {vehicle.kind}, and the Python function knows no sideways motion",
+            where=vehicle.id,
+            hint="Export --to json.",
+        )
     delay = math.fsum(
         effect.values[parameter.name]
         for effect in model

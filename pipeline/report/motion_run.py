@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
 
-_WHEELS = ("t", "left", "right", "speed", "steering", "latency")
+_WHEELS = ("t", "left", "right", "sideways", "speed", "steering", "latency")
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "poses": (
         *("t", "segment", "x", "y", "z", "q_x", "q_y", "q_z", "q_w"),
@@ -28,7 +28,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
         *("heading_delay_error", "wheel_delay", "gyro_residual", "latency_spread", "outlier_time"),
         *("recorded_modulus_command", "recorded_modulus_measured"),
     ),
-    "commands": ("t", "left_aligned", "right_aligned", "speed_aligned", "steering"),
+    "commands": ("t", *(f"{name}_aligned" for name in ("left", "right", "sideways", "speed")), "steering"),
     "wheels": _WHEELS,
     "imu": ("t", "rate_z"),
     "slip": ("t", "input", "step", "suspect"),

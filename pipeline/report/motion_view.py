@@ -28,6 +28,7 @@ Floats = NDArray[np.float64]
 COMPONENTS = ("x", "y", "w")
 SIGNALS = {
     "f_x": ("ideal speed", "m/s"),
+    "f_y": ("ideal sideways speed", "m/s"),
     "f_w": ("ideal yaw rate", "rad/s"),
     "f_x_f_w": ("ideal speed times ideal yaw rate", "m/s²"),
     "a_x": ("change of ideal speed", "m/s²"),
@@ -114,6 +115,7 @@ class MotionStage:
 
         return {
             "f_x": average(velocity.x),
+            "f_y": average(velocity.y),
             "f_w": average(velocity.w),
             "f_x_f_w": average(velocity.x * velocity.w),
             "a_x": slope(velocity.x),

@@ -105,6 +105,7 @@ class MeasuredDrive:
 
         self._left, self._right = fill(series.left), fill(series.right)
         self._steering = fill(series.steering) if series.steering.any() else None
+        self._sideways = None if series.sideways is None else fill(series.sideways)
 
     def interpolate(self, at: Floats, delay_s: float) -> Wheels:
         """Wheels at times [s] of shape (n,), their stamps being late by ``delay_s``."""
@@ -113,6 +114,7 @@ class MeasuredDrive:
             np.interp(late, self._knots, self._left),
             np.interp(late, self._knots, self._right),
             np.zeros(late.size) if self._steering is None else np.interp(late, self._knots, self._steering),
+            None if self._sideways is None else np.interp(late, self._knots, self._sideways),
         )
 
 
@@ -122,26 +124,29 @@ def begin_spans(series: DriveSeries, cells: Grid, measured: Floats) -> Commands:
     Args:
         series: held commands.
         cells: the grid.
-        measured: wheel speeds at each span's start, NaN where unknown, shape (k, 2).
+        measured: left, right and sideways speeds at each span's start, NaN where unknown, shape (k, 3).
     """
     following = np.minimum(np.searchsorted(series.times, cells.starts - 1e-6), series.times.size - 1)
     # At a hole nobody knows what was asked meanwhile; at the start of the recording nothing was.
     ends_before = np.concatenate(([-np.inf], cells.ends[:-1]))
     stamp = np.maximum(ends_before + 1e-3, cells.starts - _BEFORE)
-    values = []
-    for column, source in ((0, series.left), (1, series.right), (None, series.steering)):
-        first = source[following]
-        if column is not None:
-            first = np.where(np.isfinite(measured[:, column]), measured[:, column], first)
-        values.append(first)
     inside = cells.find_span(series.times) >= 0
     times = np.concatenate((stamp, series.times[inside]))
     order = np.argsort(times, kind="stable")
-    columns = [
-        np.concatenate((begin, source[inside]))[order]
-        for begin, source in zip(values, (series.left, series.right, series.steering), strict=True)
-    ]
-    return Commands(times[order], *columns)
+
+    def begin(source: Floats, seen: Floats | None) -> Floats:
+        first = source[following]
+        if seen is not None:
+            first = np.where(np.isfinite(seen), seen, first)
+        return np.concatenate((first, source[inside]))[order]
+
+    return Commands(
+        times[order],
+        begin(series.left, measured[:, 0]),
+        begin(series.right, measured[:, 1]),
+        begin(series.steering, None),
+        None if series.sideways is None else begin(series.sideways, measured[:, 2]),
+    )
 
 
 def hold_on_cells(commands: Commands, cells: Grid) -> Wheels:
@@ -163,4 +168,5 @@ def hold_on_cells(commands: Commands, cells: Grid) -> Wheels:
         return np.where(steady, values[index[: cells.times.size]], means)
 
     steering = average(commands.steering) if commands.steering.any() else np.zeros(cells.times.size)
-    return Wheels(average(commands.left), average(commands.right), steering)
+    sideways = None if commands.sideways is None else average(commands.sideways)
+    return Wheels(average(commands.left), average(commands.right), steering, sideways)

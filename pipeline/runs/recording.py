@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.core import rigid, segments, timegrid
 from pipeline.runs.errors import MotionError
+from pipeline.runs.signals import find_fastest_wheel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -46,12 +47,16 @@ _INPUTS = ("command", "measured")
 
 @dataclass(frozen=True)
 class DriveSeries:
-    """Wheel speeds (rear axle on a car) [rad/s] and steering [rad] at stamps [s], each of shape (n,)."""
+    """Wheel speeds (rear axle on a car) [rad/s] and steering [rad] at stamps [s], each of shape (n,).
+
+    ``sideways`` [rad/s] is None on a vehicle that cannot move so.
+    """
 
     times: Floats
     left: Floats
     right: Floats
     steering: Floats
+    sideways: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -213,7 +218,7 @@ def make_run(
     commands = _read_drive(tables.get("commands"), vehicle)
     wheels = _read_drive(tables.get("wheels"), vehicle)
     track = _read_track(tables["poses"], wheels, name)
-    if wheels is not None and max(np.abs(wheels.left).max(), np.abs(wheels.right).max()) < _DEAD:
+    if wheels is not None and find_fastest_wheel(wheels).max() < _DEAD:
         wheels = None
     imu = tables.get("imu")
     gyro = None
@@ -317,7 +322,7 @@ def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> T
 def _waits_in_motion(times: Floats, held: Flags, wheels: DriveSeries) -> Flags:
     """Repeats of a pose that are shorter than any rest while the wheels turn: a localization that waits."""
     waits = np.zeros(times.size, dtype=bool)
-    rim = np.maximum(np.abs(wheels.left), np.abs(wheels.right))
+    rim = find_fastest_wheel(wheels)
     for first, end in segments.find_runs(held):
         if times[end - 1] - times[first] > _LONGEST_WAIT:
             continue
@@ -371,11 +376,15 @@ def _read_drive(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | N
         left, right, steering = axle, axle, table["steering"].to_numpy()
     else:
         left, right, steering = read("left"), read("right"), np.zeros(times.size)
+    sideways = read("sideways") if vehicle.kinematics.has_inputs("sideways") else None
     kept = np.isfinite(left) & np.isfinite(right) & np.isfinite(steering)
     kept &= np.concatenate((np.diff(times) > 0.0, [True]))
+    if sideways is not None:
+        kept &= np.isfinite(sideways)
+        sideways = sideways[kept]
     if kept.sum() < 2:  # noqa: PLR2004 - one value is no series
         return None
-    return DriveSeries(times[kept], left[kept], right[kept], steering[kept])
+    return DriveSeries(times[kept], left[kept], right[kept], steering[kept], sideways)
 
 
 def _distinct(times: Floats, values: Floats) -> tuple[Floats, Floats]:
@@ -392,6 +401,7 @@ def _stop_when_silent(commands: DriveSeries, hold_s: float) -> DriveSeries:
         np.insert(commands.left, at, 0.0),
         np.insert(commands.right, at, 0.0),
         np.insert(commands.steering, at, 0.0),
+        None if commands.sideways is None else np.insert(commands.sideways, at, 0.0),
     )
 
 

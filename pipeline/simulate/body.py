@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.simulate.drivetrain import move_by_corners
 from pipeline.simulate.signals import filter_pole, integrate_cells, lag_signal, make_coloured_noise
 
 if TYPE_CHECKING:
@@ -59,13 +60,15 @@ def move_body(
         ground_input: what ground effects act on.
         generator: source of the disturbance.
     """
-    v0, w0 = _roll_wheels(drive, vehicle, effects)
+    v0, s0, w0 = _roll_wheels(drive, vehicle, effects)
     rim = vehicle.wheel_radius_m * np.maximum(np.abs(drive.left), np.abs(drive.right))
+    if drive.corners is not None:
+        rim = vehicle.wheel_radius_m * np.max(np.abs(list(drive.corners.values())), axis=0)
     turning = (rim > _TURNING_MPS).astype(np.float64)
-    v_x, v_y, v_w = v0, np.zeros_like(v0), w0
+    v_x, v_y, v_w = v0, s0, w0
     if effects.is_active("body_inertia"):
-        v_x, v_y, v_w = _apply_inertia(v0, w0, effects.value("body_inertia", "tau"), drive.step_s)
-    along, around = (v0, w0) if ground_input == "drive" else (v_x, v_w)
+        v_x, v_y, v_w = _apply_inertia(v0, s0, w0, effects.value("body_inertia", "tau"), drive.step_s)
+    along, aside, around = (v0, s0, w0) if ground_input == "drive" else (v_x, v_y, v_w)
     v_x = (
         v_x
         - effects.value("speed_slip", "k") * along * np.abs(along)
@@ -76,6 +79,9 @@ def move_body(
         - effects.value("lateral_skid", "c") * along * around
         + effects.value("lateral_drift", "c") * turning
     )
+    if vehicle.moves_sideways:
+        v_x = v_x + effects.value("lateral_skid", "c") * aside * around
+        v_y = v_y - effects.value("roller_slip", "k") * aside * np.abs(aside)
     v_w = v_w + effects.value("yaw_drift", "c") * turning
     shaken = _shake(disturbance, turning, drive.step_s, generator)
     v_x, v_y, v_w = v_x + shaken[0], v_y + shaken[1], v_w + shaken[2]
@@ -84,13 +90,21 @@ def move_body(
     return BodyMotion(v0, w0, np.stack((v_x, v_y, v_w), axis=1), turning)
 
 
-def _roll_wheels(drive: Drive, vehicle: Vehicle, effects: Effects) -> tuple[Floats, Floats]:
+def _roll_wheels(drive: Drive, vehicle: Vehicle, effects: Effects) -> tuple[Floats, Floats, Floats]:
     radius = vehicle.wheel_radius_m * effects.value("wheel_radius", "k")
     uneven = 0.5 * effects.value("wheel_asymmetry", "e")
     left = radius * (1.0 - uneven) * drive.left
     right = radius * (1.0 + uneven) * drive.right
     v0 = 0.5 * (left + right)
-    if vehicle.kind == "ackermann":
+    s0 = np.zeros_like(v0)
+    if drive.corners is not None:
+        radii = {place: radius * (1.0 + uneven * (1 if "right" in place else -1)) for place in drive.corners}
+        rims = {
+            place: radii[place] / vehicle.wheel_radius_m * wheel for place, wheel in drive.corners.items()
+        }
+        v0, s0, w0 = move_by_corners(vehicle, rims)
+        s0, w0 = s0 * effects.value("lateral_scale", "k"), w0 / effects.value("effective_track", "k")
+    elif vehicle.kind == "ackermann":
         reach = vehicle.wheelbase_m + effects.value("understeer", "K") * v0**2
         w0 = v0 * np.tan(drive.steering) / reach
     else:
@@ -104,16 +118,18 @@ def _roll_wheels(drive: Drive, vehicle: Vehicle, effects: Effects) -> tuple[Floa
         beyond = time >= (0.5 * duration if np.isnan(at) else at)
         gain_v = fade * np.where(beyond, effects.value("terrain_change", "k_v"), 1.0)
         gain_w = fade * np.where(beyond, effects.value("terrain_change", "k_w"), 1.0)
-    return v0 * gain_v, w0 * gain_w
+    return v0 * gain_v, s0 * gain_v, w0 * gain_w
 
 
-def _apply_inertia(v0: Floats, w0: Floats, tau_s: float, step_s: float) -> tuple[Floats, Floats, Floats]:
+def _apply_inertia(
+    v0: Floats, s0: Floats, w0: Floats, tau_s: float, step_s: float
+) -> tuple[Floats, Floats, Floats]:
     # In a frame that does not turn, the two equations of v_x and v_y are one linear lag of a complex number.
     around = lag_signal(w0, tau_s=tau_s, step_s=step_s)
     heading = integrate_cells(around, step_s=step_s)
     middle = np.exp(0.5j * (heading[:-1] + heading[1:]))
     decay = float(np.exp(-step_s / tau_s))
-    drive = v0 * middle * (1.0 - decay)
+    drive = (v0 + 1j * s0) * middle * (1.0 - decay)
     at_end = filter_pole(drive.real, decay) + 1j * filter_pole(drive.imag, decay)
     fixed = 0.5 * (at_end + np.concatenate(([0.0], at_end[:-1])))
     turned = fixed * np.conj(middle)

@@ -15,6 +15,8 @@ from pipeline.simulate.programs import Commands
 from pipeline.simulate.signals import hold_on_grid, integrate_cells, lag_signal, limit_rate
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from pipeline.simulate.effects import Effects
     from pipeline.simulate.vehicles import Vehicle
 
@@ -27,18 +29,45 @@ class Drive:
 
     Attributes:
         step_s: cell width [s].
-        left, right: true wheel speeds [rad/s], shape (n,); equal on a car, whose rear axle they are.
+        left, right: true wheel speeds [rad/s], shape (n,); equal on a car, whose rear axle they are; means of
+            a side on mecanum wheels.
         steering: true steering angle [rad], shape (n,); zero on a differential vehicle.
+        corners: true speeds of mecanum wheels by place; on omni wheels those of wheels at the corners of the
+            same body motion; None on a vehicle that cannot move sideways.
     """
 
     step_s: float
     left: Floats
     right: Floats
     steering: Floats
+    corners: Mapping[str, Floats] | None = None
 
     def wheel_angles(self) -> tuple[Floats, Floats]:
         """Turned angles [rad] of left and right wheels at the cell edges, each of shape (n + 1,)."""
         return integrate_cells(self.left, step_s=self.step_s), integrate_cells(self.right, step_s=self.step_s)
+
+
+CORNERS = ("front_left", "front_right", "rear_left", "rear_right")
+_TURNS = {"front_left": -1.0, "front_right": 1.0, "rear_left": -1.0, "rear_right": 1.0}
+_PUSHES = {"front_left": -1.0, "front_right": 1.0, "rear_left": 1.0, "rear_right": -1.0}
+
+
+def invert_corners(vehicle: Vehicle, speed: Floats, sideways: Floats, turn: Floats) -> dict[str, Floats]:
+    """Speeds [rad/s] of the four wheels that the controller asks for, by place, each of shape (n,)."""
+    around = vehicle.lever_m * vehicle.controller_track_multiplier * turn
+    return {
+        place: (speed + _PUSHES[place] * sideways + _TURNS[place] * around) / vehicle.wheel_radius_m
+        for place in CORNERS
+    }
+
+
+def move_by_corners(vehicle: Vehicle, corners: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats]:
+    """Speed ahead and to the left [m/s] and yaw rate [rad/s] of four wheels [rad/s], each of shape (n,)."""
+    rims = {place: 0.25 * vehicle.wheel_radius_m * corners[place] for place in CORNERS}
+    ahead = sum((rims[place] for place in CORNERS), start=np.zeros_like(rims["front_left"]))
+    aside = sum((_PUSHES[place] * rims[place] for place in CORNERS), start=np.zeros_like(ahead))
+    around = sum((_TURNS[place] * rims[place] for place in CORNERS), start=np.zeros_like(ahead))
+    return ahead, aside, around / vehicle.lever_m
 
 
 def invert_ideal_model(vehicle: Vehicle, speed: Floats, turn: Floats) -> tuple[Floats, Floats]:
@@ -49,7 +78,7 @@ def invert_ideal_model(vehicle: Vehicle, speed: Floats, turn: Floats) -> tuple[F
     """
     if vehicle.kind == "ackermann":
         return speed / vehicle.wheel_radius_m, speed / vehicle.wheel_radius_m
-    half = 0.5 * vehicle.track_width_m * vehicle.controller_track_multiplier
+    half = vehicle.lever_m * vehicle.controller_track_multiplier
     return (speed - half * turn) / vehicle.wheel_radius_m, (speed + half * turn) / vehicle.wheel_radius_m
 
 
@@ -60,7 +89,7 @@ def apply_ideal_model(
     speed = 0.5 * vehicle.wheel_radius_m * (left + right)
     if vehicle.kind == "ackermann":
         return speed, speed * np.tan(steering) / vehicle.wheelbase_m
-    return speed, vehicle.wheel_radius_m * (right - left) / vehicle.track_width_m
+    return speed, vehicle.wheel_radius_m * (right - left) / (2.0 * vehicle.lever_m)
 
 
 def drive_wheels(
@@ -99,12 +128,28 @@ def drive_wheels(
             wheel = lag_signal(wheel, tau_s=effects.value("drive_lag", "tau"), step_s=step_s)
         return wheel
 
+    if vehicle.moves_sideways:
+        asked = invert_corners(vehicle, speed, commands.sideways, turn)
+        turned = {place: turn_wheel(wheel) for place, wheel in asked.items()}
+        return _join_corners(turned, effects, step_s)
     asked_left, asked_right = invert_ideal_model(vehicle, speed, turn)
     if vehicle.kind == "ackermann":
         axle = turn_wheel(asked_left)
         return Drive(step_s, axle, axle, _steer(hold(turn), effects, step_s))
     left, right = _couple_sides(turn_wheel(asked_left), turn_wheel(asked_right), effects, step_s)
     return Drive(step_s, left, right, np.zeros(cells))
+
+
+def _join_corners(corners: dict[str, Floats], effects: Effects, step_s: float) -> Drive:
+    """Four wheels whose sides are coupled as those of any vehicle: what is sideways lags like the mean."""
+    sides = [0.5 * (corners[f"front_{side}"] + corners[f"rear_{side}"]) for side in ("left", "right")]
+    left, right = _couple_sides(sides[0], sides[1], effects, step_s)
+    rest = {place: corners[place] - sides[place.endswith("right")] for place in CORNERS}
+    slow = effects.value("turn_lag", "tau_mean")
+    if slow > 0.0:
+        rest = {place: lag_signal(part, tau_s=slow, step_s=step_s) for place, part in rest.items()}
+    coupled = {place: (right if place.endswith("right") else left) + rest[place] for place in CORNERS}
+    return Drive(step_s, left, right, np.zeros_like(left), coupled)
 
 
 def _stop_when_silent(commands: Commands, hold_s: float) -> Commands:
@@ -115,6 +160,7 @@ def _stop_when_silent(commands: Commands, hold_s: float) -> Commands:
         np.insert(time, at, time[silent] + hold_s),
         np.insert(commands.speed_mps, at, 0.0),
         np.insert(commands.turn, at, 0.0),
+        None if commands.sideways_mps is None else np.insert(commands.sideways_mps, at, 0.0),
     )
 
 
@@ -123,7 +169,7 @@ def _limit_body(commands: Commands, vehicle: Vehicle, effects: Effects) -> tuple
     sharpest = effects.value("body_turn_limit", "limit")
     speed = np.clip(commands.speed_mps, -fastest, fastest)
     turn = commands.turn
-    if vehicle.kind == "differential":
+    if vehicle.kind != "ackermann":
         return speed, np.clip(turn, -sharpest, sharpest)
     if effects.is_active("body_turn_limit"):
         moving = np.maximum(np.abs(speed), 1e-9)

@@ -40,10 +40,13 @@ class EffectSpec:
     id: str
     formula: str
     parameters: tuple[ParameterSpec, ...]
-    kinds: tuple[Kind, ...] = ("differential", "ackermann")
+    kinds: tuple[Kind, ...] = ("differential", "ackermann", "mecanum", "omni")
 
 
-_SKID: tuple[Kind, ...] = ("differential",)
+_SKID: tuple[Kind, ...] = ("differential", "mecanum", "omni")
+_TWO_SIDED: tuple[Kind, ...] = ("differential", "mecanum")
+_WHEELED: tuple[Kind, ...] = ("differential", "ackermann", "mecanum")
+_SIDEWAYS: tuple[Kind, ...] = ("mecanum", "omni")
 _CAR: tuple[Kind, ...] = ("ackermann",)
 
 
@@ -54,10 +57,10 @@ def _one(name: str, unit: str, neutral: float, typical: float) -> tuple[Paramete
 _SPECS: tuple[EffectSpec, ...] = (
     EffectSpec("body_speed_limit", "commanded v_x clipped to +-limit", _one("limit", "m/s", _INF, 0.7)),
     EffectSpec("body_turn_limit", "commanded yaw rate clipped to +-limit", _one("limit", "rad/s", _INF, 0.6)),
-    EffectSpec("deadband", "Omega = 0 where |r u| < d, else u", _one("d", "m/s", 0.0, 0.15)),
+    EffectSpec("deadband", "Omega = 0 where |r u| < d, else u", _one("d", "m/s", 0.0, 0.15), _WHEELED),
     EffectSpec("transport_delay", "Omega(t) = u(t - d)", _one("d", "s", 0.0, 0.2)),
-    EffectSpec("wheel_speed_limit", "Omega clipped to +-limit", _one("limit", "rad/s", _INF, 4.5)),
-    EffectSpec("acceleration_limit", "|dOmega/dt| <= limit", _one("limit", "rad/s^2", _INF, 3.0)),
+    EffectSpec("wheel_speed_limit", "Omega clipped to +-limit", _one("limit", "rad/s", _INF, 4.5), _WHEELED),
+    EffectSpec("acceleration_limit", "|dOmega/dt| <= limit", _one("limit", "rad/s^2", _INF, 3.0), _WHEELED),
     EffectSpec("drive_lag", "tau dOmega/dt = u - Omega, each wheel", _one("tau", "s", 0.0, 0.5)),
     EffectSpec(
         "turn_lag",
@@ -76,8 +79,11 @@ _SPECS: tuple[EffectSpec, ...] = (
     EffectSpec("steering_lag", "tau ddelta/dt = delta_u - delta", _one("tau", "s", 0.0, 0.4), _CAR),
     EffectSpec("understeer", "v_w = v tan(delta) / (l + K v^2)", _one("K", "s^2/m", 0.0, 0.03), _CAR),
     EffectSpec("wheel_radius", "v0 = k f_x, w0 = k f_w", _one("k", "1", 1.0, 0.92)),
-    EffectSpec("wheel_asymmetry", "left r (1 - e/2), right r (1 + e/2)", _one("e", "1", 0.0, 0.04), _SKID),
+    EffectSpec(
+        "wheel_asymmetry", "left r (1 - e/2), right r (1 + e/2)", _one("e", "1", 0.0, 0.04), _TWO_SIDED
+    ),
     EffectSpec("effective_track", "w0 = f_w / k", _one("k", "1", 1.0, 1.8), _SKID),
+    EffectSpec("lateral_scale", "s0 = k f_y", _one("k", "1", 1.0, 0.8), _SIDEWAYS),
     EffectSpec("time_drift", "v0, w0 scaled by 1 - k t/T", _one("k", "1", 0.0, 0.1)),
     EffectSpec(
         "terrain_change",
@@ -94,7 +100,8 @@ _SPECS: tuple[EffectSpec, ...] = (
         "dv_x/dt = (v0 - v_x)/tau + v_y w; dv_y/dt = -v_y/tau - v_x w; dw/dt = (w0 - w)/tau",
         _one("tau", "s", 0.0, 0.5),
     ),
-    EffectSpec("lateral_skid", "v_y += -c v0 w0", _one("c", "s", 0.0, 0.1)),
+    EffectSpec("lateral_skid", "v_y += -c v0 w0; sideways, v_x += c s0 w0", _one("c", "s", 0.0, 0.1)),
+    EffectSpec("roller_slip", "v_y -= k s0 |s0|", _one("k", "s/m", 0.0, 0.3), _SIDEWAYS),
     EffectSpec("speed_slip", "v_x -= k v0 |v0|", _one("k", "s/m", 0.0, 0.08)),
     EffectSpec("turning_resistance", "v_x -= k v0 |w0|", _one("k", "s", 0.0, 0.24)),
     EffectSpec(
@@ -166,7 +173,7 @@ def resolve_effects(asked: Mapping[str, Mapping[str, float] | float], kind: Kind
         if kind not in spec.kinds:
             raise SimulateError(
                 "wrong_vehicle",
-                f"{name} exists on {spec.kinds[0]} vehicles only, this one is {kind}",
+                f"{name} exists on {' or '.join(spec.kinds)} vehicles only, this one is {kind}",
                 where=name,
                 hint="Choose another vehicle or another effect",
             )
@@ -199,7 +206,7 @@ def _check_parameters(spec: EffectSpec, given: Mapping[str, float] | float) -> d
 
 
 _NEVER_NEGATIVE = {"tau", "tau_mean", "tau_diff", "limit", "threshold"}
-_SCALES = {"wheel_radius": 0.0, "effective_track": 0.05}
+_SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0}
 
 
 def _check_value(effect: str, name: str, value: float) -> None:

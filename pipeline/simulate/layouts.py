@@ -136,6 +136,8 @@ LAYOUTS: dict[str, Layout] = {
         "differential", _TWIST, _JOINTS, PoseTopic("pose_stamped", "/robot/pose"), "/imu/data"
     ),
     "pose_covariance": Layout("differential", _TWIST, (), PoseTopic("pose_covariance", "/amcl_pose")),
+    "mecanum": Layout("mecanum", _TWIST, _JOINTS, _ICP, "/imu/data", joints="{}_wheel_joint"),
+    "omni": Layout("omni", _TWIST, (), _ICP, "/imu/data"),
     "ackermann": Layout(
         "ackermann",
         (CommandTopic("ackermann", ("/ackermann_cmd",)),),
@@ -188,6 +190,6 @@ def find_layout(layout: str | Layout, vehicle: Vehicle) -> Layout:
 
 
 def _choose_usual(vehicle: Vehicle) -> str:
-    if vehicle.kind == "ackermann":
-        return "ackermann"
+    if vehicle.kind != "differential":
+        return vehicle.kind
     return {"husky_a200": "husky", "warthog": "warthog"}.get(vehicle.name, "tf")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.rigid import quaternions_from_yaw
-from pipeline.simulate.drivetrain import apply_ideal_model, invert_ideal_model
+from pipeline.simulate.drivetrain import CORNERS, apply_ideal_model, invert_ideal_model
 from pipeline.simulate.programs import Commands, make_commands
 from pipeline.simulate.run import integrate_odometry
 from pipeline.simulate.scenario import Program
@@ -63,6 +63,8 @@ def _write_command(run: SimulatedRun, layout: Layout, topic: CommandTopic, comma
         if vehicle.kind == "ackermann":
             rate = commands.speed_mps * np.tan(commands.turn) / vehicle.wheelbase_m
         fields: dict[str, Field] = {f"{prefix}linear.x": commands.speed_mps, f"{prefix}angular.z": rate}
+        if commands.sideways_mps is not None:
+            fields[f"{prefix}linear.y"] = commands.sideways_mps
         if stamped:
             fields["header.frame_id"] = "base_link"
         name = "geometry_msgs/msg/TwistStamped" if stamped else "geometry_msgs/msg/Twist"
@@ -133,6 +135,11 @@ def _write_wheels(run: SimulatedRun, layout: Layout, topic: WheelTopic) -> list[
         names, sides = _name_joints(layout, vehicle.wheels_per_side)
         turned = [wheels.left_angle if side == "left" else wheels.right_angle for side in sides]
         turning = [wheels.left if side == "left" else wheels.right for side in sides]
+        if wheels.corners is not None and wheels.corner_angles is not None:
+            # The same order as the names.
+            turned, turning = (
+                [by[place] for place in CORNERS] for by in (wheels.corner_angles, wheels.corners)
+            )
     fields: dict[str, Field] = {"name": names}
     if encoders.report != "velocity" or vehicle.kind == "ackermann":
         fields["position"] = np.stack(turned, axis=1)

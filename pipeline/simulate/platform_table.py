@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 from pipeline.simulate.errors import unknown_name
+from pipeline.simulate.mecanum_table import MECANUM_PLATFORMS
 from pipeline.simulate.platforms import (
     Fields,
     Platform,
@@ -458,6 +459,7 @@ PLATFORMS: dict[str, Platform] = {
             describe("/robot_description", "linorobot2", _LINO, "{}_wheel_joint", _FOUR),
         ),
     ),
+    **MECANUM_PLATFORMS,
 }
 
 

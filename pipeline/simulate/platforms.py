@@ -10,6 +10,8 @@ from pipeline.simulate.layouts import Layout, PoseTopic
 from pipeline.simulate.published import Published, Q, Source
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from pipeline.simulate.vehicles import Vehicle
 
 _XYZ, _XYZW = "xyz", "xyzw"
@@ -41,16 +43,20 @@ def pose_fields(position: str, orientation: str) -> dict[str, Q]:
     return fields | {f"{orientation}.{axis}": Q(f"q{axis}") for axis in _XYZW}
 
 
-def twist(topic: str, *, stamped: bool = False, source: Source = "command") -> Published:
+def twist(
+    topic: str, *, stamped: bool = False, source: Source = "command", sideways: bool = False
+) -> Published:
     """A body command; a ``wish`` is one that never reaches the controller."""
     prefix, name = ("twist.", "TwistStamped") if stamped else ("", "Twist")
     fields = {f"{prefix}linear.x": Q("speed"), f"{prefix}angular.z": Q("yaw_rate")}
+    if sideways:
+        fields[f"{prefix}linear.y"] = Q("sideways")
     return Published(
         topic, f"geometry_msgs/msg/{name}", source, fields, stamp="header" if stamped else "none"
     )
 
 
-def odometry(topic: str, source: Source, parent: str, child: str) -> Published:
+def odometry(topic: str, source: Source, parent: str, child: str, *, sideways: bool = False) -> Published:
     """An odometry; one of the wheels says their speed as well."""
     fields: Fields = {
         **pose_fields("pose.pose.position", "pose.pose.orientation"),
@@ -59,6 +65,8 @@ def odometry(topic: str, source: Source, parent: str, child: str) -> Published:
     }
     if source != "localization":
         fields |= {"twist.twist.linear.x": Q("speed"), "twist.twist.angular.z": Q("yaw_rate")}
+        if sideways:
+            fields["twist.twist.linear.y"] = Q("sideways")
     return Published(topic, "nav_msgs/msg/Odometry", source, fields)
 
 
@@ -71,6 +79,16 @@ def transform(topic: str, source: Source, parent: str, child: str) -> Published:
         "transforms[].child_frame_id": child,
     }
     return Published(topic, "tf2_msgs/msg/TFMessage", source, fields)
+
+
+def mecanum_joints(topic: str, names: Mapping[str, str]) -> Published:
+    """Joint states of four wheels that differ, named by their place (`CORNERS`)."""
+    values: Fields = {
+        "name": list(names.values()),
+        "position": tuple(Q(f"{place}_angle") for place in names),
+        "velocity": tuple(Q(place) for place in names),
+    }
+    return Published(topic, "sensor_msgs/msg/JointState", "wheels", values)
 
 
 def joints(topic: str, template: str, places: tuple[str, ...], fields: str = "both") -> Published:

@@ -6,7 +6,7 @@ steering angle [rad] on a car.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,11 +32,18 @@ class Commands:
         time_s: increasing, shape (n,).
         speed_mps: shape (n,).
         turn: yaw rate [rad/s] or steering angle [rad], shape (n,).
+        sideways_mps: speed to the left, shape (n,); None on a vehicle that cannot.
     """
 
     time_s: Floats
     speed_mps: Floats
     turn: Floats
+    sideways_mps: Floats | None = None
+
+    @property
+    def sideways(self) -> Floats:
+        """Speed to the left [m/s], zero on a vehicle that cannot, shape (n,)."""
+        return np.zeros_like(self.speed_mps) if self.sideways_mps is None else self.sideways_mps
 
 
 @dataclass(frozen=True)
@@ -84,12 +91,21 @@ def make_commands(
     count = max(int(duration_s * program.rate_hz), 2)
     time = np.arange(count) / program.rate_hz
     speed, turn = _PROGRAMS[program.name](time, space)
+    sideways = None
+    if vehicle.moves_sideways:
+        # Sideways motion is asked for as turning is, at other moments of the same steps.
+        _, sideways = _PROGRAMS[program.name](
+            time, replace(space, turn=vehicle.max_sideways_mps * program.speed_scale)
+        )
+        sideways = np.nan_to_num(sideways)
     stamps = _jitter_stamps(time, program, generator)
     live = np.isfinite(speed)
     resting = (time < program.lead_s) | (time > duration_s - program.lead_s)
     moving = np.where(resting | ~live, 0.0, 1.0)
     speed, turn = np.nan_to_num(speed) * moving, np.nan_to_num(turn) * moving
-    return Commands(stamps[live], speed[live], turn[live])
+    if sideways is not None:
+        sideways = (sideways * moving)[live]
+    return Commands(stamps[live], speed[live], turn[live], sideways)
 
 
 def _jitter_stamps(time: Floats, program: Program, generator: np.random.Generator) -> Floats:

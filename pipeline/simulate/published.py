@@ -131,6 +131,7 @@ def _of_command(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
         "steering": commands.turn,
         "left": left,
         "right": right,
+        "sideways": commands.sideways,
     }
     return commands.time_s, commands.time_s + run.scenario.recording.command_latency_s, series
 
@@ -143,7 +144,8 @@ def _of_wish(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
         duration_s=scenario.duration_s,
         generator=open_stream(scenario.seed, "wish"),
     )
-    return wished.time_s, wished.time_s, {"speed": wished.speed_mps, "yaw_rate": wished.turn}
+    series = {"speed": wished.speed_mps, "yaw_rate": wished.turn, "sideways": wished.sideways}
+    return wished.time_s, wished.time_s, series
 
 
 def _of_wheels(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
@@ -155,6 +157,9 @@ def _of_wheels(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
         name: getattr(wheels, name) for name in ("left", "right", "left_angle", "right_angle", "steering")
     }
     series |= {"speed": speed, "yaw_rate": rate, "zero": np.zeros_like(speed)}
+    series["sideways"] = wheels.sideways_mps(run.scenario.vehicle)
+    series |= dict(wheels.corners or {})
+    series |= {f"{place}_angle": angle for place, angle in (wheels.corner_angles or {}).items()}
     series |= {f"{side}_turns": series[f"{side}_angle"] / _TURN for side in ("left", "right")}
     return wheels.time_s, wheels.time_s + _LATE_S, series
 
@@ -169,13 +174,12 @@ def _of_odometry(run: SimulatedRun, *, gyro: bool = False) -> tuple[Floats, Floa
     step = float(np.median(np.diff(stamp)))
     heading = integrate_cells(rate, step_s=step)
     middle = 0.5 * (heading[:-1] + heading[1:])
-    way = [integrate_cells(series["speed"] * turn(middle), step_s=step)[:-1] for turn in (np.cos, np.sin)]
+    cosine, sine, aside = np.cos(middle), np.sin(middle), series["sideways"]
+    along = (series["speed"] * cosine - aside * sine, series["speed"] * sine + aside * cosine)
+    way = [integrate_cells(rates, step_s=step)[:-1] for rates in along]
     position = np.stack((*way, np.zeros_like(stamp)), axis=1)
-    return (
-        stamp,
-        log,
-        _name(position, quaternions_from_yaw(heading[:-1])) | {"speed": series["speed"], "yaw_rate": rate},
-    )
+    named = _name(position, quaternions_from_yaw(heading[:-1]))
+    return stamp, log, named | {"speed": series["speed"], "yaw_rate": rate, "sideways": aside}
 
 
 def _of_filter(run: SimulatedRun) -> tuple[Floats, Floats, Series]:

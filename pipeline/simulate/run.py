@@ -149,18 +149,19 @@ def integrate_odometry(vehicle: Vehicle, wheels: WheelReadings, *, start: tuple[
     time = wheels.time_s
     step = float(np.median(np.diff(time)))
     speed, rate = apply_ideal_model(vehicle, wheels.left, wheels.right, wheels.steering)
+    aside = wheels.sideways_mps(vehicle)
     heading = start[2] + integrate_cells(rate, step_s=step)
     middle = 0.5 * (heading[:-1] + heading[1:])
     position = np.stack(
         (
-            start[0] + integrate_cells(speed * np.cos(middle), step_s=step),
-            start[1] + integrate_cells(speed * np.sin(middle), step_s=step),
+            start[0] + integrate_cells(speed * np.cos(middle) - aside * np.sin(middle), step_s=step),
+            start[1] + integrate_cells(speed * np.sin(middle) + aside * np.cos(middle), step_s=step),
             np.zeros_like(heading),
         ),
         axis=1,
     )
     edges = np.append(time, time[-1] + step)
-    velocity = np.stack((speed, np.zeros_like(speed), rate), axis=1)
+    velocity = np.stack((speed, aside, rate), axis=1)
     return Path(edges, position, quaternions_from_yaw(heading), velocity)
 
 
@@ -170,4 +171,5 @@ def _as_recorded(scenario: Scenario, commands: Commands) -> Commands:
         return commands
     # The command topic keeps repeating zeros while a person drives by radio, past the computer.
     live = commands.time_s >= by_hand
-    return Commands(commands.time_s, commands.speed_mps * live, commands.turn * live)
+    sideways = None if commands.sideways_mps is None else commands.sideways_mps * live
+    return Commands(commands.time_s, commands.speed_mps * live, commands.turn * live, sideways)

@@ -15,12 +15,17 @@ from pipeline.core.rigid import (
     rotate,
     rotation_vectors,
 )
+from pipeline.simulate.drivetrain import move_by_corners
+from pipeline.simulate.signals import integrate_cells
 from pipeline.simulate.streams import open_stream
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from pipeline.simulate.drivetrain import Drive
     from pipeline.simulate.path import Path
     from pipeline.simulate.scenario import Encoders, Imu
+    from pipeline.simulate.vehicles import Vehicle
 
 Floats = NDArray[np.float64]
 
@@ -39,6 +44,8 @@ class WheelReadings:
         left, right: wheel speeds [rad/s], shape (n,).
         left_angle, right_angle: turned angles [rad], shape (n,).
         steering: steering angle [rad], shape (n,).
+        corners, corner_angles: speeds [rad/s] and angles [rad] of four wheels that move the vehicle sideways,
+            by place; None on a vehicle that cannot.
     """
 
     time_s: Floats
@@ -47,6 +54,12 @@ class WheelReadings:
     left_angle: Floats
     right_angle: Floats
     steering: Floats
+    corners: Mapping[str, Floats] | None = None
+    corner_angles: Mapping[str, Floats] | None = None
+
+    def sideways_mps(self, vehicle: Vehicle) -> Floats:
+        """Ideal speed to the left [m/s], zero on a vehicle that cannot, shape (n,)."""
+        return np.zeros_like(self.left) if self.corners is None else move_by_corners(vehicle, self.corners)[1]
 
 
 @dataclass(frozen=True)
@@ -73,6 +86,19 @@ def read_encoders(encoders: Encoders, drive: Drive, *, duration_s: float, seed: 
     edges = np.arange(drive.left.size + 1) * drive.step_s
     noise = generator.standard_normal((3, time.size)) * encoders.noise_radps
     left_angle, right_angle = drive.wheel_angles()
+    if drive.corners is not None:
+        shaken = generator.standard_normal((4, time.size)) * encoders.noise_radps
+        speeds, angles = {}, {}
+        for (place, wheel), more in zip(drive.corners.items(), shaken, strict=True):
+            speeds[place] = encoders.gain * (np.interp(at, middle, wheel) + more)
+            turned = integrate_cells(wheel, step_s=drive.step_s)
+            angles[place] = encoders.gain * np.interp(at, edges, turned)
+        (left, right), (left_angle, right_angle) = (
+            [0.5 * (readings[f"front_{side}"] + readings[f"rear_{side}"]) for side in ("left", "right")]
+            for readings in (speeds, angles)
+        )
+        straight = np.zeros_like(time)
+        return WheelReadings(time, left, right, left_angle, right_angle, straight, speeds, angles)
     return WheelReadings(
         time,
         encoders.gain * (np.interp(at, middle, drive.left) + noise[0]),

@@ -10,7 +10,7 @@ from typing import Literal
 
 from pipeline.simulate.errors import SimulateError, unknown_name
 
-Kind = Literal["differential", "ackermann"]
+Kind = Literal["differential", "ackermann", "mecanum", "omni"]
 
 
 @dataclass(frozen=True)
@@ -19,17 +19,18 @@ class Vehicle:
 
     Attributes:
         name: how it calls itself in the log's deployment record.
-        kind: ``differential`` (wheels or tracks a side) or ``ackermann`` (steered front axle, base_link on
-            the rear axle).
+        kind: ``differential`` (wheels or tracks a side), ``ackermann`` (steered front axle, base_link on
+            the rear axle), ``mecanum`` (four wheels) or ``omni`` (wheels on a circle of that diameter).
         wheel_radius_m: nominal radius.
         track_width_m: nominal distance between left and right wheels.
-        wheelbase_m: distance between the axles; matters for ``ackermann`` only.
+        wheelbase_m: distance between the axles; matters for ``ackermann`` and ``mecanum``.
         max_speed_mps: largest speed a program asks for.
-        max_turn_radps: largest yaw rate a program asks for (differential).
+        max_turn_radps: largest yaw rate a program asks for (not Ackermann).
         max_steering_rad: largest steering angle a program asks for (Ackermann).
+        max_sideways_mps: largest sideways speed a program asks for (mecanum, omni).
         wheels_per_side: how many joints a side has in a JointState.
         controller_track_multiplier: the onboard controller turns a body command into wheel speeds with this
-            multiple of the nominal track.
+            multiple of the nominal track (mecanum: of track and wheelbase).
     """
 
     name: str
@@ -42,6 +43,7 @@ class Vehicle:
     max_steering_rad: float = 0.0
     wheels_per_side: int = 2
     controller_track_multiplier: float = 1.0
+    max_sideways_mps: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "max_speed_mps"):
@@ -52,6 +54,17 @@ class Vehicle:
                     where=self.name,
                     hint=f"Give {name} in SI units",
                 )
+
+    @property
+    def moves_sideways(self) -> bool:
+        """Whether it can be asked to."""
+        return self.kind in {"mecanum", "omni"}
+
+    @property
+    def lever_m(self) -> float:
+        """Half of what a difference of speed between the sides turns the vehicle over."""
+        reach = self.track_width_m + (self.wheelbase_m if self.kind == "mecanum" else 0.0)
+        return 0.5 * reach
 
 
 VEHICLES: dict[str, Vehicle] = {
@@ -64,6 +77,8 @@ VEHICLES: dict[str, Vehicle] = {
     "turtlebot3": Vehicle(
         "turtlebot3_burger", "differential", 0.033, 0.16, 0.08, 0.22, max_turn_radps=2.0, wheels_per_side=1
     ),
+    "youbot": Vehicle("youbot", "mecanum", 0.0475, 0.3, 0.47, 0.8, max_turn_radps=1.2, max_sideways_mps=0.8),
+    "omni": Vehicle("omni_base", "omni", 0.05, 0.36, 0.36, 0.8, max_turn_radps=1.5, max_sideways_mps=0.8),
     "car": Vehicle("ackermann_car", "ackermann", 0.31, 1.5, 2.6, 8.0, max_steering_rad=0.5),
 }
 _ALIASES = {vehicle.name: key for key, vehicle in VEHICLES.items()} | {"ackermann": "car"}

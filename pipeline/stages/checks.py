@@ -77,7 +77,7 @@ def check_dead_wheels(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
 def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     """A vehicle that does not move: wheels in the air, or standing under commands.
 
-    The gain of displacement on the ideal's is below 5 % both ahead and in turning, or the run's net
+    The gain of displacement on the ideal's is below 5 % ahead, sideways and in turning, or the run's net
     displacement is below half a metre over more than five metres of wheel path. The pose's own path is
     no test: its noise alone sums to tens of metres.
     """
@@ -90,23 +90,25 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     if known.sum() < _FEWEST:
         return []
     period = float(np.median(np.diff(samples.times)))
-    path = float(np.abs(ideal[known, 0]).sum() * period)
+    path = float(np.hypot(ideal[known, 0], ideal[known, 1]).sum() * period)
     turned = float(np.abs(ideal[known, 2]).sum() * period)
     if path < _NET_OF_NO_MOTION and turned < _NET_OF_NO_MOTION:
         text = f"the vehicle was hardly asked to move: {path:.2g} m of path in the whole run"
         return [Finding("not_moving", "error", text, value=path)]
-    gains = [_gain_on(samples.velocity[known, axis], ideal[known, axis]) for axis in (0, 2)]
+    gains = [_gain_on(samples.velocity[known, axis], ideal[known, axis]) for axis in range(3)]
     reach = samples.position[known]
     net = float(np.linalg.norm(reach.max(axis=0) - reach.min(axis=0)))
     still = all(abs(gain) < _GAIN_OF_NO_MOTION for gain in gains)
     nowhere = net < _NET_OF_NO_MOTION and path > _PATH_OF_MOTION
-    if not still and not (nowhere and abs(gains[1]) < 10.0 * _GAIN_OF_NO_MOTION):
+    if not still and not (nowhere and abs(gains[2]) < 10.0 * _GAIN_OF_NO_MOTION):
         return []
+    # Sideways counts only where nothing was asked ahead.
+    covered = gains[0] or gains[1]
     text = (
-        f"the vehicle does not move: of {path:.0f} m that the wheels turned it covered {gains[0]:.1%}, "
+        f"the vehicle does not move: of {path:.0f} m that the wheels turned it covered {covered:.1%}, "
         f"within {net:.2g} m (wheels in the air, blocked, or stopped)"
     )
-    return [Finding("not_moving", "error", text, value=gains[0])]
+    return [Finding("not_moving", "error", text, value=covered)]
 
 
 def _gain_on(velocity: Floats, ideal: Floats) -> float:

@@ -24,28 +24,33 @@ _SPAN = 0.5
 _FEWEST_SPANS = 20
 _SIDEWAYS = 1e-4
 _ROUNDING = 5e-3
+_ROUNDING_ANY_WAY = 1e-3
+"""Of a vehicle that moves sideways no lack of such motion tells an odometry: its ways must fit better."""
 _SHORTEST_SILENCE = 3.0
 _SETTLED = 2.0
 _MOVES = 0.1
 _ZERO = 1e-6
 
 
-def check_independence(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
+def check_independence(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     """A pose that is integrated from the wheels gives zero slip by construction.
 
-    Wheel odometry never moves sideways, while any localization has noise there; and its speed is that of the
-    wheels, perhaps by another radius and a little later. Its heading may come from a gyro.
+    Wheel odometry never moves sideways where the vehicle cannot, while any localization has noise there; and
+    its speed is that of the wheels, perhaps by another radius and a little later. Its heading may come from a
+    gyro.
     """
     if samples.measured is None:
         return []
     known: Flags = np.all(np.isfinite(samples.measured), axis=1)
     moving = known & (np.abs(np.nan_to_num(samples.measured)) > _LIVE).any(axis=1)
     sideways = samples.velocity[moving, 1] - samples.measured[moving, 1]
-    if sideways.size < _FEWEST or float(np.median(np.abs(sideways))) > _SIDEWAYS:
+    is_driven = vehicle.kinematics.has_inputs("sideways")
+    if sideways.size < _FEWEST or (not is_driven and float(np.median(np.abs(sideways))) > _SIDEWAYS):
         return []
-    ahead, turning = _share_beside_wheels(samples, samples.measured, known)
-    share = turning if ahead is None else ahead
-    if share is None or share > _ROUNDING:
+    ahead, aside, turning = _share_beside_wheels(samples, samples.measured, known)
+    moved = [share for share in (ahead, aside if is_driven else None) if share is not None]
+    share = max(moved) if moved else turning
+    if share is None or share > (_ROUNDING_ANY_WAY if is_driven else _ROUNDING):
         return []
     elsewhere = turning is not None and turning > _ROUNDING
     but = " but for their heading, which may be a gyro's" if elsewhere else ""
@@ -58,8 +63,8 @@ def check_independence(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
 
 def _share_beside_wheels(
     samples: Samples, measured: Floats, known: Flags
-) -> tuple[float | None, float | None]:
-    """Shares of the way and of the turning over half seconds that the wheels do not account for.
+) -> tuple[float | None, float | None, float | None]:
+    """Shares of the ways ahead and aside and of the turning over half seconds that are not the wheels'.
 
     Any gain is allowed (another radius, another track width), and a small delay, to first order. A share is
     None where there is nothing to share.
@@ -74,22 +79,20 @@ def _share_beside_wheels(
     )
     first, last = first[whole], last[whole]
     if first.size < _FEWEST_SPANS:
-        return None, None
+        return None, None, None
     turned = samples.yaw[last] - samples.yaw[first]
     heading = samples.yaw[first] + 0.5 * turned
-    chord = np.sum(
-        (samples.position[last] - samples.position[first])
-        * np.stack((np.cos(heading), np.sin(heading)), axis=-1),
-        axis=1,
-    )
+    step = samples.position[last] - samples.position[first]
+    ahead = np.sum(step * np.stack((np.cos(heading), np.sin(heading)), axis=-1), axis=1)
+    aside = np.sum(step * np.stack((-np.sin(heading), np.cos(heading)), axis=-1), axis=1)
     # The way along an arc is longer than its chord.
-    way = chord / np.sinc(turned / (2.0 * np.pi))
+    arc = np.sinc(turned / (2.0 * np.pi))
     shares = []
-    for moved, axis in ((way, 0), (turned, 2)):
+    for moved, axis in ((ahead / arc, 0), (aside / arc, 1), (turned, 2)):
         rate = np.nan_to_num(measured[:, axis])
         driven = timegrid.integrate_rate(times, rate)
         shares.append(measure_rest(moved, driven[last] - driven[first], rate[last] - rate[first]))
-    return shares[0], shares[1]
+    return shares[0], shares[1], shares[2]
 
 
 def measure_rest(moved: Floats, driven: Floats, changed: Floats) -> float | None:

@@ -5,6 +5,7 @@ Every section is optional. Unknown keys are errors, so that a misspelt one is no
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import msgspec
@@ -12,10 +13,18 @@ import msgspec
 from pipeline.vehicles.kinematics import list_kinds
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+RunningGear = Literal["wheels", "tracks"]
+KIND_WORDS: Mapping[str, Mapping[str, str]] = {
+    "skid_steer": {"kind": "differential"},
+    "tracked": {"kind": "differential", "running_gear": "tracks"},
+}
+"""What vehicles are called that have another's kinematics."""
 if TYPE_CHECKING:
     Kind: TypeAlias = str
+    KindWord: TypeAlias = str
 else:
     Kind = Literal[list_kinds()]
+    KindWord = Literal[(*list_kinds(), *KIND_WORDS)]
 Clock = Literal["header", "log", "publish"]
 Unit = Literal["rad/s", "rpm", "deg/s", "m/s", "mm/s", "rad", "deg", "ticks", "erpm", "duty"]
 
@@ -26,7 +35,7 @@ class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     Attributes:
         preset: name or alias of a preset.
         name: what to call the vehicle.
-        kind: ideal model, the name of a file in `kinematics`.
+        kind: ideal model, the name of a file in `kinematics`; or a word of `KIND_WORDS`.
         wheel_radius_m: r.
         track_width_m: b, between the middles of the left and right wheels.
         wheelbase_m: l, between the axles.
@@ -37,11 +46,12 @@ class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         max_steering_rad: largest steering angle.
         controller_track_multiplier: what the controller multiplies the track width by when it turns a
             body command into wheel speeds.
+        running_gear: what it stands on; the kinematics are the same.
     """
 
     preset: str | None = None
     name: str | None = None
-    kind: Kind | None = None
+    kind: KindWord | None = None
     wheel_radius_m: Positive | None = None
     track_width_m: Positive | None = None
     wheelbase_m: Positive | None = None
@@ -51,6 +61,12 @@ class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     max_yaw_rate_radps: Positive | None = None
     max_steering_rad: Positive | None = None
     controller_track_multiplier: Positive | None = None
+    running_gear: RunningGear | None = None
+
+    def list_values(self) -> dict[str, object]:
+        """What is said, by name, words for a kind replaced by what they mean."""
+        values = {key: value for key, value in msgspec.structs.asdict(self).items() if value is not None}
+        return {**values, **KIND_WORDS.get(self.kind or "", {})}
 
 
 class RunSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -69,6 +85,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         topic: JointState, body command (Twist, TwistStamped) or AckermannDrive(Stamped).
         left: joint names of the left side.
         right: joint names of the right side.
+        front: joint names of the front wheels (mecanum).
         left_topic: topic of the left side.
         right_topic: topic of the right side.
         speed_topic: speed, or forward speed of a body command when ``yaw_rate_topic`` is given.
@@ -85,6 +102,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     topic: str | None = None
     left: list[str] | None = None
     right: list[str] | None = None
+    front: list[str] | None = None
     left_topic: str | None = None
     right_topic: str | None = None
     speed_topic: str | None = None

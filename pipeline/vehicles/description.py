@@ -1,15 +1,16 @@
 """Geometry out of a robot description (URDF): wheels, their radii, track width, wheelbase and steering.
 
 A wheel is a continuous joint that turns about the body's lateral axis; a steering joint turns about its
-vertical one and carries a wheel, or says so. Casters are none. The radius is that of the wheel's cylinder,
-else the height of its axis over base_footprint.
+vertical one and carries a wheel, or says so. Casters are none. Wheels are mecanum wheels where the text
+speaks of such or of rollers. The radius is that of the wheel's cylinder, else the height of its axis over
+base_footprint.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
@@ -26,6 +27,7 @@ Floats = NDArray[np.float64]
 _LONGEST = 8_000_000
 _LATERAL = 0.9
 _CASTER = re.compile(r"caster|castor|swivel|rocker|suspension")
+_ROLLERS = re.compile(r"mecanum|roller")
 _ROLLS = ("continuous", "revolute")
 _APART_M = 0.02
 
@@ -36,7 +38,7 @@ class Description:
 
     Attributes:
         name: of the robot.
-        kind: ``differential`` or ``ackermann``.
+        kind: ``differential``, ``ackermann`` or ``mecanum``.
         wheel_radius_m, track_width_m, wheelbase_m: geometry.
         base_to_rear_axle_m: how far base_link lies ahead of the rear axle (Ackermann).
         wheels: names of the wheel joints.
@@ -85,7 +87,9 @@ def read_description(text: str) -> Description | None:
             steering.append((joint, place))
     if not any(place[1] > 0.0 for _, place in wheels) or not any(place[1] < 0.0 for _, place in wheels):
         return None
-    return _describe(robot, wheels, steering, joints)
+    described = _describe(robot, wheels, steering, joints)
+    has_rollers = described.kind == "differential" and bool(_ROLLERS.search(text.lower()))
+    return replace(described, kind="mecanum") if has_rollers else described
 
 
 def _describe(

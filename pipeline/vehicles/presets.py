@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from pipeline.vehicles.configuration import Kind, Positive, VehicleSection
+from pipeline.vehicles.configuration import Kind, Positive, RunningGear, VehicleSection
 from pipeline.vehicles.errors import ConfigurationError
 from pipeline.vehicles.kinematics import USUAL_KIND, Kinematics, find_kinematics
 
@@ -54,9 +54,12 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
     Attributes:
         id: name in tables and file names, lower case with underscores.
+        running_gear: what it stands on: tracks move it as the wheels of a differential drive do.
         source: where a preset's numbers were read.
         recognized_by: words of namespaces, hosts and robot descriptions, and packages of message types, that
             tell the platform.
+        sideways_preset: the same platform on wheels that move it sideways, under the same names: what it is
+            asked tells which it is.
         controller: the vendor's.
         units: of what the platform publishes, by name.
     """
@@ -73,10 +76,12 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     max_yaw_rate_radps: Positive | None = None
     max_steering_rad: Positive | None = None
     controller_track_multiplier: Positive = 1.0
+    running_gear: RunningGear = "wheels"
     aliases: Annotated[list[str], msgspec.Meta(description="other names")] = []
     topics: UsualTopics = UsualTopics()
     source: str = ""
     recognized_by: list[str] = []
+    sideways_preset: str = ""
     controller: VendorController = VendorController()
     units: dict[str, OwnUnit] = {}
 
@@ -125,10 +130,10 @@ def resolve_vehicle(
     Raises:
         ConfigurationError: no vehicle is named, the name is unknown, or a value is missing.
     """
-    values = {key: value for key, value in msgspec.structs.asdict(section).items() if value is not None}
+    values = section.list_values()
     named = values.pop("preset", None)
     # A full geometry needs no preset; a vehicle that the log names but nobody knows is then only a name.
-    base = find_preset(named or recorded or "")
+    base = find_preset(str(named or recorded or ""))
     if named and base is None:
         raise ConfigurationError(
             "vehicle_unknown", f"no vehicle preset is called {named!r}", where=where, hint=_how_to_choose()

@@ -84,14 +84,20 @@ def recognize_vehicle(
 
 
 def _find_platform(words: Iterable[str]) -> Vehicle | None:
-    """The platform that words name; None where they name several."""
+    """The platform that words name, of words within each other the longest; None where they name several."""
     found: dict[str, Vehicle] = {}
     for preset in list_presets():
         for word in preset.recognized_by:
             pattern = re.compile(rf"(^|[^a-z0-9]){re.escape(word)}([^a-z]|$)")
             if any(pattern.search(text.lower()) for text in words):
-                found[preset.id] = preset
-    return next(iter(found.values())) if len(found) == 1 else None
+                found[word] = preset
+    longest = {
+        word: preset
+        for word, preset in found.items()
+        if not any(word in other for other in found if other != word)
+    }
+    presets = {preset.id: preset for preset in longest.values()}
+    return next(iter(presets.values())) if len(presets) == 1 else None
 
 
 def _compare(preset: Vehicle, source: VehicleSource, description: Description | None) -> Recognized:
@@ -146,7 +152,9 @@ def find_alike(radius_m: float, track_m: float) -> Vehicle | None:
 
 def list_contradictions(told: Vehicle, chosen: Vehicle) -> list[str]:
     """Numbers in which the vehicle that the log tells and the chosen one cannot be the same vehicle."""
-    found = [] if told.kind == chosen.kind else [f"kind {told.kind}, not {chosen.kind}"]
+    # A description of four wheels does not say whether they have rollers; what is commanded does.
+    steered, is_car = (one.kinematics.has_inputs("steering") for one in (told, chosen))
+    found = [] if steered == is_car else [f"kind {told.kind}, not {chosen.kind}"]
     for name, limit in (
         ("wheel_radius_m", _DIFFERS),
         ("track_width_m", _OTHER_TRACK),

@@ -392,7 +392,7 @@ export class Pane {
       event.preventDefault();
       await this.act("formula", { effect: parts.effect.value.trim(), channel: channel.value, formula: parts.formula.value, parameters: parts.parameters.value });
     } }, parts.effect, channel, parts.formula, parts.parameters, h("button", { type: "submit" }, "Add formula"),
-    h("p", { class: "quiet" }, "Signals: v0, w0, f_x, f_w, left, right, roll, pitch, yaw, x, y, t, and each with _rate. Units are checked."));
+    h("p", { class: "quiet" }, "Signals: v0, s0 (sideways), w0, f_x, f_w, left, right, roll, pitch, yaw, x, y, t, and each with _rate. Units are checked."));
     const open = this.model.querySelector(".formula")?.open ?? false;
     if (open) for (const [name, input] of Object.entries(parts)) input.value = this.model.querySelector(`[name=${name}]`)?.value ?? "";
     return h("details", { class: "formula", open }, h("summary", {}, "Write a formula"), form);

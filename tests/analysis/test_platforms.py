@@ -33,6 +33,21 @@ EXPECTED: dict[str, tuple[str, str, str, str, str]] = {
         "husky_a200",
         "robot_description",
     ),
+    "dingo_o": (
+        "/do100_0042/platform/cmd_vel_unstamped",
+        "/do100_0042/platform/joint_states",
+        "/do100_0042/lidar/icp_odom",
+        "dingo_o",
+        "robot_description",
+    ),
+    "rosbot_xl_mecanum": (
+        "/cmd_vel",
+        "/joint_states",
+        "/slam/odom",
+        "rosbot_xl_mecanum",
+        "robot_description",
+    ),
+    "youbot": ("/cmd_vel", "/joint_states", "/tf", "youbot", "robot_description"),
     "jackal": (
         "/j100_0042/platform/cmd_vel_unstamped",
         "/j100_0042/platform/joint_states",

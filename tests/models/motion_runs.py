@@ -94,7 +94,7 @@ def _commands(made: SimulatedRun, vehicle: Vehicle) -> pl.DataFrame:
     asked = made.commands
     if vehicle.kind == "ackermann":
         return _frame(asked.time_s, {"speed": asked.speed_mps, "steering": asked.turn})
-    body = (asked.speed_mps, np.zeros_like(asked.speed_mps), asked.turn)
+    body = (asked.speed_mps, asked.sideways, asked.turn)
     return _frame(asked.time_s, vehicle.kinematics.inverse(body, vehicle))
 
 
@@ -104,7 +104,10 @@ def _wheels(made: SimulatedRun, vehicle: Vehicle) -> pl.DataFrame:
         return pl.DataFrame()
     if vehicle.kind == "ackermann":
         return _frame(read.time_s, {"speed": read.left * vehicle.wheel_radius_m, "steering": read.steering})
-    return _frame(read.time_s, {"left": read.left, "right": read.right})
+    sides = {"left": read.left, "right": read.right}
+    if vehicle.kind == "mecanum":
+        sides["sideways"] = read.sideways_mps(made.scenario.vehicle) / vehicle.wheel_radius_m
+    return _frame(read.time_s, sides)
 
 
 def _imu(made: SimulatedRun) -> pl.DataFrame:

@@ -42,7 +42,7 @@ def test_the_sentence_has_the_number_and_the_side(name: str, values: dict[str, f
 
 @pytest.mark.parametrize("kind", list_effects(), ids=lambda kind: str(kind.id))
 def test_every_effect_has_a_sentence_of_its_own_that_moves_with_its_numbers(kind: type) -> None:
-    vehicle = HUSKY if "differential" in kind.kinds else CAR
+    vehicle = next(v for v in (HUSKY, CAR, PRESETS["dingo_o"]) if v.kind in kind.kinds)
     usual = {p.name: p.typical for p in kind.parameters if not p.instead_of}
     effect = kind().change(**usual)
     sentence = effect.describe_motion(vehicle)

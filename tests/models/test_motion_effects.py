@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 EFFECTS = list_effects()
 SIMULATED = {spec.id: spec for spec in list_simulated()}
-KIND_OF = {"differential": "husky_a200", "ackermann": "ackermann_car"}
+KIND_OF = {"differential": "husky_a200", "ackermann": "ackermann_car", "mecanum": "youbot"}
 
 
 def ids(effects: tuple[type[Effect], ...]) -> list[str]:
@@ -46,6 +46,8 @@ def comparison_of(kind: str) -> Comparison:
 def vehicle_and_program(kind: str) -> dict[str, object]:
     if kind == "differential":
         return {}
+    if kind == "mecanum":
+        return {"vehicle": VEHICLES["youbot"]}
     return {"vehicle": VEHICLES["car"], "program": Program(speed_scale=0.5)}
 
 
@@ -99,6 +101,7 @@ def test_what_it_is_confused_with_exists(effect: type[Effect]) -> None:
 UNITS = {
     "v0": "m/s",
     "w0": "rad/s",
+    "s0": "m/s",
     "w": "rad/s",
     "turning": "1",
     "pitch": "rad",
@@ -109,7 +112,7 @@ UNITS = {
     "l": "m",
     "delta": "rad",
 }
-FORMULA = re.compile(r"(v0|w0|v_[xyw])\s*(\+?=)\s*([^,]+?)(?=,\s| {2}|$)", re.MULTILINE)
+FORMULA = re.compile(r"(v0|w0|s0|v_[xyw])\s*(\+?=)\s*([^,]+?)(?=,\s| {2}|$)", re.MULTILINE)
 WRITTEN = [e for e in EFFECTS if issubclass(e, LinearEffect | KinematicEffect) and e.id != "terrain_change"]
 
 
@@ -128,7 +131,8 @@ def test_the_formula_of_the_page_is_that_of_the_code(effect: type[Effect]) -> No
         if effect.id == "understeer"
         else v0[::-1]
     )
-    rolling = Rolling(v0, w0, wheels)
+    s0 = generator.uniform(-2.0, 2.0, size) if "mecanum" in effect.kinds[:1] else np.zeros(size)
+    rolling = Rolling(v0, w0, wheels, s0)
     velocity = Velocity(*(generator.uniform(-1.0, 1.0, size) for _ in range(3)))
     chosen = effect(**{p.name: p.typical for p in effect.parameters})
     known = {p.name: parse_unit(p.unit, "") for p in effect.parameters}
@@ -136,6 +140,7 @@ def test_the_formula_of_the_page_is_that_of_the_code(effect: type[Effect]) -> No
     values = dict(chosen.values) | {
         "v0": v0,
         "w0": w0,
+        "s0": s0,
         "w": velocity.w,
         "turning": find_turning(wheels, around),
         "pitch": around.attitude[:, 1],
@@ -156,10 +161,10 @@ def test_the_formula_of_the_page_is_that_of_the_code(effect: type[Effect]) -> No
     else:
         assert isinstance(chosen, KinematicEffect)
         rolled = chosen.roll(rolling, around)
-        results = {"v0": rolled.v0, "w0": rolled.w0}
+        results = {"v0": rolled.v0, "s0": rolled.s0, "w0": rolled.w0}
     for name, sign, text in found:
         expression = parse_expression(text, known, effect.id)
-        assert expression.unit == parse_unit("m/s" if name in {"v0", "v_x", "v_y"} else "rad/s", "")
+        assert expression.unit == parse_unit("m/s" if name in {"v0", "s0", "v_x", "v_y"} else "rad/s", "")
         expected = np.asarray(expression.evaluate(values)) + (
             values[name] if sign == "+=" and name in values else 0.0
         )

@@ -37,6 +37,7 @@ CATALOGUE_IDS = {
     *("terrain_change", "drive_lag", "turn_lag", "transport_delay", "body_speed_limit", "body_turn_limit"),
     *("turn_droop", "acceleration_limit", "wheel_speed_limit", "deadband", "body_inertia", "heading_skew"),
     *("yaw_misalignment", "lever_arm", "clock_offset"),
+    *("lateral_scale", "roller_slip"),
     *("steering_offset", "steering_gain", "steering_lag", "understeer"),
 }
 
@@ -137,7 +138,7 @@ def test_every_case_can_be_made() -> None:
 
 @pytest.mark.parametrize(
     ("name", "vehicle"),
-    [pair for pair in product(list_programs(), ("husky", "car")) if pair != ("spins", "car")],
+    [pair for pair in product(list_programs(), ("husky", "car", "youbot")) if pair != ("spins", "car")],
 )
 def test_programs_stay_inside_the_command_space_and_repeat(name: str, vehicle: str) -> None:
     machine = VEHICLES[vehicle]
@@ -152,6 +153,8 @@ def test_programs_stay_inside_the_command_space_and_repeat(name: str, vehicle: s
     assert np.abs(first.speed_mps).max() <= 0.8 * machine.max_speed_mps + 1e-12
     assert np.abs(first.turn).max() <= 0.5 * max(machine.max_turn_radps, machine.max_steering_rad) + 1e-12
     assert first.speed_mps.any() or first.turn.any()
+    assert np.abs(first.sideways).max() <= 0.8 * machine.max_sideways_mps + 1e-12
+    assert (first.sideways_mps is None) == (vehicle != "youbot")
     resting = (first.time_s < 1.9) | (first.time_s > 118.1)
     assert not first.speed_mps[resting].any()
     assert not first.turn[resting].any()

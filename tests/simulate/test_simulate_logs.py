@@ -74,7 +74,8 @@ def record(scenario: Scenario, path: Path) -> tuple[SimulatedRun, dict[str, list
 
 
 def in_layout(name: str) -> Scenario:
-    vehicle = VEHICLES["husky" if LAYOUTS[name].kind == "differential" else "car"]
+    names = {"differential": "husky", "ackermann": "car", "mecanum": "youbot", "omni": "omni"}
+    vehicle = VEHICLES[names[LAYOUTS[name].kind]]
     return replace(SHORT, vehicle=vehicle, recording=Recording(name))
 
 
@@ -114,6 +115,20 @@ def test_wheel_commands_are_told_by_name_and_carry_the_ideal_inverse(tmp_path: P
     left = (twist.linear.x - 0.275 * twist.angular.z) / 0.165
     right = (twist.linear.x + 0.275 * twist.angular.z) / 0.165
     assert [wheels["front_left_wheel"], wheels["rear_right_wheel"]] == pytest.approx([left, right])
+
+
+def test_sideways_commands_and_four_wheels_that_differ_arrive(tmp_path: Path) -> None:
+    run, topics = record(in_layout("mecanum"), tmp_path / "a.mcap")
+    assert run.commands.sideways_mps is not None
+    assert run.wheels.corners is not None
+    assert run.wheels.corner_angles is not None
+    assert topics["/cmd_vel"][150].body.linear.y == run.commands.sideways_mps[150] != 0.0
+    state = topics["/joint_states"][150].body
+    for name, speed, angle in zip(state.name, state.velocity, state.position, strict=True):
+        place = name.removesuffix("_wheel_joint")
+        assert speed == run.wheels.corners[place][150]
+        assert angle == run.wheels.corner_angles[place][150]
+    assert len(set(state.velocity)) == 4
 
 
 def test_measured_wheels_of_both_sides_arrive(tmp_path: Path) -> None:

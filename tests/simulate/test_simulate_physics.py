@@ -21,6 +21,8 @@ Asked = Mapping[str, Mapping[str, float] | float]
 
 HUSKY = VEHICLES["husky"]
 CAR = VEHICLES["car"]
+YOUBOT = VEHICLES["youbot"]
+BY_KIND = {"differential": HUSKY, "ackermann": CAR, "mecanum": YOUBOT}
 CIRCLE = Scenario(
     program=Program("circle", lead_s=1.0),
     duration_s=30.0,
@@ -88,6 +90,64 @@ def test_ground_effects_may_act_on_what_inertia_made() -> None:
     )
     v_x = V0 / INERTIA
     np.testing.assert_allclose(after, (v_x, -0.5 * W0 * v_x - 0.1 * v_x * W0, W0), atol=1e-6)
+
+
+# On mecanum wheels a circle is driven at 60 % of 0.8 m/s ahead and to the left, and of 1.2 rad/s.
+AHEAD, ASIDE, AROUND = 0.48, 0.48, 0.72
+LEVER, RADIUS = 0.5 * (0.3 + 0.47), 0.0475
+SLIDING = (AHEAD + 1j * ASIDE) / (1.0 + 0.5j * AROUND)
+
+
+@pytest.mark.parametrize(
+    ("effects", "expected"),
+    [
+        ({}, (AHEAD, ASIDE, AROUND)),
+        ({"lateral_scale": 0.8}, (AHEAD, 0.8 * ASIDE, AROUND)),
+        ({"roller_slip": 0.3}, (AHEAD, ASIDE - 0.3 * ASIDE**2, AROUND)),
+        ({"lateral_scale": 0.8, "roller_slip": 0.3}, (AHEAD, 0.8 * ASIDE - 0.3 * (0.8 * ASIDE) ** 2, AROUND)),
+        ({"effective_track": 1.2}, (AHEAD, ASIDE, AROUND / 1.2)),
+        ({"wheel_radius": 0.9}, (0.9 * AHEAD, 0.9 * ASIDE, 0.9 * AROUND)),
+        (
+            {"wheel_asymmetry": 0.1},
+            (AHEAD + 0.05 * LEVER * AROUND, ASIDE, AROUND + 0.05 * AHEAD / LEVER),
+        ),
+        (
+            {"lateral_skid": 0.1},
+            (AHEAD + 0.1 * ASIDE * AROUND, ASIDE - 0.1 * AHEAD * AROUND, AROUND),
+        ),
+        ({"body_inertia": 0.5}, (SLIDING.real, SLIDING.imag, AROUND)),
+        ({"drive_lag": 0.4, "turn_lag": {"tau_mean": 0.2, "tau_diff": 0.9}}, (AHEAD, ASIDE, AROUND)),
+        # Rims turn at 0 -+ 0.2772 and 0.96 -+ 0.2772 m/s; only the front right one is held back, to 0.95 m/s.
+        (
+            {"wheel_speed_limit": 0.95 / RADIUS},
+            (0.4082, 0.4082, (2 * 0.2772 + 0.95 - 0.6828) / 4 / LEVER),
+        ),
+    ],
+    ids=str,
+)
+def test_mecanum_wheels_move_sideways_by_the_formula(
+    effects: Asked, expected: tuple[float, float, float]
+) -> None:
+    found = steady_velocity(effects, replace(CIRCLE, vehicle=YOUBOT))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_omni_wheels_turn_about_their_circle() -> None:
+    base = VEHICLES["omni"]
+    found = steady_velocity({"lateral_scale": 0.9}, replace(CIRCLE, vehicle=base))
+    np.testing.assert_allclose(found, (0.48, 0.9 * 0.48, 0.6 * base.max_turn_radps), atol=1e-6)
+
+
+def test_every_mecanum_wheel_has_an_encoder_of_its_own() -> None:
+    wheels = simulate_run(replace(CIRCLE, vehicle=YOUBOT)).wheels
+    assert wheels is not None
+    assert wheels.corners is not None
+    steady = (wheels.time_s > 20.0) & (wheels.time_s < 28.0)
+    found = [float(wheel[steady].mean()) for wheel in wheels.corners.values()]
+    turn = LEVER * AROUND
+    rims = [AHEAD - ASIDE - turn, AHEAD + ASIDE + turn, AHEAD + ASIDE - turn, AHEAD - ASIDE + turn]
+    assert list(wheels.corners) == ["front_left", "front_right", "rear_left", "rear_right"]
+    assert found == pytest.approx([rim / RADIUS for rim in rims], abs=0.01)
 
 
 DELTA, SPEED = 0.6 * CAR.max_steering_rad, 0.6 * CAR.max_speed_mps
@@ -177,7 +237,7 @@ def test_the_controller_stops_some_time_after_the_last_command() -> None:
 def test_neutral_parameters_change_nothing_bit_for_bit(name: str) -> None:
     spec = CATALOGUE[name]
     neutral = {item.name: item.neutral for item in spec.parameters if not math.isnan(item.neutral)}
-    vehicle = HUSKY if "differential" in spec.kinds else CAR
+    vehicle = BY_KIND[spec.kinds[0]]
     base = Scenario(
         vehicle=vehicle,
         duration_s=12.0,
@@ -202,7 +262,7 @@ def neutral_set(name: str, neutral: dict[str, float]) -> Asked:
 def test_a_usual_size_of_every_effect_moves_what_is_reported(name: str) -> None:
     spec = CATALOGUE[name]
     usual = {item.name: item.typical for item in spec.parameters if not math.isnan(item.typical)}
-    vehicle = HUSKY if "differential" in spec.kinds else CAR
+    vehicle = BY_KIND[spec.kinds[0]]
     base = Scenario(vehicle=vehicle, duration_s=30.0, ground=Ground(pitch_rad=0.15))
     plain, with_it = simulate_run(base), simulate_run(replace(base, effects={name: usual}))
     moved = np.abs(plain.poses.position - with_it.poses.position).max()

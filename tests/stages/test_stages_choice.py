@@ -212,7 +212,9 @@ def test_wheels_in_turns_a_minute_are_recognized(drive: TakeThrough) -> None:
     assert "rpm" in taken.finding("unit_wrong").text
 
 
-def test_a_command_to_move_sideways_is_said_to_have_no_model(tmp_path: Path, stamps: np.ndarray) -> None:
+def test_a_command_that_the_vehicle_cannot_follow_sideways_is_said(
+    tmp_path: Path, stamps: np.ndarray
+) -> None:
     with LogWriter(tmp_path / "run.mcap") as log:
         write_wheels_and(log, np.arange(COUNT) * 0.025, np.zeros(COUNT), stamps)
         command = {"linear.x": 0.5, "linear.y": np.where(np.arange(COUNT) > 300, 0.3, 0.0)}
@@ -223,7 +225,10 @@ def test_a_command_to_move_sideways_is_said_to_have_no_model(tmp_path: Path, sta
     data = read_topics(index, list_wanted(chosen.sources, types))
     made = extract_tables(data, chosen.sources, Configuration(), chosen.vehicle, where="run.mcap")
     (finding,) = [found for found in made.findings if found.id == "sideways_command"]
-    assert "mecanum" in finding.text
+    assert finding.severity == "error"
+    assert "Husky A200 (differential) cannot do" in finding.text
+    assert 'kind = "mecanum"' in finding.text
+    assert "youbot" in finding.text
     assert finding.value == pytest.approx(0.5, abs=0.02)
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 ROOT = Path(__file__).parents[2]
-MECANUM = """
+CRAB = """
 \"\"\"Mecanum wheels: rollers at 45 degrees; the vehicle also moves sideways.\"\"\"
 
 import numpy as np
@@ -33,7 +33,7 @@ from pipeline.vehicles.kinematics import Kinematics, Quantity
 _SIDES = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]) / 4
 
 
-class Mecanum(Kinematics):
+class Crab(Kinematics):
     inputs = (
         Quantity("front_left", "rad/s", "a wheel"),
         Quantity("front_right", "rad/s", "a wheel"),
@@ -126,6 +126,45 @@ def test_a_car_that_stands_has_its_wheels_straight() -> None:
     assert ask(CAR, 0.0, 1.0) == {"speed": 0.0, "steering": 0.0}
 
 
+YOUBOT, OMNI = (
+    preset("youbot"),
+    Vehicle(id="omni", name="omni", kind="omni", wheel_radius_m=0.05, track_width_m=0.36),
+)
+# How ideal mecanum wheels turn for a motion of the body, wheel by wheel: front left, front right, rear left,
+# rear right [rad/s] for ahead, left [m/s] and counterclockwise [rad/s]; (0.3 + 0.47) / 2 m is their lever.
+WHEELS = np.array([[1, -1, -0.385], [1, 1, 0.385], [1, 1, -0.385], [1, -1, 0.385]]) / 0.0475
+
+
+@given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-2.0, 2.0), speeds)
+def test_four_mecanum_wheels_are_two_sides_and_a_way_sideways(
+    ahead: float, aside: float, around: float, rubbing: float
+) -> None:
+    body = np.array([ahead, aside, around])
+    # The fourth combination of the wheels moves nothing: the motion is the least-squares one.
+    front_left, front_right, rear_left, rear_right = WHEELS @ body + rubbing * np.array([1, 1, -1, -1])
+    found = predict(
+        YOUBOT,
+        left=(front_left + rear_left) / 2,
+        right=(front_right + rear_right) / 2,
+        sideways=(front_right + rear_left - front_left - rear_right) / 4,
+    )
+    assert found == pytest.approx(body.tolist(), abs=1e-9)
+    assert found == pytest.approx((np.linalg.pinv(WHEELS) @ WHEELS @ body).tolist(), abs=1e-9)
+
+
+@pytest.mark.parametrize("vehicle", [YOUBOT, OMNI], ids=["mecanum", "omni"])
+@given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-2.0, 2.0), st.floats(0.5, 2.0))
+def test_a_sideways_command_comes_back_from_its_wheels(
+    vehicle: Vehicle, ahead: float, aside: float, around: float, multiplier: float
+) -> None:
+    vehicle = msgspec.structs.replace(vehicle, controller_track_multiplier=multiplier)
+    body = (one(ahead), one(aside), one(around))
+    inputs = vehicle.kinematics.inverse(body, vehicle)
+    assert np.allclose(vehicle.kinematics.asked(inputs, vehicle), body, atol=1e-12)
+    moved = np.array([ahead, aside, around * multiplier]).reshape(3, 1)
+    assert np.allclose(vehicle.kinematics.forward(inputs, vehicle), moved, atol=1e-12)
+
+
 @pytest.mark.parametrize("kind", list_kinds())
 def test_every_kind_says_its_inputs_its_geometry_and_its_source(kind: str) -> None:
     found = find_kinematics(kind)
@@ -165,11 +204,11 @@ def test_a_kind_that_nobody_knows_is_named_with_those_there_are() -> None:
 
 
 def test_a_new_kind_is_found_by_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "toy_mecanum.py").write_text(MECANUM)
+    (tmp_path / "crab.py").write_text(CRAB)
     monkeypatch.setattr(kinematics, "__path__", [*kinematics.__path__, str(tmp_path)])
-    assert "toy_mecanum" in list_kinds()
+    assert "crab" in list_kinds()
     crab = Vehicle(
-        id="crab", name="crab", kind="toy_mecanum", wheel_radius_m=0.1, track_width_m=0.5, wheelbase_m=0.3
+        id="crab", name="crab", kind="crab", wheel_radius_m=0.1, track_width_m=0.5, wheelbase_m=0.3
     )
     sideways = predict(crab, front_left=-2.0, front_right=2.0, rear_left=2.0, rear_right=-2.0)
     assert sideways == pytest.approx([0.0, 0.2, 0.0])
@@ -185,7 +224,7 @@ import numpy as np
 import polars as pl
 from pipeline.stages.slip import hold_commands
 from pipeline.vehicles import ConfigurationError, load_configuration, resolve_vehicle
-text = '[vehicle]\\nname = "crab"\\nkind = "mecanum"\\nwheel_radius_m = 0.1\\ntrack_width_m = 0.5\\n'
+text = '[vehicle]\\nname = "crab"\\nkind = "crab"\\nwheel_radius_m = 0.1\\ntrack_width_m = 0.5\\n'
 for more in ("", "wheelbase_m = 0.3\\n"):
     Path("run.toml").write_text(text + more)
     section = load_configuration(Path("log.mcap"), given=Path("run.toml")).vehicle
@@ -202,7 +241,7 @@ print(hold_commands(np.array([0.1]), table, vehicle, 0.5).velocity.round(9).toli
 def test_a_new_kind_needs_no_other_file_to_be_configured_and_predicted(tmp_path: Path) -> None:
     for room in ("pipeline", "schemas"):
         shutil.copytree(ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "pipeline" / "vehicles" / "kinematics" / "mecanum.py").write_text(MECANUM)
+    (tmp_path / "pipeline" / "vehicles" / "kinematics" / "crab.py").write_text(CRAB)
     done = subprocess.run(
         [sys.executable, "-c", ASK_THE_COPY],
         cwd=tmp_path,
@@ -213,5 +252,5 @@ def test_a_new_kind_needs_no_other_file_to_be_configured_and_predicted(tmp_path:
     )
     assert done.returncode == 0, done.stderr
     incomplete, velocity = done.stdout.splitlines()
-    assert "a vehicle of kind 'mecanum' needs wheelbase_m" in incomplete
+    assert "a vehicle of kind 'crab' needs wheelbase_m" in incomplete
     assert velocity == "[[0.0, 0.2, 0.0]]"

@@ -19,6 +19,7 @@ def list_paths(kind: MessageType) -> list[str]:
     paths: list[str] = []
     if kind.drive is not None:
         paths += [*kind.drive.first.split("+"), *kind.drive.second.split("+")]
+        paths += [kind.drive.sideways] if kind.drive.sideways else []
     if kind.number is not None:
         paths += [kind.number.field, *filter(None, [kind.number.per_turn])]
     if kind.joints is not None:

@@ -12,8 +12,8 @@ PRESETS = list_presets()
 
 @pytest.mark.parametrize("vehicle", PRESETS, ids=lambda vehicle: vehicle.id)
 def test_a_preset_has_the_geometry_of_its_ideal_model(vehicle: Vehicle) -> None:
-    needed = vehicle.track_width_m if vehicle.kind == "differential" else vehicle.wheelbase_m
-    assert needed is not None
+    needed = [quantity.name for quantity in vehicle.kinematics.geometry if quantity.required]
+    assert all(getattr(vehicle, name) for name in needed)
     assert 0.01 < vehicle.wheel_radius_m < 1.0
 
 
@@ -43,6 +43,20 @@ def test_published_vehicles_have_their_published_numbers(
     vehicle = find_preset(name)
     assert vehicle is not None
     assert (vehicle.wheel_radius_m, vehicle.track_width_m, vehicle.mass_kg) == (radius, track, mass)
+
+
+@pytest.mark.parametrize("name", ["marmotte", "bunker"])
+def test_tracked_vehicles_are_known_by_name(name: str) -> None:
+    vehicle = find_preset(name)
+    assert vehicle is not None
+    assert (vehicle.kind, vehicle.running_gear) == ("differential", "tracks")
+
+
+@pytest.mark.parametrize(("word", "gear"), [("tracked", "tracks"), ("skid_steer", "wheels")])
+def test_words_for_a_differential_drive_are_understood(word: str, gear: str) -> None:
+    section = VehicleSection(kind=word, wheel_radius_m=0.1, track_width_m=0.4)
+    found = resolve_vehicle(section, recorded=None, where="a.mcap")
+    assert (found.kind, found.running_gear) == ("differential", gear)
 
 
 def test_the_log_names_the_vehicle_when_nobody_else_does() -> None:

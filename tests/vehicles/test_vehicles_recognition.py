@@ -85,6 +85,10 @@ def test_a_text_that_describes_no_wheels_is_no_description(text: str) -> None:
         ("/a200_0042/platform/cmd_vel", "husky_a200"),
         ("/j100_0001/cmd_vel", "jackal"),
         ("/panther/cmd_vel", "panther"),
+        ("/do100_0001/platform/cmd_vel", "dingo_o"),
+        ("/rosbot/cmd_vel", "rosbot_2r"),
+        # Of words within each other the longest counts.
+        ("/rosbot_xl/cmd_vel", "rosbot_xl"),
     ],
 )
 def test_a_namespace_tells_the_platform(topic: str, vehicle: str) -> None:
@@ -105,6 +109,25 @@ def test_message_types_and_hosts_tell_the_platform() -> None:
 @pytest.mark.parametrize("topic", ["/cmd_vel", "/scouting/cmd_vel", "/lynxes/odom", "/nav/husk"])
 def test_other_words_tell_nothing(topic: str) -> None:
     assert recognize(topic) is None
+
+
+def test_a_tracked_platform_is_told_by_its_message_types() -> None:
+    found = recognize("/bunker_status", types="bunker_msgs/msg/BunkerStatus")
+    assert found is not None
+    assert (found.vehicle.id, found.vehicle.running_gear) == ("bunker", "tracks")
+
+
+def test_mecanum_wheels_are_told_by_a_description_that_speaks_of_them() -> None:
+    (text,) = [one.fields["data"] for one in PLATFORMS["youbot"].topics if "description" in one.topic]
+    plain = read_description(str(text).replace("youbot", "my_robot"))
+    rollers = str(text).replace("youbot", "my_robot").replace("<link ", '<link name="roller_1"/><link ', 1)
+    described = read_description(rollers)
+    assert plain is not None
+    assert described is not None
+    assert (plain.kind, described.kind) == ("differential", "mecanum")
+    found = recognize_vehicle([], {}, described)
+    assert found is not None
+    assert (found.vehicle.kind, found.vehicle.wheelbase_m) == ("mecanum", pytest.approx(0.47))
 
 
 def test_a_description_of_no_platform_gives_its_own_geometry() -> None:
@@ -138,6 +161,18 @@ def test_another_vehicle_than_the_logs_is_contradicted() -> None:
     assert jackal is not None
     assert [text for text in list_contradictions(husky, jackal) if "wheel_radius_m" in text]
     assert list_contradictions(husky, husky) == []
+
+
+def test_four_described_wheels_contradict_a_car_and_no_mecanum_vehicle() -> None:
+    youbot, car = find_preset("youbot"), find_preset("car")
+    assert youbot is not None
+    assert car is not None
+    (text,) = [one.fields["data"] for one in PLATFORMS["youbot"].topics if "description" in one.topic]
+    described = recognize_vehicle([], {}, read_description(str(text).replace("youbot", "my_robot")))
+    assert described is not None
+    assert described.vehicle.kind == "differential"
+    assert list_contradictions(described.vehicle, youbot) == []
+    assert "kind differential, not ackermann" in list_contradictions(described.vehicle, car)
 
 
 def test_of_several_platforms_in_a_log_the_configured_topic_tells_which_is_meant() -> None:

@@ -9,10 +9,9 @@ Source: acceleration limits of a ros2_control diff_drive_controller; torque limi
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import INF, DriveEffect, Excitation, Parameter, Search
+from pipeline.models.effect import INF, WHEELED, DriveEffect, Excitation, Parameter, Search
 from pipeline.models.filters import limit_rate
 from pipeline.models.quantity import Quantity
 
@@ -30,6 +29,7 @@ class AccelerationLimit(DriveEffect):
 
     id = "acceleration_limit"
     rank = 10
+    kinds = WHEELED
     parameters = (
         Parameter(
             "limit",
@@ -61,10 +61,10 @@ class AccelerationLimit(DriveEffect):
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
         limit, resets, step = self.values["limit"], around.wheels, around.step_s
-        return replace(
-            wheels,
-            left=limit_rate(wheels.left, limit, step, resets, resets.start[:, 0]),
-            right=limit_rate(wheels.right, limit, step, resets, resets.start[:, 1]),
+        if self.is_neutral:
+            return wheels
+        return wheels.change_each_wheel(
+            lambda speed, start: limit_rate(speed, limit, step, resets, start), resets.start
         )
 
     def is_degenerate(self, evidence: Evidence) -> bool:

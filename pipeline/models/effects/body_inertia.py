@@ -2,7 +2,8 @@
 
     dv_x/dt = (v0 - v_x)/tau + v_y*w,  dv_y/dt = -v_y/tau - v_x*w,  dw/dt = (w0 - w)/tau
 
-tau [s], 0.2 to 1 on ice. Change speed while turning.
+tau [s], 0.2 to 1 on ice. A vehicle that drives sideways at s0 has (s0 - v_y)/tau in the second equation.
+Change speed while turning.
 
 Source: Newton's law of a body in viscous contact, written in its own turning frame; the ice runs of Samson et
 al. 2024.
@@ -69,13 +70,13 @@ class BodyInertia(BodyEffect):
         """See the formula above."""
         tau, resets, step = self.values["tau"], around.body, around.step_s
         if tau <= 0.0:
-            return Velocity(rolling.v0, np.zeros_like(rolling.v0), rolling.w0)
+            return rolling.velocity
         w = lag_signal(rolling.w0, tau, step, resets, resets.start[:, 2])
         heading = (np.cumsum(w) - 0.5 * w) * step
         # In a frame that does not turn the two equations of v_x and v_y are one lag of a complex number.
         frame = np.exp(1j * heading)
         start = (resets.start[:, 0] + 1j * resets.start[:, 1]) * frame[resets.at]
-        slide = lag_signal(rolling.v0 * frame, tau, step, resets, start) * np.conj(frame)
+        slide = lag_signal((rolling.v0 + 1j * rolling.s0) * frame, tau, step, resets, start) * np.conj(frame)
         return Velocity(slide.real, slide.imag, w)
 
     def is_equivalent(self, evidence: Evidence) -> bool:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import CommandEffect, Excitation, Parameter, Search
+from pipeline.models.effect import WHEELED, CommandEffect, Excitation, Parameter, Search
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ class Deadband(CommandEffect):
 
     id = "deadband"
     rank = 30
+    kinds = WHEELED
     parameters = (
         Parameter(
             "d",
@@ -58,9 +59,9 @@ class Deadband(CommandEffect):
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""
         least = self.values["d"] / around.vehicle.wheel_radius_m
-        left = np.where(np.abs(commands.left) < least, 0.0, commands.left)
-        right = np.where(np.abs(commands.right) < least, 0.0, commands.right)
-        return commands.change_wheels(left, right)
+        if self.is_neutral:
+            return commands
+        return commands.change_each_wheel(lambda speed: np.where(np.abs(speed) < least, 0.0, speed))
 
     def is_degenerate(self, evidence: Evidence) -> bool:
         """It is too small against what was asked for."""

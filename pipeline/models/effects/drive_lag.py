@@ -63,10 +63,14 @@ class DriveLag(DriveEffect):
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
         tau, resets, step = self.values["tau"], around.wheels, around.step_s
+        sideways = wheels.sideways
+        if sideways is not None:
+            sideways = lag_signal(sideways, tau, step, resets, resets.start[:, 2])
         return replace(
             wheels,
             left=lag_signal(wheels.left, tau, step, resets, resets.start[:, 0]),
             right=lag_signal(wheels.right, tau, step, resets, resets.start[:, 1]),
+            sideways=sideways,
         )
 
     def is_equivalent(self, evidence: Evidence) -> bool:

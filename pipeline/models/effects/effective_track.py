@@ -2,7 +2,8 @@
 
     w0 = w0 / k    (b_eff = k b)
 
-k is a plain number: 1 without skidding, about 1.9 on a Husky, 1.8 on a Warthog. Turn both ways.
+k is a plain number: 1 without skidding, about 1.9 on a Husky, 1.8 on a Warthog. On mecanum wheels it scales
+the sum of track width and wheelbase, on omni wheels the diameter of their circle. Turn both ways.
 
 Source: Mandow et al., IROS 2007; Baril et al., CRV 2020.
 """
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.models.effect import (
     DATA_SHEET,
-    DIFFERENTIAL,
+    SIDES,
     Excitation,
     KinematicEffect,
     Least,
@@ -34,7 +35,7 @@ class EffectiveTrack(KinematicEffect):
 
     id = "effective_track"
     rank = 20
-    kinds = DIFFERENTIAL
+    kinds = SIDES
     parameters = (
         Parameter(
             "k",

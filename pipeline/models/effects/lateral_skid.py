@@ -2,8 +2,9 @@
 
     v_y += -c * v0 * w0
 
-c [s] grows with speed and falls with grip: 0.02 on tile, 0.15 on ice. Drive turns of both signs at several
-speeds, forward and backward, to tell it from a shifted centre of rotation.
+c [s] grows with speed and falls with grip: 0.02 on tile, 0.15 on ice. A vehicle that drives sideways at s0
+slides outward along x as well, by c s0 w0. Drive turns of both signs at several speeds, forward and
+backward, to tell it from a shifted centre of rotation.
 
 Source: Seegmiller and Kelly, RSS 2014, the centripetal term of the slip model.
 """
@@ -55,4 +56,4 @@ class LateralSkid(LinearEffect):
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         del velocity, around
-        return {"c": (0.0, -rolling.v0 * rolling.w0, 0.0)}
+        return {"c": (rolling.s0 * rolling.w0, -rolling.v0 * rolling.w0, 0.0)}

@@ -17,8 +17,8 @@ import numpy as np
 
 from pipeline.models.effect import (
     DATA_SHEET,
-    DIFFERENTIAL,
     NAN,
+    SIDES,
     DriveEffect,
     Excitation,
     Least,
@@ -44,7 +44,7 @@ class TurnDroop(DriveEffect):
 
     id = "turn_droop"
     rank = 40
-    kinds = DIFFERENTIAL
+    kinds = SIDES
     parameters = (
         Parameter(
             "threshold",

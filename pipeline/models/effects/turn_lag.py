@@ -4,7 +4,8 @@
     tau_mean * dM/dt = u_M - M,  tau_diff * dD/dt = u_D - D
 
 tau_mean, tau_diff [s]: friction on the ground brakes turning, so 0.4 and 1.1 to 1.6 s on a Warthog (0.55
-on ice), 0.1 and 0.35 s on a Husky. Change speed and turning separately.
+on ice), 0.1 and 0.35 s on a Husky. What moves a vehicle sideways follows like the mean. Change speed and
+turning separately.
 
 Source: measured on the DRIVE recordings; the powertrain model of DRIVE, Baril et al. 2024, split in two.
 """
@@ -14,7 +15,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import DIFFERENTIAL, DriveEffect, Excitation, Parameter, Plausible, Search
+from pipeline.models.effect import SIDES, DriveEffect, Excitation, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import DriveLag
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
@@ -36,7 +37,7 @@ class TurnLag(DriveEffect):
 
     id = "turn_lag"
     rank = 30
-    kinds = DIFFERENTIAL
+    kinds = SIDES
     parameters = (
         Parameter(
             "tau_mean",
@@ -93,7 +94,10 @@ class TurnLag(DriveEffect):
         left, right = resets.start[:, 0], resets.start[:, 1]
         mean = lag_signal(0.5 * (wheels.left + wheels.right), fast, step, resets, 0.5 * (left + right))
         difference = lag_signal(wheels.right - wheels.left, slow, step, resets, right - left)
-        return replace(wheels, left=mean - 0.5 * difference, right=mean + 0.5 * difference)
+        sideways = wheels.sideways
+        if sideways is not None:
+            sideways = lag_signal(sideways, fast, step, resets, resets.start[:, 2])
+        return replace(wheels, left=mean - 0.5 * difference, right=mean + 0.5 * difference, sideways=sideways)
 
     def is_degenerate(self, evidence: Evidence) -> bool:
         """With equal time constants it is a drive lag."""

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 from pipeline.models.effect import (
     DATA_SHEET,
-    DIFFERENTIAL,
     Excitation,
     KinematicEffect,
     Least,
@@ -34,7 +33,7 @@ class WheelAsymmetry(KinematicEffect):
 
     id = "wheel_asymmetry"
     rank = 10
-    kinds = DIFFERENTIAL
+    kinds = ("differential", "mecanum")
     parameters = (
         Parameter(
             "e",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter, Search
+from pipeline.models.effect import INF, WHEELED, CommandEffect, Excitation, Parameter, Search
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ class WheelSpeedLimit(CommandEffect):
 
     id = "wheel_speed_limit"
     rank = 50
+    kinds = WHEELED
     parameters = (
         Parameter(
             "limit",
@@ -57,9 +58,9 @@ class WheelSpeedLimit(CommandEffect):
         """See the formula above."""
         del around
         limit = self.values["limit"]
-        return commands.change_wheels(
-            np.clip(commands.left, -limit, limit), np.clip(commands.right, -limit, limit)
-        )
+        if self.is_neutral:
+            return commands
+        return commands.change_each_wheel(lambda speed: np.clip(speed, -limit, limit))
 
     def is_degenerate(self, evidence: Evidence) -> bool:
         """No command reaches it."""

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 _BASE_UNITS = {
     "v0": "m/s",
     "w0": "rad/s",
+    "s0": "m/s",
     "f_x": "m/s",
     "f_w": "rad/s",
     "roll": "rad",
@@ -200,6 +201,7 @@ class _Signals:
         self._makers: Mapping[str, Callable[[], NDArray[np.float64]]] = {
             "v0": lambda: rolling.v0,
             "w0": lambda: rolling.w0,
+            "s0": lambda: rolling.velocity.y,
             "f_x": lambda: ideal.v0,
             "f_w": lambda: ideal.w0,
             "roll": lambda: around.attitude[:, 0],

@@ -58,8 +58,9 @@ class ModelFeed:
         self._source = source
         self._model = model
         tables = source.manifest.tables
+        # Results of an earlier version lack the newer columns.
         self._feeds: dict[str, Sequence[Feed]] = {
-            name: [source.feed(name, "t", columns)]
+            name: [source.feed(name, "t", [column for column in columns if column in source.columns(name)])]
             for name, columns in COLUMNS.items()
             if name in tables and "t" in columns and name != "slip"
         }

@@ -56,7 +56,11 @@ def list_residuals(scene: Scene) -> dict[str, pl.DataFrame]:
 def choose_signal(motion: MotionView, component: str) -> str:
     """The signal whose bins explain most of the ideal model's residual; the usual one where none does."""
     residual = motion.residuals[f"ideal_{component}"].to_numpy()
-    shares = {name: _explain(motion.residuals[name].to_numpy(), residual) for name in SIGNALS}
+    shares = {
+        name: _explain(motion.residuals[name].to_numpy(), residual)
+        for name in SIGNALS
+        if name in motion.residuals.columns
+    }
     best = max(shares, key=lambda name: shares[name])
     return best if shares[best] > _LEAST_SHARE else _USUAL[component]
 

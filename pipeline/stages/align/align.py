@@ -173,15 +173,16 @@ def _correct_commands(commands: pl.DataFrame, vehicle: Vehicle, scale: CommandSc
         name: commands[name].cast(pl.Float64).to_numpy()
         if name in commands.columns
         else np.full(commands.height, np.nan)
-        for name in ("left", "right", "speed", "body_x", "body_w")
+        for name in ("left", "right", "speed", "sideways", "body_x", "body_y", "body_w")
     }
     left, right = columns["left"], columns["right"]
     if scale.track_multiplier != vehicle.controller_track_multiplier:
         there = msgspec.structs.replace(vehicle, controller_track_multiplier=scale.track_multiplier)
-        forward, turning = columns["body_x"], columns["body_w"]
-        asked = there.kinematics.inverse((forward, np.zeros_like(forward), turning), there)
+        body = (columns["body_x"], np.nan_to_num(columns["body_y"]), columns["body_w"])
+        asked = there.kinematics.inverse(body, there)
         left, right = asked["left"], asked["right"]
-    aligned = {"left_aligned": left, "right_aligned": right, "speed_aligned": columns["speed"]}
+    aligned = {"left_aligned": left, "right_aligned": right}
+    aligned |= {f"{name}_aligned": columns[name] for name in ("sideways", "speed")}
     return commands.with_columns(
         pl.Series(name, scale.scale * values, dtype=pl.Float64).fill_nan(None)
         for name, values in aligned.items()

@@ -91,7 +91,7 @@ def _measure_misfit(
     heading, delay = _choose_heading(run)
     moved = (track.path[last] - track.path[first]) * np.exp(-0.5j * (heading[first] + heading[last]))
     span = track.times[last] - track.times[first]
-    forward, _, turning = vehicle.kinematics.forward(name_inputs(wheels, vehicle), vehicle)
+    forward, sideways, turning = vehicle.kinematics.forward(name_inputs(wheels, vehicle), vehicle)
 
     def drive(rate: Floats, late: float) -> Floats:
         way = timegrid.integrate_rate(wheels.times, rate)
@@ -105,10 +105,16 @@ def _measure_misfit(
     beside = [own * way for way in along]
     rest = [span, drive(forward * np.abs(turning), 0.1), drive(forward * np.abs(forward), 0.1)]
     rest += [drive(np.abs(forward), 0.1), drive(np.abs(turning), 0.1), drive(turning, 0.1), own * span]
+    speed = np.abs(along[_LAGS_S.index(0.1)])
+    if wheels.sideways is not None:
+        aside = [drive(sideways, late) for late in _LAGS_S]
+        rest += [*aside, *(own * way for way in aside), drive(sideways * np.abs(sideways), 0.1)]
+        rest += [drive(sideways * turning, 0.1), drive(np.abs(sideways), 0.1)]
+        speed = np.hypot(speed, aside[_LAGS_S.index(0.1)])
     columns = np.column_stack((*along, *across, *beside, *rest))
     gap = np.column_stack([_fit_robustly(columns, part) for part in (moved.real, moved.imag)])
     size = np.hypot(gap[:, 0], gap[:, 1])
-    usual = _spread_by_speed(size, np.abs(along[_LAGS_S.index(0.1)]) / span)
+    usual = _spread_by_speed(size, speed / span)
     misfit: Floats = size / np.maximum(_FAR * usual, _LEAST_M)
     return misfit
 

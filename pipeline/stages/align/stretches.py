@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Vectors = NDArray[np.complex128]
+"""Velocities in the plane, x + iy."""
 
 _FEWEST = 8
 _LEAST_PATH = 0.5
@@ -172,32 +174,36 @@ def _sum_stretches(
     period = float(np.median(np.diff(times))) if times.size > 1 else 0.0
     samples = np.bincount(label, minlength=count)
     known = np.isfinite(ideal).all(axis=1)
-    forward = np.where(known, ideal[:, 0], 0.0)
+    asked = np.where(known, ideal[:, 0] + 1j * ideal[:, 1], 0.0)
     speed = velocities["v_x"].to_numpy() + 1j * velocities["v_y"].to_numpy()
     # Weighed by the way travelled: at a stop or a reversal the direction is that of noise.
-    travelled = speed * np.sign(forward) * period
+    travelled = speed * _find_direction(asked).conj() * period
     length = _sum_by(label, np.abs(speed) * period, count)
-    mean = _sum_by(label, travelled.real, count) + 1j * _sum_by(label, travelled.imag, count)
+    mean = _sum_vectors_by(label, travelled, count)
     whole = (_sum_by(label, known.astype(float), count) == samples) & (samples * period > 0.9 * span)
     return _Sums(
         length=length,
-        driven=_sum_by(label, np.abs(forward) * period, count),
+        driven=_sum_by(label, np.abs(asked) * period, count),
         direction=np.angle(mean),
         steadiness=np.abs(mean) / np.maximum(length, 1e-9),
         turned=_sum_by(label, velocities["v_w"].to_numpy() * period, count),
-        settled=_is_settled(label, forward, samples, times),
+        settled=_is_settled(label, asked, samples, times),
         whole=whole,
     )
 
 
-def _is_settled(
-    label: NDArray[np.int64], forward: Floats, samples: NDArray[np.int64], times: Floats
-) -> Flags:
+def _find_direction(asked: Vectors) -> Vectors:
+    """Unit vectors along some vectors, zero where they are."""
+    size = np.abs(asked)
+    return asked / np.where(size > 0.0, size, 1.0)
+
+
+def _is_settled(label: NDArray[np.int64], asked: Vectors, samples: NDArray[np.int64], times: Floats) -> Flags:
     """Whether the drive hardly changed in a stretch and in the one right before it."""
     count = samples.size
-    mean = _sum_by(label, forward, count) / np.maximum(samples, 1)
-    square = _sum_by(label, forward**2, count) / np.maximum(samples, 1)
-    even = np.sqrt(np.maximum(square - mean**2, 0.0)) < _STEADY_DRIVE * np.abs(mean)
+    mean = _sum_vectors_by(label, asked, count) / np.maximum(samples, 1)
+    square = _sum_by(label, np.abs(asked) ** 2, count) / np.maximum(samples, 1)
+    even = np.sqrt(np.maximum(square - np.abs(mean) ** 2, 0.0)) < _STEADY_DRIVE * np.abs(mean)
     first = np.searchsorted(label, np.arange(count))
     last = np.append(first[1:], times.size) - 1
     joined = np.concatenate(([False], times[first[1:]] - times[last[:-1]] < 0.2))  # noqa: PLR2004 - no hole
@@ -210,6 +216,11 @@ def _is_settled(
 def _sum_by(label: NDArray[np.int64], values: Floats, count: int) -> Floats:
     """Sums of values with equal labels."""
     return np.bincount(label, values, count).astype(np.float64)
+
+
+def _sum_vectors_by(label: NDArray[np.int64], values: Vectors, count: int) -> Vectors:
+    """Sums of vectors with equal labels."""
+    return _sum_by(label, values.real, count) + 1j * _sum_by(label, values.imag, count)
 
 
 class _AngleLine:

@@ -142,9 +142,8 @@ def _rate(
     coverage = min(float(np.minimum(np.diff(time), 2.0 * period).sum()) / length, 1.0)
     wheels = made.tables["wheels"]
     reach, turned = np.ptp(position, axis=0).max(), np.ptp(yaw)
-    rolled = read_speed(wheels, vehicle)
-    path = None if rolled is None else (rolled[0], timegrid.integrate_rate(*rolled))
-    drove = path is not None and float(np.abs(np.diff(path[1])).sum()) > _DRIVES_M
+    path = _path_of(wheels, vehicle)
+    drove = path is not None and float(np.hypot(*np.diff(path[1:])).sum()) > _DRIVES_M
     if reach < _STILL_M and (turned > _TURNS_RAD or drove):
         living = "its heading turns" if turned > _TURNS_RAD else "the wheels drive"
         return replace(bare, rate_hz=rate, refused=f"its position never changes while {living}")
@@ -226,10 +225,24 @@ def _score_satellites(
     return score, reasons
 
 
+def _path_of(wheels: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats, Floats] | None:
+    """Times [s] of the wheels' messages, ways [m] ahead and aside since the first; None without wheels."""
+    rolled = read_speed(wheels, vehicle)
+    if rolled is None:
+        return None
+    time, speed = rolled
+    aside = np.zeros_like(speed)
+    if vehicle.kinematics.has_inputs("sideways"):
+        known = wheels.drop_nulls("sideways")
+        if not known.is_empty():
+            aside = vehicle.wheel_radius_m * np.interp(time, known["t"], known["sideways"])
+    return time, timegrid.integrate_rate(time, speed), timegrid.integrate_rate(time, aside)
+
+
 def _compare_with_wheels(
-    time: Floats, position: Floats, yaw: Floats, path: tuple[Floats, Floats] | None
+    time: Floats, position: Floats, yaw: Floats, path: tuple[Floats, Floats, Floats] | None
 ) -> tuple[float | None, float]:
-    """Share of a pose's way that the wheels do not account for, and its median sideways speed [m/s].
+    """Share of a pose's way that is not the wheels', and its median sideways speed beside theirs [m/s].
 
     Any gain is allowed, and a small delay. What a coarse integration makes of a turn is no sideways motion:
     it is proportional to way times turn.
@@ -242,10 +255,11 @@ def _compare_with_wheels(
         return None, np.inf
     ends = np.arange(0, time.size, timegrid.count_steps(time, _SPAN_S))
     way, _ = split_chords(position[ends], yaw[ends])
-    rolled = np.interp(time[ends], *path)
+    rolled = np.interp(time[ends], *path[:2])
     rate = np.gradient(path[1], path[0] + np.arange(path[0].size) * 1e-12)
     share = measure_rest(way, np.diff(rolled), np.diff(np.interp(time[ends], path[0], rate)))
     ahead, aside = split_chords(position, yaw)
+    aside = aside - np.diff(np.interp(time, path[0], path[2]))
     turned = ahead * np.diff(yaw)
     gain = float(turned @ aside) / max(float(turned @ turned), 1e-12)
     elapsed = np.maximum(np.diff(time), 1e-3)

@@ -27,6 +27,8 @@ Floats = NDArray[np.float64]
 
 _LEFT = re.compile(r"left|(^|[_/])(l|lf|fl|rl|bl|ml|lb)([_/\d]|$)")
 _RIGHT = re.compile(r"right|(^|[_/])(r|rf|fr|rr|br|mr|rb)([_/\d]|$)")
+_FRONT = re.compile(r"front|(^|[_/])(f|fl|fr|lf|rf)([_/\d]|$)")
+_REAR = re.compile(r"rear|back|(^|[_/])(rl|rr|bl|br|lr|lb|rb)([_/\d]|$)")
 _STEERS = re.compile(r"steer")
 _USUAL_UNITS = {
     DriveForm.SIDES: ("rad/s", "rad/s"),
@@ -51,7 +53,9 @@ class Drive:
         right: speed of the right wheels [rad/s].
         speed: speed [m/s] (Ackermann).
         steering: steering angle [rad] (Ackermann).
+        sideways: speed of the wheels that moves the vehicle to the left [rad/s] (mecanum, omni).
         body_x: forward speed of the body command [m/s].
+        body_y: speed to the left of the body command [m/s] (mecanum, omni).
         body_w: yaw rate of the body command [rad/s].
     """
 
@@ -59,9 +63,16 @@ class Drive:
     right: Floats | None = None
     speed: Floats | None = None
     steering: Floats | None = None
+    sideways: Floats | None = None
     body_x: Floats | None = None
+    body_y: Floats | None = None
     body_w: Floats | None = None
     findings: tuple[Finding, ...] = field(default=())
+
+    @classmethod
+    def list_signals(cls) -> tuple[str, ...]:
+        """Names of the signals, in the order of the tables' columns."""
+        return tuple(name for name in cls.__dataclass_fields__ if name != "findings")
 
 
 def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, vehicle: Vehicle) -> Drive:
@@ -76,6 +87,8 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     Raises:
         StageError: no joint can be told to be on a side, or there is neither velocity nor position.
     """
+    if not vehicle.kinematics.known_joints:
+        raise _no_wheels(columns.topic, ())
     velocity, position = _read_series(columns)
     joints = sorted(set(velocity) | set(position))
     rolling = [
@@ -121,7 +134,33 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
         _to_radps(np.mean([velocity[joint] for joint in side], axis=0), section, vehicle)
         for side in (left, right)
     ]
-    return Drive(left=sides[0], right=sides[1], findings=tuple(found))
+    speeds = {joint: _to_radps(velocity[joint], section, vehicle) for joint in (*left, *right)}
+    moves = vehicle.kinematics.has_inputs("sideways")
+    sideways = _mean_sideways(speeds, left, section, columns.topic) if moves else None
+    return Drive(left=sides[0], right=sides[1], sideways=sideways, findings=tuple(found))
+
+
+def _mean_sideways(
+    wheels: Mapping[str, Floats], left: Sequence[str], section: DriveSection, topic: str
+) -> Floats:
+    """Speed [rad/s] of wheels with rollers that moves the vehicle to the left.
+
+    Front right and rear left push to the left when they turn forward, the others to the right.
+    """
+    parts = []
+    for joint, speed in wheels.items():
+        name = joint.lower()
+        is_front = joint in section.front if section.front is not None else bool(_FRONT.search(name))
+        if section.front is None and is_front == bool(_REAR.search(name)):
+            raise StageError(
+                "no_wheels",
+                f"{joint} of {topic} cannot be told to be a front or a rear wheel",
+                where=topic,
+                hint=f"Set front to the names of the front wheels; it has: {', '.join(wheels)}.",
+            )
+        parts.append(speed if is_front != (joint in left) else -speed)
+    mean: Floats = np.mean(parts, axis=0)
+    return mean
 
 
 def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> str | None:
@@ -320,7 +359,14 @@ def unwrap_counter(count: Floats) -> Floats:
 
 
 def read_pair(
-    form: DriveForm, first: Floats, second: Floats, section: DriveSection, vehicle: Vehicle, *, nominal: bool
+    form: DriveForm,
+    first: Floats,
+    second: Floats,
+    section: DriveSection,
+    vehicle: Vehicle,
+    *,
+    nominal: bool,
+    sideways: Floats | None = None,
 ) -> Drive:
     """Two signals at common times as what the drive is told.
 
@@ -332,6 +378,7 @@ def read_pair(
         vehicle: its kind and geometry.
         nominal: whether a body motion is meant with the nominal track width, whatever the controller
             multiplies it by.
+        sideways: speed to the left of a body motion [m/s]; None where it is not said.
 
     Raises:
         StageError: the vehicle is of a kind that is told something else.
@@ -342,7 +389,7 @@ def read_pair(
         return read_steering(first * section.sign, second, vehicle)
     if nominal:
         vehicle = structs.replace(vehicle, controller_track_multiplier=1.0)
-    return read_body(first * section.sign, second, vehicle)
+    return read_body(first * section.sign, second, vehicle, sideways)
 
 
 def read_sides(left: Floats, right: Floats, vehicle: Vehicle) -> Drive:
@@ -354,13 +401,21 @@ def read_sides(left: Floats, right: Floats, vehicle: Vehicle) -> Drive:
             where="configuration",
             hint="Configure speed_topic and steering_topic, or an AckermannDrive topic.",
         )
+    if vehicle.kinematics.has_inputs("sideways"):
+        raise StageError(
+            "no_sideways",
+            f"a pair of wheel speeds does not say how {vehicle.name} ({vehicle.kind}) moves sideways",
+            where="configuration",
+            hint="Configure a topic of body motion with linear.y, or a JointState of all wheels.",
+        )
     return Drive(left=left, right=right)
 
 
-def read_body(forward: Floats, yaw_rate: Floats, vehicle: Vehicle) -> Drive:
+def read_body(forward: Floats, yaw_rate: Floats, vehicle: Vehicle, sideways: Floats | None = None) -> Drive:
     """A body command, turned into the drive's by the vehicle's ideal inverse."""
-    inputs = vehicle.kinematics.inverse((forward, np.zeros_like(forward), yaw_rate), vehicle)
-    return Drive(**inputs, body_x=forward, body_w=yaw_rate, findings=())
+    aside = np.zeros_like(forward) if sideways is None else sideways
+    inputs = vehicle.kinematics.inverse((forward, aside, yaw_rate), vehicle)
+    return Drive(**inputs, body_x=forward, body_y=sideways, body_w=yaw_rate, findings=())
 
 
 def read_steering(speed: Floats, steering: Floats, vehicle: Vehicle) -> Drive:

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 _LONGEST_NAME = 200
+_SIDEWAYS_MPS = 0.02
+_SIDEWAYS_SHARE = 0.01
+"""A hundredth of the commands is no slip of a joystick."""
 _NANOSECONDS = 1_000_000_000
 _NED_IN_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 _FRAME = "header.frame_id"
@@ -58,12 +61,27 @@ def is_of_base(source: DriveSource, types: Mapping[str, str]) -> bool:
 
 
 def sideways_field(source: DriveSource, types: Mapping[str, str]) -> Signal | None:
-    """Where a body command of a known type asks for sideways motion."""
+    """Where a body motion of a known type says how it goes sideways."""
     topic = source.signals[0].topic
     drive = find_type(types[topic]).drive
     if source.form is not DriveForm.BODY or not source.name or drive is None or not drive.sideways:
         return None
     return Signal(topic, drive.sideways)
+
+
+def asks_sideways(speeds: Floats) -> float:
+    """Share of body commands that ask for sideways motion [m/s]; zero where it is a slip of a joystick."""
+    share = float(np.mean(np.abs(speeds) > _SIDEWAYS_MPS)) if speeds.size else 0.0
+    return share if share >= _SIDEWAYS_SHARE else 0.0
+
+
+def find_sideways_share(topics: Iterable[TopicColumns], source: DriveSource | None) -> float:
+    """As `asks_sideways`, of a source among topics that were read; zero where it is no body command."""
+    for columns in topics:
+        if source is not None and columns.topic == source.signals[0].topic:
+            signal = sideways_field(source, {columns.topic: columns.type_name})
+            return asks_sideways(numbers(columns, signal.field)) if signal is not None else 0.0
+    return 0.0
 
 
 def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:

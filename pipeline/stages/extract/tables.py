@@ -51,6 +51,7 @@ from pipeline.vehicles import (
     PoseSource,
     Sources,
     Vehicle,
+    list_presets,
 )
 from pipeline.vehicles.configuration import IntervalSection
 from pipeline.vehicles.message_types import find_type
@@ -64,9 +65,6 @@ Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-_SIDEWAYS_MPS = 0.02
-_SIDEWAYS_SHARE = 0.01
-"""A hundredth of the commands is no slip of a joystick."""
 _DEFAULT_SECTION = IntervalSection(topic=DEFAULT_INTERVAL[0], equals=DEFAULT_INTERVAL[1])
 
 
@@ -376,14 +374,16 @@ class _Extraction:
             stamp, log_time, (first, second) = self._read_pair(source, section, held=held)
             topic = source.signals[0].topic
             nominal = not held and reading.is_of_base(source, {topic: self.columns[topic].type_name})
-            drive = read_pair(source.form, first, second, section, self.vehicle, nominal=nominal)
-            self.findings += self._check_sideways(source)
+            sideways = self._read_sideways(source, held=held)
+            drive = read_pair(
+                source.form, first, second, section, self.vehicle, nominal=nominal, sideways=sideways
+            )
         self.findings += drive.findings
         times = self._seconds(stamp)
         empty = np.full(times.size, np.nan)
         values = {
             name: empty if (series := getattr(drive, name)) is None else series
-            for name in ("left", "right", "speed", "steering", "body_x", "body_w")
+            for name in Drive.list_signals()
             if held or not name.startswith("body")
         }
         absent = [name for name in values if getattr(drive, name) is None]
@@ -412,20 +412,42 @@ class _Extraction:
             raise self._nothing("command" if held else "wheels", topic)
         return found
 
-    def _check_sideways(self, source: DriveSource) -> list[Finding]:
-        """Commands that no vehicle of this kind can follow: it moves along its wheels alone."""
+    def _read_sideways(self, source: DriveSource, *, held: bool) -> Floats | None:
+        """Speed to the left of a body motion [m/s], in the order of `_read_pair`; None where it has none.
+
+        Raises:
+            StageError: ``no_sideways``, the vehicle moves sideways, and what was measured does not say how.
+        """
+        if source.form is not DriveForm.BODY:
+            return None
         topic = source.signals[0].topic
-        columns = self.columns[topic]
-        signal = reading.sideways_field(source, {topic: columns.type_name})
+        signal = reading.sideways_field(source, {topic: self.columns[topic].type_name})
+        moves = self.vehicle.kinematics.has_inputs("sideways")
         if signal is None:
-            return []
-        share = float(np.mean(np.abs(reading.numbers(columns, signal.field)) > _SIDEWAYS_MPS))
-        if share < _SIDEWAYS_SHARE:
+            if moves and not held:
+                raise StageError(
+                    "no_sideways",
+                    f"{source} does not say how {self.vehicle.name} moves sideways",
+                    where=topic,
+                    hint="Configure an odometry, or a JointState of all wheels.",
+                )
+            return None
+        columns, _, order = self._require(topic, held=held)
+        sideways = reading.numbers(columns, signal.field)[order]
+        if not moves and held:
+            self.findings += self._check_sideways(sideways, topic)
+        return sideways if moves else None
+
+    def _check_sideways(self, sideways: Floats, topic: str) -> list[Finding]:
+        """Commands that no vehicle of this kind can follow: it moves along its wheels alone."""
+        share = reading.asks_sideways(sideways)
+        if share == 0.0:
             return []
         text = (
             f"{share:.0%} of the commands of {topic} ask for sideways motion, which {self.vehicle.name} "
-            f"({self.vehicle.kind}) cannot do: mecanum and other omnidirectional drives have no model here, "
-            "and that motion is left out"
+            f"({self.vehicle.kind}) cannot do, and that motion is left out: are its wheels mecanum or omni "
+            'wheels? Then [vehicle] kind = "mecanum" (with wheelbase_m) or "omni" in run.toml, or --vehicle '
+            f"with one of {', '.join(p.id for p in list_presets() if p.kinematics.has_inputs('sideways'))}"
         )
         return [Finding("sideways_command", "error", text, where=topic, value=share)]
 
@@ -475,6 +497,6 @@ def _take(drive: Drive, order: NDArray[np.int64]) -> Drive:
     """A drive's signals in another order."""
     series = {
         name: None if (values := getattr(drive, name)) is None else values[order]
-        for name in ("left", "right", "speed", "steering", "body_x", "body_w")
+        for name in Drive.list_signals()
     }
     return Drive(**series, findings=drive.findings)

@@ -54,10 +54,12 @@ class Kinematics(ABC):
     Attributes:
         inputs: what the drive is told, and what its encoders say.
         geometry: what of a vehicle's numbers the kind uses.
+        known_joints: whether single wheels, told apart by their names, tell the inputs.
     """
 
     inputs: ClassVar[tuple[Quantity, ...]]
     geometry: ClassVar[tuple[Quantity, ...]]
+    known_joints: ClassVar[bool] = True
 
     @abstractmethod
     def forward(self, inputs: Inputs, vehicle: Vehicle) -> Body:
@@ -75,6 +77,10 @@ class Kinematics(ABC):
         """How far base_link lies ahead of the point that moves straight ahead when nothing slips [m]."""
         del vehicle
         return 0.0
+
+    def turning_width_m(self, vehicle: Vehicle) -> float:
+        """Over which a difference of speed between the sides turns the vehicle [m]; one where unknown."""
+        return vehicle.track_width_m or 1.0
 
     def has_inputs(self, *names: str) -> bool:
         """Whether the drive is told all of these."""

@@ -28,7 +28,7 @@ Convention = Literal["flu", "ned_frd"]
 
 
 class DriveFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Two fields of one message that speak of the drive; ``sideways`` is the body command's third."""
+    """Two fields of one message that speak of the drive; ``sideways`` is the body motion's third."""
 
     form: Form
     role: Role

@@ -1,0 +1,70 @@
+"""Lateral scale: rollers give away a share of the sideways motion, whatever its speed.
+
+    s0 = k * s0
+
+s0 is the speed to the left. k is a plain number: 1 for ideal rollers, less where they turn against friction
+and slip along their axes; 0.88 is a "lateral multiplier" of 1.14 of competition robots. Drive sideways both
+ways.
+
+Source: Diegel, Badve, Bright, Potgieter and Tlale, ACRA 2002 (losses of mecanum wheels driving sideways).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import (
+    DATA_SHEET,
+    SIDEWAYS,
+    Excitation,
+    KinematicEffect,
+    Least,
+    Parameter,
+    Plausible,
+)
+from pipeline.models.effects.wheel_radius import WheelRadius
+from pipeline.models.wording import describe_share
+
+if TYPE_CHECKING:
+    from pipeline.models.effect import Effect
+    from pipeline.runs.signals import Rolling, RunContext
+    from pipeline.vehicles import Vehicle
+
+
+class LateralScale(KinematicEffect):
+    """Lateral scale: rollers give away a share of the sideways motion, whatever its speed."""
+
+    id = "lateral_scale"
+    rank = 25
+    kinds = SIDEWAYS
+    parameters = (
+        Parameter(
+            "k",
+            "1",
+            (0.0, 2.0),
+            1.0,
+            "sideways speed over that of ideal rollers",
+            0.8,
+            least=Least(0.01, DATA_SHEET),
+            plausible=Plausible(
+                0.3, 1.2, "wider than the lateral multipliers of 1 to 2 of competition robots"
+            ),
+        ),
+    )
+    needs = (Excitation.SIDEWAYS,)
+    confused_with = ("roller_slip", "wheel_radius")
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        return f"travels {describe_share(self.values['k'])} sideways than its wheels turn"
+
+    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
+        """See the formula above."""
+        del around
+        return replace(rolling, s0=self.values["k"] * rolling.s0)
+
+    def depends_on(self, other: Effect) -> bool:
+        """Sideways only the product with a wheel radius shows."""
+        return isinstance(other, WheelRadius)

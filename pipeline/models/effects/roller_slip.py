@@ -1,0 +1,57 @@
+"""Roller slip: the faster the vehicle drives sideways, the larger the share of that motion its rollers lose.
+
+    v_y += -k * s0 * abs(s0)
+
+s0 is the speed to the left. k [s/m]: 0.3 loses 15 % at 0.5 m/s. Drive sideways at several speeds, both ways,
+to tell it from a scale that is the same at every speed.
+
+Source: slip growing with traction; see Wong, Theory of Ground Vehicles, chapter 2.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models.effect import SIDEWAYS, Excitation, LinearEffect, Parameter, Plausible
+from pipeline.models.wording import describe_share
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.models.effect import Column
+    from pipeline.runs.signals import Rolling, RunContext, Velocity
+    from pipeline.vehicles import Vehicle
+
+
+class RollerSlip(LinearEffect):
+    """Roller slip: the faster it drives sideways, the larger the share of that motion its rollers lose."""
+
+    id = "roller_slip"
+    kinds = SIDEWAYS
+    parameters = (
+        Parameter(
+            "k",
+            "s/m",
+            (-2.0, 2.0),
+            0.0,
+            "share of sideways speed lost per sideways speed",
+            0.3,
+            plausible=Plausible(-0.05, 1.5, "wider than losing half of one metre a second"),
+            one_sign=True,
+        ),
+    )
+    needs = (Excitation.SIDEWAYS, Excitation.SPEED_SPREAD)
+    confused_with = ("lateral_scale",)
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        share = describe_share(1.0 - 0.5 * self.values["k"])
+        return f"travels {share} sideways than its wheels turn at 0.5 m/s, more so with speed"
+
+    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
+        """See the formula above."""
+        del velocity, around
+        return {"k": (0.0, -rolling.s0 * np.abs(rolling.s0), 0.0)}
