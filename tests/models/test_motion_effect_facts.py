@@ -24,6 +24,8 @@ GENERIC = sorted(
     for path in SOURCES.rglob("*.py")
     if OWN not in path.parents and SOURCES / "simulate" not in path.parents
 )
+# Parameters of other people's controllers that are called as an effect is.
+NAMESAKES = {"vehicles/parameters.py": {"'wheel_radius'"}}
 ASKED = Largest(1.5, 1.2, 9.0, 8.0, np.linspace(0.0, 300.0, 11), np.linspace(-5.0, 20.0, 11))
 
 
@@ -44,7 +46,11 @@ def list_mentions(path: Path) -> list[str]:
 
 
 def test_no_generic_file_knows_an_effect() -> None:
-    knowing = {str(path.relative_to(SOURCES)): list_mentions(path) for path in GENERIC}
+    knowing = {
+        name: [line for line in list_mentions(path) if line.split(": ")[1] not in NAMESAKES.get(name, ())]
+        for path in GENERIC
+        if (name := str(path.relative_to(SOURCES)))
+    }
     assert {path: lines for path, lines in knowing.items() if lines} == {}
 
 

@@ -74,6 +74,12 @@ class Drive:
         """Names of the signals, in the order of the tables' columns."""
         return tuple(name for name in cls.__dataclass_fields__ if name != "findings")
 
+    def take(self, order: NDArray[np.int64]) -> Drive:
+        """The signals in another order."""
+        series = {name: getattr(self, name) for name in self.list_signals()}
+        taken = {name: None if values is None else values[order] for name, values in series.items()}
+        return Drive(**taken, findings=self.findings)
+
 
 def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, vehicle: Vehicle) -> Drive:
     """Joint states: wheels by joint name, averaged a side.

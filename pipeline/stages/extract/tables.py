@@ -368,7 +368,7 @@ class _Extraction:
         if source.form is DriveForm.JOINTS:
             columns, clock, order = self._require(source.signals[0].topic, held=held)
             drive = read_joints(columns, self._seconds(clock.stamp), section, self.vehicle)
-            drive = _take(drive, order)
+            drive = drive.take(order)
             stamp, log_time = clock.stamp[order], columns.log_time[order]
         else:
             stamp, log_time, (first, second) = self._read_pair(source, section, held=held)
@@ -491,12 +491,3 @@ class _Extraction:
                 "active": is_inside(times, self._spans),
             }
         )
-
-
-def _take(drive: Drive, order: NDArray[np.int64]) -> Drive:
-    """A drive's signals in another order."""
-    series = {
-        name: None if (values := getattr(drive, name)) is None else values[order]
-        for name in Drive.list_signals()
-    }
-    return Drive(**series, findings=drive.findings)
