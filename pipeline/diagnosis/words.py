@@ -68,6 +68,7 @@ def _list_shared(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
         share = max(min(diagnosis.explained_share, 1.0), 0.0)
         now, floor = _number(last, "t_mrmse_m"), _number(diagnosis.noise_floor, "t_mrmse_m")
         lines.append(("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m"))
+    lines += _label("budget", _describe_budget(diagnosis))
     return [*lines, *_describe_unobservable(diagnosis)]
 
 
@@ -99,6 +100,16 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
             rows += [f"{'':<20}{line}" for line in left.formula.splitlines() if line.startswith("v_")]
     if not rows:
         rows.append("nothing: the model is as good as the localization lets us see")
+    return rows
+
+
+def _describe_budget(diagnosis: RunDiagnosis) -> list[str]:
+    """Who carries the slip on the leading input, in parts of its mean square."""
+    rows = []
+    for budget in diagnosis.budgets:
+        if (budget.input, budget.quantity) == (diagnosis.input, "slip") and diagnosis.effects:
+            parts = [f"{one.name.replace('_noise', ' noise')} {one.share:.0%}" for one in budget.shares]
+            rows.append(f"of {math.sqrt(budget.total):.3g} m/s of slip (mean square): {', '.join(parts)}")
     return rows
 
 

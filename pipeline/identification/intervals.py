@@ -87,7 +87,7 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
         fitted: a converged fit.
     """
     made = [
-        _estimate_part(part, fit) for part, fit in zip(problem.parts, fitted.fits, strict=True) if fit.free
+        estimate_part(part, fit) for part, fit in zip(problem.parts, fitted.fits, strict=True) if fit.free
     ]
     if not made:
         return NOTHING
@@ -99,7 +99,8 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
     return Estimates(items, correlation, min(one.blocks for one in made))
 
 
-def _estimate_part(part: Part, fit: PartFit) -> Estimates:
+def estimate_part(part: Part, fit: PartFit) -> Estimates:
+    """Intervals of the free numbers of one part, the others as they are."""
     from scipy.stats import t as student  # noqa: PLC0415 - heavy
 
     count = len(fit.free)
