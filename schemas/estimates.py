@@ -23,7 +23,7 @@ class Estimates(Table):
     unit = fields.text("unit of value and standard_error")
     value = fields.number("1", "its estimate, in the unit of the column `unit`")
     standard_error = dy.Float64(
-        min=0.0, metadata={"unit": "1", "description": "of the estimate; 1.96 of it make a 95 % interval"}
+        min=0.0, metadata={"unit": "1", "description": "standard deviation of the estimate"}
     )
     named = fields.flag(
         "the diagnosis names the effect; else the estimate is what one step of a joint fit gives"

@@ -94,7 +94,7 @@ class EstimatedNumber:
         input: what the model was fed with.
         effect, parameter, unit: which number.
         value: the estimate; of an effect that was not named what one step of a joint fit gives it.
-        standard_error: of it; a 95 % interval is 1.96 of it wide to each side.
+        standard_error: standard deviation of the estimate.
         named: whether the diagnosis names the effect.
         at_bound: whether it stopped at a bound of the search.
     """

@@ -37,10 +37,11 @@ def list_estimates(
     ids = {effect.id for effect in named}
     known = {effect.id for effect in list_effects()}
     candidates = {e.id: e() for e in (*context.list_candidates(source), *context.list_drivetrain())}
-    rivals = [effect for effect in candidates.values() if effect.id not in ids and not _overlaps(effect, model)]
+    rivals = [
+        effect for effect in candidates.values() if effect.id not in ids and not _overlaps(effect, model)
+    ]
     for item in (*judgement.estimates.items, *estimate_unnamed(judgement.fitted, rivals)):
-        error = (item.high - item.low) / (2.0 * _HALF)
-        number = item.free
+        error, number = item.deviation, item.free
         if (
             number.effect in known
             and number.run is None

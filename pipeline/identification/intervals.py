@@ -26,6 +26,8 @@ _DELAY_STEP = 5e-3
 _RISEN = 1.92
 _LONGEST_S = 20.0
 _SEED = 20240513
+# So many degrees of freedom are as good as a normal distribution.
+_NORMAL = 1e9
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ class Estimate:
         standard_error: of the estimate.
         at_bound: whether it stopped at a bound, so that the interval means little.
         observable: whether the data move with it at all.
+        freedom: degrees of freedom of Student's t that the interval was made with.
     """
 
     free: Free
@@ -48,6 +51,15 @@ class Estimate:
     standard_error: float
     at_bound: bool
     observable: bool
+    freedom: float = np.inf
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the estimate, few blocks allowed for: Student's t of it is the interval."""
+        from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
+
+        half = 0.5 * (self.high - self.low)
+        return half / float(stdtrit(min(self.freedom, _NORMAL), 0.975))
 
 
 @dataclass(frozen=True)
@@ -135,6 +147,7 @@ def estimate_part(part: Part, fit: PartFit) -> Estimates:
                 float(errors[index]),
                 at_bound=stands_at_bound(value, number.bounds),
                 observable=bool(observable[index]),
+                freedom=float(freedom) if number.is_smooth else np.inf,
             )
         )
     return Estimates(tuple(items), correlation, pieces)

@@ -49,7 +49,7 @@ class FigureCache:
         self._tables = {name: manifest.read(name) for name in wanted if name in manifest.tables}
         self._summary = read_summary(manifest)
         told = manifest.read_json(DIAGNOSIS) if DIAGNOSIS in manifest.files else {}
-        self._diagnosis = {key: told[key] for key in ("input", "budget") if key in told}
+        self._diagnosis: dict[str, object] = {key: told[key] for key in ("input", "budget") if key in told}
 
     def draw(self, view: MotionView) -> dict[str, object]:
         """Specifications, rows, titles and words of all figures."""

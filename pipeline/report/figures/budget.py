@@ -45,9 +45,7 @@ def draw_budget(scene: Scene) -> Drawing | None:
     x = alt.X(
         "from:Q",
         scale=alt.Scale(domain=[left, _ROOM], nice=False),
-        axis=alt.Axis(
-            title="share of the mean square slip", format="%", values=[0.0, 0.25, 0.5, 0.75, 1.0]
-        ),
+        axis=alt.Axis(title="share of the mean square slip", format="%", values=[0.0, 0.25, 0.5, 0.75, 1.0]),
     )
     colour = alt.Color(
         "kind:N", scale=alt.Scale(domain=list(_COLOURS), range=list(_COLOURS.values())), legend=None
@@ -56,12 +54,10 @@ def draw_budget(scene: Scene) -> Drawing | None:
     ends = base.mark_rule(color=theme.INK, strokeWidth=1.2).encode(x=alt.X("low:Q"), x2="high:Q")
     words = base.mark_text(align="left", dx=6, fontSize=11).encode(x=alt.X("right:Q"), text="told:N")
     rows = rows.with_columns(right=pl.max_horizontal("from", "to", pl.col("high").fill_null(0.0)))
-    chart = alt.layer(bars, ends, words).properties(
-        width=480, height=alt.Step(26), usermeta={"gutter": 130}
-    )
+    chart = alt.layer(bars, ends, words).properties(width=480, height=alt.Step(26), usermeta={"gutter": 130})
     note = (
-        "Of the model that the diagnosis names. Shares are fair to the order of its effects and add up; lines are 95 % "
-        "intervals over stretches of ten seconds. A bar to the right makes held-out slip larger."
+        "Of the model that the diagnosis names. Shares are fair to the order of its effects and add up; "
+        "lines are 95 % intervals over stretches of ten seconds. A bar to the right makes slip larger."
     )
     return Drawing(chart, {"budget": rows}, note)
 
@@ -106,7 +102,9 @@ def describe_budget(scene: Scene) -> str:
     total = number_in(slip, "total")
     told = "; ".join(f"{row['cause']}: {row['told']}" for row in list_parts(scene).iter_rows(named=True))
     words = INPUT_WORDS.get(str(slip.get("input")), "")
-    return f"Mean square slip {words}, {say_number(total)} m\u00b2/s\u00b2 over half a second, by cause. {told}."
+    return (
+        f"Mean square slip {words}, {say_number(total)} m\u00b2/s\u00b2 over half a second, by cause. {told}."
+    )
 
 
 FIGURE = Figure(
