@@ -27,6 +27,7 @@ from pipeline.fleet.statistics.intervals import (
     bound_shift,
     bound_typical,
 )
+from pipeline.fleet.statistics.levels import GroupMean, LevelFit, split_levels
 from pipeline.fleet.statistics.orders import kendall_tau, list_swaps
 from pipeline.fleet.statistics.pairs import Blocks, Comparison, compare_blocks, compare_runs, cut_blocks
 from pipeline.fleet.statistics.permutation import (
@@ -45,7 +46,9 @@ __all__ = [
     "Blocks",
     "Change",
     "Comparison",
+    "GroupMean",
     "Interval",
+    "LevelFit",
     "PermutationTest",
     "StatisticsError",
     "adjust_holm",
@@ -72,4 +75,5 @@ __all__ = [
     "runs_needed_against",
     "shift_between",
     "smallest_p",
+    "split_levels",
 ]
