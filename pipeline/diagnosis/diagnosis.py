@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 from pipeline.diagnosis.error_regions import tabulate_regions
+from pipeline.models.catalogue import find_effect
 from pipeline.models.model_text import format_model
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.undecided import Undecided
     from pipeline.identification.apportion import Share, SlipBudget
     from pipeline.models import ModelFile
+    from pipeline.models.level import Reading
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 
@@ -62,6 +64,19 @@ class Named:
     selected: float
     tentative: bool = False
 
+    @property
+    def readings(self) -> tuple[Reading, ...]:
+        """What it is if it belongs to the vehicle, the ground or the run, which one run cannot tell."""
+        return find_effect(self.id).readings
+
+    @property
+    def sentence(self) -> str:
+        """What it may be by other names, and what would tell; empty where all levels share its name."""
+        texts = {reading.name: f"{reading.text} ({reading.name})" for reading in reversed(self.readings)}
+        if len(texts) <= 1:
+            return ""
+        return f"{', or '.join(reversed(texts.values()))}: runs on another ground tell"
+
     def to_json(self) -> dict[str, Json]:
         """The promised keys, and more."""
         return {
@@ -83,6 +98,11 @@ class Named:
             "found_on": self.way,
             "selection_frequency": _clean(self.selected),
             "tentative": self.tentative,
+            "level": None,
+            "could_be": [
+                {"level": one.level.value, "name": one.name, "text": one.text} for one in self.readings
+            ],
+            "sentence": self.sentence or None,
         }
 
 

@@ -90,6 +90,7 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
             notes.append("tentative")
         note = f"  ({'; '.join(notes)})" if notes else ""
         rows.append(f"{effect.id:<20}{_values(effect):<{width}}{falls.get(effect.id, '')}{note}")
+        rows += [f"{'':<20}{effect.sentence}"] if effect.sentence else []
     rows += [
         f"{'undecided':<20}{' or '.join(item.candidates)}: {item.separate_by}" for item in diagnosis.undecided
     ]

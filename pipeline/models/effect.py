@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from pipeline.models.evidence import Evidence, Largest, Relative
+    from pipeline.models.level import Reading
     from pipeline.runs.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
 
 INF = math.inf
@@ -181,6 +182,8 @@ class Effect(ABC):
         parts: numbers of other effects under which it is searched; found together, they are named as it.
         late: what it makes late, where its only number is a delay.
         price: share of the held-out error that it must take away before it counts.
+        readings: what it is if its numbers prove to be the vehicle's, the ground's or a run's own, where one
+            run cannot tell these apart.
         values: the numbers themselves.
         fixed: names of parameters that a fit leaves alone.
     """
@@ -199,6 +202,7 @@ class Effect(ABC):
     parts: tuple[Part, ...] = ()
     late: Late | None = None
     price: float = 0.0
+    readings: tuple[Reading, ...] = ()
 
     def __init__(self, *, fixed: Iterable[str] = (), **values: float) -> None:
         self.values: Mapping[str, float] = self._complete(values)

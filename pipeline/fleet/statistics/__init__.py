@@ -27,7 +27,7 @@ from pipeline.fleet.statistics.intervals import (
     bound_shift,
     bound_typical,
 )
-from pipeline.fleet.statistics.levels import GroupMean, LevelFit, split_levels
+from pipeline.fleet.statistics.levels import GroupMean, LevelFit, find_outlier, split_levels
 from pipeline.fleet.statistics.orders import kendall_tau, list_swaps
 from pipeline.fleet.statistics.pairs import Blocks, Comparison, compare_blocks, compare_runs, cut_blocks
 from pipeline.fleet.statistics.permutation import (
@@ -63,6 +63,7 @@ __all__ = [
     "count_effective",
     "cut_blocks",
     "find_changes",
+    "find_outlier",
     "integrated_time",
     "kendall_tau",
     "list_swaps",

@@ -30,6 +30,8 @@ _LEVEL = 0.95
 _NORMAL = 1e6
 # Spreads from which the likelihood is climbed, as parts of the scatter: large, or one of them small.
 _STARTS = ((0.7, 0.7), (0.7, 0.1), (0.1, 0.7))
+# Scatter of fewer runs than that says little of what is odd.
+_FEWEST_OTHERS = 3
 # A variance below this part of the whole is none.
 _NONE = 1e-8
 
@@ -52,6 +54,7 @@ class LevelFit:
         interval: of it; None with a single run.
         spread_group, spread_run: standard deviations between groups and between runs of a group; NaN where
             no group has two runs, the first also where there is one group only.
+        scatter: standard deviation of the numbers of runs about those of their groups, their errors included.
         groups: means by label; their intervals take runs of all groups to scatter alike, None without
             scatter.
         p_groups: how often equal groups would differ as much; NaN where that cannot be asked.
@@ -64,6 +67,7 @@ class LevelFit:
     interval: Interval | None
     spread_group: float
     spread_run: float
+    scatter: float
     groups: dict[str, GroupMean]
     p_groups: float
     p_runs: float
@@ -85,17 +89,8 @@ def split_levels(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) ->
     """
     from scipy.special import chdtrc, fdtrc  # noqa: PLC0415 - heavy
 
-    y, s = check_values(values, what="values"), check_values(errors, what="errors")
-    if not y.size == s.size == len(groups) or np.any(s <= 0.0):
-        raise StatisticsError(
-            "bad_errors",
-            f"{y.size} values have {s.size} errors and {len(groups)} groups, the least error is {s.min():g}",
-            hint="Give every value a group and a positive error.",
-        )
-    names = sorted(set(groups))
-    number = np.array([names.index(name) for name in groups], dtype=np.int64)
-    sample = _Sample(y, s**2, number, len(names))
-    freedom = y.size - len(names)
+    sample, names = _make_sample(values, errors, groups)
+    freedom = sample.y.size - len(names)
     within = _maximize(sample, common=False)[1]
     between, run = _maximize(sample, common=True)
     p_groups = p_runs = chi_square = math.nan
@@ -110,12 +105,64 @@ def split_levels(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) ->
         interval=_bound_mean(sample, between, run),
         spread_group=math.sqrt(between) if freedom and len(names) > 1 else math.nan,
         spread_run=math.sqrt(run) if freedom else math.nan,
+        scatter=math.sqrt(run + float(np.median(sample.known))),
         groups=_describe_groups(sample, names, within, freedom),
         p_groups=p_groups,
         p_runs=p_runs,
         chi_square=chi_square,
         freedom=freedom,
     )
+
+
+def find_outlier(values: ArrayLike, errors: ArrayLike, groups: Sequence[str], *, chance: float) -> int | None:
+    """The run that stands apart from the others of its group, if one does; None else.
+
+    The run that lies farthest off is left out; whether it belongs to what the others say of its group is
+    asked of Student's t, for as many runs as could have lain farthest off (Bonferroni). Groups of fewer than
+    three runs do not tell which run is the odd one.
+
+    Args:
+        values: as of `split_levels`.
+        errors: as there.
+        groups: as there.
+        chance: of one run or more being taken for odd where none is.
+    """
+    from scipy.special import stdtr  # noqa: PLC0415 - heavy, and only this function of it
+
+    sample, _ = _make_sample(values, errors, groups)
+    runs = np.bincount(sample.group, minlength=sample.count)[sample.group]
+    asked = runs > 2  # noqa: PLR2004 - of two runs nobody knows which is odd
+    if not asked.any():
+        return None
+    weight, means, total = sample.weigh(0.0)
+    size = np.abs(sample.y - means[sample.group]) / np.sqrt(
+        np.maximum(1.0 / weight - 1.0 / total[sample.group], 1e-300)
+    )
+    worst = int(np.argmax(np.where(asked, size, -1.0)))
+    kept = np.arange(sample.y.size) != worst
+    others = _Sample(sample.y[kept], sample.known[kept], sample.group[kept], sample.count)
+    freedom = others.y.size - others.count
+    if freedom < _FEWEST_OTHERS:
+        return None
+    run = _maximize(others, common=False)[1]
+    _, means, total = others.weigh(run)
+    group = sample.group[worst]
+    deviation = math.sqrt(sample.known[worst] + run + 1.0 / float(total[group]))
+    farther = 2.0 * float(stdtr(freedom, -abs(sample.y[worst] - means[group]) / deviation))
+    return worst if farther * int(asked.sum()) < chance else None
+
+
+def _make_sample(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) -> tuple[_Sample, list[str]]:
+    y, s = check_values(values, what="values"), check_values(errors, what="errors")
+    if not y.size == s.size == len(groups) or np.any(s <= 0.0):
+        raise StatisticsError(
+            "bad_errors",
+            f"{y.size} values have {s.size} errors and {len(groups)} groups, the least error is {s.min():g}",
+            hint="Give every value a group and a positive error.",
+        )
+    names = sorted(set(groups))
+    number = np.array([names.index(name) for name in groups], dtype=np.int64)
+    return _Sample(y, s**2, number, len(names)), names
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from pipeline.models.effect import (
     Plausible,
 )
 from pipeline.models.effects.wheel_radius import WheelRadius
+from pipeline.models.level import Level, Reading
 
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
@@ -47,6 +48,11 @@ class EffectiveTrack(KinematicEffect):
     )
     needs = (Excitation.TURNING,)
     confused_with = ("wheel_radius", "terrain_change")
+    readings = (
+        Reading(Level.VEHICLE, "geometry", "wheels and wheelbase as they are, or a wrong track width"),
+        Reading(Level.TERRAIN, "effective_track", "skidding in turns as this ground makes it"),
+        Reading(Level.RUN, "effective_track", "another tyre pressure or load in some runs"),
+    )
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.models.effect import DATA_SHEET, Excitation, KinematicEffect, Least, Parameter, Plausible
+from pipeline.models.level import Level, Reading
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import Rolling, RunContext
@@ -36,6 +37,11 @@ class WheelRadius(KinematicEffect):
     )
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("speed_slip", "effective_track")
+    readings = (
+        Reading(Level.VEHICLE, "wheel_radius", "wheels smaller or larger than configured"),
+        Reading(Level.TERRAIN, "longitudinal_slip", "wheels that turn on without grip on this ground"),
+        Reading(Level.RUN, "wheel_radius", "another tyre pressure or load in some runs"),
+    )
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
