@@ -28,7 +28,7 @@ _SCHEMA = {
 }
 _LEFT = {"disturbance": "disturbance", "localization_noise": "localization noise"}
 _COLOURS = {"effect": theme.MODEL, "disturbance": theme.GROUND, "localization_noise": theme.CROSS}
-_ROOM = 1.5
+_ROOM = 2.2
 
 
 def draw_budget(scene: Scene) -> Drawing | None:
@@ -56,8 +56,8 @@ def draw_budget(scene: Scene) -> Drawing | None:
     rows = rows.with_columns(right=pl.max_horizontal("from", "to", pl.col("high").fill_null(0.0)))
     chart = alt.layer(bars, ends, words).properties(width=480, height=alt.Step(26), usermeta={"gutter": 130})
     note = (
-        "Of the model that the diagnosis names. Shares are fair to the order of its effects and add up; "
-        "lines are 95 % intervals over stretches of ten seconds. A bar to the right makes slip larger."
+        "Numbers: share of the slip, then of the 2 s position error, of the model that the diagnosis names; "
+        "fair to the order of its effects. Lines are 95 % intervals. A bar to the right makes slip larger."
     )
     return Drawing(chart, {"budget": rows}, note)
 
@@ -81,7 +81,7 @@ def list_parts(scene: Scene) -> pl.DataFrame:
                 "low": None if high is None else top - high,
                 "high": None if low is None else top - low,
                 "kind": kind,
-                "told": f"{say_share(share)} of slip \u00b7 {say_share(errors.get(name))} of the 2 s error",
+                "told": f"{say_share(share)} \u00b7 {say_share(errors.get(name))}",
             }
         )
         top -= share
@@ -102,8 +102,10 @@ def describe_budget(scene: Scene) -> str:
     total = number_in(slip, "total")
     told = "; ".join(f"{row['cause']}: {row['told']}" for row in list_parts(scene).iter_rows(named=True))
     words = INPUT_WORDS.get(str(slip.get("input")), "")
+    size = f"{say_number(total)} m\u00b2/s\u00b2"
     return (
-        f"Mean square slip {words}, {say_number(total)} m\u00b2/s\u00b2 over half a second, by cause. {told}."
+        f"Mean square slip {words}, {size} over half a second, by cause, with its shares of slip and of the 2 s "
+        f"error. {told}."
     )
 
 
