@@ -104,8 +104,8 @@ def describe_budget(scene: Scene) -> str:
     words = INPUT_WORDS.get(str(slip.get("input")), "")
     size = f"{say_number(total)} m\u00b2/s\u00b2"
     return (
-        f"Mean square slip {words}, {size} over half a second, by cause, with its shares of slip and of the 2 s "
-        f"error. {told}."
+        f"Mean square slip {words}, {size} over half a second by cause, shares of it and of the 2 s error. "
+        f"{told}."
     )
 
 
