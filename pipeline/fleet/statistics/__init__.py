@@ -23,6 +23,7 @@ from pipeline.fleet.statistics.families import (
 from pipeline.fleet.statistics.intervals import (
     Interval,
     bootstrap_median,
+    bound_difference,
     bound_mean,
     bound_shift,
     bound_typical,
@@ -54,6 +55,7 @@ __all__ = [
     "adjust_holm",
     "adjust_max_t",
     "bootstrap_median",
+    "bound_difference",
     "bound_mean",
     "bound_shift",
     "bound_typical",

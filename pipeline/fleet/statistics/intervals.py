@@ -78,12 +78,35 @@ def bound_shift(a: ArrayLike, b: ArrayLike, *, level: float = 0.95) -> Interval:
     Raises:
         StatisticsError: a side is empty, both have a single value, or one is not finite.
     """
+    first, second = _check_sides(a, b)
+    return _bound_welch(first, second, shift_between(first, second), level)
+
+
+def bound_difference(a: ArrayLike, b: ArrayLike, *, level: float = 0.95) -> Interval:
+    """Welch's interval of the difference of means b - a; sides as in `bound_shift`.
+
+    Args:
+        a: one number a unit, shape (n,).
+        b: the same for the other side, shape (m,), n + m >= 3.
+        level: confidence level.
+
+    Raises:
+        StatisticsError: a side is empty, both have a single value, or one is not finite.
+    """
+    first, second = _check_sides(a, b)
+    return _bound_welch(first, second, float(second.mean() - first.mean()), level)
+
+
+def _check_sides(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
     first = check_values(a, what="values", fewest=1)
-    second = check_values(b, what="values", fewest=2 if first.size == 1 else 1)
+    return first, check_values(b, what="values", fewest=2 if first.size == 1 else 1)
+
+
+def _bound_welch(first: Floats, second: Floats, centre: float, level: float) -> Interval:
     scatter = [float(np.var(side, ddof=1)) for side in (first, second) if side.size > 1]
     freedom = [side.size - 1 for side in (first, second) if side.size > 1]
     parts = [scatter[0] / first.size, scatter[-1] / second.size]
-    centre, error = shift_between(first, second), sum(parts) ** 0.5
+    error = sum(parts) ** 0.5
     if error == 0.0:
         return Interval(centre, centre, level)
     if len(freedom) == 1:
