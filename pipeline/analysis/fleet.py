@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from typing import TYPE_CHECKING
@@ -62,6 +63,16 @@ def write_fleet(store: Store, model: FleetModel, keys: tuple[str, ...]) -> Path:
     store.write_results_table("fleet", tabulate_fleet(model, keys))
     content = {**describe_fleet(model), "keys": list(keys)}
     return store.write_results_text(FLEET, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def update_fleet(store: Store) -> None:
+    """Fit the fleet model anew where one was fitted before; nothing else is done.
+
+    Results without any run that tells of it keep the model they have.
+    """
+    if (store.root / FLEET).is_file():
+        with contextlib.suppress(JobError):
+            write_fleet(store, *fit_results(store))
 
 
 def read_fleet(store: Store) -> dict[str, object]:

@@ -10,6 +10,7 @@ import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
+from pipeline.batch.pooling import refresh_pools
 from pipeline.cli import main
 from pipeline.fleet.hierarchy import FleetModel, FleetNumber, fit_fleet
 from pipeline.models.level import Level
@@ -197,6 +198,21 @@ def test_a_fleet_that_is_out_of_date_says_so(results: Store, capsys: pytest.Capt
     run_slip(capsys, "fleet", "fit", str(results.root))
     write_run(results, Run(name="new", seconds=6.0, estimates=[("wheel_radius", "k", 1.0, ERROR)]))
     assert "1 results have changed since" in run_slip(capsys, "fleet", "show", str(results.root))[1]
+
+
+def test_a_batch_keeps_a_fleet_that_was_fitted_up_to_date(
+    results: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    refresh_pools(results)
+    assert not (results.root / "fleet.json").exists()
+    run_slip(capsys, "fleet", "fit", str(results.root))
+    write_run(
+        results, Run(name="new", terrain="mud", seconds=6.0, estimates=[("wheel_radius", "k", 0.9, ERROR)])
+    )
+    refresh_pools(results)
+    shown = json.loads(run_slip(capsys, "fleet", "show", str(results.root), "--json")[1])
+    assert "mud" in shown["parameters"][0]["terrains"]
+    assert not any("have changed since" in note for note in shown["notes"])
 
 
 def test_without_a_fleet_or_estimates_one_line_says_what_to_do(
