@@ -22,8 +22,8 @@ STAGE = "diagnosis"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 5
-_WRITTEN = ("ladder", "parameters")
+VERSION = 6
+_WRITTEN = ("ladder", "parameters", "budget", "estimates")
 
 
 def key_diagnosis(keys: Mapping[str, str]) -> str:
@@ -78,6 +78,7 @@ def _diagnose(work: Work) -> dict[str, JSON]:
         work.run,
         (generation.table_names, generation.read_table),
         {"sha256": work.sha256, "path": str(setup.path)},
+        setup.configuration.slip.length_scale_m,
     )
     try:
         diagnosis = diagnose_runs([recording], work.vehicle, inputs=work.options.inputs, tell=work.progress)
@@ -89,6 +90,8 @@ def _diagnose(work: Work) -> dict[str, JSON]:
     for table, frame in (
         ("ladder", diagnosis.tabulate_ladder(work.run)),
         ("parameters", diagnosis.tabulate_parameters(work.run)),
+        ("budget", diagnosis.tabulate_budget(work.run)),
+        ("estimates", diagnosis.tabulate_estimates(work.run)),
     ):
         if not frame.is_empty():
             work.write(table, frame)
@@ -108,6 +111,7 @@ def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
         manifest.run,
         (manifest.tables, manifest.read),
         log if isinstance(log, dict) else {},
+        _read_length_scale(manifest),
     )
     return load_vehicle(manifest), recording
 
@@ -122,6 +126,7 @@ def _make_recording(
     run: str,
     tables: tuple[Iterable[str], Callable[[str], pl.DataFrame]],
     log: Mapping[str, JSON],
+    length_scale_m: float,
 ) -> Recording:
     """The tables that a diagnosis reads, with where they came from."""
     from pipeline.diagnosis import Recording  # noqa: PLC0415 - heavy
@@ -132,4 +137,13 @@ def _make_recording(
         {name: read(name) for name in names if name in _TABLES},
         sha256=str(log.get("sha256", "")),
         path=str(log.get("path", "")),
+        length_scale_m=length_scale_m,
     )
+
+
+def _read_length_scale(manifest: Manifest) -> float:
+    """Length scale of the slip modulus that a run was analyzed with [m]."""
+    configuration = manifest.details.get("configuration")
+    slip = configuration.get("slip") if isinstance(configuration, dict) else None
+    scale = slip.get("length_scale_m") if isinstance(slip, dict) else None
+    return float(scale) if isinstance(scale, int | float) else 1.0

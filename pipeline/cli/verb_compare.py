@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from cyclopts import App, Parameter
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.analysis.compare import Answer
+    from pipeline.store import Store
 
 _NAME = 34
 
@@ -41,6 +42,7 @@ def compare(  # noqa: D417 - arguments document themselves
         ),
     ] = None,
     as_published: Annotated[bool, Parameter(negative="")] = False,
+    causes: Annotated[bool, Parameter(negative="")] = False,
     figures: FigureFormat | None = None,
     out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
     json: bool = False,
@@ -52,6 +54,8 @@ def compare(  # noqa: D417 - arguments document themselves
 
     Args:
         as_published: compare window norms of the published chain in place of median moduli.
+        causes: compare budgets: which effects carry the slip, and which the differences. Writes causes.html,
+            causes.csv, causes.tex, cause_differences.csv and cause_differences.tex.
         figures: also write the figures in this format, for papers.
         json: print one JSON object in place of the tables.
         quiet: print nothing.
@@ -62,6 +66,9 @@ def compare(  # noqa: D417 - arguments document themselves
 
     store = Store(out or results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
+    if causes:
+        _compare_causes(store, names, fed, figures, json=json, quiet=quiet)
+        return CLEAN
     answer = compare_results(store, Question(by=names, input=fed, as_published=as_published))
     written = write_answer(store, answer, figures)
     if json:
@@ -69,6 +76,41 @@ def compare(  # noqa: D417 - arguments document themselves
     elif not quiet:
         print_lines(_describe(answer, written).split("\n"))
     return CLEAN
+
+
+def _compare_causes(
+    store: Store,
+    by: tuple[str, ...],
+    fed: str | None,
+    figures: FigureFormat | None,
+    *,
+    json: bool,
+    quiet: bool,
+) -> None:
+    from pipeline.analysis.causes import describe_causes, find_causes, write_causes  # noqa: PLC0415 - heavy
+
+    found = find_causes(store, by, fed)
+    written = write_causes(store, found, figures)
+    content = describe_causes(found)
+    if json:
+        print_json({**content, "page": str(written["causes.html"])})
+    elif not quiet:
+        lines = [
+            f"slip on {found.input.replace('measured', 'measured wheels')} by cause, parts of its mean square"
+        ]
+        for budget in found.budgets:
+            parts = ", ".join(
+                f"{found.names.get(one.name, one.name)} {one.share:.0%}" for one in budget.parts
+            )
+            lines += [
+                "",
+                f"{budget.dataset}: {budget.total**0.5:.3g} m/s, {budget.runs} run{'s' * (budget.runs != 1)}",
+                f"  {parts}",
+            ]
+        lines.append("")
+        for one in cast("Sequence[Mapping[str, object]]", content["differences"]):
+            lines += [str(one["sentence"]), *([f"  {one['note']}"] if one["note"] else [])]
+        print_lines([*lines, "", *(f"! {note}" for note in found.notes), f"page    {written['causes.html']}"])
 
 
 def _describe(answer: Answer, written: Mapping[str, Path]) -> str:

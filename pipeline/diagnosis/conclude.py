@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from pipeline.diagnosis import residual_structure
 from pipeline.diagnosis.diagnosis import Named, RunDiagnosis
 from pipeline.diagnosis.error_regions import map_errors, pick_regions
+from pipeline.diagnosis.estimates import list_estimates
 from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.naming_rules import join_classes, list_equivalents
 from pipeline.diagnosis.plausibility import find_implausible
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.values import list_values, read_clock
 from pipeline.identification import Input
+from pipeline.identification.apportion import apportion
 from pipeline.identification.describe import errors_as_json, ladder_as_json
 from pipeline.identification.judgement import judge_model, note_fit
 from pipeline.identification.ladder import compare_losses
@@ -63,7 +65,9 @@ def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -
     )
 
 
-def summarize(context: Context, source: Input, ways: Sequence[Explored], clocks: Clocks) -> RunDiagnosis:
+def summarize(
+    context: Context, source: Input, ways: Sequence[Explored], clocks: Clocks, length_scale_m: float
+) -> RunDiagnosis:
     """What is common to the runs that were judged together."""
     body = ways[0]
     undecided = [item for way in ways for item in way.undecided if not is_term(item.candidates[0])]
@@ -119,6 +123,12 @@ def summarize(context: Context, source: Input, ways: Sequence[Explored], clocks:
         by_way=_describe_ways(ways, source, judgements.get("measured")),
         disturbance=residual_structure.describe_disturbance(body, unexplained),
         proposal=None if judgement is None else note_fit(ModelFile(judgement.fitted.model), judgement),
+        budgets=tuple(
+            budget for one in judgements.values() for budget in apportion(one, length_scale_m=length_scale_m)
+        ),
+        estimates=tuple(
+            number for one in judgements.values() for number in list_estimates(context, one, named)
+        ),
     )
 
 
@@ -245,7 +255,7 @@ def _describe(
         corrected=_was_aligned(effect, context),
         way=way.search.way,
         selected=selected,
-        sentence=_restore(effect.id, values).describe_motion(context.vehicle),
+        motion=_restore(effect.id, values).describe_motion(context.vehicle),
     )
 
 

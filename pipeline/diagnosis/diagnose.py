@@ -142,7 +142,9 @@ def _conclude(
     ways: Sequence[Explored],
     clocks: Clocks,
 ) -> Diagnosis:
-    common: RunDiagnosis = conclude.summarize(context, chosen.source, ways, clocks)
+    common: RunDiagnosis = conclude.summarize(
+        context, chosen.source, ways, clocks, recordings[0].length_scale_m
+    )
     common = replace(common, input_reason=chosen.reason)
     return Diagnosis(
         tuple(

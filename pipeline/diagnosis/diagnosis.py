@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 from pipeline.diagnosis.error_regions import tabulate_regions
+from pipeline.models.catalogue import find_effect
 from pipeline.models.model_text import format_model
 
 if TYPE_CHECKING:
@@ -16,7 +17,9 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.error_regions import Region
     from pipeline.diagnosis.excitation import Unobservable
     from pipeline.diagnosis.undecided import Undecided
+    from pipeline.identification.apportion import Share, SlipBudget
     from pipeline.models import ModelFile
+    from pipeline.models.level import Reading
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 
@@ -47,7 +50,7 @@ class Named:
         corrected: whether it is a clock that was put right before any model: no effect of the written one.
         way: on which way it was found: `command`, `measured` or `wheels`.
         selected: share of resampled recordings in which it is still worth its place.
-        sentence: what the vehicle does by it, with its numbers.
+        motion: what the vehicle does by it, with its numbers.
         tentative: far more structure stays in its channel than it explains; or it lowers no error on its own
             way; or its interval holds doing nothing.
     """
@@ -60,8 +63,21 @@ class Named:
     corrected: bool
     way: str
     selected: float
-    sentence: str
+    motion: str
     tentative: bool = False
+
+    @property
+    def readings(self) -> tuple[Reading, ...]:
+        """What it is if it belongs to the vehicle, the ground or the run, which one run cannot tell."""
+        return find_effect(self.id).readings
+
+    @property
+    def sentence(self) -> str:
+        """What the vehicle does by it, and what it may be by other names, where one run cannot tell them."""
+        texts = {reading.name: f"{reading.text} ({reading.name})" for reading in reversed(self.readings)}
+        if len(texts) <= 1:
+            return self.motion
+        return f"{self.motion}: {', or '.join(reversed(texts.values()))}; runs on another ground tell"
 
     def to_json(self) -> dict[str, Json]:
         """The promised keys, and more."""
@@ -85,7 +101,34 @@ class Named:
             "found_on": self.way,
             "selection_frequency": _clean(self.selected),
             "tentative": self.tentative,
+            "level": None,
+            "could_be": [
+                {"level": one.level.value, "name": one.name, "text": one.text} for one in self.readings
+            ],
         }
+
+
+@dataclass(frozen=True)
+class EstimatedNumber:
+    """A number of an effect in a run, whether or not the effect was named: what fleets are fitted to.
+
+    Attributes:
+        input: what the model was fed with.
+        effect, parameter, unit: which number.
+        value: the estimate; of an effect that was not named what one step of a joint fit gives it.
+        standard_error: standard deviation of the estimate.
+        named: whether the diagnosis names the effect.
+        at_bound: whether it stopped at a bound of the search.
+    """
+
+    input: str
+    effect: str
+    parameter: str
+    unit: str
+    value: float
+    standard_error: float
+    named: bool
+    at_bound: bool
 
 
 @dataclass(frozen=True)
@@ -148,6 +191,8 @@ class RunDiagnosis:
         by_way: ladders of the drivetrain and of the ground apart, where there are encoders.
         disturbance: rms of what is left in x, y, w, and the part of it that lasts for seconds.
         proposal: model file with what was named, fitted; None where nothing could be judged.
+        budgets: who carries the slip and the 2 s errors of the ideal model, of each input.
+        estimates: numbers of all effects that these runs tell of.
     """
 
     run: str
@@ -168,6 +213,8 @@ class RunDiagnosis:
     by_way: Mapping[str, Json] = field(default_factory=dict)
     disturbance: Mapping[str, Json] = field(default_factory=dict)
     proposal: ModelFile | None = None
+    budgets: tuple[SlipBudget, ...] = ()
+    estimates: tuple[EstimatedNumber, ...] = ()
 
     def to_json(self) -> dict[str, Json]:
         """The promised keys of `slip diagnose --json` for one run, and more."""
@@ -206,6 +253,7 @@ class RunDiagnosis:
             "by_way": dict(self.by_way),
             "disturbance": dict(self.disturbance),
             "model": None if self.proposal is None else format_model(self.proposal),
+            "budget": [_budget_as_json(budget) for budget in self.budgets],
         }
 
 
@@ -264,6 +312,46 @@ class Diagnosis:
         }  # fmt: skip
         return pl.DataFrame(rows, schema=schema, orient="row")
 
+    def tabulate_budget(self, run: str) -> pl.DataFrame:
+        """Budgets of one run as table `budget` (without the run's own columns)."""
+        import polars as pl  # noqa: PLC0415 - heavy
+
+        rows = [
+            {
+                "input": budget.input,
+                "quantity": budget.quantity,
+                "kind": share.kind,
+                "name": share.name,
+                "mean_square": share.share * budget.total,
+                "unit": budget.unit,
+                **{key: _clean(getattr(share, key)) for key in ("share", "low", "high", "alone", "last")},
+                "stretches": budget.stretches,
+            }
+            for item in self.runs
+            if item.run == run
+            for budget in item.budgets
+            for share in budget.shares
+        ]
+        schema: dict[str, pl.DataType | type[pl.DataType]] = {
+            "input": pl.Enum(["command", "measured"]), "quantity": pl.Enum(["slip", "position", "heading"]),
+            "kind": pl.Enum(["effect", "disturbance", "localization_noise"]), "name": pl.String,
+            "mean_square": pl.Float64, "unit": pl.String, "share": pl.Float64, "low": pl.Float64,
+            "high": pl.Float64, "alone": pl.Float64, "last": pl.Float64, "stretches": pl.Int32,
+        }  # fmt: skip
+        return pl.DataFrame(rows, schema=schema, orient="row")
+
+    def tabulate_estimates(self, run: str) -> pl.DataFrame:
+        """Numbers of all effects in one run as table `estimates` (without the run's own columns)."""
+        import polars as pl  # noqa: PLC0415 - heavy
+
+        rows = [vars(number) for item in self.runs if item.run == run for number in item.estimates]
+        schema: dict[str, pl.DataType | type[pl.DataType]] = {
+            "input": pl.Enum(["command", "measured"]), "effect": pl.String, "parameter": pl.String,
+            "unit": pl.String, "value": pl.Float64, "standard_error": pl.Float64, "named": pl.Boolean,
+            "at_bound": pl.Boolean,
+        }  # fmt: skip
+        return pl.DataFrame(rows, schema=schema, orient="row")
+
     def tabulate_where(self, run: str) -> pl.DataFrame:
         """All regions of one run with their part of the ideal model's error."""
         return tabulate_regions([region for item in self.runs if item.run == run for region in item.regions])
@@ -295,6 +383,28 @@ def _ladder_rows(item: RunDiagnosis) -> list[dict[str, Json]]:
         )
         before |= set(names)
     return rows
+
+
+def _budget_as_json(budget: SlipBudget) -> dict[str, Json]:
+    """The keys of `slip compare --causes` for one run, for each input and quantity."""
+
+    def numbers(share: Share, *keys: str) -> dict[str, Json]:
+        return {key: _clean(getattr(share, key)) for key in ("share", "low", "high", *keys)}
+
+    left: dict[str, Json] = {share.kind: numbers(share) for share in budget.shares if share.kind != "effect"}
+    return {
+        "input": budget.input,
+        "quantity": budget.quantity,
+        "total": _clean(budget.total),
+        "unit": budget.unit,
+        "stretches": budget.stretches,
+        "shares": [
+            {"effect": share.name, **numbers(share, "alone", "last")}
+            for share in budget.shares
+            if share.kind == "effect"
+        ],
+        **left,
+    }
 
 
 def _clean(value: float) -> float | None:

@@ -30,12 +30,14 @@ class Recording:
             log lacks may miss.
         sha256: of the recording.
         path: of the log.
+        length_scale_m: of the slip modulus [m].
     """
 
     name: str
     tables: Mapping[str, pl.DataFrame] = field(repr=False)
     sha256: str = ""
     path: str = ""
+    length_scale_m: float = 1.0
 
     def list_findings(self) -> list[dict[str, object]]:
         """What the stages noticed: id, text, where, severity and the number behind it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from textwrap import wrap
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
@@ -11,6 +12,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.diagnosis import Diagnosis, Json, Named, RunDiagnosis, Value
 
 _LABEL = 10
+_SENTENCE = 90
 _WHERE_SHOWN = 3
 _UNOBSERVABLE_SHOWN = 8
 _WAYS = {"command": "from the command", "measured": "from the measured wheels"}
@@ -68,6 +70,7 @@ def _list_shared(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
         share = max(min(diagnosis.explained_share, 1.0), 0.0)
         now, floor = _number(last, "t_mrmse_m"), _number(diagnosis.noise_floor, "t_mrmse_m")
         lines.append(("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m"))
+    lines += _label("budget", _describe_budget(diagnosis))
     return [*lines, *_describe_unobservable(diagnosis)]
 
 
@@ -89,7 +92,7 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
             notes.append("tentative")
         note = f"  ({'; '.join(notes)})" if notes else ""
         rows.append(f"{effect.id:<20}{_values(effect):<{width}}{falls.get(effect.id, '')}{note}")
-        rows.append(f"{'':<20}{effect.sentence}")
+        rows += [f"{'':<20}{line}" for line in wrap(effect.sentence, _SENTENCE)]
     rows += [
         f"{'undecided':<20}{' or '.join(item.candidates)}: {item.separate_by}" for item in diagnosis.undecided
     ]
@@ -100,6 +103,16 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
             rows += [f"{'':<20}{line}" for line in left.formula.splitlines() if line.startswith("v_")]
     if not rows:
         rows.append("nothing: the model is as good as the localization lets us see")
+    return rows
+
+
+def _describe_budget(diagnosis: RunDiagnosis) -> list[str]:
+    """Who carries the slip on the leading input, in parts of its mean square."""
+    rows = []
+    for budget in diagnosis.budgets:
+        if (budget.input, budget.quantity) == (diagnosis.input, "slip") and diagnosis.effects:
+            parts = [f"{one.name.replace('_noise', ' noise')} {one.share:.0%}" for one in budget.shares]
+            rows.append(f"of {math.sqrt(budget.total):.3g} m/s of slip (mean square): {', '.join(parts)}")
     return rows
 
 

@@ -38,6 +38,24 @@ _LATEX: dict[str, tuple[tuple[str, str, int], ...]] = {
         ("p_adjusted", "$p$ corrected", 4),
         ("smallest_p", "smallest $p$", 4),
     ),
+    "causes": (
+        ("dataset", "dataset", 0),
+        ("runs", "runs", 0),
+        ("cause", "cause", 0),
+        ("share", "share", 3),
+        ("low", "low", 3),
+        ("high", "high", 3),
+        ("rms", "slip [m/s]", 3),
+    ),
+    "cause_differences": (
+        ("a", "a", 0),
+        ("b", "b", 0),
+        ("cause", "cause", 0),
+        ("difference", "difference [m/s]", 3),
+        ("low", "low", 3),
+        ("high", "high", 3),
+        ("p_adjusted", "$p$ corrected", 4),
+    ),
 }
 _SPECIAL = {mark: rf"\{mark}" for mark in "&%$#_{}"} | {
     "~": r"\textasciitilde{}",
@@ -118,12 +136,12 @@ def write_csv(frame: pl.DataFrame) -> str:
 
 
 def write_latex(name: str, frame: pl.DataFrame) -> str:
-    """The columns of `datasets` or `comparisons` that a paper shows, as a LaTeX tabular (booktabs).
+    """The columns of a table that a paper shows, as a LaTeX tabular (booktabs).
 
     Columns without any value are left out.
 
     Args:
-        name: `datasets` or `comparisons`.
+        name: `datasets`, `comparisons`, `causes` or `cause_differences`.
         frame: that table.
     """
     columns = [

@@ -227,6 +227,10 @@ def describe_effect(effect: type[Effect] | Effect) -> str:
         lines.append(f"contains      {', '.join(effect.contains)}")
     if effect.parts:
         lines.append(f"searched as   {', '.join(part.effect for part in effect.parts)}")
+    lines += [
+        f"{'' if number else 'by level':<14}{one.level.value}: {one.name}, {one.text}"
+        for number, one in enumerate(effect.readings)
+    ]
     if effect.confused_with:
         lines.append(f"looks like    {', '.join(effect.confused_with)}")
     return "\n".join(lines)

@@ -26,6 +26,8 @@ _TAUS = 5.0
 _DELAY_STEP = 5e-3
 _RISEN = 1.92
 _LONGEST_S = 20.0
+# So many degrees of freedom are as good as a normal distribution.
+_NORMAL = 1e9
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ class Estimate:
         standard_error: of the estimate.
         at_bound: whether it stopped at a bound, so that the interval means little.
         observable: whether the data move with it at all.
+        freedom: degrees of freedom of Student's t that the interval was made with.
     """
 
     free: Free
@@ -48,6 +51,15 @@ class Estimate:
     standard_error: float
     at_bound: bool
     observable: bool
+    freedom: float = np.inf
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the estimate, few blocks allowed for: Student's t of it is the interval."""
+        from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
+
+        half = 0.5 * (self.high - self.low)
+        return half / float(stdtrit(min(self.freedom, _NORMAL), 0.975))
 
 
 @dataclass(frozen=True)
@@ -88,7 +100,7 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
         fitted: a converged fit.
     """
     made = [
-        _estimate_part(part, fit) for part, fit in zip(problem.parts, fitted.fits, strict=True) if fit.free
+        estimate_part(part, fit) for part, fit in zip(problem.parts, fitted.fits, strict=True) if fit.free
     ]
     if not made:
         return NOTHING
@@ -100,7 +112,8 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
     return Estimates(items, correlation, min(one.blocks for one in made))
 
 
-def _estimate_part(part: Part, fit: PartFit) -> Estimates:
+def estimate_part(part: Part, fit: PartFit) -> Estimates:
+    """Intervals of the free numbers of one part, the others as they are."""
     from scipy.stats import t as student  # noqa: PLC0415 - heavy
 
     count = len(fit.free)
@@ -118,7 +131,8 @@ def _estimate_part(part: Part, fit: PartFit) -> Estimates:
         errors[rows] = np.sqrt(np.diag(spread))
         deviation = np.maximum(np.outer(errors[rows], errors[rows]), 1e-300)
         correlation[np.ix_(rows, rows)] = spread / deviation
-    wide = float(student.ppf(0.975, max(pieces - 1, 1)))
+    freedom = max(pieces - 1, 1)
+    wide = float(student.ppf(0.975, freedom))
     errors[rows] = np.hypot(errors[rows], _carry_clocks(part, fit, total, rows, size))
     items = []
     for index, number in enumerate(fit.free):
@@ -133,6 +147,7 @@ def _estimate_part(part: Part, fit: PartFit) -> Estimates:
                 float(errors[index]),
                 at_bound=stands_at_bound(value, number.bounds),
                 observable=bool(observable[index]),
+                freedom=float(freedom) if number.is_smooth else np.inf,
             )
         )
     return Estimates(tuple(items), correlation, pieces)

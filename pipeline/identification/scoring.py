@@ -79,16 +79,32 @@ def hold_out(problem: Problem, fitted: Fitted) -> HeldOut:
 
     Every free number, delays of the recording included, is fitted anew without the tested stretches.
     """
-    whole = problem.whole
-    residuals = np.full(fitted.residuals.shape, np.nan)
-    position = [np.full(c.horizons.number.size, np.nan) for c in problem.comparisons]
-    yaw = [np.full(c.horizons.number.size, np.nan) for c in problem.comparisons]
-    for fold, training in zip(problem.folds, problem.training, strict=True):
-        if not fold.test.any():
-            continue
+    return score_folds(problem, refit_folds(problem, fitted))
+
+
+def refit_folds(problem: Problem, fitted: Fitted) -> tuple[State, ...]:
+    """The state of a fit repeated without each fold of the problem."""
+    states = []
+    for training in problem.training:
         state = fitted.state
         for part, fit, train in zip(problem.parts, fitted.fits, training, strict=True):
             state = state.take_over(refit(part, fit, train), fit.free)
+        states.append(state)
+    return tuple(states)
+
+
+def score_folds(problem: Problem, states: Sequence[State]) -> HeldOut:
+    """Score the stretches of each fold under a state of its own.
+
+    Args:
+        problem: the runs.
+        states: one a fold of the problem, made without its tested stretches.
+    """
+    whole = problem.whole
+    residuals = np.full((whole.run.size, 3), np.nan)
+    position = [np.full(c.horizons.number.size, np.nan) for c in problem.comparisons]
+    yaw = [np.full(c.horizons.number.size, np.nan) for c in problem.comparisons]
+    for fold, state in zip(problem.folds, states, strict=True):
         for run, comparison in enumerate(problem.comparisons):
             rows = whole.run == run
             if fold.test[rows].any():

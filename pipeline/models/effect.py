@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from pipeline.models.evidence import Evidence, Largest
+    from pipeline.models.level import Reading
     from pipeline.runs.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
     from pipeline.vehicles import Vehicle
 
@@ -118,6 +119,8 @@ class Effect(ABC):
         price: share of the held-out error that it must take away before it counts.
         python: its step in the exported function, numbers as `{name}`; None where there is none.
         python_state: names that its step carries on to the next one; zero at the start.
+        readings: what it is if its numbers prove to be the vehicle's, the ground's or a run's own, where one
+            run cannot tell these apart.
         values: the numbers themselves.
         fixed: names of parameters that a fit leaves alone.
     """
@@ -138,6 +141,7 @@ class Effect(ABC):
     price: float = 0.0
     python: str | None = None
     python_state: tuple[str, ...] = ()
+    readings: tuple[Reading, ...] = ()
 
     def __init__(self, *, fixed: Iterable[str] = (), **values: float) -> None:
         self.values: Mapping[str, float] = self._complete(values)

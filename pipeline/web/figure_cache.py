@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pipeline.analysis.diagnosis import DIAGNOSIS
 from pipeline.report import RunReport, theme
 from pipeline.report.figures import list_figures
 from pipeline.report.figures.autocorrelation import list_autocorrelations
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 FIGURES = (
     "ladder",
+    "budget",
     "trajectory",
     "residuals",
     "reach",
@@ -46,6 +48,8 @@ class FigureCache:
         wanted = ("velocities", "slip", "windows", "aggregates")
         self._tables = {name: manifest.read(name) for name in wanted if name in manifest.tables}
         self._summary = read_summary(manifest)
+        told = manifest.read_json(DIAGNOSIS) if DIAGNOSIS in manifest.files else {}
+        self._diagnosis: dict[str, object] = {key: told[key] for key in ("input", "budget") if key in told}
 
     def draw(self, view: MotionView) -> dict[str, object]:
         """Specifications, rows, titles and words of all figures."""
@@ -86,4 +90,4 @@ class FigureCache:
         return [{"words": words, "slip": slip, "time": time} for words, slip, time in found]
 
     def _scene(self, view: MotionView) -> Scene:
-        return Scene(RunReport(self._summary, self._tables, motion=view))
+        return Scene(RunReport(self._summary, self._tables, self._diagnosis, motion=view))

@@ -39,6 +39,8 @@ class Run:
     start_ns: int = 1_700_000_000_000_000_000
     findings: Sequence[tuple[str, str, float | None]] = field(default=())
     parameters: Sequence[tuple[str, str, float, str]] = field(default=())
+    estimates: Sequence[tuple[str, str, float, float]] = field(default=())
+    budget: pl.DataFrame | None = None
     still: bool = False
 
 
@@ -91,6 +93,10 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
         "poses": _integrate(t, speed, turn, run.start_ns),
         "parameters": _list_parameters(run),
     }
+    if run.budget is not None:
+        tables["budget"] = _complete_budget(run.budget)
+    if run.estimates:
+        tables["estimates"] = _list_estimates(run)
     names = {"run": run.name, "dataset": run.dataset, "vehicle": run.vehicle, "terrain": run.terrain}
     labels = [pl.lit(value).alias(name) for name, value in names.items()]
     with store.open_generation(run.name, f"k{seed}") as generation:
@@ -222,4 +228,30 @@ def _integrate(t: np.ndarray, speed: np.ndarray, turn: np.ndarray, start_ns: int
             "held": zero > 1.0,
             "active": zero < 1.0,
         }
+    )
+
+
+def _list_estimates(run: Run) -> pl.DataFrame:
+    rows = [
+        {"effect": effect, "parameter": parameter, "value": value, "standard_error": error}
+        for effect, parameter, value, error in run.estimates
+    ]
+    return pl.DataFrame(rows).with_columns(
+        pl.lit("measured").cast(_INPUTS).alias("input"),
+        pl.lit("1").alias("unit"),
+        pl.lit(value=True).alias("named"),
+        pl.lit(value=False).alias("at_bound"),
+    )
+
+
+def _complete_budget(budget: pl.DataFrame) -> pl.DataFrame:
+    kinds = pl.Enum(["effect", "disturbance", "localization_noise"])
+    return budget.with_columns(
+        pl.col("kind").cast(kinds),
+        pl.lit("measured").cast(_INPUTS).alias("input"),
+        pl.lit("slip").cast(pl.Enum(["slip", "position", "heading"])).alias("quantity"),
+        pl.lit("m^2/s^2").alias("unit"),
+        pl.lit(None, pl.Float64).alias("alone"),
+        pl.lit(None, pl.Float64).alias("last"),
+        pl.lit(20, pl.Int32).alias("stretches"),
     )

@@ -71,6 +71,9 @@ def test_an_effect_that_a_file_knows_is_seen(tmp_path: Path) -> None:
 @pytest.mark.parametrize("effect", EFFECTS, ids=list(BY_ID))
 def test_sizes_have_reasons_and_fit_each_other(effect: type[Effect]) -> None:
     page = describe_effect(effect)
+    for reading in effect.readings:
+        assert reading.text in page
+    assert len({reading.level for reading in effect.readings}) == len(effect.readings)
     for parameter in effect.parameters:
         low, high = parameter.bounds
         if parameter.least is not None:

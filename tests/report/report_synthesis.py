@@ -64,6 +64,23 @@ def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
         ],
         "noise_floor": {"t_mrmse_m": 0.19, "r_mrmse_rad": 0.07},
         "explained_share": 0.86,
+        "budget": [make_budget("slip", 1.87), make_budget("position", 1.12)],
+    }
+
+
+def make_budget(quantity: str, total: float) -> dict[str, object]:
+    """A budget whose second effect makes held-out data worse."""
+    shares = {"effective_track": 0.85, "drive_lag": -0.05}
+    return {
+        "input": "command",
+        "quantity": quantity,
+        "total": total,
+        "shares": [
+            {"effect": name, "share": share, "low": share - 0.03, "high": share + 0.03}
+            for name, share in shares.items()
+        ],
+        "disturbance": {"share": 0.15, "low": 0.12, "high": 0.18},
+        "localization_noise": {"share": 0.05, "low": None, "high": None},
     }
 
 

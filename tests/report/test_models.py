@@ -12,6 +12,7 @@ from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.models.model_text import format_model
 from pipeline.report.diagnosed import read_model_text
 from pipeline.report.figures.autocorrelation import correlate
+from pipeline.report.figures.budget import list_parts
 from pipeline.report.figures.ladder import list_rungs
 from pipeline.report.figures.residuals import choose_signal
 from pipeline.report.figures.step_response import find_steps
@@ -83,6 +84,14 @@ def test_the_staircase_names_what_each_rung_adds() -> None:
     assert rows["ladder_floor"]["t"].to_list() == [0.19]
     assert rows["ladder_ceiling"]["t"].to_list() == [1.06]
     assert rows["ladder_ceiling"]["label"].to_list() == ["ceiling 1.06 m"]
+
+
+def test_the_budget_is_one_bar_from_the_whole_down_to_nothing() -> None:
+    rows = list_parts(Scene(make_report(duration_s=20.0)))
+    assert rows["cause"].to_list() == ["effective_track", "drive_lag", "disturbance", "localization noise"]
+    assert rows["from"].to_list() == pytest.approx([1.0, 0.15, 0.2, 0.05])
+    assert rows["to"].to_list() == pytest.approx([0.15, 0.2, 0.05, 0.0], abs=1e-12)
+    assert rows["high"].to_list() == [*map(pytest.approx, (0.18, 0.23, 0.08)), None]
 
 
 def test_the_model_that_is_drawn_is_the_one_that_was_written() -> None:

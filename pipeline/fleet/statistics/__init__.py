@@ -23,10 +23,12 @@ from pipeline.fleet.statistics.families import (
 from pipeline.fleet.statistics.intervals import (
     Interval,
     bootstrap_median,
+    bound_difference,
     bound_mean,
     bound_shift,
     bound_typical,
 )
+from pipeline.fleet.statistics.levels import GroupMean, LevelFit, find_outlier, split_levels
 from pipeline.fleet.statistics.orders import kendall_tau, list_swaps
 from pipeline.fleet.statistics.pairs import Blocks, Comparison, compare_blocks, compare_runs, cut_blocks
 from pipeline.fleet.statistics.permutation import (
@@ -45,12 +47,15 @@ __all__ = [
     "Blocks",
     "Change",
     "Comparison",
+    "GroupMean",
     "Interval",
+    "LevelFit",
     "PermutationTest",
     "StatisticsError",
     "adjust_holm",
     "adjust_max_t",
     "bootstrap_median",
+    "bound_difference",
     "bound_mean",
     "bound_shift",
     "bound_typical",
@@ -60,6 +65,7 @@ __all__ = [
     "count_effective",
     "cut_blocks",
     "find_changes",
+    "find_outlier",
     "integrated_time",
     "kendall_tau",
     "list_swaps",
@@ -72,4 +78,5 @@ __all__ = [
     "runs_needed_against",
     "shift_between",
     "smallest_p",
+    "split_levels",
 ]

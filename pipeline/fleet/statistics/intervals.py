@@ -37,7 +37,7 @@ def bound_mean(values: ArrayLike, *, level: float = 0.95) -> Interval:
         StatisticsError: fewer than two values, or one that is not finite.
     """
     checked = check_values(values, what="values", fewest=2)
-    half = _student(level, checked.size - 1) * float(np.std(checked, ddof=1)) / checked.size**0.5
+    half = student_quantile(level, checked.size - 1) * float(np.std(checked, ddof=1)) / checked.size**0.5
     centre = float(np.mean(checked))
     return Interval(centre - half, centre + half, level)
 
@@ -78,19 +78,42 @@ def bound_shift(a: ArrayLike, b: ArrayLike, *, level: float = 0.95) -> Interval:
     Raises:
         StatisticsError: a side is empty, both have a single value, or one is not finite.
     """
+    first, second = _check_sides(a, b)
+    return _bound_welch(first, second, shift_between(first, second), level)
+
+
+def bound_difference(a: ArrayLike, b: ArrayLike, *, level: float = 0.95) -> Interval:
+    """Welch's interval of the difference of means b - a; sides as in `bound_shift`.
+
+    Args:
+        a: one number a unit, shape (n,).
+        b: the same for the other side, shape (m,), n + m >= 3.
+        level: confidence level.
+
+    Raises:
+        StatisticsError: a side is empty, both have a single value, or one is not finite.
+    """
+    first, second = _check_sides(a, b)
+    return _bound_welch(first, second, float(second.mean() - first.mean()), level)
+
+
+def _check_sides(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
     first = check_values(a, what="values", fewest=1)
-    second = check_values(b, what="values", fewest=2 if first.size == 1 else 1)
+    return first, check_values(b, what="values", fewest=2 if first.size == 1 else 1)
+
+
+def _bound_welch(first: Floats, second: Floats, centre: float, level: float) -> Interval:
     scatter = [float(np.var(side, ddof=1)) for side in (first, second) if side.size > 1]
     freedom = [side.size - 1 for side in (first, second) if side.size > 1]
     parts = [scatter[0] / first.size, scatter[-1] / second.size]
-    centre, error = shift_between(first, second), sum(parts) ** 0.5
+    error = sum(parts) ** 0.5
     if error == 0.0:
         return Interval(centre, centre, level)
     if len(freedom) == 1:
-        half = _student(level, freedom[0]) * error
+        half = student_quantile(level, freedom[0]) * error
     else:
         weights = sum(part**2 / count for part, count in zip(parts, freedom, strict=True))
-        half = _student(level, sum(parts) ** 2 / weights) * error
+        half = student_quantile(level, sum(parts) ** 2 / weights) * error
     return Interval(centre - half, centre + half, level)
 
 
@@ -126,7 +149,9 @@ def bootstrap_median(
     drawn = generator.multinomial(blocks_there, np.full(blocks_there, 1.0 / blocks_there), size=draws)
     medians = _read_medians(np.cumsum(drawn @ counts, axis=1), edges)
     # Percentiles of few blocks are too narrow: by sqrt((n - 1) / n), and by normal in place of t quantiles.
-    widen = _student(level, max(blocks_there - 1, 1)) / _student(level, 1e6) * _grow(blocks_there)
+    widen = (
+        student_quantile(level, max(blocks_there - 1, 1)) / student_quantile(level, 1e6) * _grow(blocks_there)
+    )
     centre = float(np.median(samples))
     low, high = np.quantile(medians, [(1.0 - level) / 2.0, (1.0 + level) / 2.0])
     return Interval(
@@ -152,7 +177,7 @@ def _read_medians(cumulated: Floats, edges: Floats) -> Floats:
 
 
 @functools.lru_cache(maxsize=256)
-def _student(level: float, freedom: float) -> float:
+def student_quantile(level: float, freedom: float) -> float:
     """Quantile of Student's t for a two-sided level."""
     from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
 

@@ -7,6 +7,7 @@ and Bootstrap Tests of Hypotheses (2005); studentized: Janssen, Statistics and P
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from dataclasses import dataclass
@@ -80,6 +81,7 @@ def smallest_p(first: int, second: int, *, draws: int = DRAWS) -> float:
     return min((2.0 if first == second else 1.0) / total, 1.0)
 
 
+@functools.lru_cache(maxsize=8)
 def list_labellings(first: int, second: int, *, seed: int, draws: int = DRAWS) -> NDArray[np.bool_]:
     """Labellings of first + second units: all of them, or random ones with the given one in front.
 

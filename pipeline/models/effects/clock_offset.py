@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.models.effect import STAMPS, Excitation, Late, Least, Parameter, Plausible, ReportEffect, Search
 from pipeline.models.evidence import LEAST_DELAY_S
+from pipeline.models.level import Level, Reading
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
@@ -46,6 +47,11 @@ class ClockOffset(ReportEffect):
     equivalent_to = ("transport_delay",)
     equivalent_when = "the input is the command and there are neither encoders, gyro nor another clock"
     late = Late.POSES
+    readings = (
+        Reading(Level.VEHICLE, "clock_offset", "a localization that is always as late"),
+        Reading(Level.TERRAIN, "body_inertia", "a body that follows its wheels late on this ground"),
+        Reading(Level.RUN, "clock_offset", "clocks that are set anew in each run"),
+    )
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""

@@ -22,6 +22,7 @@ from pipeline.models.effect import (
     Plausible,
 )
 from pipeline.models.effects.wheel_radius import WheelRadius
+from pipeline.models.level import Level, Reading
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
@@ -53,6 +54,11 @@ class EffectiveTrack(KinematicEffect):
     confused_with = ("wheel_radius", "terrain_change")
     python = """
         w0 = w0 / {k}"""
+    readings = (
+        Reading(Level.VEHICLE, "geometry", "wheels and wheelbase as they are, or a wrong track width"),
+        Reading(Level.TERRAIN, "effective_track", "skidding in turns as this ground makes it"),
+        Reading(Level.RUN, "effective_track", "another tyre pressure or load in some runs"),
+    )
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""

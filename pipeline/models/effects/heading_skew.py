@@ -17,6 +17,7 @@ import numpy as np
 
 from pipeline.models.effect import STAMPS, Excitation, Late, Least, Parameter, Plausible, ReportEffect
 from pipeline.models.evidence import LEAST_DELAY_S
+from pipeline.models.level import Level, Reading
 from pipeline.runs.signals import earlier_in_span
 
 if TYPE_CHECKING:
@@ -48,6 +49,11 @@ class HeadingSkew(ReportEffect):
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("lateral_skid", "body_inertia", "icr_offset")
     late = Late.HEADING
+    readings = (
+        Reading(Level.VEHICLE, "heading_skew", "a recorder that dates headings late"),
+        Reading(Level.TERRAIN, "lateral_skid", "sliding outward in turns on this ground"),
+        Reading(Level.RUN, "heading_skew", "clocks that are set anew in each run"),
+    )
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""

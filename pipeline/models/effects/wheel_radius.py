@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.models.effect import DATA_SHEET, Excitation, KinematicEffect, Least, Parameter, Plausible
+from pipeline.models.level import Level, Reading
 from pipeline.models.quantity import Quantity
 from pipeline.models.wording import describe_share
 
@@ -42,6 +43,11 @@ class WheelRadius(KinematicEffect):
     confused_with = ("speed_slip", "effective_track")
     python = """
         v0, w0 = {k} * v0, {k} * w0"""
+    readings = (
+        Reading(Level.VEHICLE, "wheel_radius", "wheels smaller or larger than configured"),
+        Reading(Level.TERRAIN, "longitudinal_slip", "wheels that turn on without grip on this ground"),
+        Reading(Level.RUN, "wheel_radius", "another tyre pressure or load in some runs"),
+    )
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""

@@ -15,6 +15,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pipeline.models.effect import MOUNTING, Excitation, Least, Parameter, Plausible, ReportEffect
+from pipeline.models.level import Level, Reading
 from pipeline.models.wording import name_side
 
 if TYPE_CHECKING:
@@ -41,6 +42,11 @@ class YawMisalignment(ReportEffect):
     )
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("lateral_drift",)
+    readings = (
+        Reading(Level.VEHICLE, "yaw_misalignment", "a sensor mounted askew, or an axle that is bent"),
+        Reading(Level.TERRAIN, "crabbing", "a ground that pushes the vehicle aside"),
+        Reading(Level.RUN, "yaw_misalignment", "a sensor mounted anew in some runs"),
+    )
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""

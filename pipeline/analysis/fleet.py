@@ -1,0 +1,188 @@
+"""The fleet model of the results: fitted to the estimates of all runs, written, and read again."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from typing import TYPE_CHECKING
+
+from pipeline.analysis.compared_runs import find_material
+from pipeline.analysis.errors import JobError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    import polars as pl
+
+    from pipeline.analysis.compared_runs import ComparedRuns
+    from pipeline.fleet.hierarchy import FleetModel, FleetNumber
+    from pipeline.fleet.statistics import Interval
+    from pipeline.store import Store
+
+FLEET = "fleet.json"
+_TABLES = ("estimates",)
+_EVERY = "*"
+
+
+def fit_results(store: Store) -> tuple[FleetModel, tuple[str, ...]]:
+    """Fit the fleet model of the results; it, and runs with the keys of their results.
+
+    Args:
+        store: the results.
+
+    Raises:
+        JobError: ``nothing_to_fit``: no run has estimates, or none is on a known terrain.
+    """
+    from pipeline.fleet.hierarchy import FleetModel, fit_fleet  # noqa: PLC0415 - heavy
+
+    compared = _find_runs(store)
+    if not compared.manifests:
+        raise JobError(
+            "nothing_to_fit",
+            "no run has estimates" + "".join(f"; {note}" for note in compared.notes),
+            where=str(store.root),
+            hint="Analyze logs with their diagnosis: slip analyze LOG..., or slip batch.",
+        )
+    model = fit_fleet(compared.scan("estimates").collect())
+    notes = (*compared.notes, *model.notes)
+    return FleetModel(model.numbers, model.runs, notes), _list_keys(compared)
+
+
+def _find_runs(store: Store) -> ComparedRuns:
+    return find_material(store, ("vehicle",), trusted_only=True, tables=_TABLES)
+
+
+def _list_keys(compared: ComparedRuns) -> tuple[str, ...]:
+    return tuple(f"{run}/{manifest.key}" for run, manifest in sorted(compared.manifests.items()))
+
+
+def write_fleet(store: Store, model: FleetModel, keys: tuple[str, ...]) -> Path:
+    """Write `fleet.json` and the table `fleet`; the path of the first."""
+    store.write_results_table("fleet", tabulate_fleet(model, keys))
+    content = {**describe_fleet(model), "keys": list(keys)}
+    return store.write_results_text(FLEET, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def update_fleet(store: Store) -> None:
+    """Fit the fleet model anew where one was fitted before; nothing else is done.
+
+    Results without any run that tells of it keep the model they have.
+    """
+    if (store.root / FLEET).is_file():
+        with contextlib.suppress(JobError):
+            write_fleet(store, *fit_results(store))
+
+
+def read_fleet(store: Store) -> dict[str, object]:
+    """The JSON object of the fleet model that was written last; `notes` say where results have changed since.
+
+    Raises:
+        JobError: ``no_fleet``: none was written, or it cannot be read.
+    """
+    path = store.root / FLEET
+    hint = f"Fit it: slip fleet fit {store.root}"
+    if not path.is_file():
+        raise JobError("no_fleet", "no fleet model was fitted to these results", where=str(path), hint=hint)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        known = set(content["keys"])
+        notes = list(content["notes"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise JobError("no_fleet", "the fleet model cannot be read", where=str(path), hint=hint) from error
+    now = set(_list_keys(_find_runs(store)))
+    if now != known:
+        notes.append(f"{len(now ^ known)} results have changed since: slip fleet fit brings it up to date")
+    return {**content, "notes": notes}
+
+
+def describe_fleet(model: FleetModel) -> dict[str, object]:
+    """The JSON object of `slip fleet fit`."""
+    return {
+        "parameters": [_describe_number(number) for number in model.numbers],
+        "resolved": [
+            {
+                "vehicle": number.vehicle,
+                "parameter": number.label,
+                "candidates": list(number.candidates),
+                "answer": None if number.level is None else number.name,
+                "because": number.because,
+            }
+            for number in model.numbers
+            if len(number.candidates) > 1
+        ],
+        "runs": {vehicle: list(runs) for vehicle, runs in model.runs.items()},
+        "notes": list(model.notes),
+    }
+
+
+def _describe_number(number: FleetNumber) -> dict[str, object]:
+    fit = number.fit
+    return {
+        "effect": number.effect,
+        "parameter": number.parameter,
+        "unit": number.unit,
+        "vehicle": number.vehicle,
+        "level": None if number.level is None else number.level.value,
+        "name": number.name,
+        "because": number.because,
+        "value": fit.value,
+        **_bounds(fit.interval),
+        "spread_terrain": _clean(fit.spread_group),
+        "spread_run": _clean(fit.spread_run),
+        "chi_square": _clean(fit.chi_square),
+        "p_terrain": _clean(fit.p_groups),
+        "terrains": {
+            name: {"value": mean.value, **_bounds(mean.interval), "runs": mean.runs}
+            for name, mean in fit.groups.items()
+        },
+        "runs": len(number.runs),
+        "named": number.named,
+        "odd": list(number.odd),
+    }
+
+
+def tabulate_fleet(model: FleetModel, keys: tuple[str, ...]) -> pl.DataFrame:
+    """The table `fleet`."""
+    import polars as pl  # noqa: PLC0415 - heavy
+
+    from schemas import contract_of  # noqa: PLC0415 - brings a table library along
+
+    rows: list[Mapping[str, object]] = []
+    for number in model.numbers:
+        fit = number.fit
+        common = {
+            "run": _EVERY,
+            "dataset": _EVERY,
+            "vehicle": number.vehicle,
+            "effect": number.effect,
+            "parameter": number.parameter,
+            "unit": number.unit,
+            "level": "open" if number.level is None else number.level.value,
+            "name": number.name,
+            "because": number.because,
+            "spread_terrain": _clean(fit.spread_group),
+            "spread_run": _clean(fit.spread_run),
+            "chi_square": _clean(fit.chi_square),
+            "p_terrain": _clean(fit.p_groups),
+            "keys": " ".join(keys),
+        }
+        rows.append({**common, "terrain": _EVERY, "value": fit.value, **_bounds(fit.interval),
+                     "runs": len(number.runs), "named": number.named})  # fmt: skip
+        rows += [
+            {**common, "terrain": name, "value": mean.value, **_bounds(mean.interval), "runs": mean.runs}
+            for name, mean in fit.groups.items()
+        ]
+    empty = contract_of("fleet").schema.create_empty()
+    return pl.DataFrame(rows, schema=empty.schema, orient="row")
+
+
+def _bounds(interval: Interval | None) -> dict[str, float | None]:
+    if interval is None:
+        return {"low": None, "high": None}
+    return {"low": interval.low, "high": interval.high}
+
+
+def _clean(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,211 @@
+"""Deployments compared by cause: whose budget of slip is made of what, and what a difference is made of.
+
+Runs are the unit. A deployment's mean square slip is the mean over its runs, cause by cause; of two
+deployments the mean squares differ by the sum of what their causes differ by, and since the difference of two
+roots is that of their squares over the sum of the roots, so does the rms slip.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from pipeline.fleet.statistics import adjust_holm, bound_difference, permute_means, runs_needed
+from pipeline.identification.apportion import jackknife_ratio
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.fleet.statistics.arrays import Floats
+
+RUNS, BLOCKS = "runs", "blocks"
+_LEVEL = 0.05
+_WORTH_SAYING = 0.05
+_NO_PART = 0.01
+
+
+@dataclass(frozen=True)
+class CausePart:
+    """What a cause carries of a deployment's mean square slip; NaN ends where runs do not tell."""
+
+    name: str
+    kind: str
+    share: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Budget:
+    """A deployment's mean square slip by cause.
+
+    Attributes:
+        dataset: its name.
+        runs: how many.
+        total: mean over the runs of their mean square slip [m^2/s^2].
+        parts: effects, the largest first, then disturbance and localization noise; they add up to one.
+        unit: whether intervals are over runs, or over blocks of the only run.
+    """
+
+    dataset: str
+    runs: int
+    total: float
+    parts: tuple[CausePart, ...]
+    unit: str
+
+
+@dataclass(frozen=True)
+class CauseDifference:
+    """What a cause does to the difference of two deployments [m/s]; p is NaN where nothing is permuted."""
+
+    name: str
+    kind: str
+    difference: float
+    low: float
+    high: float
+    p: float
+    p_adjusted: float
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How much more rms slip ``b`` has than ``a``, and of what.
+
+    Attributes:
+        a, b: datasets; b has more slip.
+        total: difference of rms slip [m/s].
+        parts: causes, the largest first; they add up to the total.
+        unit: what was permuted and bounded.
+        note: what such counts of runs cannot show; empty where they can.
+    """
+
+    a: str
+    b: str
+    total: float
+    parts: tuple[CauseDifference, ...]
+    unit: str
+    note: str
+
+    def describe(self, names: Mapping[str, str]) -> str:
+        """The difference in words.
+
+        Args:
+            names: what each cause is called.
+        """
+        largest = max((abs(part.difference) for part in self.parts), default=0.0)
+        if largest > self.total:
+            # What one side has more of outweighs what it has more in all: shares would say nothing.
+            words = ", ".join(
+                f"{part.difference:+.2g} {_say(names, part)}"
+                for part in self.parts
+                if abs(part.difference) >= _WORTH_SAYING * largest
+            )
+            return f"{self.b} against {self.a}, {self.total:.2g} m/s of slip more: in m/s {words}"
+        told = [part for part in self.parts if abs(part.difference) >= _WORTH_SAYING * self.total]
+        none = [part for part in self.parts if abs(part.difference) < _NO_PART * self.total]
+        words = ", ".join(f"{part.difference / self.total:.0%} {_say(names, part)}" for part in told)
+        rest = f"; {', '.join(_say(names, part) for part in none)} no part" if none else ""
+        return f"{self.b} against {self.a}, {self.total:.2g} m/s of slip more: {words}{rest}"
+
+
+def compare_causes(rows: pl.DataFrame) -> tuple[tuple[Budget, ...], tuple[Difference, ...]]:
+    """Budgets of deployments, and what the difference of every two is made of.
+
+    A cause that a run does not name carries nothing there: what it does is in that run's disturbance.
+
+    Args:
+        rows: of one input and quantity: ``group``, ``run``, ``name``, ``kind``, ``mean_square``, ``low``,
+            ``high`` (ends of the share).
+    """
+    own = rows.sort("group", "run").partition_by("group", maintain_order=True)
+    groups = [_Group.gather(str(one["group"][0]), one) for one in own]
+    budgets = tuple(group.describe() for group in groups)
+    pairs = [
+        _compare(*sorted(pair, key=lambda group: float(group.table.sum(axis=1).mean())))
+        for pair in combinations(groups, 2)
+    ]
+    return budgets, tuple(pairs)
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Runs of a deployment: mean squares by run and cause, shape (runs, causes), and their half-widths."""
+
+    name: str
+    causes: tuple[tuple[str, str], ...]
+    table: Floats
+    half: Floats
+
+    @classmethod
+    def gather(cls, name: str, rows: pl.DataFrame) -> _Group:
+        """Of rows of one group."""
+        causes = tuple(dict.fromkeys(rows.select("name", "kind").iter_rows()))
+        runs = rows["run"].unique(maintain_order=True).to_list()
+        table, half = np.zeros((len(runs), len(causes))), np.full((len(runs), len(causes)), np.nan)
+        totals = dict(rows.group_by("run").agg(pl.col("mean_square").sum()).iter_rows())
+        for row in rows.iter_rows(named=True):
+            place = runs.index(row["run"]), causes.index((row["name"], row["kind"]))
+            table[place] = row["mean_square"]
+            if row["low"] is not None and row["high"] is not None:
+                half[place] = 0.5 * (row["high"] - row["low"]) * totals[row["run"]]
+        return cls(name, causes, table, half)
+
+    def take(self, cause: tuple[str, str]) -> tuple[Floats, Floats]:
+        """Mean squares of a cause in every run, and their half-widths; zeros where no run names it."""
+        if cause not in self.causes:
+            return np.zeros(self.table.shape[0]), np.zeros(self.table.shape[0])
+        place = self.causes.index(cause)
+        return self.table[:, place], self.half[:, place]
+
+    def describe(self) -> Budget:
+        """The budget."""
+        whole = self.table.sum(axis=1)
+        parts = []
+        for place, (name, kind) in enumerate(self.causes):
+            share, half = jackknife_ratio(self.table[:, place], whole)
+            if whole.size == 1:
+                half = float(self.half[0, place] / whole[0])
+            parts.append(CausePart(name, kind, share, share - half, share + half))
+        parts.sort(key=lambda part: (part.kind != "effect", part.kind, -part.share))
+        unit = BLOCKS if whole.size == 1 else RUNS
+        return Budget(self.name, whole.size, float(whole.mean()), tuple(parts), unit)
+
+
+def _compare(a: _Group, b: _Group) -> Difference:
+    roots = [math.sqrt(float(group.table.sum(axis=1).mean())) for group in (a, b)]
+    scale = 1.0 / max(sum(roots), 1e-300)
+    single = a.table.shape[0] == b.table.shape[0] == 1
+    causes = list(dict.fromkeys((*a.causes, *b.causes)))
+    found, smallest = [], 0.0
+    for cause in causes:
+        (first, half_first), (second, half_second) = a.take(cause), b.take(cause)
+        difference = float(second.mean() - first.mean())
+        if single:
+            half, p = float(np.hypot(half_first[0], half_second[0])), math.nan
+        else:
+            inside = bound_difference(first, second)
+            half, test = 0.5 * (inside.high - inside.low), permute_means(first, second)
+            p, smallest = test.p, test.smallest_p
+        found.append((cause, difference, half, p))
+    adjusted = [math.nan] * len(found) if single else adjust_holm([p for *_, p in found]).tolist()
+    parts = []
+    for ((name, kind), difference, half, p), q in zip(found, adjusted, strict=True):
+        ends = (scale * (difference - half), scale * (difference + half))
+        parts.append(CauseDifference(name, kind, scale * difference, *ends, p, q))
+    parts.sort(key=lambda part: -abs(part.difference))
+    note = "this run against that run, not the terrain" if single else ""
+    if not single and smallest * len(causes) > _LEVEL:
+        note = (
+            f"no cause can be significant with {a.table.shape[0]} and {b.table.shape[0]} runs; "
+            f"{runs_needed(len(causes))} a side would do"
+        )
+    return Difference(a.name, b.name, roots[1] - roots[0], tuple(parts), BLOCKS if single else RUNS, note)
+
+
+def _say(names: Mapping[str, str], part: CauseDifference) -> str:
+    return names[part.name].replace("localization_noise", "localization noise")

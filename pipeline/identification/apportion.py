@@ -1,0 +1,263 @@
+"""The budget of a run: how much of its slip, and of its 2 s error, each effect of a model carries.
+
+An effect's share of the mean square is its Shapley value: what the held-out error falls by when it is added,
+averaged over the orders in which the effects of the model can be added (Shapley, Contributions to the Theory
+of Games II, 1953). It is fair to the order, and the shares, the disturbance and the noise floor add up to the
+whole. All orders are gone through for up to six effects; for more, some and their reversals, which is exact
+as long as effects interact in pairs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise, permutations
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core.timegrid import nearest_indices
+from pipeline.identification.proposals import TERM
+from pipeline.identification.scoring import HeldOut, refit_folds, score_folds
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from pipeline.identification.judgement import Judgement
+    from pipeline.identification.problem import Problem
+
+Floats = NDArray[np.float64]
+Kind = Literal["effect", "disturbance", "localization_noise"]
+Subset = frozenset[str]
+
+UNEXPLAINED = "unexplained"
+QUANTITIES = {"slip": "m^2/s^2", "position": "m^2", "heading": "rad^2"}
+"""Mean squares that are shared out, with their units: slip modulus over half a second, 2 s errors."""
+
+_ALL_ORDERS = 6
+_DRAWN_ORDERS = 24
+_SEED = 20240513
+_FEWEST_STRETCHES = 3
+
+
+@dataclass(frozen=True)
+class Share:
+    """What one cause carries of a mean square.
+
+    Attributes:
+        name: id of the effect, `disturbance` or `localization_noise`.
+        kind: which of these.
+        share: of the whole; below zero for an effect that makes held-out data worse.
+        low, high: 95 % interval over stretches of ten seconds, with the numbers of the model as they are;
+            NaN with fewer than three.
+        alone: what the effect takes away from the ideal model by itself; NaN for what is no effect.
+        last: what it takes away when all others are there already. Both equal the share where it acts apart
+            from the others; what they differ by is shared with others.
+    """
+
+    name: str
+    kind: Kind
+    share: float
+    low: float
+    high: float
+    alone: float = math.nan
+    last: float = math.nan
+
+
+@dataclass(frozen=True)
+class SlipBudget:
+    """A mean square and who carries it.
+
+    Attributes:
+        input: what the model is fed with.
+        quantity: one of `QUANTITIES`.
+        total: mean square of the ideal model, held out, in `unit`.
+        unit: of the total.
+        shares: effects, the largest first, then disturbance and localization noise; they add up to one.
+        stretches: stretches of ten seconds behind the intervals.
+    """
+
+    input: str
+    quantity: str
+    total: float
+    unit: str
+    shares: tuple[Share, ...]
+    stretches: int
+
+
+def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[SlipBudget, ...]:
+    """The budgets of a judged model: of the slip, and of the 2 s errors of position and heading.
+
+    The ideal model and the whole model are those of the ladder and its top, so that totals and remainders
+    are the numbers of the ladder; in between, effects are left out of the fits of the whole model's folds.
+
+    Args:
+        judgement: the model on its runs.
+        length_scale_m: of the slip modulus [m].
+    """
+    problem, fitted = judgement.problem, judgement.fitted
+    players: dict[str, set[str]] = {}
+    for name in fitted.model.ids:
+        players.setdefault(UNEXPLAINED if name.startswith(TERM) else name, set()).add(name)
+    states = refit_folds(problem, fitted)
+
+    def sum_stretches(held: HeldOut) -> Floats:
+        return _sum_stretches(problem, held, length_scale_m)
+
+    def look(present: Subset) -> Floats:
+        gone = [name for player, names in players.items() if player not in present for name in names]
+        return sum_stretches(score_folds(problem, [state.drop(gone) for state in states]))
+
+    ideal = sum_stretches(judgement.ladder.rungs[0].held_out)
+    rest = sum_stretches(judgement.whole.held_out)
+    seen = {frozenset[str](): ideal, frozenset(players): rest} if players else {frozenset[str](): ideal}
+    split = share_out(tuple(players), look, seen)
+    floor = judgement.floor
+    x, y, w = floor.velocity_rms
+    floors = (x**2 + y**2 + (length_scale_m * w) ** 2, floor.t_mrmse_m**2, floor.r_mrmse_rad**2)
+    return tuple(
+        _make_budget(problem.source.value, quantity, split, floors[column], column)
+        for column, quantity in enumerate(QUANTITIES)
+    )
+
+
+@dataclass(frozen=True)
+class Split:
+    """Losses shared out, stretch by stretch: each array has shape (stretches, ...) and adds up over them.
+
+    Attributes:
+        whole: without any player.
+        rest: with all of them.
+        parts: Shapley value of each player.
+        alone: what a player takes away by itself.
+        last: what it takes away last.
+    """
+
+    whole: Floats
+    rest: Floats
+    parts: Mapping[str, Floats]
+    alone: Mapping[str, Floats]
+    last: Mapping[str, Floats]
+
+
+def share_out(
+    players: Sequence[str], look: Callable[[Subset], Floats], seen: Mapping[Subset, Floats] | None = None
+) -> Split:
+    """Shapley values of players that take parts of a loss away.
+
+    Args:
+        players: names.
+        look: loss with these players present, any shape; asked once a subset.
+        seen: subsets whose loss is known.
+    """
+    known = dict(seen or {})
+
+    def ask(present: Subset) -> Floats:
+        if present not in known:
+            known[present] = look(present)
+        return known[present]
+
+    nobody, everybody = frozenset[str](), frozenset(players)
+    parts = {name: np.zeros_like(ask(nobody)) for name in players}
+    count = 0
+    for order in _list_orders(players):
+        count += 1
+        steps = [frozenset(order[:size]) for size in range(len(order) + 1)]
+        for name, (before, after) in zip(order, pairwise(steps), strict=True):
+            parts[name] += ask(before) - ask(after)
+    return Split(
+        whole=ask(nobody),
+        rest=ask(everybody),
+        parts={name: part / count for name, part in parts.items()},
+        alone={name: ask(nobody) - ask(frozenset({name})) for name in players},
+        last={name: ask(everybody - {name}) - ask(everybody) for name in players},
+    )
+
+
+def _list_orders(players: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    """All orders of few players; of many some, each with its reversal."""
+    if len(players) <= _ALL_ORDERS:
+        yield from permutations(players)
+        return
+    generator = np.random.default_rng(_SEED)
+    for _ in range(_DRAWN_ORDERS):
+        order = tuple(players[place] for place in generator.permutation(len(players)).tolist())
+        yield order
+        yield order[::-1]
+
+
+def _sum_stretches(problem: Problem, held: HeldOut, length_scale_m: float) -> Floats:
+    """Part of each mean square by stretch of ten seconds, shape (stretches, quantities)."""
+    unit, run = problem.whole.unit, problem.whole.run
+    squares = np.sum((held.residuals * [1.0, 1.0, length_scale_m]) ** 2, axis=1)
+    columns = [_add_up(unit, squares, unit)]
+    middle = problem.whole.times.mean(axis=1)
+    for errors in (held.position, held.yaw):
+        stretch = [
+            unit[run == number][
+                nearest_indices(comparison.horizons.times.mean(axis=1), middle[run == number])
+            ]
+            for number, comparison in enumerate(problem.comparisons)
+        ]
+        columns.append(_add_up(np.concatenate(stretch), np.concatenate(errors) ** 2, unit))
+    return np.column_stack(columns)
+
+
+def _add_up(stretch: NDArray[np.int64], squares: Floats, unit: NDArray[np.int64]) -> Floats:
+    known = np.isfinite(squares)
+    sums = np.bincount(stretch[known], squares[known], minlength=int(unit.max()) + 1)
+    parts: Floats = sums / max(int(known.sum()), 1)
+    return parts
+
+
+def _make_budget(source: str, quantity: str, split: Split, floor: float, column: int) -> SlipBudget:
+    whole, rest = split.whole[:, column], split.rest[:, column]
+    there = whole > 0.0
+
+    def bound(part: Floats, factor: float = 1.0) -> tuple[float, float, float]:
+        share, half = jackknife_ratio(part[there], whole[there])
+        return factor * share, factor * (share - half), factor * (share + half)
+
+    def ratio(part: Floats) -> float:
+        return float(part.sum()) / max(float(whole.sum()), 1e-300)
+
+    shares = [
+        Share(name, "effect", *bound(part[:, column]), ratio(split.alone[name][:, column]),
+              ratio(split.last[name][:, column]))
+        for name, part in split.parts.items()
+    ]  # fmt: skip
+    shares.sort(key=lambda one: -one.share)
+    # The floor is one number for all stretches: it is taken to be the same part of what is left in each.
+    noise = min(floor / max(float(rest.sum()), 1e-300), 1.0)
+    shares.append(Share("disturbance", "disturbance", *bound(rest, 1.0 - noise)))
+    shares.append(Share("localization_noise", "localization_noise", *bound(rest, noise)))
+    return SlipBudget(
+        source, quantity, float(whole.sum()), QUANTITIES[quantity], tuple(shares), int(there.sum())
+    )
+
+
+def jackknife_ratio(part: Floats, whole: Floats) -> tuple[float, float]:
+    """Ratio of two sums over stretches and the half-width of its 95 % interval.
+
+    Each stretch is left out once; Student's t counts the stretches. Source: Tukey, Annals of Mathematical
+    Statistics 29 (1958); for ratios Cochran, Sampling Techniques (1977), chapter 6.
+
+    Args:
+        part: shape (n,).
+        whole: shape (n,), positive.
+
+    Returns:
+        The ratio, and NaN for the half-width with fewer than three stretches.
+    """
+    total = float(whole.sum())
+    if total <= 0.0:
+        return 0.0, math.nan
+    ratio, count = float(part.sum()) / total, part.size
+    if count < _FEWEST_STRETCHES:
+        return ratio, math.nan
+    from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
+
+    without = (part.sum() - part) / np.maximum(total - whole, 1e-300)
+    error = math.sqrt((count - 1) / count * float(np.sum((without - without.mean()) ** 2)))
+    return ratio, float(stdtrit(count - 1, 0.975)) * error

@@ -1,0 +1,80 @@
+"""Numbers of effects that a model lacks: what adding each would make of it, to first order.
+
+That an effect is not named in a run is no number, and setting runs side by side needs one: the estimate that
+one step of the joint fit gives the effect, with the error that not knowing the others' numbers leaves it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.identification.fit import PartFit, solve_step
+from pipeline.identification.intervals import Estimate, estimate_part
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from pipeline.identification.fit import Fitted
+    from pipeline.identification.parts import Part
+    from pipeline.models.effect import Effect
+
+
+def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Estimate, ...]:
+    """Estimates of effects beside a fitted model, each added to it alone.
+
+    Left out are effects that the model has, that do not act on its input, whose numbers derivatives do not
+    find, and numbers that the runs do not move with or leave anywhere within their bounds.
+
+    Args:
+        fitted: a converged fit.
+        candidates: effects at neutral values.
+    """
+    found: list[Estimate] = []
+    for effect in candidates:
+        if effect.id in fitted.model or not all(math.isfinite(p.neutral) for p in effect.parameters):
+            continue
+        for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
+            if part.owns(effect):
+                found += _estimate_added(part, fit, effect)
+                break
+    return tuple(found)
+
+
+def _estimate_added(part: Part, fit: PartFit, effect: Effect) -> list[Estimate]:
+    added = fit.state.add(effect)
+    new = tuple(n for n in added.list_free(part.delays) if n.effect == effect.id)
+    if not all(number.is_smooth for number in new):
+        return []
+    columns = part.differentiate(added, fit.residual, new)
+    grown = PartFit(
+        added,
+        (*fit.free, *new),
+        fit.residual,
+        np.concatenate((fit.jacobian, columns), axis=2),
+        fit.weights,
+        fit.loss,
+    )
+    made = {item.free: item for item in estimate_part(part, grown).items}
+    if not all(made[number].observable for number in new):
+        return []
+    step, _ = solve_step(grown.jacobian, grown.residual, grown.weights)
+    shifts = dict(zip(grown.free, step.tolist(), strict=True))
+    items = []
+    for number in new:
+        item, shift = made[number], float(shifts[number])
+        low, high = number.bounds
+        if item.high - item.low <= high - low:
+            items.append(
+                replace(
+                    item,
+                    value=item.value + shift,
+                    low=item.low + shift,
+                    high=item.high + shift,
+                    at_bound=False,
+                )
+            )
+    return items

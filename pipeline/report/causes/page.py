@@ -1,0 +1,146 @@
+"""The page of `slip compare --causes`."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import altair as alt
+import polars as pl
+
+from pipeline.report import theme
+from pipeline.report.elements import Column, Picture, Table
+from pipeline.report.figures import Drawing
+from pipeline.report.page import render_figures
+from pipeline.report.run import INPUT_WORDS
+from pipeline.report.words import MISSING, say_number, say_share
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from pipeline.fleet.causes import Budget, Difference
+
+_COLOURS = (
+    theme.MODEL, theme.ON_COMMAND, theme.ON_MEASURED, theme.SLIP, theme.DRIVETRAIN, theme.MARK,
+    theme.MEASURED,
+)  # fmt: skip
+_LEFT = {"disturbance": theme.GROUND, "localization_noise": theme.CROSS}
+_OTHERS = "other effects"
+
+
+def render_causes(
+    budgets: Sequence[Budget],
+    differences: Sequence[Difference],
+    *,
+    input_name: str,
+    sentences: Sequence[str],
+    names: Mapping[str, str],
+    notes: Sequence[str],
+    keys: Sequence[str],
+) -> str:
+    """The whole page as HTML.
+
+    Args:
+        budgets: of every dataset.
+        differences: of every two.
+        input_name: what u was.
+        sentences: the differences in words.
+        names: what effects are called, where that is not their id.
+        notes: what must be known.
+        keys: run/generation of every run.
+    """
+    return render_figures(
+        "report/templates/causes.html",
+        [draw_causes(budgets, names)],
+        title="Deployments compared by cause",
+        facts=[f"{len(budgets)} datasets", f"{len(keys)} runs", f"slip {INPUT_WORDS[input_name]}"],
+        sentences_told=sentences,
+        budgets=_tabulate_budgets(budgets, names),
+        differences=_tabulate_differences(differences, names),
+        notes=notes,
+        runs=keys,
+    )
+
+
+def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
+    """A bar a dataset as long as its rms slip, cut into its causes; the largest effects have a colour."""
+    size: dict[str, float] = {}
+    for budget in budgets:
+        for part in budget.parts:
+            if part.kind == "effect":
+                size[part.name] = size.get(part.name, 0.0) + abs(part.share) * budget.total
+    shown = sorted(size, key=lambda name: -size[name])[: len(_COLOURS)]
+    rows = []
+    for budget in budgets:
+        rms = math.sqrt(budget.total)
+        for part in budget.parts:
+            known = part.kind != "effect" or part.name in shown
+            cause = names.get(part.name, part.name) if known else _OTHERS
+            rows.append(
+                (budget.dataset, cause.replace("_noise", " noise"), rms * part.share, say_share(part.share))
+            )
+    kinds = {"dataset": pl.String, "cause": pl.String, "slip": pl.Float64, "told": pl.String}
+    order = [*(names.get(name, name) for name in shown), _OTHERS, "disturbance", "localization noise"]
+    colours = [*_COLOURS[: len(shown)], theme.QUIET, *_LEFT.values()]
+    chart = (
+        alt.Chart(alt.NamedData("causes"))
+        .mark_bar()
+        .encode(
+            y=alt.Y(
+                "dataset:N",
+                sort=[budget.dataset for budget in budgets],
+                axis=alt.Axis(title=None, grid=False),
+            ),
+            x=alt.X("sum(slip):Q", axis=alt.Axis(title="rms slip over half a second [m/s]", format=",~r")),
+            color=alt.Color(
+                "cause:N",
+                scale=alt.Scale(domain=order, range=colours),
+                legend=alt.Legend(title=None, columns=3),
+            ),
+            tooltip=[alt.Tooltip("dataset:N"), alt.Tooltip("cause:N"), alt.Tooltip("told:N", title="share")],
+        )
+        .properties(width=640, height=alt.Step(30), usermeta={"gutter": 150})
+    )
+    frame = pl.DataFrame(rows, schema=kinds, orient="row")
+    told = "; ".join(f"{one.dataset} {say_number(math.sqrt(one.total))} m/s" for one in budgets)
+    note = "Cut by shares of the mean square. What makes held-out slip larger stands left of zero."
+    return Picture("causes", "Slip by cause", Drawing(chart, {"causes": frame}, note), f"Rms slip: {told}.")
+
+
+def _tabulate_budgets(budgets: Sequence[Budget], names: Mapping[str, str]) -> Table:
+    columns = (
+        Column("dataset"), Column("runs", number=True), Column("cause"), Column("share", number=True),
+        Column("95 % interval", number=True),
+    )  # fmt: skip
+    rows = [
+        (
+            one.dataset,
+            str(one.runs),
+            names.get(part.name, part.name),
+            say_share(part.share),
+            _say_ends(part.low, part.high),
+        )
+        for one in budgets
+        for part in one.parts
+    ]
+    return Table("Budgets: shares of the mean square slip, means over runs", columns, rows)
+
+
+def _tabulate_differences(differences: Sequence[Difference], names: Mapping[str, str]) -> Table:
+    columns = (
+        Column("difference"), Column("cause"), Column("more slip", "m/s", number=True),
+        Column("95 % interval", number=True), Column("p corrected", number=True), Column("unit"),
+    )  # fmt: skip
+    rows = [
+        (f"{one.b} \u2212 {one.a}", names.get(part.name, part.name), say_number(part.difference),
+         _say_ends(part.low, part.high, say_number), say_number(part.p_adjusted), one.unit)
+        for one in differences
+        for part in one.parts
+    ]  # fmt: skip
+    return Table("Differences of rms slip by cause; p after Holm over the causes of a pair", columns, rows)
+
+
+def _say_ends(low: float, high: float, say: Callable[[float], str] = say_share) -> str:
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return MISSING
+    return f"{say(low)} to {say(high)}"

@@ -1,0 +1,120 @@
+"""Who carries the slip: one bar from the ideal model's slip down to the floor, effect by effect."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import altair as alt
+import polars as pl
+
+from pipeline.report import theme
+from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.run import INPUT_WORDS, mapping_in, number_in, objects_in
+from pipeline.report.words import say_number, say_share
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.report.scene import Scene
+
+_SCHEMA = {
+    "cause": pl.String,
+    "from": pl.Float64,
+    "to": pl.Float64,
+    "low": pl.Float64,
+    "high": pl.Float64,
+    "kind": pl.String,
+    "told": pl.String,
+}
+_LEFT = {"disturbance": "disturbance", "localization_noise": "localization noise"}
+_COLOURS = {"effect": theme.MODEL, "disturbance": theme.GROUND, "localization_noise": theme.CROSS}
+_ROOM = 2.2
+
+
+def draw_budget(scene: Scene) -> Drawing | None:
+    """Steps from the whole of the ideal model's mean square slip down to nothing, one a cause."""
+    rows = list_parts(scene)
+    if rows.is_empty():
+        return None
+    left = min(0.0, float(rows.select(pl.min_horizontal(pl.col("from", "to").min())).item()))
+    base = alt.Chart(alt.NamedData("budget")).encode(
+        y=alt.Y(
+            "cause:N", sort=None, axis=alt.Axis(title=None, grid=False, labelLimit=150, labelColor=theme.INK)
+        )
+    )
+    x = alt.X(
+        "from:Q",
+        scale=alt.Scale(domain=[left, _ROOM], nice=False),
+        axis=alt.Axis(title="share of the mean square slip", format="%", values=[0.0, 0.25, 0.5, 0.75, 1.0]),
+    )
+    colour = alt.Color(
+        "kind:N", scale=alt.Scale(domain=list(_COLOURS), range=list(_COLOURS.values())), legend=None
+    )
+    bars = base.mark_bar().encode(x=x, x2="to:Q", color=colour)
+    ends = base.mark_rule(color=theme.INK, strokeWidth=1.2).encode(x=alt.X("low:Q"), x2="high:Q")
+    words = base.mark_text(align="left", dx=6, fontSize=11).encode(x=alt.X("right:Q"), text="told:N")
+    rows = rows.with_columns(right=pl.max_horizontal("from", "to", pl.col("high").fill_null(0.0)))
+    chart = alt.layer(bars, ends, words).properties(width=480, height=alt.Step(26), usermeta={"gutter": 130})
+    note = (
+        "Numbers: share of the slip, then of the 2 s position error, of the model that the diagnosis names; "
+        "fair to the order of its effects. Lines are 95 % intervals. A bar to the right makes slip larger."
+    )
+    return Drawing(chart, {"budget": rows}, note)
+
+
+def list_parts(scene: Scene) -> pl.DataFrame:
+    """Rows ``cause from to low high kind told``: where each cause's step begins and ends, and in words."""
+    slip, position = _find_budget(scene, "slip"), _find_budget(scene, "position")
+    errors = {str(part.get("effect")): number_in(part, "share") for part in objects_in(position, "shares")}
+    errors |= {kind: number_in(mapping_in(position, kind), "share") for kind in _LEFT}
+    parts = [("effect", str(part.get("effect")), part) for part in objects_in(slip, "shares")]
+    parts += [(kind, kind, mapping_in(slip, kind)) for kind in _LEFT if mapping_in(slip, kind)]
+    rows, top = [], 1.0
+    for kind, name, part in parts:
+        share = number_in(part, "share") or 0.0
+        low, high = number_in(part, "low"), number_in(part, "high")
+        rows.append(
+            {
+                "cause": _LEFT.get(name, name),
+                "from": top,
+                "to": top - share,
+                "low": None if high is None else top - high,
+                "high": None if low is None else top - low,
+                "kind": kind,
+                "told": f"{say_share(share)} \u00b7 {say_share(errors.get(name))}",
+            }
+        )
+        top -= share
+    return pl.DataFrame(rows, schema=_SCHEMA)
+
+
+def _find_budget(scene: Scene, quantity: str) -> Mapping[str, object]:
+    """The budget of a quantity on the leading input; empty without."""
+    diagnosis = scene.report.diagnosis
+    wanted = (diagnosis.get("input"), quantity)
+    found = objects_in(diagnosis, "budget")
+    return next((one for one in found if (one.get("input"), one.get("quantity")) == wanted), {})
+
+
+def describe_budget(scene: Scene) -> str:
+    """Every cause with its share."""
+    slip = _find_budget(scene, "slip")
+    total = number_in(slip, "total")
+    told = "; ".join(f"{row['cause']}: {row['told']}" for row in list_parts(scene).iter_rows(named=True))
+    words = INPUT_WORDS.get(str(slip.get("input")), "")
+    size = f"{say_number(total)} m\u00b2/s\u00b2"
+    return (
+        f"Mean square slip {words}, {size} over half a second by cause, shares of it and of the 2 s error. "
+        f"{told}."
+    )
+
+
+FIGURE = Figure(
+    id="budget",
+    title="The budget: who carries the slip",
+    section=Section.WHY,
+    order=5,
+    width=Width.HALF,
+    draw=draw_budget,
+    describe=describe_budget,
+)

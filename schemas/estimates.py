@@ -1,0 +1,31 @@
+"""Numbers of all effects that a run tells of, named or not."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import dataframely as dy
+
+from schemas import fields
+from schemas.contract import Table
+from schemas.slip import INPUTS
+
+
+class Estimates(Table):
+    """One row a parameter: what runs are set side by side with."""
+
+    NAME: ClassVar[str] = "estimates"
+    VERSION: ClassVar[int] = 1
+
+    input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})
+    effect = dy.String(min_length=1, metadata={"description": "id of the effect"})
+    parameter = dy.String(min_length=1, metadata={"description": "name of the parameter"})
+    unit = fields.text("unit of value and standard_error")
+    value = fields.number("1", "its estimate, in the unit of the column `unit`")
+    standard_error = dy.Float64(
+        min=0.0, metadata={"unit": "1", "description": "standard deviation of the estimate"}
+    )
+    named = fields.flag(
+        "the diagnosis names the effect; else the estimate is what one step of a joint fit gives"
+    )
+    at_bound = fields.flag("it stopped at a bound of the search: the error says little")

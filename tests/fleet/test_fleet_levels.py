@@ -1,0 +1,237 @@
+"""Numbers of a fleet by level: the vehicle's, the ground's, a run's own, or open."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from comparison_store import Run, write_run
+
+from pipeline.batch.pooling import refresh_pools
+from pipeline.cli import main
+from pipeline.fleet.hierarchy import FleetModel, FleetNumber, fit_fleet
+from pipeline.models.level import Level
+from pipeline.store import Store
+
+ERROR = 0.02
+ICE_AND_OTHERS = {"asphalt": 1.0, "gravel": 0.98, "ice": 0.7}
+ALIKE = {"asphalt": 0.9, "gravel": 0.9, "ice": 0.9}
+
+
+def draw(
+    means: dict[str, float],
+    *,
+    effect: str = "wheel_radius",
+    parameter: str = "k",
+    runs: int = 3,
+    vehicle: str = "warthog",
+    spread: float = 0.01,
+    seed: int = 0,
+    **more: object,
+) -> pl.DataFrame:
+    """Estimates of a number on several terrains."""
+    rng = np.random.default_rng(seed)
+    rows = [
+        {
+            "run": f"{vehicle}_{terrain}_{number}",
+            "dataset": f"{vehicle}_{terrain}",
+            "vehicle": vehicle,
+            "terrain": terrain,
+            "input": "measured",
+            "effect": effect,
+            "parameter": parameter,
+            "unit": "1",
+            "value": mean + float(np.hypot(spread, ERROR) * rng.normal()),
+            "standard_error": ERROR,
+            "named": True,
+            "at_bound": False,
+            **more,
+        }
+        for terrain, mean in means.items()
+        for number in range(runs)
+    ]
+    return pl.DataFrame(rows)
+
+
+def fit_one(estimates: pl.DataFrame) -> FleetNumber:
+    (number,) = fit_fleet(estimates).numbers
+    return number
+
+
+def test_wheels_that_are_small_are_so_on_every_ground() -> None:
+    number = fit_one(draw(ALIKE))
+    assert (number.level, number.name) == (Level.VEHICLE, "wheel_radius")
+    assert number.fit.interval is not None
+    assert number.fit.interval.low < 0.9 < number.fit.interval.high
+    assert "3 terrains differ no more than runs do" in number.because
+
+
+def test_wheels_that_slip_on_ice_are_not_small() -> None:
+    number = fit_one(draw(ICE_AND_OTHERS))
+    assert (number.level, number.name) == (Level.TERRAIN, "longitudinal_slip")
+    assert number.fit.groups["ice"].value == pytest.approx(0.7, abs=0.05)
+    assert "ice 0.7" in number.because
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_radius_is_never_named_for_slip_where_two_terrains_are_there(seed: int) -> None:
+    for runs in (1, 2, 3):
+        number = fit_one(draw({"asphalt": 1.0, "ice": 0.7}, runs=runs, seed=seed))
+        assert number.level in {Level.TERRAIN, None}
+        assert number.name in {"longitudinal_slip", "wheel_radius or longitudinal_slip"}
+
+
+def test_what_comes_and_goes_is_the_runs_own() -> None:
+    number = fit_one(
+        draw(
+            dict.fromkeys(ICE_AND_OTHERS, 0.0), effect="yaw_misalignment", parameter="psi", spread=0.2, runs=5
+        )
+    )
+    assert number.level is Level.RUN
+    assert number.fit.spread_run == pytest.approx(0.2, rel=0.5)
+
+
+def test_one_terrain_leaves_it_open_and_says_what_would_tell() -> None:
+    number = fit_one(draw({"ice": 0.7}))
+    assert number.level is None
+    assert number.name == "wheel_radius or longitudinal_slip"
+    assert number.because == "all runs are on ice: runs on another ground tell whose it is"
+
+
+def test_a_damaged_run_is_told_apart_and_leaves_the_others_as_they_are() -> None:
+    rows = draw(ALIKE, runs=4)
+    damaged = rows["run"][2]
+    hurt = rows.with_columns(pl.when(pl.col("run") == damaged).then(0.5).otherwise("value").alias("value"))
+    number = fit_one(hurt)
+    assert number.odd == (damaged,)
+    assert damaged not in number.runs
+    assert number.level is Level.VEHICLE
+    assert number.fit.value == pytest.approx(0.9, abs=0.02)
+    assert fit_one(rows).odd == ()
+
+
+def test_only_what_is_named_counts_and_what_is_not_named_there_counts_as_measured() -> None:
+    elsewhere = {"asphalt": 1.0, "gravel": 1.0}
+    quiet = draw(elsewhere, named=False)
+    assert fit_fleet(quiet).numbers == ()
+    number = fit_one(pl.concat([quiet, draw({"ice": 0.7})]))
+    assert (number.named, len(number.runs)) == (3, 9)
+    assert number.name == "longitudinal_slip"
+
+
+def test_runs_on_unknown_ground_and_numbers_at_a_bound_are_left_out_and_said() -> None:
+    model = fit_fleet(pl.concat([draw(ALIKE), draw({"unknown": 0.1}), draw({"mud": 5.0}, at_bound=True)]))
+    (number,) = model.numbers
+    assert set(number.fit.groups) == set(ALIKE)
+    assert any("terrain unknown: warthog_unknown_0" in note for note in model.notes)
+    assert any("at a bound" in note and "wheel_radius" in note for note in model.notes)
+
+
+def test_of_two_inputs_the_command_counts_once() -> None:
+    both = [draw(ALIKE), draw(ALIKE, input="command", value=0.8)]
+    number = fit_one(pl.concat(both))
+    assert len(number.runs) == 9
+    assert number.fit.value == pytest.approx(0.8)
+
+
+def test_vehicles_are_fitted_apart() -> None:
+    model = fit_fleet(pl.concat([draw(ALIKE), draw(ICE_AND_OTHERS, vehicle="husky_a200")]))
+    assert {number.vehicle: number.level for number in model.numbers} == {
+        "husky_a200": Level.TERRAIN,
+        "warthog": Level.VEHICLE,
+    }
+    assert list(model.runs) == ["husky_a200", "warthog"]
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Store:
+    """Results of nine runs on three grounds, one of them ice."""
+    store = Store(tmp_path / "results")
+    for (run, terrain), rows in draw(ICE_AND_OTHERS).partition_by("run", "terrain", as_dict=True).items():
+        estimates = [
+            (row["effect"], row["parameter"], row["value"], row["standard_error"])
+            for row in rows.iter_rows(named=True)
+        ]
+        write_run(store, Run(name=str(run), terrain=str(terrain), seconds=6.0, estimates=estimates))
+    return store
+
+
+def run_slip(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as ended:
+        main(list(arguments))
+    told = capsys.readouterr()
+    return int(ended.value.code or 0), told.out, told.err
+
+
+def test_what_is_fitted_is_written_and_shown_again(
+    results: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, _ = run_slip(capsys, "fleet", "fit", str(results.root), "--json")
+    fitted = json.loads(out)
+    assert code == 0
+    (number,) = fitted["parameters"]
+    assert (number["effect"], number["parameter"], number["level"]) == ("wheel_radius", "k", "terrain")
+    assert number["terrains"]["ice"]["runs"] == 3
+    assert number["terrains"]["ice"]["low"] < number["terrains"]["ice"]["value"]
+    assert number["spread_terrain"] > number["spread_run"]
+    (resolved,) = fitted["resolved"]
+    assert resolved["candidates"] == ["wheel_radius", "longitudinal_slip"]
+    assert resolved["answer"] == "longitudinal_slip"
+    assert "ice" in resolved["because"]
+    assert set(fitted["runs"]) == {"warthog"}
+
+    table = pl.read_parquet(results.root / "fleet.parquet")
+    assert table.filter(pl.col("terrain") == "*")["value"].item() == pytest.approx(number["value"])
+    assert table.height == 1 + len(ICE_AND_OTHERS)
+
+    shown = json.loads(run_slip(capsys, "fleet", "show", str(results.root), "--json")[1])
+    assert shown["parameters"] == fitted["parameters"]
+    text = run_slip(capsys, "fleet", "show", str(results.root))[1]
+    assert "warthog: 9 runs" in text
+    assert "longitudinal_slip" in text
+
+
+def test_a_fleet_that_is_out_of_date_says_so(results: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    run_slip(capsys, "fleet", "fit", str(results.root))
+    write_run(results, Run(name="new", seconds=6.0, estimates=[("wheel_radius", "k", 1.0, ERROR)]))
+    assert "1 results have changed since" in run_slip(capsys, "fleet", "show", str(results.root))[1]
+
+
+def test_a_batch_keeps_a_fleet_that_was_fitted_up_to_date(
+    results: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    refresh_pools(results)
+    assert not (results.root / "fleet.json").exists()
+    run_slip(capsys, "fleet", "fit", str(results.root))
+    write_run(
+        results, Run(name="new", terrain="mud", seconds=6.0, estimates=[("wheel_radius", "k", 0.9, ERROR)])
+    )
+    refresh_pools(results)
+    shown = json.loads(run_slip(capsys, "fleet", "show", str(results.root), "--json")[1])
+    assert "mud" in shown["parameters"][0]["terrains"]
+    assert not any("have changed since" in note for note in shown["notes"])
+
+
+def test_without_a_fleet_or_estimates_one_line_says_what_to_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = Store(tmp_path / "results")
+    write_run(store, Run(name="plain", seconds=6.0))
+    code, _, error = run_slip(capsys, "fleet", "fit", str(store.root))
+    assert code == 1
+    assert "no run has estimates" in error
+    assert error.count("\n") == 1
+    code, _, error = run_slip(capsys, "fleet", "show", str(store.root))
+    assert code == 1
+    assert "slip fleet fit" in error
+    (store.root / "fleet.json").write_text("{", encoding="utf-8")
+    code, _, error = run_slip(capsys, "fleet", "show", str(store.root))
+    assert code == 1
+    assert "cannot be read" in error
+
+
+def test_a_model_of_no_run_is_empty() -> None:
+    assert fit_fleet(draw(ALIKE).clear()) == FleetModel((), {}, ())

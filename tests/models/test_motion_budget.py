@@ -1,0 +1,132 @@
+"""The budget: shares that are fair to the order and add up; and numbers of what was not named."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from math import factorial
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from motion_runs import simulate, vehicle_of
+
+from pipeline.identification import Fitted, Input, Problem, fit_model
+from pipeline.identification.apportion import QUANTITIES, apportion, jackknife_ratio, share_out
+from pipeline.identification.judgement import Judgement, judge_model
+from pipeline.identification.unnamed import estimate_unnamed
+from pipeline.models import Model, find_effect
+
+TRUE = {"effective_track": {"k": 1.6}, "lateral_skid": {"c": 0.08}}
+
+
+@pytest.fixture(scope="module")
+def judged() -> Judgement:
+    problem = Problem([simulate(TRUE)], vehicle_of("husky_a200"), Input.MEASURED)
+    model = Model(problem.vehicle, tuple(find_effect(name)() for name in (*TRUE, "speed_slip")))
+    return judge_model(problem, model)
+
+
+def shapley_by_subsets(names: tuple[str, ...], loss: dict[frozenset[str], float], name: str) -> float:
+    """The textbook sum over subsets, written apart from what is tested."""
+    others, count = [other for other in names if other != name], len(names)
+    total = 0.0
+    for size in range(count):
+        for subset in combinations(others, size):
+            weight = factorial(size) * factorial(count - size - 1) / factorial(count)
+            total += weight * (loss[frozenset(subset)] - loss[frozenset((*subset, name))])
+    return total
+
+
+@given(st.integers(1, 6), st.integers(0, 2**32 - 1))
+@settings(max_examples=20)
+def test_shares_are_the_shapley_values_of_any_loss(count: int, seed: int) -> None:
+    names = tuple("abcdef"[:count])
+    draw = np.random.default_rng(seed).uniform(0.0, 1.0, 2**count)
+    loss = {
+        frozenset(name for bit, name in enumerate(names) if code >> bit & 1): value
+        for code, value in enumerate(draw.tolist())
+    }
+    split = share_out(names, lambda present: np.array([loss[present]]))
+    for name in names:
+        assert split.parts[name][0] == pytest.approx(shapley_by_subsets(names, loss, name), abs=1e-12)
+
+
+def test_many_effects_that_interact_in_pairs_are_shared_out_exactly() -> None:
+    rng = np.random.default_rng(3)
+    names = tuple("abcdefghi")
+    pushes = {name: rng.normal(size=40) for name in names}
+    whole = rng.normal(size=40)
+
+    def look(present: frozenset[str]) -> np.ndarray:
+        return (whole - sum(pushes[name] for name in sorted(present))) ** 2
+
+    split = share_out(names, look)
+    rest = whole - sum(pushes.values())
+    for name in names:
+        # Of a quadratic loss the Shapley value is the push times the sum of both ends.
+        assert split.parts[name] == pytest.approx(pushes[name] * (whole + rest), abs=1e-9)
+    assert sum(split.parts.values()) + split.rest == pytest.approx(split.whole)
+
+
+def test_a_budget_adds_up_to_the_ladders_numbers(judged: Judgement) -> None:
+    slip, position, heading = apportion(judged, length_scale_m=0.5)
+    ideal = judged.ladder.rungs[0].errors
+    x, y, w = ideal.velocity_rms
+    assert slip.total == pytest.approx(x**2 + y**2 + (0.5 * w) ** 2)
+    assert position.total == pytest.approx(ideal.t_mrmse_m**2)
+    assert heading.total == pytest.approx(ideal.r_mrmse_rad**2)
+    for budget in (slip, position, heading):
+        assert budget.unit == QUANTITIES[budget.quantity]
+        assert sum(share.share for share in budget.shares) == pytest.approx(1.0)
+        left = sum(share.share for share in budget.shares if share.kind != "effect") * budget.total
+        whole = judged.whole.errors
+        x, y, w = whole.velocity_rms
+        squares = {
+            "slip": x**2 + y**2 + (0.5 * w) ** 2,
+            "position": whole.t_mrmse_m**2,
+            "heading": whole.r_mrmse_rad**2,
+        }
+        assert left == pytest.approx(squares[budget.quantity])
+
+
+def test_what_was_put_into_a_run_carries_its_slip_and_what_was_not_carries_none(judged: Judgement) -> None:
+    slip = apportion(judged)[0]
+    shares = {share.name: share for share in slip.shares}
+    assert [share.name for share in slip.shares][:2] == ["effective_track", "lateral_skid"]
+    assert shares["effective_track"].share > 0.5
+    assert shares["lateral_skid"].low > 0.0
+    assert abs(shares["speed_slip"].share) < 0.001
+
+
+def test_intervals_of_a_ratio_hold_it_as_often_as_they_say() -> None:
+    rng, held = np.random.default_rng(5), 0
+    for _ in range(400):
+        whole = rng.gamma(2.0, 1.0, 30)
+        part = whole * 0.4 + rng.normal(0.0, 0.3, 30)
+        ratio, half = jackknife_ratio(part, whole)
+        held += abs(ratio - 0.4) <= half
+    assert 0.92 <= held / 400 <= 0.98
+
+
+def test_few_stretches_have_a_share_and_no_interval() -> None:
+    ratio, half = jackknife_ratio(np.array([1.0, 2.0]), np.array([2.0, 4.0]))
+    assert ratio == pytest.approx(0.5)
+    assert np.isnan(half)
+
+
+def test_effects_that_were_not_named_have_numbers_that_hold_the_truth() -> None:
+    vehicle = vehicle_of("husky_a200")
+
+    def fit(seed: int) -> Fitted:
+        problem = Problem([simulate(TRUE, seed=seed)], vehicle, Input.MEASURED)
+        return fit_model(problem, Model(vehicle, (find_effect("effective_track")(),)), exact=True)
+
+    rivals = [find_effect(name)() for name in ("lateral_skid", "wheel_radius", "body_speed_limit")]
+    for seed in (1, 2):
+        found = {item.free.label: item for item in estimate_unnamed(fit(seed), rivals)}
+        # A limit has no neutral value to start a step from.
+        assert set(found) == {"lateral_skid.c", "wheel_radius.k"}
+        assert found["lateral_skid.c"].value == pytest.approx(0.08, abs=0.02)
+        assert found["lateral_skid.c"].low < 0.08 < found["lateral_skid.c"].high
+        assert found["wheel_radius.k"].low < 1.0 < found["wheel_radius.k"].high
