@@ -73,6 +73,8 @@ _ON_ROLLING = {
         w0 = w0 / {k}""",
     "wheel_radius": """
         v0, w0 = {k} * v0, {k} * w0""",
+    "steering_sensor_offset": """
+        w0 = w0 + v0 * (math.tan(steering + {o}) - math.tan(steering)) / WHEELBASE""",
     "understeer": """
         w0 = w0 / max(1.0 + {K} / WHEELBASE * v0 * v0, 0.05)""",
     "time_drift": """

@@ -92,7 +92,8 @@ def _roll_wheels(drive: Drive, vehicle: Vehicle, effects: Effects) -> tuple[Floa
     v0 = 0.5 * (left + right)
     if vehicle.kind == "ackermann":
         reach = vehicle.wheelbase_m + effects.value("understeer", "K") * v0**2
-        w0 = v0 * np.tan(drive.steering) / reach
+        tyres = drive.steering + effects.value("steering_sensor_offset", "o")
+        w0 = v0 * np.tan(tyres) / reach
     else:
         w0 = (right - left) / (vehicle.track_width_m * effects.value("effective_track", "k"))
     time = (np.arange(v0.size) + 0.5) * drive.step_s

@@ -37,7 +37,7 @@ CATALOGUE_IDS = {
     *("terrain_change", "drive_lag", "turn_lag", "transport_delay", "body_speed_limit", "body_turn_limit"),
     *("turn_droop", "acceleration_limit", "wheel_speed_limit", "deadband", "body_inertia", "heading_skew"),
     *("yaw_misalignment", "lever_arm", "clock_offset"),
-    *("steering_offset", "steering_gain", "steering_lag", "understeer"),
+    *("steering_offset", "steering_gain", "steering_lag", "steering_sensor_offset", "understeer"),
 }
 
 

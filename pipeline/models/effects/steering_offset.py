@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from pipeline.models.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter
 
 if TYPE_CHECKING:
+    from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Wheels
 
 
@@ -37,8 +38,14 @@ class SteeringOffset(DriveEffect):
     )
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("yaw_drift",)
+    equivalent_to = ("steering_sensor_offset",)
+    equivalent_when = "only the way from the command to the body counts"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
         del around
         return replace(wheels, steering=wheels.steering + self.values["o"])
+
+    def is_equivalent(self, evidence: Evidence) -> bool:
+        """Measured steering tells on which side of the sensor the offset is."""
+        return not evidence.encoders
