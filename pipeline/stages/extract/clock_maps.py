@@ -29,6 +29,10 @@ _FASTEST_DRIFT = 5e-4
 """Quartz clocks differ by less than 200e-6, one that is being set right by up to 500e-6 (NTP's slew)."""
 _AT_ONCE = 0.1
 _BUNCHED = 0.25
+_PACE_NS = 5e9
+_FEWEST_OF_PACE = 100
+_STEADY = 0.05
+"""A bridge that holds up .2 s changes 5 s by 2 %, independent messages ten a second by 14 %."""
 _USUAL_SHARE = 0.99
 _HELD_UP_SHARE = 0.95
 _LEAST_HELD_UP_S = 0.03
@@ -109,22 +113,42 @@ class Drift:
 
     Attributes:
         rate: [s/s], above zero where the stamps' clock is the faster one.
-        certain: whether it is more than the delays' own changes.
+        scatter: of the least delays about the straight line [ns].
+        first, last: stamps between which it was seen [ns].
+        least_ns: the least delay of the topic's messages at the first stamp, on the straight line.
     """
 
-    rate: float
-    certain: bool
+    rate: float = 0.0
+    scatter: float = 0.0
+    first: int = 0
+    last: int = 0
+    least_ns: float = 0.0
 
-    def is_nearer(self, other: float) -> bool:
-        """Whether it is nearer to another rate than to none."""
-        return abs(self.rate - other) < abs(self.rate)
+    @property
+    def is_certain(self) -> bool:
+        """Whether it is a clock's, and more than the delays' own changes."""
+        return self._is_apart(0.0) and abs(self.rate) < _FASTEST_DRIFT
+
+    def is_same(self, other: Drift) -> bool:
+        """Whether it may well be the drift of another topic, which is known better, and rather than none."""
+        return not self._is_apart(other.rate) and abs(self.rate - other.rate) < abs(self.rate)
+
+    def find_agreement(self) -> int:
+        """The stamp at which both clocks show the same, or that of the run's ends which is nearer to it [ns].
+
+        Nothing is recorded before it was stamped, and the fastest message hardly later.
+        """
+        return round(min(max(self.first + self.least_ns / self.rate, self.first), self.last))
+
+    def _is_apart(self, rate: float) -> bool:
+        return abs(self.rate - rate) * (self.last - self.first) > max(_LEAST_DRIFT_NS, _SURE * self.scatter)
 
 
 def measure_drift(log_time: Stamps, stamp: Stamps) -> Drift:
     """The drift of a topic's stamps: a straight line through the least delays of pieces of the run."""
     pieces = min(_PIECES, stamp.size // _FEWEST_IN_PIECE)
     if pieces < _FEWEST_PIECES:
-        return Drift(0.0, certain=False)
+        return Drift()
     delay = (log_time - stamp).astype(np.float64)
     spans = np.array_split(np.arange(stamp.size), pieces)
     at = np.array([float(np.median(stamp[span])) for span in spans]) - float(stamp[0])
@@ -132,13 +156,11 @@ def measure_drift(log_time: Stamps, stamp: Stamps) -> Drift:
     one, two = np.triu_indices(pieces, 1)
     apart = at[two] - at[one]
     if not (apart > 0.0).all():
-        return Drift(0.0, certain=False)
+        return Drift()
     slope = float(np.median((floor[two] - floor[one]) / apart))
     rest = floor - slope * at
     scatter = 1.4826 * float(np.median(np.abs(rest - np.median(rest))))
-    away = abs(slope) * float(at[-1] - at[0])
-    certain = away > max(_LEAST_DRIFT_NS, _SURE * scatter) and abs(slope) < _FASTEST_DRIFT
-    return Drift(-slope, certain)
+    return Drift(-slope, scatter, int(stamp.min()), int(stamp.max()), float(np.median(rest)))
 
 
 def spread_bunches(log_time: Stamps) -> Stamps:
@@ -158,7 +180,7 @@ def spread_bunches(log_time: Stamps) -> Stamps:
     if gaps.size < _REACH:
         return log_time
     period = float(gaps[gaps <= np.quantile(gaps, _USUAL_SHARE)].mean())
-    if float(np.mean(gaps < _AT_ONCE * period)) < _BUNCHED:
+    if float(np.mean(gaps < _AT_ONCE * period)) < _BUNCHED or not _is_steady(log_time, period):
         return log_time
     even = (log_time - log_time[0]).astype(np.float64)
     holes = np.flatnonzero(gaps > max(_HOLE_NS, _HOLE_PERIODS * period)) + 1
@@ -167,6 +189,16 @@ def spread_bunches(log_time: Stamps) -> Stamps:
             even[part] = np.minimum(_draw_below(even[part]), even[part])
     spread: Stamps = log_time[0] + np.rint(np.maximum.accumulate(even)).astype(np.int64)
     return spread if find_held_up_s(log_time, spread) > _LEAST_HELD_UP_S else log_time
+
+
+def _is_steady(log_time: Stamps, period: float) -> bool:
+    """Whether equal numbers of messages take equal times: a hand on a joystick keeps no pace."""
+    many = max(round(_PACE_NS / period), _FEWEST_OF_PACE) if period > 0.0 else log_time.size
+    took = np.diff(log_time[::many]).astype(np.float64)
+    if took.size < _FEWEST_PIECES:
+        return False
+    usual = float(np.median(took))
+    return 1.4826 * float(np.median(np.abs(took - usual))) < _STEADY * usual
 
 
 def find_held_up_s(log_time: Stamps, spread: Stamps) -> float:

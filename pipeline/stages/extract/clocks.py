@@ -180,17 +180,18 @@ def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
         key: measure_drift(recorded[key].log_time[counts[key]], header[counts[key]])
         for key, header in headers.items()
     }
-    known = [drift.rate for drift in drifts.values() if drift.certain]
-    usual = float(np.median(known)) if known else 0.0
+    known = [drift for drift in drifts.values() if drift.is_certain]
+    if not known:
+        return dict(recorded), []
+    best = min(known, key=lambda drift: drift.scatter)
     findings, steady = [], dict(recorded)
-    for key, drift in drifts.items():
-        rate = drift.rate if drift.certain else usual
-        if rate == 0.0 or not (drift.certain or drift.is_nearer(usual)):
+    for key, own in drifts.items():
+        # Topics of one computer have one drift, which is known best where delays vary least.
+        drift = best if own.is_same(best) else own
+        if not drift.is_certain:
             continue
-        header, used, topic = headers[key], counts[key], recorded[key].topic
-        # Half-way through the run nothing changes: the delay that is left is the usual one.
-        middle = float(np.median(header[used]))
-        change = np.where(used, np.rint(-rate * (header - middle)), 0.0).astype(np.int64)
+        header, used, topic, rate = headers[key], counts[key], recorded[key].topic, drift.rate
+        change = np.where(used, np.rint(-rate * (header - drift.find_agreement())), 0.0).astype(np.int64)
         steady[key] = replace(recorded[key], header_time=header + change)
         run_away = abs(rate) * float(np.ptp(header[used])) / 1e9
         text = (
