@@ -8,13 +8,16 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 from pipeline.diagnosis.error_regions import tabulate_regions
+from pipeline.diagnosis.materiality import LEAST_TURN_RAD, LEAST_WAY_SHARE
 from pipeline.models.model_text import format_model
+from pipeline.runs.windows import HORIZON_S
 
 if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.diagnosis.error_regions import Region
     from pipeline.diagnosis.excitation import Unobservable
+    from pipeline.diagnosis.materiality import Moves
     from pipeline.diagnosis.undecided import Undecided
     from pipeline.models import ModelFile
 
@@ -49,6 +52,7 @@ class Named:
         selected: share of resampled recordings in which it is still worth its place.
         tentative: far more structure stays in its channel than it explains; or it lowers no error on its own
             way; or its interval holds doing nothing.
+        moves: how far it moves predictions over 2 s; None where the model does not hold it.
     """
 
     id: str
@@ -60,6 +64,7 @@ class Named:
     way: str
     selected: float
     tentative: bool = False
+    moves: Moves | None = None
 
     def to_json(self) -> dict[str, Json]:
         """The promised keys, and more."""
@@ -82,6 +87,13 @@ class Named:
             "found_on": self.way,
             "selection_frequency": _clean(self.selected),
             "tentative": self.tentative,
+            "moves": None
+            if self.moves is None
+            else {
+                "position_m": _clean(self.moves.position_m),
+                "heading_rad": _clean(self.moves.heading_rad),
+                "way_share": _clean(self.moves.way_share),
+            },
         }
 
 
@@ -132,6 +144,7 @@ class RunDiagnosis:
         input_reason: why; empty where nothing was fitted.
         joint: names of all runs that were judged together.
         effects: what is missing.
+        immaterial: what is missing, too, but moves no prediction so far that it would be felt.
         undecided: explanations that are as good as each other.
         unobservable: what this log could not tell.
         unexplained: structure without a name; None without.
@@ -152,6 +165,7 @@ class RunDiagnosis:
     input_reason: str = ""
     joint: tuple[str, ...] = ()
     effects: tuple[Named, ...] = ()
+    immaterial: tuple[Named, ...] = ()
     undecided: tuple[Undecided, ...] = ()
     unobservable: tuple[Unobservable, ...] = ()
     unexplained: Unexplained | None = None
@@ -174,6 +188,12 @@ class RunDiagnosis:
             "input_reason": self.input_reason or None,
             "joint_with": [name for name in self.joint if name != self.run],
             "effects": [effect.to_json() for effect in self.effects],
+            "immaterial": [effect.to_json() for effect in self.immaterial],
+            "materiality": {
+                "way_share": LEAST_WAY_SHARE,
+                "heading_rad": LEAST_TURN_RAD,
+                "horizon_s": HORIZON_S,
+            },
             "undecided": [
                 {"candidates": list(item.candidates), "separate_by": item.separate_by}
                 for item in self.undecided

@@ -82,6 +82,9 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str]]:
         formula = f", for example {rest['formula']}" if rest.get("formula") else ""
         channel = _CHANNELS.get(str(rest.get("channel")), "motion")
         yield "unexplained", f"{share} of what is left in the {channel}: {rest.get('where', '')}{formula}"
+    small = [str(entry.get("id", "")) for entry in objects_in(diagnosis, "immaterial")]
+    if small:
+        yield "below what matters", f"{', '.join(small)}: a planner would not feel it, see the JSON"
     unseen = diagnosis.get("unobservable")
     if isinstance(unseen, list) and unseen:
         yield "unobservable", f"{', '.join(map(str, unseen))}: this log would not show it"
