@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import cast
 
 from pipeline.cli.output import tidy_line
+from pipeline.report.words import say_split
 
 Summary = Mapping[str, object]
 
@@ -86,9 +87,7 @@ def _describe_slip(summary: Summary) -> list[str]:
     split = _part(summary, "split")
     detail = []
     if split:
-        detail.append(
-            "   ".join(f"{name} {float(cast('float', value)):.0%}" for name, value in split.items())
-        )
+        detail.append(say_split(**{name: float(cast("float", value)) for name, value in split.items()}))
     lead = _part(by_input, str(summary.get("leading_input")))
     detail.append(
         f"transitory {_number(lead, 'transitory_median_modulus')} | "
