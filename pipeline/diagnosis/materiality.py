@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from pipeline.models.effect import Effect
 
 LEAST_WAY_SHARE = 0.01
-"""Of the way driven over 2 s: what a costmap of 5 cm cells shows after 5 m. Measured: see CHANGELOG."""
+"""Of the way driven over 2 s: a cell of 5 cm after 5 m. What the sample logs hide moves 3 % or more of it."""
 LEAST_TURN_RAD = 0.005
-"""Of the heading over 2 s: 2.5 cm beside the path after 5 m."""
+"""Of the heading over 2 s: half a cell of 5 cm beside the path after 5 m."""
 _OFTEN = 0.95
 
 

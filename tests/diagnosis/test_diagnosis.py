@@ -74,6 +74,29 @@ def test_what_is_missing_is_named_with_its_size(skidding: Diagnosis) -> None:
     assert named["effective_track"].way == "measured"
 
 
+def test_what_a_planner_would_not_feel_is_listed_apart(tmp_path: Path) -> None:
+    effects = {"effective_track": 1.8, "icr_offset": 0.008}
+    quiet = replace(_SCENE, effects=effects, disturbance=Disturbance(), pose=PoseSensor(), duration_s=90.0)
+    diagnosis = _diagnose(quiet, tmp_path, inputs=("measured",))
+    found = diagnosis.runs[0]
+    assert [effect.id for effect in found.effects] == ["effective_track"]
+    (small,) = found.immaterial
+    assert small.id == "icr_offset"
+    assert small.parameters["x_icr"].value == pytest.approx(0.008, abs=0.002)
+    assert small.moves is not None
+    # A centre that lies 8 mm behind moves the pose by as much in a turn of 60 degrees, and turns nothing.
+    assert small.moves.position_m == pytest.approx(0.008, rel=0.3)
+    assert small.moves.heading_rad < 1e-6
+    assert all("icr_offset" not in str(rung["effects"]) for rung in found.ladder)
+    (run,) = diagnosis.to_json()
+    assert [entry["id"] for entry in run["immaterial"]] == ["icr_offset"]  # type: ignore[index, union-attr, call-overload]
+    assert run["materiality"] == {"way_share": 0.01, "heading_rad": 0.005, "horizon_s": 2.0}
+    assert "icr_offset" not in str(run["model"])
+    labels = dict(reversed(list_lines(found)))
+    assert labels["below"].startswith("icr_offset")
+    assert "1% of the way or 5 mrad" in describe(diagnosis)
+
+
 _CAR = replace(
     _SCENE, vehicle=VEHICLES["car"], program=Program(speed_scale=0.5), disturbance=Disturbance(0.01, 0.005)
 )
