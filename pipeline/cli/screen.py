@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import cast
 
 from pipeline.cli.output import tidy_line
-from pipeline.report.words import say_split
 
 Summary = Mapping[str, object]
 
@@ -75,6 +74,8 @@ def _describe_gaps(found: Mapping[str, object]) -> str:
 
 
 def _describe_slip(summary: Summary) -> list[str]:
+    from pipeline.report.words import say_split  # noqa: PLC0415 - heavy, by its room
+
     by_input = _part(summary, "by_input")
     words = {"command": "on command", "measured": "on measured wheels"}
     shown = [name for name in words if name in by_input]
