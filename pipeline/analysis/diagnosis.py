@@ -22,7 +22,7 @@ STAGE = "diagnosis"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 5
+VERSION = 6
 _WRITTEN = ("ladder", "parameters")
 
 

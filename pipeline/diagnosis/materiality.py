@@ -15,26 +15,25 @@ if TYPE_CHECKING:
     from pipeline.identification.judgement import Judgement
     from pipeline.models.effect import Effect
 
-LEAST_WAY_SHARE = 0.01
-"""Of the way driven over 2 s: a cell of 5 cm after 5 m. What the sample logs hide moves 3 % or more of it."""
-LEAST_TURN_RAD = 0.005
-"""Of the heading over 2 s: half a cell of 5 cm beside the path after 5 m."""
-_OFTEN = 0.95
+LEAST_WAY_SHARE = 0.005
+"""Of the way driven over 2 s: half a cell of 5 cm after 5 m. What the sample logs hide moves 2.6 % or more."""
+LEAST_TURN_RAD = 0.0025
+"""Of the heading over 2 s: a quarter of such a cell beside the path after 5 m."""
 
 
 def describe_threshold() -> str:
     """The least that matters, in words."""
-    return f"{LEAST_WAY_SHARE:.0%} of the way or {LEAST_TURN_RAD * 1e3:g} mrad"
+    return f"{LEAST_WAY_SHARE:.1%} of the way or {LEAST_TURN_RAD * 1e3:g} mrad (rms)"
 
 
 @dataclass(frozen=True)
 class Moves:
-    """How far an effect moves predictions over 2 s, in all but one of twenty of them.
+    """How far an effect moves predictions over 2 s: root mean squares, as errors over 2 s are.
 
     Attributes:
         position_m: distance [m].
         heading_rad: turn [rad].
-        way_share: the distance as a share of the way that is driven in as many predictions.
+        way_share: the distance as a share of the way that is predicted.
     """
 
     position_m: float
@@ -51,8 +50,7 @@ def measure_moves(judgement: Judgement, effect: Effect) -> Moves | None:
     """What an effect of a fitted model does to its predictions; None where it is no part of the model.
 
     Everything else stays as it is: what another effect would take over in its place is no reason to say that
-    it does nothing. Of twenty predictions the one in which it does most is left out, not the usual one taken:
-    a limit or a deadband matters where it acts.
+    it does nothing. A limit that acts seldom, but then far, counts by its square.
     """
     state = judgement.fitted.state
     if effect.id not in state.ids:
@@ -66,6 +64,6 @@ def measure_moves(judgement: Judgement, effect: Effect) -> Moves | None:
         for run, comparison in enumerate(judgement.problem.comparisons)
     ]
     distance, turn, way = (
-        float(np.quantile(np.concatenate(column), _OFTEN)) for column in zip(*shifts, strict=True)
+        float(np.sqrt(np.mean(np.concatenate(column) ** 2))) for column in zip(*shifts, strict=True)
     )
     return Moves(distance, turn, distance / way if way > 0.0 else 0.0)
