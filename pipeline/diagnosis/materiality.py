@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pipeline.models.effect import Effect
 
 LEAST_WAY_SHARE = 0.005
-"""Of the way driven over 2 s: half a cell of 5 cm after 5 m. What the sample logs hide moves 2.6 % or more."""
+"""Of the way driven over 2 s: half a cell of 5 cm after 5 m. The sample logs hide 2.6 % or more."""
 LEAST_TURN_RAD = 0.0025
 """Of the heading over 2 s: a quarter of such a cell beside the path after 5 m."""
 
