@@ -48,6 +48,8 @@ DIFFERENTIAL = (
     "yaw_misalignment", "lever_arm", "clock_offset",
 )  # fmt: skip
 CAR = ("steering_offset", "steering_gain", "steering_lag", "understeer")
+# Asked for by name only, so that every seed draws what it always drew.
+SENSED = ("steering_sensor_offset",)
 EMPTY = ("plain", "jumps", "noisy", "tilted")
 MACHINERY = ("track", "payload", "small_wheels", "slope", "slow_motors", "low_grip")
 _CARS = 0.1
@@ -56,8 +58,8 @@ _EQUIPMENT = ("effective_track", "drive_lag")
 _MORE = tuple(name for name in DIFFERENTIAL if name not in {*_EQUIPMENT, "turn_lag"})
 _POOR = tuple(name for name in DIFFERENTIAL if name != "slope_drift")
 POOLS: dict[str, tuple[str, ...]] = {
-    "single": DIFFERENTIAL + CAR,
-    "small": DIFFERENTIAL + CAR,
+    "single": DIFFERENTIAL + CAR + SENSED,
+    "small": DIFFERENTIAL + CAR + SENSED,
     "equipped": (*_MORE, "nothing"),
     "empty": EMPTY,
     "poor": _POOR + CAR,
@@ -183,6 +185,7 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         "lever_arm": {"l_x": 0.2 * size, "l_y": sign * 0.1 * size},
         "clock_offset": {"d": -0.2 * size},
         "steering_offset": {"o": sign * 0.04 * size},
+        "steering_sensor_offset": {"o": sign * 0.04 * size},
         "steering_gain": {"g": 1.0 - 0.15 * size},
         "steering_lag": {"tau": 0.4 * size},
         "understeer": {"K": 0.035 * size},
@@ -192,7 +195,9 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
 
 def _draw_scene(draw: np.random.Generator, seed: int, effect: str | None = None) -> Scenario:
     """Everything but the riddle itself."""
-    car = effect in CAR or (effect in {"drive_lag", "wheel_radius", "time_drift"} and draw.random() < _CARS)
+    car = effect in CAR + SENSED or (
+        effect in {"drive_lag", "wheel_radius", "time_drift"} and draw.random() < _CARS
+    )
     name = "car" if car else str(draw.choice(["husky", "husky", "warthog", "jackal", "marmotte"]))
     vehicle = VEHICLES[name]
     layouts = [key for key, item in LAYOUTS.items() if item.kind == vehicle.kind]

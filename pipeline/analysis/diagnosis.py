@@ -22,7 +22,7 @@ STAGE = "diagnosis"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 6
+VERSION = 7
 _WRITTEN = ("ladder", "parameters", "budget", "estimates")
 
 

@@ -74,6 +74,8 @@ def _describe_gaps(found: Mapping[str, object]) -> str:
 
 
 def _describe_slip(summary: Summary) -> list[str]:
+    from pipeline.report.words import say_split  # noqa: PLC0415 - heavy, by its room
+
     by_input = _part(summary, "by_input")
     words = {"command": "on command", "measured": "on measured wheels"}
     shown = [name for name in words if name in by_input]
@@ -86,9 +88,7 @@ def _describe_slip(summary: Summary) -> list[str]:
     split = _part(summary, "split")
     detail = []
     if split:
-        detail.append(
-            "   ".join(f"{name} {float(cast('float', value)):.0%}" for name, value in split.items())
-        )
+        detail.append(say_split(**{name: float(cast("float", value)) for name, value in split.items()}))
     lead = _part(by_input, str(summary.get("leading_input")))
     detail.append(
         f"transitory {_number(lead, 'transitory_median_modulus')} | "

@@ -16,6 +16,7 @@ from pipeline.diagnosis.diagnosis import Named, RunDiagnosis
 from pipeline.diagnosis.error_regions import map_errors, pick_regions
 from pipeline.diagnosis.estimates import list_estimates
 from pipeline.diagnosis.library import is_term
+from pipeline.diagnosis.materiality import measure_moves
 from pipeline.diagnosis.naming_rules import join_classes, list_equivalents
 from pipeline.diagnosis.plausibility import find_implausible
 from pipeline.diagnosis.unexplained import find_places
@@ -84,12 +85,15 @@ def summarize(
         # From measured wheels the drivetrain's effects were not in it.
         judgements |= _judge_ways(context, [source], [*found, *terms], open_ids)
     judgement = judgements.get(source.value)
+    told = [e for e in found if not e.searched_as & open_ids and e.id not in known]
+    small = [effect for effect in told if judgement is not None and _is_immaterial(effect, judgement)]
+    immaterial = tuple(_describe(effect, context, ways, judgement) for effect in small)
+    if small:
+        found, told = ([effect for effect in some if effect not in small] for some in (found, told))
+        judgements = _judge_ways(context, inputs, [*found, *terms], open_ids)
+        judgement = judgements.get(source.value)
     unexplained = residual_structure.describe(ways)
-    described = tuple(
-        _describe(effect, context, ways, judgement)
-        for effect in _order(found, judgement)
-        if not effect.searched_as & open_ids and effect.id not in known
-    )
+    described = tuple(_describe(effect, context, ways, judgement) for effect in _order(told, judgement))
     named = tuple(effect for effect in described if _doubt(effect) is None)
     named = residual_structure.mark_tentative(_mark_idle(named, judgements), ways, unexplained)
     part, start = context.problem.whole, body.search.start
@@ -106,6 +110,7 @@ def summarize(
         input=source.value,
         joint=tuple(run.name for run in context.runs),
         effects=named,
+        immaterial=immaterial,
         undecided=tuple(undecided),
         unobservable=tuple(unobservable.values()),
         unexplained=unexplained,
@@ -139,6 +144,12 @@ def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Con
     findings += _note_brevity(context, common)
     runs = cast("Sequence[Mapping[str, Json]]", common.timing["runs"])
     return replace(common, run=recording.name, findings=tuple(findings), timing=runs[number])
+
+
+def _is_immaterial(effect: Effect, judgement: Judgement) -> bool:
+    """Whether a planner would not miss an effect of the model."""
+    moves = measure_moves(judgement, effect)
+    return moves is not None and not moves.is_material
 
 
 def _doubt(effect: Named) -> str | None:
@@ -256,6 +267,7 @@ def _describe(
         way=way.search.way,
         selected=selected,
         motion=_restore(effect.id, values).describe_motion(context.vehicle),
+        moves=None if judgement is None else measure_moves(judgement, effect),
     )
 
 

@@ -8,14 +8,17 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 from pipeline.diagnosis.error_regions import tabulate_regions
+from pipeline.diagnosis.materiality import LEAST_TURN_RAD, LEAST_WAY_SHARE
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model_text import format_model
+from pipeline.runs.windows import HORIZON_S
 
 if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.diagnosis.error_regions import Region
     from pipeline.diagnosis.excitation import Unobservable
+    from pipeline.diagnosis.materiality import Moves
     from pipeline.diagnosis.undecided import Undecided
     from pipeline.identification.apportion import Share, SlipBudget
     from pipeline.models import ModelFile
@@ -53,6 +56,7 @@ class Named:
         motion: what the vehicle does by it, with its numbers.
         tentative: far more structure stays in its channel than it explains; or it lowers no error on its own
             way; or its interval holds doing nothing.
+        moves: how far it moves predictions over 2 s; None where the model does not hold it.
     """
 
     id: str
@@ -65,6 +69,7 @@ class Named:
     selected: float
     motion: str
     tentative: bool = False
+    moves: Moves | None = None
 
     @property
     def readings(self) -> tuple[Reading, ...]:
@@ -105,6 +110,13 @@ class Named:
             "could_be": [
                 {"level": one.level.value, "name": one.name, "text": one.text} for one in self.readings
             ],
+            "moves": None
+            if self.moves is None
+            else {
+                "position_m": _clean(self.moves.position_m),
+                "heading_rad": _clean(self.moves.heading_rad),
+                "way_share": _clean(self.moves.way_share),
+            },
         }
 
 
@@ -178,6 +190,7 @@ class RunDiagnosis:
         input_reason: why; empty where nothing was fitted.
         joint: names of all runs that were judged together.
         effects: what is missing.
+        immaterial: what is missing, too, but moves no prediction so far that it would be felt.
         undecided: explanations that are as good as each other.
         unobservable: what this log could not tell.
         unexplained: structure without a name; None without.
@@ -200,6 +213,7 @@ class RunDiagnosis:
     input_reason: str = ""
     joint: tuple[str, ...] = ()
     effects: tuple[Named, ...] = ()
+    immaterial: tuple[Named, ...] = ()
     undecided: tuple[Undecided, ...] = ()
     unobservable: tuple[Unobservable, ...] = ()
     unexplained: Unexplained | None = None
@@ -224,6 +238,12 @@ class RunDiagnosis:
             "input_reason": self.input_reason or None,
             "joint_with": [name for name in self.joint if name != self.run],
             "effects": [effect.to_json() for effect in self.effects],
+            "immaterial": [effect.to_json() for effect in self.immaterial],
+            "materiality": {
+                "way_share": LEAST_WAY_SHARE,
+                "heading_rad": LEAST_TURN_RAD,
+                "horizon_s": HORIZON_S,
+            },
             "undecided": [
                 {"candidates": list(item.candidates), "separate_by": item.separate_by}
                 for item in self.undecided

@@ -6,6 +6,9 @@ import math
 from textwrap import wrap
 from typing import TYPE_CHECKING, cast
 
+from pipeline.diagnosis.materiality import describe_threshold
+from pipeline.runs.windows import HORIZON_S
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -71,7 +74,7 @@ def _list_shared(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
         now, floor = _number(last, "t_mrmse_m"), _number(diagnosis.noise_floor, "t_mrmse_m")
         lines.append(("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m"))
     lines += _label("budget", _describe_budget(diagnosis))
-    return [*lines, *_describe_unobservable(diagnosis)]
+    return [*lines, *_label("below", _describe_immaterial(diagnosis)), *_describe_unobservable(diagnosis)]
 
 
 def _label(label: str, texts: Sequence[str]) -> list[tuple[str, str]]:
@@ -114,6 +117,20 @@ def _describe_budget(diagnosis: RunDiagnosis) -> list[str]:
             parts = [f"{one.name.replace('_noise', ' noise')} {one.share:.0%}" for one in budget.shares]
             rows.append(f"of {math.sqrt(budget.total):.3g} m/s of slip (mean square): {', '.join(parts)}")
     return rows
+
+
+def _describe_immaterial(diagnosis: RunDiagnosis) -> list[str]:
+    """What is too small to matter, and how small."""
+    if not diagnosis.immaterial:
+        return []
+    width = max(len(_values(effect)) for effect in diagnosis.immaterial) + 2
+    rows = [
+        f"{effect.id:<20}{_values(effect):<{width}}moves predictions by "
+        f"{effect.moves.position_m * 1e3:.2g} mm and {effect.moves.heading_rad * 1e3:.2g} mrad"
+        for effect in diagnosis.immaterial
+        if effect.moves is not None
+    ]
+    return [*rows, f"what a planner feels over {HORIZON_S:g} s: {describe_threshold()}"]
 
 
 def _values(effect: Named) -> str:

@@ -224,20 +224,46 @@ class Comparison:
             timing: of the run.
             late_s: how much later the poses are than they are taken for [s].
         """
-        velocity = self._run(self._reaching, effects, timing)
         delay = late_s + self._find_delay(effects)
+        moved, turned = self._predict_horizons(effects, timing, delay)
+        heading = self._node_headings(delay)
+        origin, node = self.horizons.origin, self.horizons.node
+        predicted = self._path[origin] + np.exp(1j * heading[origin]) * moved
+        yaw = (heading[node] - heading[origin]) - turned
+        wrapped = np.abs(np.angle(np.exp(1j * yaw)))
+        return HorizonErrors(np.abs(predicted - self._path[node]), wrapped, np.abs(yaw))
+
+    def find_horizon_shifts(
+        self, effects: Sequence[Effect], others: Sequence[Effect], timing: Timing
+    ) -> tuple[Floats, Floats, Floats]:
+        """How far two models' two-second predictions lie apart.
+
+        Args:
+            effects: of one model.
+            others: of the other one.
+            timing: of the run.
+
+        Returns:
+            Distance [m] and turn [rad] between them, and the way that the first predicts [m], (n,) each.
+        """
+        one, two = (
+            self._predict_horizons(model, timing, self._find_delay(model)) for model in (effects, others)
+        )
+        return np.abs(one[0] - two[0]), np.abs(one[1] - two[1]), np.abs(one[0])
+
+    def _predict_horizons(
+        self, effects: Sequence[Effect], timing: Timing, delay: float
+    ) -> tuple[Complex, Floats]:
+        """Displacement [m] in the frame of the start and turn [rad] of every prediction, shape (n,) each."""
+        velocity = self._run(self._reaching, effects, timing)
         place = self._find_place(delay)
         edges = self.cells.sum_up(velocity.w)
         own = np.exp(0.5j * (edges[1:] + edges[:-1]))
         travelled = self._at_nodes(self.cells.sum_up((velocity.x + 1j * velocity.y) * own), place)
         turned = self._at_nodes(edges, place)
-        heading = self._node_headings(delay)
         origin, node = self.horizons.origin, self.horizons.node
-        turn = np.exp(1j * (heading[origin] - turned[origin]))
-        predicted = self._path[origin] + turn * (travelled[node] - travelled[origin])
-        yaw = (heading[node] - heading[origin]) - (turned[node] - turned[origin])
-        wrapped = np.abs(np.angle(np.exp(1j * yaw)))
-        return HorizonErrors(np.abs(predicted - self._path[node]), wrapped, np.abs(yaw))
+        back: Complex = np.exp(-1j * turned[origin])
+        return back * (travelled[node] - travelled[origin]), turned[node] - turned[origin]
 
     def list_starts(self) -> tuple[Floats, Floats]:
         """Where predictions begin: stamps [s], shape (k,), and poses (x, y [m], yaw [rad]), shape (k, 3)."""

@@ -32,6 +32,24 @@ def say_share(value: float | None) -> str:
     return MISSING if value is None else f"{value:.0%}".replace("-", "\u2212").replace("%", "\u202f%")
 
 
+def say_split(drivetrain: float, ground: float, cross: float) -> str:
+    """How the mean square of the slip on command splits; in words where the parts cancel each other.
+
+    Args:
+        drivetrain: share of what happens between command and wheels.
+        ground: share of what happens between wheels and body.
+        cross: share of twice their product.
+    """
+    if max(drivetrain, ground) <= 1.0:
+        shares = zip(("drivetrain", "ground", "cross"), (drivetrain, ground, cross), strict=True)
+        return "   ".join(f"{name} {share:.0%}" for name, share in shares)
+    one, two = (say_number(math.sqrt(share), digits=2) for share in (drivetrain, ground))
+    return (
+        f"drivetrain and ground cancel in part: {one} and {two} times the slip that is left (rms), "
+        "so shares would mean nothing"
+    )
+
+
 def say_duration(seconds: float | None) -> str:
     """A duration in the two units that matter."""
     if seconds is None:

@@ -106,7 +106,8 @@ def _roll_wheels(drive: Drive, vehicle: Vehicle, effects: Effects) -> tuple[Floa
         s0, w0 = s0 * effects.value("lateral_scale", "k"), w0 / effects.value("effective_track", "k")
     elif vehicle.kind == "ackermann":
         reach = vehicle.wheelbase_m + effects.value("understeer", "K") * v0**2
-        w0 = v0 * np.tan(drive.steering) / reach
+        tyres = drive.steering + effects.value("steering_sensor_offset", "o")
+        w0 = v0 * np.tan(tyres) / reach
     else:
         w0 = (right - left) / (vehicle.track_width_m * effects.value("effective_track", "k"))
     time = (np.arange(v0.size) + 0.5) * drive.step_s

@@ -77,6 +77,12 @@ _SPECS: tuple[EffectSpec, ...] = (
     EffectSpec("steering_gain", "delta = g delta_u", _one("g", "1", 1.0, 0.85), _CAR),
     EffectSpec("steering_offset", "delta = delta_u + o", _one("o", "rad", 0.0, 0.04), _CAR),
     EffectSpec("steering_lag", "tau ddelta/dt = delta_u - delta", _one("tau", "s", 0.0, 0.4), _CAR),
+    EffectSpec(
+        "steering_sensor_offset",
+        "tyres steer delta + o, sensors read delta",
+        _one("o", "rad", 0.0, 0.02),
+        _CAR,
+    ),
     EffectSpec("understeer", "v_w = v tan(delta) / (l + K v^2)", _one("K", "s^2/m", 0.0, 0.03), _CAR),
     EffectSpec("wheel_radius", "v0 = k f_x, w0 = k f_w", _one("k", "1", 1.0, 0.92)),
     EffectSpec(

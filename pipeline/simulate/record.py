@@ -62,6 +62,8 @@ def write_log(run: SimulatedRun, path: Path) -> None:
     with LogWriter(path) as writer:
         for sheet in cut_gaps(run, sheets):
             header = None if sheet.header_s is None else stamp_headers(scenario.clock, sheet.header_s)
+            if header is not None and sheet.topic in scenario.recording.zero_stamps:
+                header = np.zeros_like(header)
             fields = sheet.fields
             if header is not None and sheet.stamp != "header":
                 fields, header = fields | _write_stamp(sheet.stamp, header, scenario.clock.start_ns), None

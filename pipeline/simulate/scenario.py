@@ -206,6 +206,9 @@ class Clock:
         backward_at_s, backward_s: at this time the clock goes back by that much; none when NaN.
         real_time_factor: stamps count simulated time from zero, of which so much passes in a second of the
             recorder's clock; None where one clock serves both.
+        swing: by which share that factor rises and falls, over seven seconds of simulated time.
+        drift_ppm: how much faster the robot's clock, which stamps, runs than the recorder's [1e-6].
+        bunch_s: the recorder gets messages in bunches of up to so long, as a bridge between networks does.
     """
 
     start_ns: int = 1_717_000_000_000_000_000
@@ -213,6 +216,9 @@ class Clock:
     backward_at_s: float = float("nan")
     backward_s: float = 0.0
     real_time_factor: float | None = None
+    swing: float = 0.0
+    drift_ppm: float = 0.0
+    bunch_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -229,6 +235,7 @@ class Recording:
         command_scale: factor on recorded wheel commands (a topic made with another vehicle's radius).
         command_latency_s: from a command's stamp to the recorder.
         gaps: how many holes of ``gap_s`` the whole recording has.
+        zero_stamps: topics whose headers say zero throughout.
     """
 
     layout: str | Layout = "usual"
@@ -240,6 +247,7 @@ class Recording:
     command_latency_s: float = 0.001
     gaps: int = 0
     gap_s: float = 2.0
+    zero_stamps: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

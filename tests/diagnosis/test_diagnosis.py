@@ -74,6 +74,60 @@ def test_what_is_missing_is_named_with_its_size(skidding: Diagnosis) -> None:
     assert named["effective_track"].way == "measured"
 
 
+def test_what_a_planner_would_not_feel_is_listed_apart(tmp_path: Path) -> None:
+    effects = {"effective_track": 1.8, "icr_offset": 0.008}
+    quiet = replace(_SCENE, effects=effects, disturbance=Disturbance(), pose=PoseSensor(), duration_s=90.0)
+    diagnosis = _diagnose(quiet, tmp_path, inputs=("measured",))
+    found = diagnosis.runs[0]
+    assert [effect.id for effect in found.effects] == ["effective_track"]
+    (small,) = found.immaterial
+    assert small.id == "icr_offset"
+    assert small.parameters["x_icr"].value == pytest.approx(0.008, abs=0.002)
+    assert small.moves is not None
+    # A centre that lies 8 mm behind moves the pose by as much in a turn of 60 degrees, and turns nothing.
+    assert 0.002 < small.moves.position_m < 0.008
+    assert small.moves.heading_rad < 1e-6
+    assert all("icr_offset" not in str(rung["effects"]) for rung in found.ladder)
+    (run,) = diagnosis.to_json()
+    assert [entry["id"] for entry in run["immaterial"]] == ["icr_offset"]  # type: ignore[index, union-attr, call-overload]
+    assert run["materiality"] == {"way_share": 0.005, "heading_rad": 0.0025, "horizon_s": 2.0}
+    assert "icr_offset" not in str(run["model"])
+    labels = dict(reversed(list_lines(found)))
+    assert labels["below"].startswith("icr_offset")
+    assert "0.5% of the way or 2.5 mrad (rms)" in describe(diagnosis)
+
+
+_CAR = replace(
+    _SCENE, vehicle=VEHICLES["car"], program=Program(speed_scale=0.5), disturbance=Disturbance(0.01, 0.005)
+)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("imu", [Imu(), Imu(bias_radps=0.004), None], ids=["gyro", "biased gyro", "no gyro"])
+@pytest.mark.parametrize(
+    ("hidden", "size", "way"),
+    [
+        ("steering_offset", 0.01, "wheels"),
+        ("steering_sensor_offset", 0.01, "measured"),
+        ("yaw_drift", 0.03, "measured"),
+    ],
+)
+def test_a_gyro_does_not_turn_one_effect_into_another(
+    hidden: str, size: float, way: str, imu: Imu | None, tmp_path: Path
+) -> None:
+    found = _diagnose(replace(_CAR, effects={hidden: size}, imu=imu), tmp_path).runs[0]
+    assert [(effect.id, effect.way) for effect in found.effects] == [(hidden, way)]
+    (value,) = found.effects[0].parameters.values()
+    assert value.value == pytest.approx(size, rel=0.15)
+
+
+def test_an_offset_between_the_steering_sensor_and_the_tyres_is_named(tmp_path: Path) -> None:
+    car = replace(_CAR, effects={"steering_sensor_offset": 0.02}, duration_s=60.0)
+    found = _diagnose(car, tmp_path, inputs=("measured",)).runs[0]
+    assert [effect.id for effect in found.effects] == ["steering_sensor_offset"]
+    assert found.effects[0].equivalent_to == ("steering_offset",)
+
+
 def test_the_ladder_falls_on_data_that_no_rung_has_seen(skidding: Diagnosis) -> None:
     errors = [rung["t_mrmse_m"] for rung in skidding.runs[0].ladder]
     assert len(errors) == 3

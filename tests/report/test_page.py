@@ -18,7 +18,7 @@ from pipeline.report import RunReport, render_report, templating
 from pipeline.report.figures import list_figures
 from pipeline.report.sections.glance import say_standing
 from pipeline.report.templating import render_template, show_text
-from pipeline.report.words import say_date, say_duration, say_number, say_share
+from pipeline.report.words import say_date, say_duration, say_number, say_share, say_split
 
 TEMPLATES = Path(templating.__file__).parents[1]
 HOSTILE = "</script><script>alert(1)</script><!-- <img src=x onerror=alert(2)> \u2028 \" ' & \u202e"
@@ -145,6 +145,13 @@ def test_every_row_block_that_a_figure_names_is_there_once(outline: Outline) -> 
     for name, columns in data["rows"].items():
         lengths = {len(c["codes"] if isinstance(c, dict) else c) for c in columns.values()}  # type: ignore[arg-type]
         assert len(lengths) == 1, name
+
+
+def test_shares_that_cancel_are_put_into_words() -> None:
+    assert say_split(0.35, 0.63, 0.02) == "drivetrain 35%   ground 63%   cross 2%"
+    told = say_split(6.96, 5.92, -11.88)
+    assert "%" not in told
+    assert "2.6 and 2.4 times the slip that is left" in told
 
 
 def test_numbers_of_both_inputs_are_told(page: str, report: RunReport) -> None:

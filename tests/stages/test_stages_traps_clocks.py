@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms
 
-from pipeline.simulate import Clock, Encoders, Imu, Program, Recording
+from pipeline.simulate import Clock, Encoders, Imu, Program, Recording, Scenario
 from pipeline.stages.delays import estimate_delay
 from pipeline.stages.extract.clocks import Recorded, align_clocks
 
@@ -151,6 +151,82 @@ def test_trap_5_stamps_of_simulated_time_meet_topics_without_any() -> None:
     assert np.array_equal(stamps["cmd"], stamps["pose"])
 
 
+def test_trap_5_simulated_time_is_followed_through_stops_and_spurts() -> None:
+    stamp = np.arange(2000) * SECOND // 50
+    pace = np.where((stamp // (5 * SECOND)) % 2 == 0, 0.3, 3.0)
+    log = START + np.cumsum(SECOND / 50 / pace).astype(np.int64)
+    log[1000:] += 20 * SECOND
+    stamps, ids = align(
+        imu=recorded(log, stamp, topic="/imu"), cmd=recorded(log + 1000, None, topic="/cmd_vel")
+    )
+    assert ids == {"simulated_time"}
+    assert np.abs(stamps["cmd"] - stamp)[:-1].max() < SECOND // 1000
+
+
+def test_trap_5_a_node_that_ignores_simulated_time_is_brought_to_it() -> None:
+    stamp = np.arange(2000) * SECOND // 50
+    log = START + stamp * 2
+    stamps, ids = align(
+        imu=recorded(log, stamp, topic="/imu"),
+        pose=recorded(log[::5], log[::5] - SECOND // 50, topic="/pose"),
+    )
+    assert ids == {"simulated_time"}
+    assert np.abs(stamps["pose"] - stamp[::5]).max() < SECOND // 40
+
+
+@pytest.mark.parametrize("ppm", [50.0, -50.0, 200.0])
+def test_trap_5_computers_that_run_apart_are_brought_together(ppm: float) -> None:
+    generator = np.random.default_rng(3)
+    sent = np.arange(24_000) * SECOND // 20
+    late = (generator.uniform(0.002, 0.03, sent.size) * SECOND).astype(np.int64)
+    header = START + sent + np.rint(sent * ppm * 1e-6).astype(np.int64)
+    stamps, ids = align(
+        imu=recorded(START + sent + late, header, topic="/imu"),
+        # Too uneven to tell on its own.
+        pose=recorded(START + sent[::10] + 20 * late[::10], header[::10], topic="/pose"),
+        cmd=recorded(START + sent + SECOND // 500, None, topic="/cmd_vel"),
+    )
+    assert ids == {"clock_drift"}
+    for name, step in (("imu", 1), ("pose", 10)):
+        assert np.abs(stamps[name] - START - sent[::step]).max() < 8e-3 * SECOND
+    assert np.array_equal(stamps["cmd"], START + sent + SECOND // 500)
+
+
+@given(st.floats(0.0, 0.2), st.floats(2.0, 60.0), st.integers(0, 10**6))
+def test_trap_5_delays_that_vary_are_no_drift(spread: float, period_s: float, seed: int) -> None:
+    header = START + np.arange(6_000) * SECOND // 10
+    busy = np.abs(np.sin((header - START) / SECOND / period_s))
+    noise = np.random.default_rng(seed).exponential(0.01, header.size)
+    log = np.sort(header + ((0.02 + spread * busy + noise) * SECOND).astype(np.int64))
+    _, ids = align(pose=recorded(log, header))
+    assert ids == set()
+
+
+@pytest.mark.parametrize("period_s", [0.02, 0.05, 0.1])
+def test_trap_5_what_a_bridge_holds_up_is_put_back_to_its_pace(period_s: float) -> None:
+    sent = START + (np.arange(3000) * period_s * SECOND).astype(np.int64)
+    sent[1500:] += 30 * SECOND
+    ends = START + np.cumsum(np.random.default_rng(5).uniform(0.05, 0.25, 5000) * SECOND).astype(np.int64)
+    clocks, findings = align_clocks(
+        {"cmd": recorded(ends[np.searchsorted(ends, sent)], None, topic="/cmd_vel")}
+    )
+    assert [finding.id for finding in findings] == ["bunched_times"]
+    error = clocks["cmd"].stamp - sent
+    assert np.quantile(np.abs(error), 0.9) < 0.04 * SECOND
+    assert abs(float(np.median(error))) < 0.02 * SECOND
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_trap_5_commands_of_a_joystick_are_no_bunches(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    log = START + np.cumsum(generator.exponential(0.05, 2000) * SECOND).astype(np.int64)
+    twice = np.sort(np.concatenate((log, log + 1000)))
+    for times in (log, twice):
+        stamps, ids = align(cmd=recorded(times, None, topic="/cmd_vel"))
+        assert ids == set()
+        assert np.array_equal(stamps["cmd"], times)
+
+
 @given(st.floats(0.0, 0.3), st.integers(0, 10**6))
 def test_trap_5_plain_latency_changes_no_stamp(latency: float, seed: int) -> None:
     header = START + EVERY_50_MS
@@ -168,6 +244,46 @@ def test_trap_5_the_configured_time_is_taken(clock: str) -> None:
     clocks, _ = align_clocks({"pose": times})
     offset = {"log": 2, "publish": 1, "header": 0}[clock]
     assert np.array_equal(clocks["pose"].stamp, header + offset * SECOND // 10)
+
+
+@pytest.fixture(scope="module")
+def unstamped() -> Scenario:
+    """A robot whose commands have no stamps."""
+    return replace(FIELD, recording=Recording("tf"), program=Program())
+
+
+@pytest.mark.parametrize(
+    ("clock", "noticed"),
+    [
+        (Clock(real_time_factor=1.0), "clock_offset"),
+        (Clock(real_time_factor=1.0, swing=0.5), "simulated_time"),
+        (Clock(real_time_factor=0.6), "simulated_time"),
+        (Clock(real_time_factor=0.6, swing=0.5), "simulated_time"),
+        (Clock(real_time_factor=0.05), "simulated_time"),
+        (Clock(bunch_s=0.2), "bunched_times"),
+        (Clock(real_time_factor=0.6, bunch_s=0.2), "bunched_times"),
+    ],
+    ids=["factor 1", "swings about 1", "factor .6", "swings about .6", "factor .05", "bridge", "both"],
+)
+def test_trap_5_slip_is_that_of_a_log_with_one_clock(
+    drive: TakeThrough, unstamped: Scenario, clock: Clock, noticed: str
+) -> None:
+    plain, taken = drive(unstamped), drive(replace(unstamped, clock=clock))
+    assert noticed in taken.ids()
+    assert noticed not in plain.ids()
+    for name in ("command", "measured"):
+        usual = float(np.median(plain.slip(name)["modulus"]))
+        assert float(np.median(taken.slip(name)["modulus"])) == pytest.approx(usual, rel=0.02)
+
+
+def test_trap_5_topics_whose_stamps_are_zero_have_log_times(drive: TakeThrough, unstamped: Scenario) -> None:
+    zero = replace(unstamped.recording, zero_stamps=("/joint_states", "/imu/data"))
+    for clock in (Clock(), Clock(real_time_factor=0.6)):
+        taken = drive(replace(unstamped, recording=zero, clock=clock))
+        plain = drive(unstamped)
+        assert "no_header_stamp" in taken.ids()
+        usual = float(np.median(plain.slip("measured")["modulus"]))
+        assert float(np.median(taken.slip("measured")["modulus"])) == pytest.approx(usual, rel=0.02)
 
 
 def test_trap_5_a_recorder_whose_clock_goes_back_mixes_nothing(drive: TakeThrough) -> None:

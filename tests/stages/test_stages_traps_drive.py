@@ -176,6 +176,24 @@ def test_trap_11_a_controller_that_widens_the_track_is_found(drive: TakeThrough)
     assert slope(steady["f_w"], steady["f_w_measured"]) == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.parametrize("program", ["smooth", "slalom", "stop_and_go", "circle"])
+def test_trap_11_a_multiplier_shows_without_steady_steps(drive: TakeThrough, program: str) -> None:
+    clearpath = replace(VEHICLES["husky"], controller_track_multiplier=1.875)
+    driven = replace(LONGER, recording=Recording("husky_body_command"), program=Program(program))  # type: ignore[arg-type]
+    taken = drive(replace(driven, vehicle=clearpath))
+    assert taken.finding("controller_multiplier").value == pytest.approx(1.875, rel=0.05)
+    assert {"controller_multiplier", "command_scale"} & drive(driven).ids() == set()
+
+
+def test_trap_11_a_multiplier_that_the_controller_does_not_use_is_taken_back(drive: TakeThrough) -> None:
+    scenario = replace(LONGER, recording=Recording("husky_body_command"))
+    taken = drive(scenario, {"vehicle": {"controller_track_multiplier": 1.875}})
+    assert taken.finding("controller_multiplier").value == pytest.approx(1.0, rel=0.03)
+    both = taken.slip("command").join(taken.slip("measured"), on="stamp", suffix="_measured")
+    steady = both.filter(~pl.col("transitory"))
+    assert slope(steady["f_w"], steady["f_w_measured"]) == pytest.approx(1.0, abs=0.02)
+
+
 @pytest.mark.parametrize("layout", ["husky_body_command", "husky"])
 def test_trap_11_a_plain_controller_is_not_accused(drive: TakeThrough, layout: str) -> None:
     taken = drive(replace(LONGER, recording=Recording(layout)))

@@ -17,6 +17,7 @@ from pipeline.models.quantity import Quantity
 from pipeline.models.wording import name_side
 
 if TYPE_CHECKING:
+    from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Wheels
     from pipeline.vehicles import Vehicle
 
@@ -41,6 +42,8 @@ class SteeringOffset(DriveEffect):
     )
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("yaw_drift",)
+    equivalent_to = ("steering_sensor_offset",)
+    equivalent_when = "only the way from the command to the body counts"
     python = """
         steering = steering + {o}"""
 
@@ -54,3 +57,7 @@ class SteeringOffset(DriveEffect):
         """See the formula above."""
         del around
         return replace(wheels, steering=wheels.steering + self.values["o"])
+
+    def is_equivalent(self, evidence: Evidence) -> bool:
+        """Measured steering tells on which side of the sensor the offset is."""
+        return not evidence.encoders

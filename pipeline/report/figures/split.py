@@ -9,6 +9,7 @@ import polars as pl
 
 from pipeline.report import theme
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.words import say_split
 
 if TYPE_CHECKING:
     from pipeline.report.scene import Scene
@@ -44,7 +45,7 @@ def draw_split(scene: Scene) -> Drawing | None:
     bars = base.mark_bar(cornerRadiusEnd=2).encode(color=alt.Color("part:N", scale=scale, legend=legend))
     right = base.transform_filter("datum.mean_square >= 0").mark_text(align="left", dx=5)
     left = base.transform_filter("datum.mean_square < 0").mark_text(align="right", dx=-5)
-    words = [side.encode(text=alt.Text("share:Q", format=".0%")) for side in (right, left)]
+    words = [side.encode(text=alt.Text("label:N")) for side in (right, left)]
     chart = alt.layer(bars, *words).properties(
         width=640, height=34 * 3 * rows["subset"].n_unique() // 2 + 40, usermeta={"gutter": 60}
     )
@@ -53,7 +54,7 @@ def draw_split(scene: Scene) -> Drawing | None:
 
 
 def _list_parts(scene: Scene) -> pl.DataFrame | None:
-    """Long rows ``subset part mean_square share``; None without measured wheels."""
+    """Long rows ``subset part mean_square share label``; None without measured wheels."""
     table = scene.report.table("aggregates")
     if table is None:
         return None
@@ -72,6 +73,12 @@ def _list_parts(scene: Scene) -> pl.DataFrame | None:
         )
         .unpivot(list(_PARTS), index=["subset", "total"], variable_name="part", value_name="mean_square")
         .with_columns(share=pl.col("mean_square") / pl.col("total"))
+        # A part larger than the whole is no share of it: its bar says how large it is.
+        .with_columns(
+            label=pl.when((pl.col("share") > 1.0).any().over("subset"))
+            .then(pl.lit(""))
+            .otherwise((pl.col("share") * 100.0).round(0).cast(pl.Int64).cast(pl.String) + "%")
+        )
         .drop("total")
         .sort(
             pl.col("subset").replace_strict({name: i for i, name in enumerate(_SUBSETS)}), maintain_order=True
@@ -84,11 +91,9 @@ def describe_split(scene: Scene) -> str:
     rows = _list_parts(scene)
     if rows is None:
         return "There are no measured wheel speeds to split slip with."
-    told = [
-        f"{_PARTS[row['part']]} {row['share']:.0%}"
-        for row in rows.filter(pl.col("subset") == rows["subset"][0]).iter_rows(named=True)
-    ]
-    return "Shares of the mean square slip on the command: " + ", ".join(told) + "."
+    first = rows.filter(pl.col("subset") == rows["subset"][0])
+    shares = dict(zip(first["part"], first["share"], strict=True))
+    return f"Mean square of the slip on the command: {say_split(**shares)}."
 
 
 FIGURE = Figure(

@@ -8,7 +8,7 @@ from pipeline.report.elements import Cell, Column, Table
 from pipeline.report.figures.figure import Section
 from pipeline.report.run import mapping_in, number_in, objects_in
 from pipeline.report.sections.health import list_findings
-from pipeline.report.words import say_number, say_share
+from pipeline.report.words import say_number, say_share, say_split
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -27,14 +27,15 @@ def view_why(page: Page) -> dict[str, object]:
     effects = objects_in(report.diagnosis, "effects")
     rows = [row for entry in effects for row in _list_parameters(entry)]
     drivetrain, ground, cross = report.split
-    known = drivetrain is not None and ground is not None
     return {
         "diagnosed": bool(report.diagnosis),
         "named": [(entry.get("id", ""), entry.get("sentence") or "shows") for entry in effects],
         "explained": number_in(report.diagnosis, "explained_share"),
         "table": Table("Missing from the ideal model", _HEAD, rows),
         "open": list(_list_open(report)),
-        "split": {"drivetrain": drivetrain, "ground": ground, "cross": cross} if known else None,
+        "split": None
+        if drivetrain is None or ground is None or cross is None
+        else {"from_drivetrain": drivetrain > ground, "words": say_split(drivetrain, ground, cross)},
         "pictures": page.pictures[Section.WHY],
     }
 
@@ -82,6 +83,9 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str]]:
         formula = f", for example {rest['formula']}" if rest.get("formula") else ""
         channel = _CHANNELS.get(str(rest.get("channel")), "motion")
         yield "unexplained", f"{share} of what is left in the {channel}: {rest.get('where', '')}{formula}"
+    small = [str(entry.get("id", "")) for entry in objects_in(diagnosis, "immaterial")]
+    if small:
+        yield "below what matters", f"{', '.join(small)}: a planner would not feel it, see the JSON"
     unseen = diagnosis.get("unobservable")
     if isinstance(unseen, list) and unseen:
         yield "unobservable", f"{', '.join(map(str, unseen))}: this log would not show it"

@@ -15,10 +15,13 @@ if TYPE_CHECKING:
     from pipeline.vehicles import Vehicle
 
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 _LIVE = 0.02
 _FEWEST_STEPS = 6
 _SCALED = 0.18
+_BLOCK_S = 0.5
+_FEWEST_BLOCKS = 60
 _DISAGREES = 0.2
 
 
@@ -41,6 +44,8 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
     """Steady commanded wheel speeds against measured ones.
 
     Only the slower half of the steps counts: there nothing saturates, and a wrong scale is the same in all.
+    Where a body command never holds still for so many steps, the gain of a lag from command to wheels tells
+    the controller's multiplier.
 
     Args:
         samples: of the run, before any correction.
@@ -49,14 +54,8 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
     as_told = CommandScale(1.0, vehicle.controller_track_multiplier)
     if samples.measured is None or samples.command is None:
         return as_told
-    both = (
-        np.isfinite(samples.measured).all(axis=1) & np.isfinite(samples.command).all(axis=1) & samples.steady
-    )
-    if not both.any():
-        return as_told
-    asked, got = _average_steps(samples.step[both], samples.command[both], samples.measured[both])
-    forward = _slow_ratio(asked[:, 0], got[:, 0])
-    turning = _slow_ratio(asked[:, 2], got[:, 2])
+    both: Flags = np.all(np.isfinite(np.hstack((samples.measured, samples.command))), axis=1)
+    forward, turning = _measure_ratios(samples, both)
     if forward is None:
         return as_told
     if abs(np.log(forward)) > _SCALED:
@@ -66,28 +65,71 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
         )
         finding = Finding("command_scale", "warning", text, where="command", value=forward)
         return CommandScale(forward, vehicle.controller_track_multiplier, (finding,))
-    if turning is None or not samples.body_commanded or np.log(turning / forward) < _SCALED:
+    if turning is None or not samples.body_commanded or not _is_multiplied(turning / forward, vehicle):
         return as_told
-    multiplier = turning / forward * vehicle.controller_track_multiplier
+    used = vehicle.controller_track_multiplier
+    multiplier = turning / forward * used
+    track = "the nominal track width" if used == 1.0 else f"{used:g} times the nominal track width"
     text = (
-        f"in slow steady turns the wheels differ {turning / forward:.2f} times as much as the command asks "
-        f"with the nominal track width: vehicle.controller_track_multiplier = {multiplier:.3g} was used"
+        f"in turns the wheels differ {turning / forward:.2f} times as much as the command asks "
+        f"with {track}: vehicle.controller_track_multiplier = {multiplier:.3g} was used"
     )
     finding = Finding("controller_multiplier", "warning", text, where="command", value=multiplier)
     return CommandScale(1.0, multiplier, (finding,))
 
 
-def _average_steps(step: NDArray[np.int32], command: Floats, measured: Floats) -> tuple[Floats, Floats]:
-    """Mean command and mean measured wheels of every command step, each of shape (steps, 3)."""
-    _, label, count = np.unique(step, return_inverse=True, return_counts=True)
+def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float | None]:
+    """Ratio of measured to asked speed and yaw rate; None where it cannot be told."""
+    steady = both & samples.steady
+    if steady.any():
+        forward, turning = (
+            _find_ratio(asked, got) for asked, got in _average(samples, steady, samples.step.astype(np.int64))
+        )
+        if forward is not None and turning is not None:
+            return forward, turning
+    else:
+        forward = turning = None
+    if samples.body_commanded and both.any():
+        blocks = _average(samples, both, (samples.times // _BLOCK_S).astype(np.int64))
+        along, around = (_find_gain(asked, got) for asked, got in blocks)
+        # Limits and droops lower the gain of fast turns; nothing but a multiplier raises it.
+        if along is not None and around is not None and abs(np.log(along)) < _SCALED and around > along:
+            return along, around
+    return forward, turning
+
+
+def _is_multiplied(ratio: float, vehicle: Vehicle) -> bool:
+    """Whether turns show another multiplier than the configured one.
+
+    A controller widens the track or leaves it: wheels that differ by less are a matter of the drive.
+    """
+    multiplier = ratio * vehicle.controller_track_multiplier
+    return bool(abs(np.log(ratio)) >= _SCALED and np.log(multiplier) > -_SCALED)
+
+
+def _average(samples: Samples, counts: Flags, label: NDArray[np.int64]) -> Floats:
+    """Means over stretches of one label, in their order.
+
+    Args:
+        samples: of the run.
+        counts: samples that count, shape (n,).
+        label: of the stretch of each sample, shape (n,).
+
+    Returns:
+        Speed and yaw rate, each asked and measured, shape (2, 2, stretches).
+    """
+    _, number, size = np.unique(label[counts], return_inverse=True, return_counts=True)
     means = [
-        np.stack([np.bincount(label, values[:, i]) / count for i in range(3)], axis=-1)
-        for values in (command, measured)
+        [
+            np.zeros(0) if values is None else np.bincount(number, values[counts, channel]) / size
+            for values in (samples.command, samples.measured)
+        ]
+        for channel in (0, 2)
     ]
-    return means[0], means[1]
+    return np.array(means, dtype=np.float64)
 
 
-def _slow_ratio(asked: Floats, got: Floats) -> float | None:
+def _find_ratio(asked: Floats, got: Floats) -> float | None:
     """Median ratio of measured to asked over the slower half of the steps; None where they disagree."""
     size = np.abs(asked)
     slow = (size > max(0.1 * float(size.max()), _LIVE)) & (size < 0.5 * float(size.max()))
@@ -97,3 +139,16 @@ def _slow_ratio(asked: Floats, got: Floats) -> float | None:
     middle = float(np.median(ratio))
     spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
     return middle if middle > _LIVE and spread < _DISAGREES * middle else None
+
+
+def _find_gain(asked: Floats, got: Floats) -> float | None:
+    """Gain of a first-order lag, got + tau dgot/dt = gain * asked; None where it is none."""
+    if asked.size < _FEWEST_BLOCKS or float(np.abs(asked).max()) < _LIVE:
+        return None
+    change = 0.5 * (got[2:] - got[:-2])
+    inner = got[1:-1]
+    design = np.column_stack((asked[1:-1], change))
+    fitted = np.linalg.lstsq(design, inner, rcond=None)[0]
+    gain, rest = float(fitted[0]), inner - design @ fitted
+    agrees = float(np.sum(rest**2)) < _DISAGREES**2 * float(np.sum(inner**2))
+    return gain if gain > _LIVE and agrees else None

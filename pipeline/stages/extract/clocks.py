@@ -9,13 +9,20 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
+from pipeline.stages.extract.clock_maps import (
+    ClockMap,
+    find_held_up_s,
+    map_clock,
+    measure_drift,
+    spread_bunches,
+)
 from pipeline.stages.finding import Finding
 
 if TYPE_CHECKING:
@@ -32,11 +39,10 @@ _AROUND = 20
 _BIN_NS = 500_000_000
 _FREQUENT = 4
 _DENSE = 1.6
-_KNOT_NS = 2_000_000_000
-_FEWEST_KNOTS = 5
-_ROUGH_KNOTS = 200
 _OTHER_RATE = 5e-3
 """No two real clocks differ by so much; simulated time does."""
+_BENT_S = 0.3
+"""More than networks hold messages up: the clock itself stood still, or ran."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +96,9 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
         The clocks by the same keys, and what was noticed.
     """
     recorded, findings = _follow_simulated_time(recorded)
+    recorded, drifts = _take_off_drift(recorded)
+    recorded, bunches = _spread_bunches(recorded)
+    findings += drifts + bunches
     clocks = {key: _read_clock(times) for key, times in recorded.items()}
     findings += [found for clock in clocks.values() for found in clock.findings]
     findings += _check_early_stamps(clocks)
@@ -101,69 +110,115 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
 def _follow_simulated_time(
     recorded: Mapping[str, Recorded],
 ) -> tuple[Mapping[str, Recorded], list[Finding]]:
-    """Log times on the clock of the stamps where that runs at another rate than the recorder's.
+    """Log times on the clock of the stamps where that passes otherwise than the recorder's.
 
     In simulation stamps count simulated time, which may run slower or faster than the recorder's clock and
-    stand still now and then. The topic with most stamps tells, for every two seconds of log time, what the
-    stamps' clock showed; all log times are mapped through that, so that topics without stamps fit.
+    stand still now and then. The topic with most such stamps tells what the stamps' clock showed at every
+    moment; all log times are mapped through that, so that topics without stamps fit, and so are stamps that
+    are the recorder's time themselves.
     """
-    stamped = [
-        times
-        for times in recorded.values()
-        if times.header_time is not None and times.clock is None and times.header_time.any()
-    ]
-    if not stamped:
-        return recorded, []
-    leading = max(stamped, key=lambda times: times.log_time.size)
-    rough = _find_knots(leading, most=_ROUGH_KNOTS)
-    if rough is None:
-        return recorded, []
-    log, stamp = rough
-    rate = float(np.median(np.diff(stamp) / np.diff(log)))
-    if abs(rate - 1.0) < _OTHER_RATE or abs(rate - 1.0) * (log[-1] - log[0]) < _JUMP_NS:
-        return recorded, []
-    log, stamp = _find_knots(leading) or rough
-
-    def follow(times: Stamps) -> Stamps:
-        # Beyond the first and the last knot the clock runs on as it did there.
-        inside = np.interp(times, log, stamp)
-        before = np.minimum(times - log[0], 0.0) * (stamp[1] - stamp[0]) / (log[1] - log[0])
-        after = np.maximum(times - log[-1], 0.0) * (stamp[-1] - stamp[-2]) / (log[-1] - log[-2])
-        # Log times become those of stamps that are as late as the leading topic's.
-        mapped: Stamps = np.rint(inside + before + after).astype(np.int64)
-        return mapped
-
-    mapped = {
-        key: replace(times, log_time=follow(times.log_time), publish_time=follow(times.publish_time))
-        for key, times in recorded.items()
-    }
-    text = (
-        f"the stamps run {rate:.3g} times as fast as the recorder's clock (simulated time): log times were "
-        f"mapped onto them by those of {leading.topic}"
+    stamped = sorted(
+        (
+            times
+            for times in recorded.values()
+            if times.header_time is not None and times.clock is None and times.header_time.any()
+        ),
+        key=lambda times: -times.log_time.size,
     )
-    return mapped, [Finding("simulated_time", "info", text, where=leading.topic, value=rate)]
+    for leading in stamped:
+        found = map_clock(leading.log_time, cast("Stamps", leading.header_time))
+        if found is not None and _is_simulated(found):
+            return _follow(recorded, found, leading.topic)
+    return recorded, []
 
 
-def _find_knots(
-    times: Recorded, *, most: int | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Medians of log time and stamp [ns] in bins of log time; None where there are too few to tell a rate.
+def _is_simulated(found: ClockMap) -> bool:
+    """Whether stamps pass at another rate than the recorder's time, or unevenly and from another start."""
+    rate, span = found.usual_rate, float(found.log[-1] - found.log[0])
+    if abs(rate - 1.0) >= _OTHER_RATE and abs(rate - 1.0) * span >= _JUMP_NS:
+        return True
+    apart = abs(float(np.median(found.log - found.stamp)))
+    return apart > DAY_NS and found.bend_s > _BENT_S and not found.leaps
 
-    Args:
-        times: of a topic with stamps.
-        most: how many bins there may be.
+
+def _follow(
+    recorded: Mapping[str, Recorded], found: ClockMap, leading: str
+) -> tuple[Mapping[str, Recorded], list[Finding]]:
+    mapped, real = {}, []
+    for key, times in recorded.items():
+        header, log = times.header_time, found.follow(times.log_time)
+        if header is not None and header.any():
+            away = [abs(float(np.median(clock - header))) for clock in (times.log_time, log)]
+            if away[0] < _APART_NS < away[1]:
+                header = found.follow(header)
+                real.append(times.topic)
+        publish = found.follow(times.publish_time)
+        mapped[key] = replace(times, log_time=log, publish_time=publish, header_time=header)
+    also = f"; so were the stamps of {', '.join(real)}, which are no simulated time" if real else ""
+    text = (
+        f"the stamps run {found.rate:.3g} times as fast as the recorder's clock (simulated time, at this "
+        f"real-time factor): log times were mapped onto them by those of {leading}{also}"
+    )
+    return mapped, [Finding("simulated_time", "info", text, where=leading, value=found.rate)]
+
+
+def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorded], list[Finding]]:
+    """Stamps at the rate of the recorder's clock: computers that set their clocks apart run apart.
+
+    Where the delays of a topic are too uneven to tell, it has the drift of the others, if it looks like it.
     """
-    header, log = times.header_time, times.log_time
-    if header is None or log.size < _FEWEST_KNOTS:
-        return None
-    width = max(_KNOT_NS, int(log[-1] - log[0]) // most if most else 0)
-    edges = np.searchsorted(log, np.arange(int(log[0]), int(log[-1]) + width, width))
-    spans = [slice(a, b) for a, b in itertools.pairwise(np.unique(np.append(edges, log.size)).tolist())]
-    if len(spans) < _FEWEST_KNOTS:
-        return None
-    middle = np.array([[np.median(log[span]), np.median(header[span])] for span in spans])
-    rises = (np.diff(middle, axis=0) >= [1.0, 0.0]).all()
-    return (middle[:, 0], middle[:, 1]) if rises else None
+    headers = {
+        key: times.header_time
+        for key, times in recorded.items()
+        if times.header_time is not None and times.clock is None and times.header_time.any()
+    }
+    counts = {
+        key: header > DAY_NS if float(np.median(header)) > DAY_NS else np.ones(header.size, dtype=bool)
+        for key, header in headers.items()
+    }
+    drifts = {
+        key: measure_drift(recorded[key].log_time[counts[key]], header[counts[key]])
+        for key, header in headers.items()
+    }
+    known = [drift for drift in drifts.values() if drift.is_certain]
+    if not known:
+        return dict(recorded), []
+    best = min(known, key=lambda drift: drift.scatter)
+    findings, steady = [], dict(recorded)
+    for key, own in drifts.items():
+        # Topics of one computer have one drift, which is known best where delays vary least.
+        drift = best if own.is_same(best) else own
+        if not drift.is_certain:
+            continue
+        header, used, topic, rate = headers[key], counts[key], recorded[key].topic, drift.rate
+        change = np.where(used, np.rint(-rate * (header - drift.find_agreement())), 0.0).astype(np.int64)
+        steady[key] = replace(recorded[key], header_time=header + change)
+        run_away = abs(rate) * float(np.ptp(header[used])) / 1e9
+        text = (
+            f"the clock of {topic} runs {abs(rate) * 1e6:.0f} ppm {'fast' if rate > 0.0 else 'slow'} against "
+            f"the recorder's ({run_away * 1e3:.0f} ms over the run): its stamps were put right"
+        )
+        findings.append(Finding("clock_drift", "info", text, where=topic, value=rate * 1e6))
+    return steady, findings
+
+
+def _spread_bunches(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorded], list[Finding]]:
+    """Log times of topics without stamps as they were sent, where a bridge recorded them in bunches."""
+    findings, even = [], dict(recorded)
+    for key, times in recorded.items():
+        if times.clock is not None or (times.header_time is not None and times.header_time.any()):
+            continue
+        log = spread_bunches(times.log_time)
+        if log is times.log_time:
+            continue
+        even[key] = replace(times, log_time=log)
+        late = find_held_up_s(times.log_time, log)
+        text = (
+            f"{times.topic} has no stamps and was recorded in bunches, up to {late * 1e3:.0f} ms late: its "
+            "messages were put back to the pace of their sender"
+        )
+        findings.append(Finding("bunched_times", "info", text, where=times.topic, value=late))
+    return even, findings
 
 
 def _read_clock(times: Recorded) -> TopicClock:

@@ -1,0 +1,70 @@
+"""Steering sensor offset: the tyres are off centre when the steering sensor reads straight ahead.
+
+    w0 += v0 * (tan(delta + o) - tan(delta)) / l
+
+delta [rad] is the measured steering, o [rad] what the tyres steer beyond it, about 0.02: a sensor that was
+zeroed off centre, a bent linkage, or a "measured" angle that repeats the command. What sensor and tyres share
+is steering_offset; from the command alone the two are one. Drive straight at several speeds.
+
+Source: kinematic bicycle with an uncalibrated steering; Becker et al. 2023.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models.effect import ACKERMANN, DATA_SHEET, Excitation, KinematicEffect, Least, Parameter
+from pipeline.models.quantity import Quantity
+from pipeline.models.wording import name_side
+
+if TYPE_CHECKING:
+    from pipeline.models.evidence import Evidence
+    from pipeline.runs.signals import Rolling, RunContext
+    from pipeline.vehicles import Vehicle
+
+
+class SteeringSensorOffset(KinematicEffect):
+    """Steering sensor offset: the tyres are off centre when the steering sensor reads straight ahead."""
+
+    id = "steering_sensor_offset"
+    # Before understeer and all that scales the rolling: it belongs to the steering.
+    rank = 0
+    kinds = ACKERMANN
+    parameters = (
+        Parameter(
+            "o",
+            "rad",
+            (-0.5, 0.5),
+            0.0,
+            "steering of the tyres less that of the sensor",
+            0.02,
+            least=Least(0.002, DATA_SHEET),
+            quantities=(Quantity.STEERING_OFFSET,),
+        ),
+    )
+    needs = (Excitation.SPEED_SPREAD,)
+    confused_with = ("yaw_drift",)
+    equivalent_to = ("steering_offset",)
+    equivalent_when = "only the way from the command to the body counts"
+
+    python = """
+        w0 = w0 + v0 * (math.tan(steering + {o}) - math.tan(steering)) / WHEELBASE"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        angle = self.values["o"]
+        return f"steers {abs(angle):.2g} rad to the {name_side(angle)} of what its steering sensor reads"
+
+    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
+        """See the formula above."""
+        steering = rolling.wheels.steering
+        beyond = np.tan(steering + self.values["o"]) - np.tan(steering)
+        return replace(rolling, w0=rolling.w0 + rolling.v0 * beyond / (around.vehicle.wheelbase_m or 1.0))
+
+    def can_show(self, evidence: Evidence) -> bool:
+        """Without measured steering it is the offset of the steering."""
+        return evidence.encoders
