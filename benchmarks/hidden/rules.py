@@ -179,8 +179,6 @@ _NEVER, _ALWAYS = 1e9, -1e9
 RULES: tuple[Rule, ...] = (
     Rule("rare", "what acts in a few stretches needs less t there", verdict.Verdict, "accepts",
          _set(verdict, _RARE_T=_NEVER)),
-    Rule("plain", "what is beyond six deviations needs no t", verdict.Verdict, "accepts",
-         _set(verdict, _PLAIN_Z=_NEVER)),
     Rule("faint", "a gain must stand out of the noise", verdict.Verdict, "accepts",
          _set(verdict, _FAINT_Z=_ALWAYS)),
     Rule("short_stretches", "three-second stretches may decide too", selection, "compare",
@@ -191,8 +189,6 @@ RULES: tuple[Rule, ...] = (
          _set(verdict, _FEWEST_ACTIVE=0.0), _grade),
     Rule("few_moved", "what moves one short stretch stands out of nothing", selection, "compare",
          _set(verdict, LEAST_STRETCHES=0.0), _grade),
-    Rule("asked_share", "from encoders, a share of the motion must be explained", selection.Selection,
-         "_matters", _give(True)),
     Rule("price", "some effects must gain more than others", search, "price_of", _give(verdict.LEAST_GAIN)),
     Rule("price_of_number", "a number more must buy something", selection.Selection, "_present",
          _set(selection, _PRICE_OF_A_NUMBER=0.0), costly=True),

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.selection import CandidateModel, Selection
     from pipeline.models.effect import Effect
 
-_LEAST_SHARE = 0.01
-
 Way = Literal["command", "measured", "wheels"]
 
 
@@ -66,5 +64,4 @@ def search_wheels(context: Context, known: Sequence[Effect], body: Search, budge
     start = State((), body.final.state.timing).add(*usable)
     part, candidates = context.problem.parts[1], context.list_drivetrain()
     selection, first = open_selection(part, start, candidates, context.evidence, budget)
-    selection.least_share = _LEAST_SHARE
     return Search("wheels", selection, first, search_effects(selection, first))

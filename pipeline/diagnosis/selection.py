@@ -13,7 +13,6 @@ from pipeline.diagnosis.plausibility import is_nameable
 from pipeline.diagnosis.verdict import LEAST_GAIN, Verdict, compare
 from pipeline.identification.fit import PartFit, fit_part
 from pipeline.identification.folds import hold_out_part, make_folds
-from pipeline.identification.parts import IDEAL_CHANNELS
 from pipeline.identification.proposals import propose
 from pipeline.identification.weights import Weights, make_weights, measure_spread
 
@@ -72,7 +71,6 @@ class Selection:
         weights: cost of residuals at the current model.
         budget: how long the search may take.
         work: how many times candidates were looked through.
-        least_share: share of the asked motion (rms) that an effect must account for.
     """
 
     part: Part
@@ -81,7 +79,6 @@ class Selection:
     folds: tuple[Fold, ...]
     weights: Weights
     kept: frozenset[str] = frozenset()
-    least_share: float = 0.0
     budget: Budget = field(default_factory=Budget)
     _dropped: dict[tuple[str, ...], CandidateModel] = field(default_factory=dict)
     _suggested: dict[tuple[object, ...], list[CandidateModel]] = field(default_factory=dict)
@@ -95,7 +92,7 @@ class Selection:
         """The same selection with other candidates; nothing that was tried here counts there."""
         return Selection(
             self.part, candidates, self.evidence, self.folds, self.weights,
-            kept=self.kept, least_share=self.least_share, budget=self.budget,
+            kept=self.kept, budget=self.budget,
         )  # fmt: skip
 
     def is_done(self, most: int) -> bool:
@@ -132,15 +129,7 @@ class Selection:
 
     def prefers(self, before: CandidateModel, after: CandidateModel, least_gain: float = LEAST_GAIN) -> bool:
         """Whether ``after`` is better beyond doubt, and by enough to matter."""
-        return self.judge(before, after).accepts(least_gain) and self._matters(before, after)
-
-    def _matters(self, before: CandidateModel, after: CandidateModel) -> bool:
-        """Whether enough of the motion is explained: encoders are so exact that all else is certain."""
-        if self.least_share == 0.0:
-            return True
-        asked = (self.part.find_ideal()[:, 0, :] ** 2).mean(axis=0)
-        fall = (before.held**2 - after.held**2).mean(axis=0)[list(IDEAL_CHANNELS[: asked.size])]
-        return bool((fall > self.least_share**2 * asked).any())
+        return self.judge(before, after).accepts(least_gain)
 
     def adapt(self, tested: CandidateModel) -> CandidateModel:
         """Take the weights from a model's own residuals, and fit it anew."""

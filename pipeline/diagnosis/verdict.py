@@ -32,7 +32,6 @@ _FAINT_Z = 1.5
 _RARE_GAIN = 0.02
 _RARE_Z = 3.0
 _RARE_T = 1.5
-_PLAIN_Z = 6.0
 LEAST_STRETCHES = 1.7
 _LAGS = 8
 
@@ -59,7 +58,7 @@ class Verdict:
             return False
         common = self.t >= LEAST_T and self.z >= _FAINT_Z
         rare = self.gain >= _RARE_GAIN and self.z >= _RARE_Z and self.t >= _RARE_T
-        return common or rare or (self.gain >= _RARE_GAIN and self.z >= _PLAIN_Z)
+        return common or rare
 
 
 def compare(part: Part, weights: Weights, before: Floats, after: Floats) -> Verdict:
