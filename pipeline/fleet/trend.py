@@ -122,7 +122,9 @@ def describe_quiet(series: Sequence[Series]) -> str:
     most = max((one.points.height for one in series), default=0)
     if most >= FEWEST_RUNS:
         return "nothing moved beyond the threshold"
-    return f"nothing could be tested: a change of level takes {FEWEST_RUNS} runs of a group, the most is {most}"
+    return (
+        f"nothing could be tested: a change of level takes {FEWEST_RUNS} runs, the most of a group is {most}"
+    )
 
 
 def describe_step(series: Series, step: Step) -> str:

@@ -101,7 +101,7 @@ def test_where_no_group_has_enough_runs_nothing_is_said_to_stand_still(
     with pytest.raises(SystemExit) as ended:
         main(["trend", str(store.root), "--by", "vehicle"])
     assert ended.value.code == 0
-    said = "nothing could be tested: a change of level takes 8 runs of a group, the most is 1"
+    said = "nothing could be tested: a change of level takes 8 runs, the most of a group is 1"
     spoken = capsys.readouterr().out
     assert spoken.startswith(said)
     assert "nothing moved" not in spoken
