@@ -1,4 +1,4 @@
-"""The commands of the handbook and the README: run as a reader would, and what they print compared or renewed.
+"""The commands of handbook and README: run as a reader would, what they print compared or renewed.
 
 A fenced block of the language `console` holds commands, each behind `$ `, and below each what it prints on
 stdout. Nothing below a command means that only its exit code counts: 0, or 3 for losses.
@@ -31,7 +31,15 @@ _BLOCK = re.compile(r"^```console\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])")
 _HASH = re.compile(r"\b[0-9a-f]{12,}\b")
 _NEAR = {"rel_tol": 0.1, "abs_tol": 0.03}
-_LINKED = ("Makefile", "pyproject.toml", "requirements.txt", "requirements-dev.txt", ".venv", "benchmarks", "examples")
+_LINKED = (
+    "Makefile",
+    "pyproject.toml",
+    "requirements.txt",
+    "requirements-dev.txt",
+    ".venv",
+    "benchmarks",
+    "examples",
+)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import sys
 from typing import TYPE_CHECKING
 
@@ -63,9 +64,11 @@ def _usual(kind: type[Effect]) -> Effect:
 def _write_list() -> str:
     parts = [
         "# Catalogue of effects",
-        f"Physical effects that the ideal model lacks, {len(list_effects())} in all, in the order in which a "
-        "command meets them. What a vehicle does is said here for the parameter's usual size; a page has formula, "
-        "parameters, source, and what looks alike. `slip effects` prints the same on a terminal.",
+        (
+            f"Physical effects that the ideal model lacks, {len(list_effects())} in all, in the order in which a "
+            "command meets them. What a vehicle does is said here for the parameter's usual size; a page has "
+            "formula, parameters, source, and what looks alike. `slip effects` prints the same on a terminal."
+        ),
     ]
     for place, title in _PLACES.items():
         rows = [
@@ -86,7 +89,9 @@ def _write_page(kind: type[Effect]) -> str:
     parts = [
         f"# {title}",
         f"`{kind.id}` · {escape(first.partition(': ')[2])}",
-        "\n".join(line if line.startswith("    ") else escape(line) for line in rest.strip("\n").splitlines()),
+        "\n".join(
+            line if line.startswith("    ") else escape(line) for line in rest.strip("\n").splitlines()
+        ),
         f"At its usual size on {vehicle.name} the vehicle *{said}*.",
         "## Parameters",
         table(("name", "what it is", "unit", "bounds", "nothing at", "usually"), map(_row, kind.parameters)),
@@ -100,7 +105,7 @@ def _write_page(kind: type[Effect]) -> str:
 
 def _row(p: Parameter) -> tuple[str, ...]:
     low, high = p.bounds
-    neutral = "-" if p.neutral != p.neutral else f"{p.neutral:g}"  # noqa: PLR0124 - NaN says where, not how much
+    neutral = "-" if math.isnan(p.neutral) else f"{p.neutral:g}"
     return (f"`{p.name}`", escape(p.about), p.unit, f"{low:g} to {high:g}", neutral, f"{p.typical:g}")
 
 
@@ -114,7 +119,8 @@ def _list_limits(kind: type[Effect]) -> list[str]:
             )
         if p.least:
             lines.append(
-                f"- Less than {p.least.size:g} off neutral in `{p.name}` gets no name: {escape(p.least.reason)}."
+                f"- Less than {p.least.size:g} off neutral in `{p.name}` gets no name: "
+                f"{escape(p.least.reason)}."
             )
     return ["\n".join(lines)]
 
@@ -144,7 +150,7 @@ def _describe_exports(kind: type[Effect]) -> list[str]:
 
 @functools.cache
 def list_settings(kind: type[Effect]) -> list[tuple[str, list[str]]]:
-    """Targets with the settings that change or appear when a model has this effect, as the exports write them."""
+    """Targets with the settings that change or appear in their exports when a model has this effect."""
     vehicle, effect = _vehicle_of(kind), _usual(kind)
     found = []
     for target in list_targets():

@@ -58,9 +58,11 @@ def write_verbs() -> str:
     """Every verb with its arguments and options, as `--help` has them."""
     parts = [
         "# Verbs",
-        "`slip VERB --help` prints the same. Exit codes: 0 clean; 1 failed, with one line that says what to do; "
-        "2 usage; 3 done, but the log had losses or something could not be looked at, which is listed; 4 an "
-        "alert of `slip trend`.",
+        (
+            "`slip VERB --help` prints the same. Exit codes: 0 clean; 1 failed, with one line that says what to "
+            "do; 2 usage; 3 done, but the log had losses or something could not be looked at, which is listed; "
+            "4 an alert of `slip trend`."
+        ),
     ]
     for words, verb in list_verbs().items():
         about = inspect.cleandoc(verb.default_command.__doc__ or "").split("\nArgs:")[0].strip()
@@ -83,9 +85,11 @@ def write_configuration() -> str:
     """Every section and key of run.toml and fleet.toml."""
     parts = [
         "# Configuration, key by key",
-        "What `run.toml` beside a log and `fleet.toml` above a folder may hold. Every section and every key may "
-        "be left out; a key that is not in this list is an error, with its line. How the files work together: "
-        "[Configuration](configuration.md).",
+        (
+            "What `run.toml` beside a log and `fleet.toml` above a folder may hold. Every section and every key "
+            "may be left out; a key that is not in this list is an error, with its line. How the files work "
+            "together: [Configuration](configuration.md)."
+        ),
     ]
     hints = typing.get_type_hints(Configuration)
     for field in msgspec.structs.fields(Configuration):
@@ -142,9 +146,11 @@ def write_tables() -> str:
     """Every table of the results, column by column."""
     parts = [
         "# Tables, column by column",
-        "The contract of the Parquet files of a run, out of `schemas/`. Units and frames stand in the files' field "
-        "metadata as well. `base_link` is the frame of the vehicle: x forward, y left, z up. Where the files "
-        "stand and how they are read: [Results and file formats](formats.md).",
+        (
+            "The contract of the Parquet files of a run, out of `schemas/`. Units and frames stand in the files' "
+            "field metadata as well. `base_link` is the frame of the vehicle: x forward, y left, z up. Where the "
+            "files stand and how they are read: [Results and file formats](formats.md)."
+        ),
     ]
     for contract in schemas.list_contracts():
         about = inspect.cleandoc(contract.schema.__doc__ or "")
@@ -176,14 +182,17 @@ def write_vehicles() -> str:
             f"`{vehicle.id}`",
             escape(vehicle.name),
             vehicle.kind,
-            *(_say_number(each) for each in (vehicle.wheel_radius_m, vehicle.track_width_m, vehicle.wheelbase_m)),
+            *(
+                _say_number(each)
+                for each in (vehicle.wheel_radius_m, vehicle.track_width_m, vehicle.wheelbase_m)
+            ),
         )
         for vehicle in list_presets()
     ]
     return (
         "# Vehicles that are known\n\n"
-        "`--vehicle ID` names one; mostly the log tells. Numbers of one's own go into `run.toml` and win. Each is "
-        "a file in `pipeline/vehicles/presets` that says where its numbers were read.\n\n"
+        "`--vehicle ID` names one; mostly the log tells. Numbers of one's own go into `run.toml` and win. Each "
+        "is a file in `pipeline/vehicles/presets` that says where its numbers were read.\n\n"
         + table(("id", "name", "kind", "wheel radius [m]", "track width [m]", "wheelbase [m]"), rows)
         + "\n"
     )
@@ -206,8 +215,8 @@ def write_message_types() -> str:
                 rows.append((f"`{package}/{name}`", *_say_roles(content)))
     return (
         "# Message types that are read\n\n"
-        "Types that can serve as command, wheels, pose or gyro without any configuration; each package is a file in "
-        "`pipeline/vehicles/message_types`. A number in any other message can be named by its path, such as "
+        "Types that can serve as command, wheels, pose or gyro without any configuration; each package is a "
+        "file in `pipeline/vehicles/message_types`. A number in any other message can be named by its path, such as "
         '`left_topic = "/drive/status.states[0].rpm"`: see [Configuration](configuration.md).\n\n'
         + table(("type", "serves as", "fields"), rows)
         + "\n"
@@ -237,13 +246,18 @@ def _say_roles(content: dict[str, Any]) -> tuple[str, str]:
 def write_targets() -> str:
     """Every target of `slip model export`, and where its names were read."""
     rows = [
-        (f"`{each.name}`", escape(each.about), ", ".join(f"`{name}`" for name in each.corrects), escape(each.source))
+        (
+            f"`{each.name}`",
+            escape(each.about),
+            ", ".join(f"`{name}`" for name in each.corrects),
+            escape(each.source),
+        )
         for each in list_targets()
     ]
     return (
         "# Targets of `slip model export`\n\n"
-        "What is written, which parameters of the robot's own are read with `--current` and corrected, and where names "
-        "and meanings were read. Which effect changes which parameter stands on the "
+        "What is written, which parameters of the robot's own are read with `--current` and corrected, and "
+        "where names and meanings were read. Which effect changes which parameter stands on the "
         "[effect's page](effects/index.md); how to use it: [Give the answer to a controller](exports.md).\n\n"
         + table(("`--to`", "writes", "`--current` corrects", "names read in"), rows)
         + "\n"
