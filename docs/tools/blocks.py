@@ -36,7 +36,6 @@ _LINKED = (
     "pyproject.toml",
     "requirements.txt",
     "requirements-dev.txt",
-    ".venv",
     "benchmarks",
     "examples",
 )
@@ -94,6 +93,13 @@ def furnish(folder: Path) -> Path:
     shutil.copy(ROOT / "data_samples" / "husky_tile.mcap", folder / "run.mcap")
     for name in _LINKED:
         (folder / name).symlink_to(ROOT / name)
+    # Ready as it is: `make` must not install the program anew from this folder.
+    (folder / ".venv").mkdir()
+    for path in Path(sys.prefix).iterdir():
+        if not path.name.startswith(".ready"):
+            (folder / ".venv" / path.name).symlink_to(path)
+    for name in (".ready", ".ready-dev"):
+        (folder / ".venv" / name).touch()
     return folder
 
 
@@ -104,7 +110,7 @@ def run_command(text: str, folder: Path) -> str:
         RuntimeError: it fails.
     """
     kept = {key: value for key, value in os.environ.items() if not key.startswith(("MAKE", "MFLAGS"))}
-    programs = os.pathsep.join((str(ROOT / ".venv" / "bin"), kept["PATH"]))
+    programs = os.pathsep.join((str(Path(sys.executable).parent), kept["PATH"]))
     around = {**kept, "PATH": programs, "HOME": str(folder / ".home"), "COLUMNS": "100"}
     if text.startswith(("slip serve", "make serve")):
         return _run_server(text, folder, around)
@@ -136,7 +142,7 @@ def _run_server(text: str, folder: Path, around: dict[str, str]) -> str:
     try:
         line = server.stdout.readline() if server.stdout else ""
     finally:
-        os.killpg(server.pid, signal.SIGINT)
+        os.killpg(server.pid, signal.SIGTERM)
         server.wait(timeout=60.0)
     if "?token=" not in line:
         raise RuntimeError(f"{text}\nno address: {line!r}")

@@ -65,9 +65,10 @@ def _write_list() -> str:
     parts = [
         "# Catalogue of effects",
         (
-            f"Physical effects that the ideal model lacks, {len(list_effects())} in all, in the order in which a "
-            "command meets them. What a vehicle does is said here for the parameter's usual size; a page has "
-            "formula, parameters, source, and what looks alike. `slip effects` prints the same on a terminal."
+            f"Physical effects that the ideal model lacks, {len(list_effects())} in all, in the order in "
+            "which a command meets them. What a vehicle does is said here for the parameter's usual "
+            "size; a page has formula, parameters, source, and what looks alike. `slip effects` prints the "
+            "same on a terminal."
         ),
     ]
     for place, title in _PLACES.items():

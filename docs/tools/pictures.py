@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 FOLDER = ROOT / "docs" / "pages" / "pictures"
 LOG = "data_samples/warthog_ice.mcap"
-SLIP = ROOT / ".venv" / "bin" / "slip"
+SLIP = Path(sys.executable).parent / "slip"
 WIDTH, HEIGHT = 1280, 800
 DRAWN = "document.querySelectorAll('.plot.drawn').length === document.querySelectorAll('.plot').length"
 STAIRS = "document.querySelectorAll('[data-figure=ladder] .mark-rect path').length"
@@ -88,7 +88,7 @@ def _serve(results: Path) -> Iterator[str]:
         told = json.loads(text)
         yield f"{told['address']}?token={told['token']}"
     finally:
-        os.killpg(server.pid, signal.SIGINT)
+        os.killpg(server.pid, signal.SIGTERM)
         server.wait(timeout=60.0)
 
 

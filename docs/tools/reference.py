@@ -59,9 +59,9 @@ def write_verbs() -> str:
     parts = [
         "# Verbs",
         (
-            "`slip VERB --help` prints the same. Exit codes: 0 clean; 1 failed, with one line that says what to "
-            "do; 2 usage; 3 done, but the log had losses or something could not be looked at, which is listed; "
-            "4 an alert of `slip trend`."
+            "`slip VERB --help` prints the same. Exit codes: 0 clean; 1 failed, with one line that says "
+            "what to do; 2 usage; 3 done, but the log had losses or something could not be looked at, "
+            "which is listed; 4 an alert of `slip trend`."
         ),
     ]
     for words, verb in list_verbs().items():
@@ -86,9 +86,9 @@ def write_configuration() -> str:
     parts = [
         "# Configuration, key by key",
         (
-            "What `run.toml` beside a log and `fleet.toml` above a folder may hold. Every section and every key "
-            "may be left out; a key that is not in this list is an error, with its line. How the files work "
-            "together: [Configuration](configuration.md)."
+            "What `run.toml` beside a log and `fleet.toml` above a folder may hold. Every section and "
+            "every key may be left out; a key that is not in this list is an error, with its line. How "
+            "the files work together: [Configuration](configuration.md)."
         ),
     ]
     hints = typing.get_type_hints(Configuration)
@@ -147,9 +147,10 @@ def write_tables() -> str:
     parts = [
         "# Tables, column by column",
         (
-            "The contract of the Parquet files of a run, out of `schemas/`. Units and frames stand in the files' "
-            "field metadata as well. `base_link` is the frame of the vehicle: x forward, y left, z up. Where the "
-            "files stand and how they are read: [Results and file formats](formats.md)."
+            "The contract of the Parquet files of a run, out of `schemas/`. Units and frames stand in the "
+            "files' "
+            "field metadata as well. `base_link` is the frame of the vehicle: x forward, y left, z up. "
+            "Where the files stand and how they are read: [Results and file formats](formats.md)."
         ),
     ]
     for contract in schemas.list_contracts():
@@ -191,8 +192,8 @@ def write_vehicles() -> str:
     ]
     return (
         "# Vehicles that are known\n\n"
-        "`--vehicle ID` names one; mostly the log tells. Numbers of one's own go into `run.toml` and win. Each "
-        "is a file in `pipeline/vehicles/presets` that says where its numbers were read.\n\n"
+        "`--vehicle ID` names one; mostly the log tells. Numbers of one's own go into `run.toml` and win. "
+        "Each is a file in `pipeline/vehicles/presets` that says where its numbers were read.\n\n"
         + table(("id", "name", "kind", "wheel radius [m]", "track width [m]", "wheelbase [m]"), rows)
         + "\n"
     )
@@ -216,7 +217,8 @@ def write_message_types() -> str:
     return (
         "# Message types that are read\n\n"
         "Types that can serve as command, wheels, pose or gyro without any configuration; each package is a "
-        "file in `pipeline/vehicles/message_types`. A number in any other message can be named by its path, such as "
+        "file in `pipeline/vehicles/message_types`. A number in any other message can be named by its "
+        "path, such as "
         '`left_topic = "/drive/status.states[0].rpm"`: see [Configuration](configuration.md).\n\n'
         + table(("type", "serves as", "fields"), rows)
         + "\n"

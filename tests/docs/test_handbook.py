@@ -77,9 +77,8 @@ def test_the_search_works_from_the_disk_and_nothing_is_asked_of_a_network(
     chrome.wait("document.readyState === 'complete' && document.querySelector('.md-search__input')")
     chrome.click(".md-search__input")
     chrome.run("document.querySelector('.md-search__input').value = 'understeer'")
-    chrome.run(
-        "document.querySelector('.md-search__input').dispatchEvent(new KeyboardEvent('keyup', {bubbles: true}))"
-    )
+    typed = "new KeyboardEvent('keyup', { bubbles: true })"
+    chrome.run(f"document.querySelector('.md-search__input').dispatchEvent({typed})")
     chrome.wait("document.querySelector('.md-search-result__link[href*=understeer]')")
     assert chrome.errors == []
     assert {address.split(":")[0] for address in chrome.requests} <= {"file", "data", "about", "blob"}
@@ -100,7 +99,7 @@ def test_what_is_typed_can_be_run_and_what_is_mentioned_exists(page: Path) -> No
 
 def _require_verb(text: str, verbs: dict[str, object]) -> None:
     """A command of slip in a text names a verb that there is, with options that it has."""
-    words = text.split(" | ", maxsplit=1)[0].split(" && ")[0].split()
+    words = re.split(r" [|&]", text, maxsplit=1)[0].split()
     if words[0] != "slip" or words[1] in {"VERB", "--version", "--help"}:
         return
     found = next((verbs[" ".join(words[:n])] for n in (3, 2) if " ".join(words[:n]) in verbs), None)
