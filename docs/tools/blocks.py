@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
+from pipeline.simulate import simulate_case
+
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ROOT / "docs" / "pages"
 PATIENCE_S = 1800.0
@@ -90,7 +92,7 @@ def furnish(folder: Path) -> Path:
     """A folder as a reader has it after `make`: samples to read, and `run.mcap`, a log of one's own."""
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copytree(ROOT / "data_samples", folder / "data_samples")
-    shutil.copy(ROOT / "data_samples" / "husky_tile.mcap", folder / "run.mcap")
+    simulate_case("husky_tile", out=folder / "run.mcap", seed=3, duration_s=90.0)
     for name in _LINKED:
         (folder / name).symlink_to(ROOT / name)
     # Ready as it is: `make` must not install the program anew from this folder.
