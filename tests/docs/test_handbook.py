@@ -18,7 +18,10 @@ from pipeline.vehicles import Configuration, list_presets
 from schemas import list_contracts
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from chrome import Chrome
+    from cyclopts import App
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
@@ -92,22 +95,31 @@ def test_what_is_typed_can_be_run_and_what_is_mentioned_exists(page: Path) -> No
     commands = read_commands(text)
     assert {shlex.split(command.text)[0] for command in commands} <= PROGRAMS
     assert not [command.text for command in commands if "?" in command.shown], "run `make docs-outputs`"
+    assert str(ROOT) not in text
+    assert "/tmp/" not in text  # noqa: S108 - where outputs of this machine would show
     verbs = list_verbs()
     for mentioned in [*INLINE.findall(text), *(command.text for command in commands)]:
         _require_verb(mentioned, verbs)
 
 
-def _require_verb(text: str, verbs: dict[str, object]) -> None:
+def _require_verb(text: str, verbs: Mapping[str, App]) -> None:
     """A command of slip in a text names a verb that there is, with options that it has."""
     words = re.split(r" [|&]", text, maxsplit=1)[0].split()
     if words[0] != "slip" or words[1] in {"VERB", "--version", "--help"}:
         return
     found = next((verbs[" ".join(words[:n])] for n in (3, 2) if " ".join(words[:n]) in verbs), None)
     if found is None:
+        # Verbs of `model` in one word, and the other spelling of `model drop`.
         assert words[1:] == ["model"] or words[1:3] == ["model", "remove"], text
         return
-    known = {name for argument in found.assemble_argument_collection() for name in argument.names}  # type: ignore[attr-defined]
+    known = _list_options(found)
+    if words[1] == "schedule":
+        known |= _list_options(verbs["slip batch"])  # what it is given it passes on
     assert {word.split("=")[0] for word in words if word.startswith("--")} <= known | {"--help"}, text
+
+
+def _list_options(verb: App) -> set[str]:
+    return {name for argument in verb.assemble_argument_collection() for name in argument.names}
 
 
 def test_a_symptom_has_its_looks_a_log_an_answer_and_a_remedy() -> None:
