@@ -73,7 +73,8 @@ def read_commands(text: str) -> list[Command]:
     found = []
     for block in _BLOCK.finditer(text):
         place = block.start(1)
-        typed, shown, start = "", [], place
+        typed, start = "", place
+        shown: list[str] = []
         for line in block[1].splitlines(keepends=True):
             place += len(line)
             if line.startswith("$ "):

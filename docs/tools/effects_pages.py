@@ -13,7 +13,7 @@ from pipeline.models.export import export_model, list_targets
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
 from pipeline.runs.errors import MotionError
-from pipeline.vehicles import Vehicle, find_preset
+from pipeline.vehicles import Vehicle, list_presets
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -54,7 +54,8 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def _vehicle_of(kind: type[Effect]) -> Vehicle:
-    return find_preset("ackermann_car" if kind.kinds == ("ackermann",) else "husky_a200")
+    wanted = "ackermann_car" if kind.kinds == ("ackermann",) else "husky_a200"
+    return next(vehicle for vehicle in list_presets() if vehicle.id == wanted)
 
 
 def _usual(kind: type[Effect]) -> Effect:
