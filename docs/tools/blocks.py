@@ -142,11 +142,9 @@ def _run_server(text: str, folder: Path, around: dict[str, str]) -> str:
         text=True,
         start_new_session=True,
     )
-    try:
+    with server:
         line = server.stdout.readline() if server.stdout else ""
-    finally:
         os.killpg(server.pid, signal.SIGTERM)
-        server.wait(timeout=60.0)
     if "?token=" not in line:
         raise RuntimeError(f"{text}\nno address: {line!r}")
     return ""

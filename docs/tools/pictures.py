@@ -81,15 +81,17 @@ def _serve(results: Path) -> Iterator[str]:
         text=True,
         start_new_session=True,
     )
-    try:
-        text = ""
-        while server.stdout and not text.rstrip().endswith("}"):
-            text += server.stdout.readline()
-        told = json.loads(text)
-        yield f"{told['address']}?token={told['token']}"
-    finally:
-        os.killpg(server.pid, signal.SIGTERM)
-        server.wait(timeout=60.0)
+    with server:
+        try:
+            text = ""
+            for line in server.stdout or ():
+                text += line
+                if line.startswith("}"):
+                    break
+            told = json.loads(text)
+            yield f"{told['address']}?token={told['token']}"
+        finally:
+            os.killpg(server.pid, signal.SIGTERM)
 
 
 def main() -> int:
