@@ -70,7 +70,7 @@ docs: $(VENV)/.ready-dev ## the handbook as pages that need no network, in build
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet --config-file docs/mkdocs.yml
 	@echo "build/docs/index.html"
 
-docs-outputs: $(VENV)/.ready-dev ## run every command of the handbook and put what it prints below it [ARGS=docs/pages/late.md]
+docs-outputs: $(VENV)/.ready-dev ## run every command of the handbook and put what it prints below it [ARGS=docs/pages/symptoms/late.md]
 	$(BIN)/python docs/tools/blocks.py --write $$ARGS
 
 pictures: $(VENV)/.ready-dev ## make the handbook's pictures of the report and the workbench again
