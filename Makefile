@@ -17,8 +17,8 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: ablate hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season fleets format fuzz inspect lock map platforms samples \
-	serve test test-long trend
+.PHONY: ablate hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs fleets format fuzz inspect lock map pictures platforms samples \
+	serve test test-long trend wheel
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -65,6 +65,19 @@ check: $(VENV)/.ready-dev ## style, types, and who imports whom
 format: $(VENV)/.ready-dev ## put the code into the house's layout
 	$(BIN)/ruff format
 	$(BIN)/ruff check --fix
+
+docs: $(VENV)/.ready-dev ## the handbook as pages that need no network, in build/docs
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet --config-file docs/mkdocs.yml
+	@echo "build/docs/index.html"
+
+docs-outputs: $(VENV)/.ready-dev ## run every command of the handbook and put what it prints below it [ARGS=docs/pages/symptoms/late.md]
+	$(BIN)/python docs/tools/blocks.py --write $$ARGS
+
+pictures: $(VENV)/.ready-dev ## make the handbook's pictures of the report and the workbench again
+	$(BIN)/python docs/tools/pictures.py
+
+wheel: $(VENV)/.ready ## the program as one file to install, in dist
+	$(BIN)/python -m hatchling build --target wheel
 
 samples: $(VENV)/.ready ## make the logs in data_samples again
 	@for case in husky_tile warthog_ice ackermann_gravel; do \
@@ -141,7 +154,7 @@ lock: $(VENV)/.ready-dev ## pin the dependencies of pyproject.toml again
 	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
 		--no-emit-index-url --no-header --no-annotate --extra build --output-file requirements.txt
 	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
-		--no-emit-index-url --no-header --no-annotate --extra build --extra dask --extra dev --extra s3 --extra sim \
+		--no-emit-index-url --no-header --no-annotate --extra build --extra dask --extra dev --extra docs --extra s3 --extra sim \
 		--constraint requirements.txt --output-file requirements-dev.txt
 
 clean: ## remove the environment and caches; results stay

@@ -29,6 +29,7 @@ _EXPLAINED = (
     ("lossy", "with losses"),
     ("failed", "failed"),
     ("quarantined", "quarantined"),
+    ("growing", "being written"),
     ("skipped", "left out"),
 )
 

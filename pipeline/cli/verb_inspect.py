@@ -27,14 +27,18 @@ def register(app: App) -> None:
     app.command(inspect)
 
 
-def inspect(
+def inspect(  # noqa: D417 - the shared choices document themselves
     log: Annotated[Path, Parameter(help="a log, MCAP file or folder of a split recording")],
     /,
     *,
     choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
     json: bool = False,
 ) -> int:
-    """Show topics, rates, gaps, clocks and damage of a log, and which topics would serve, and why."""
+    """Show topics, rates, gaps, clocks and damage of a log, and which topics would serve, and why.
+
+    Args:
+        json: print one JSON object.
+    """
     from pipeline.analysis.inspection import inspect_log  # noqa: PLC0415 - heavy
 
     options = build_options(choices)

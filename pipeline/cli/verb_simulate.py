@@ -110,5 +110,6 @@ def _print_catalogue(
         return
     for title, rows in (("cases", cases), ("effects", effects), ("platforms", platforms)):
         print(title)
+        width = max(len(name) for name, _ in rows)
         for name, text in rows:
-            print(f"  {name:<24}{text}")
+            print(f"  {name:<{width}}  {text}")

@@ -73,7 +73,9 @@ def _read_limit(text: str) -> tuple[str, float]:
 
 
 def _describe(found: Trend, page: Path) -> str:
-    lines = [f"!! {alert.text}" for alert in found.alerts] or ["nothing moved beyond the threshold"]
+    from pipeline.fleet.trend import describe_quiet  # noqa: PLC0415 - heavy
+
+    lines = [f"!! {alert.text}" for alert in found.alerts] or [describe_quiet(found.series)]
     groups = list(dict.fromkeys(one.group for one in found.series))
     for group in groups:
         own = [one for one in found.series if one.group == group]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from pipeline.fleet.statistics import find_changes
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     import polars as pl
 
@@ -115,6 +115,16 @@ def raise_alerts(series: list[Series], *, threshold: float, limits: Mapping[str,
             )
             alerts.append(Alert(one.group, one.quantity, text))
     return alerts
+
+
+def describe_quiet(series: Sequence[Series]) -> str:
+    """What is to be said where there is no alert: that nothing moved, or that nothing could be tested."""
+    most = max((one.points.height for one in series), default=0)
+    if most >= FEWEST_RUNS:
+        return "nothing moved beyond the threshold"
+    return (
+        f"nothing could be tested: a change of level takes {FEWEST_RUNS} runs, the most of a group is {most}"
+    )
 
 
 def describe_step(series: Series, step: Step) -> str:

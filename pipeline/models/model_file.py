@@ -234,7 +234,7 @@ class _Reader:
             raise self._error(
                 "vehicle_invalid",
                 f"the vehicle is not valid: {error}",
-                "See README.md, Configuration, for the keys.",
+                "The handbook, Configuration, lists the keys.",
                 ("vehicle", 0),
                 error.key.rpartition(".")[2] if isinstance(error, TomlError) else "",
             ) from None

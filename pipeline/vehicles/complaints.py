@@ -35,11 +35,11 @@ def describe_fault(error: msgspec.ValidationError, where: str, source: Path | No
     steps = _STEP.findall(place)
     if unknown:
         keys = ", ".join(sorted(_list_keys(steps)))
-        hint = f"The keys there are: {keys}." if keys else "README.md, Configuration, lists the keys."
+        hint = f"The keys there are: {keys}." if keys else "The handbook, Configuration, lists the keys."
         steps.append(unknown)
     else:
         words = ", ".join(str(word) for word in _list_words(steps))
-        hint = f"Write one of: {words}." if words else "README.md, Configuration, lists the keys and units."
+        hint = f"Write one of: {words}." if words else "The handbook, Configuration, lists keys and units."
     return ConfigurationError(
         "config_invalid",
         f"the configuration is not valid: {shorten(_readable(message))}",

@@ -196,20 +196,26 @@ addEventListener("resize", () => {
 });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", again);
 
+const openAddress = async () => {
+  const kept = address();
+  arrange(kept.has("b"));
+  const known = (run) => run && listed.runs.some((entry) => entry.run === run);
+  const first = known(kept.get("a")) ? kept.get("a") : [...listed.runs].sort(ORDERS.slip)[0]?.run;
+  if (first) await panes.a.open(first);
+  if (panes.b && first) await panes.b.open(known(kept.get("b")) ? kept.get("b") : first);
+};
+
 const begin = async () => {
   try {
-    const kept = address();
     if (matchMedia("(max-width: 860px)").matches) find("shelf").open = false;
     await load();
-    arrange(kept.has("b"));
-    const known = (run) => run && listed.runs.some((entry) => entry.run === run);
     for (const job of listed.jobs) if (job.done) opened.add(job.id);
     if (listed.jobs.some((job) => !job.done)) watch();
-    const first = known(kept.get("a")) ? kept.get("a") : [...listed.runs].sort(ORDERS.slip)[0]?.run;
-    if (first) await panes.a.open(first);
-    if (panes.b && first) await panes.b.open(known(kept.get("b")) ? kept.get("b") : first);
+    await openAddress();
   } catch (error) {
     toast(error.message);
   }
 };
+// `remember` replaces the address without this event: it comes only from a link, a bookmark or the keyboard.
+addEventListener("hashchange", () => openAddress().catch((error) => toast(error.message)));
 begin();

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from pipeline.web.limits import Limits
 
 
+_LAST_PORT = 65535
+
+
 def is_loopback(host: str) -> bool:
     """Whether an address can be reached from this machine only."""
     return host in LOOPBACK or host == "::1"
@@ -43,7 +46,7 @@ def serve(
         diagnosis: whether a dropped log is diagnosed too.
 
     Raises:
-        WorkbenchError: ``port_taken``, nothing can listen there.
+        WorkbenchError: ``no_such_port``; ``port_taken``, nothing can listen there.
     """
     import uvicorn  # noqa: PLC0415 - heavy
 
@@ -68,6 +71,13 @@ def serve(
 
 
 def _listen(host: str, port: int) -> socket.socket:
+    if not 0 <= port <= _LAST_PORT:
+        raise WorkbenchError(
+            "no_such_port",
+            f"ports are 0 to {_LAST_PORT}",
+            where=f"{host}:{port}",
+            hint="Give another --port, or 0 for any that is free.",
+        )
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

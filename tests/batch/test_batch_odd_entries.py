@@ -112,6 +112,18 @@ def test_a_log_of_the_future_is_growing_while_it_grows(season: Path, tmp_path: P
         assert find_recordings([str(log)], settle_s=120.0).recordings == (log,)
 
 
+def test_a_log_that_is_being_written_is_named(
+    season: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    KINDS["a cut log"].make(tmp_path, season / "a.mcap")
+    with pytest.raises(SystemExit) as ended:
+        main(["batch", str(tmp_path), "--out", str(tmp_path / "out")])
+    assert ended.value.code == 0
+    spoken = capsys.readouterr().out.splitlines()
+    assert "being written      1" in spoken
+    assert spoken[spoken.index("being written") + 1].strip() == str(tmp_path / "x.mcap")
+
+
 @pytest.fixture
 def odd(season: Path, tmp_path: Path) -> Path:
     """A log whose folder and name are no UTF-8."""

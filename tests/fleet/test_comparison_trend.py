@@ -13,6 +13,7 @@ from pipeline.analysis.errors import JobError
 from pipeline.analysis.trend import Trend, follow_trend, write_trend
 from pipeline.cli.app import main
 from pipeline.fleet import read_day
+from pipeline.fleet.trend import describe_quiet
 from pipeline.store import Store
 
 if TYPE_CHECKING:
@@ -78,11 +79,35 @@ def test_small_steps_raise_no_alert_and_few_runs_are_said(store: Store) -> None:
     assert not [alert for alert in found.alerts if alert.quantity == steady.quantity]
 
 
+def test_where_all_stands_still_nothing_moved(store: Store) -> None:
+    drive_a_season(store, [1.8] * 8)
+    found = follow(store)
+    assert not found.alerts
+    assert describe_quiet(found.series) == "nothing moved beyond the threshold"
+    assert "Nothing moved beyond the threshold" in write_trend(store, found).read_text(encoding="utf-8")
+
+
 def test_too_few_runs_are_said(store: Store) -> None:
     drive_a_season(store, [1.8, 1.8, 1.8, 2.4, 2.4, 2.4])
     found = follow(store)
     assert not found.alerts
     assert any("too few runs to find a change, 8 are needed: warthog-2" in note for note in found.notes)
+
+
+def test_where_no_group_has_enough_runs_nothing_is_said_to_stand_still(
+    store: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive_a_season(store, [1.8])
+    with pytest.raises(SystemExit) as ended:
+        main(["trend", str(store.root), "--by", "vehicle"])
+    assert ended.value.code == 0
+    said = "nothing could be tested: a change of level takes 8 runs, the most of a group is 1"
+    spoken = capsys.readouterr().out
+    assert spoken.startswith(said)
+    assert "nothing moved" not in spoken
+    page = (store.root / "trend.html").read_text(encoding="utf-8")
+    assert said[1:] in page
+    assert "Nothing moved" not in page
 
 
 def test_the_exit_code_serves_a_nightly_job(store: Store, capsys: pytest.CaptureFixture[str]) -> None:

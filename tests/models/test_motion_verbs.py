@@ -68,7 +68,7 @@ def test_a_model_is_made_grown_asked_about_another_run_and_exported(folder: Path
     floors = [line for line in asleep.stdout.splitlines() if line.startswith("noise floor")]
     assert len(floors) == 2
     assert floors[0] == floors[1]
-    run_slip("model", "drop", model, "drive_lag", *on)
+    run_slip("model", "remove", model, "drive_lag", *on)
 
     dropped = run_slip("model", "drop", model, "lateral_drift", *on)
     assert "before" in dropped.stdout

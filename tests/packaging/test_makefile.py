@@ -37,7 +37,20 @@ def test_make_alone_lists_the_verbs() -> None:
     done = make()
 
     assert done.returncode == 0
-    for verb in ("analyze", "batch", "compare", "trend", "map", "test", "check", "samples", "clean"):
+    for verb in (
+        "analyze",
+        "batch",
+        "compare",
+        "trend",
+        "map",
+        "test",
+        "check",
+        "samples",
+        "docs",
+        "pictures",
+        "wheel",
+        "clean",
+    ):
         assert f"make {verb} " in done.stdout
 
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import os
+import re
 import subprocess
 import sys
+import urllib.request
 import zipfile
 from pathlib import Path
 
@@ -42,24 +46,57 @@ def test_the_wheel_carries_presets_contracts_and_pages(wheel: Path) -> None:
     assert not any(name.startswith(("tests/", "data_samples/")) for name in names)
 
 
-@pytest.mark.long
-def test_the_wheel_analyzes_a_log_in_a_bare_environment(wheel: Path, tmp_path: Path) -> None:
-    environment = tmp_path / "bare"
-    subprocess.run([sys.executable, "-m", "venv", str(environment)], check=True)
-    pip = [str(environment / "bin" / "python"), "-m", "pip", "install", "--quiet"]
-    subprocess.run([*pip, "--require-hashes", "-r", str(ROOT / "requirements.txt")], check=True)
-    subprocess.run([*pip, "--no-deps", str(wheel)], check=True)
+def use_it(program: Path, wheel: Path, tmp_path: Path) -> None:
+    """A sample is analyzed, and its results are served to who has the token."""
     log = ROOT / "data_samples" / "husky_tile.mcap"
     done = subprocess.run(
-        [str(environment / "bin" / "slip"), "analyze", str(log), "--out", str(tmp_path / "out")],
+        [str(program), "analyze", str(log), "--out", "out"],
         cwd=tmp_path,
         capture_output=True,
         text=True,
         check=False,
     )
-
     assert done.returncode == 0, done.stderr
     assert "husky_a200" in done.stdout
-    asked = [str(environment / "bin" / "slip"), "--version"]
-    said = subprocess.run(asked, cwd=tmp_path, capture_output=True, text=True, check=True)
+    said = subprocess.run(
+        [str(program), "--version"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
     assert f"-{said.stdout.strip()}-" in wheel.name
+
+    serve = [str(program), "serve", "out", "--port", "0"]
+    with subprocess.Popen(serve, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            (address,) = re.findall(r"http://\S+", server.stdout.readline())
+            origin, _, token = address.partition("/?token=")
+            asked = urllib.request.Request(  # noqa: S310 - the workbench that was just started
+                f"{origin}/api/runs", headers={"Authorization": f"Bearer {token}"}
+            )
+            with urllib.request.urlopen(asked, timeout=60.0) as answer:  # noqa: S310
+                runs = json.load(answer)["runs"]
+            with urllib.request.urlopen(address, timeout=60.0) as page:  # noqa: S310
+                assert b"workbench" in page.read()
+        finally:
+            server.terminate()
+    assert [run["run"] for run in runs] == ["data_samples/husky_tile"]
+
+
+@pytest.mark.long
+def test_the_wheel_analyzes_and_serves_in_a_bare_environment(wheel: Path, tmp_path: Path) -> None:
+    environment = tmp_path / "bare"
+    subprocess.run([sys.executable, "-m", "venv", str(environment)], check=True)
+    pip = [str(environment / "bin" / "python"), "-m", "pip", "install", "--quiet"]
+    subprocess.run([*pip, "--require-hashes", "-r", str(ROOT / "requirements.txt")], check=True)
+    subprocess.run([*pip, "--no-deps", str(wheel)], check=True)
+
+    use_it(environment / "bin" / "slip", wheel, tmp_path)
+
+
+@pytest.mark.long
+def test_the_wheel_installs_as_a_tool_as_the_readme_says(wheel: Path, tmp_path: Path) -> None:
+    assert "uv tool install dist/slip_pipeline-*.whl" in (ROOT / "README.md").read_text()
+    around = {**os.environ, "UV_TOOL_DIR": str(tmp_path / "tools"), "UV_TOOL_BIN_DIR": str(tmp_path / "bin")}
+    uv = Path(sys.executable).parent / "uv"
+    subprocess.run([str(uv), "tool", "install", "--quiet", str(wheel)], env=around, check=True)
+
+    use_it(tmp_path / "bin" / "slip", wheel, tmp_path)

@@ -164,7 +164,7 @@ def test_a_wrong_override_names_the_command_line(log: Path) -> None:
         ('\n[velocity]\nyaw = "gyro"', 3, "'gyro' in `velocity.yaw`", "Write one of: imu, pose."),
         ('[run]\nterain = "ice"', 2, "unknown key `terain` in `run`", "keys there are: dataset, terrain."),
         ('[comand]\ntopic = "/a"', 1, "unknown key `comand`", "command, imu"),
-        ('[[interval]]\nstart_s = 1\n[[interval]]\nend_s = "late"', 4, "interval[1].end_s", "README.md"),
+        ('[[interval]]\nstart_s = 1\n[[interval]]\nend_s = "late"', 4, "interval[1].end_s", "The handbook"),
         (('[[match]]\nglob = "*"\n[match.command]\nunit = "rpm"\n'
          '[[match]]\nglob = "b*"\n[match.command]\nunit = "km/h"'), 8, "'km/h'", "m/s, mm/s, rad"),
     ],

@@ -152,6 +152,19 @@ def test_two_models_of_a_run_stand_side_by_side(chrome: Chrome, workbench: Workb
     look_for_trouble(chrome)
 
 
+def test_an_address_that_changes_in_an_open_tab_is_followed(chrome: Chrome, workbench: Workbench) -> None:
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    panes = "document.querySelectorAll('.pane').length"
+    chrome.run(f"location.hash = 'a={RUN}&b={RUN}'")
+    chrome.wait(f"{panes} === 2 && document.querySelector('[data-slot=b]')?.dataset.drawn")
+    assert chrome.run("document.querySelector('#compare').checked")
+    chrome.run(f"location.hash = 'a={RUN}'")
+    chrome.wait(f"{panes} === 1 && !document.querySelector('#compare').checked")
+    look_for_trouble(chrome)
+
+
 def count_marks(figure: str, pane: str = "a") -> str:
     """How many marked spans or points a figure shows."""
     kinds = "path[stroke='#00b3d6'], path[fill='#00b3d6']"

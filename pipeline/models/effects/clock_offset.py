@@ -2,8 +2,10 @@
 
     reported pose(t) = pose(t - d)
 
-d [s]; d < 0 is a clock that runs ahead, which no physics can do. Encoders or a gyro with their own stamps
-tell it from a delay of the drive.
+d [s]: above zero a pose is stamped after its moment, by a localization that stamps its results when they are
+ready or by a clock ahead of the command's. Below zero it is stamped before its moment: the poses move before
+the wheels do, which no physics does, only a clock behind the command's. Encoders or a gyro with stamps of
+their own tell it from a delay of the drive; without them d > 0 and such a delay are one number.
 
 Source: header stamps against log times; measured on the DRIVE recordings.
 """

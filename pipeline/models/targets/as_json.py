@@ -63,4 +63,4 @@ def _plain(value: object) -> object:
     return value
 
 
-TARGET = Target("json", "the model with values, intervals and units", "README.md, Models", write)
+TARGET = Target("json", "the model with values, intervals and units", "the handbook, Models", write)

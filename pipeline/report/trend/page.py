@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import altair as alt
 import polars as pl
 
-from pipeline.fleet.trend import describe_step
+from pipeline.fleet.trend import describe_quiet, describe_step
 from pipeline.report import theme
 from pipeline.report.elements import Picture
 from pipeline.report.figures import Drawing
@@ -47,6 +47,7 @@ def render_trend(
         title="Trends",
         facts=[f"{len(names)} groups", f"{len(series)} series", f"{len(keys)} runs", f"{len(alerts)} alerts"],
         alerts=[alert.text for alert in alerts],
+        quiet=begin_large(describe_quiet(series)),
         notes=notes,
         groups=[group for group in groups if group[2]],
         runs=keys,

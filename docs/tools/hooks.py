@@ -1,0 +1,33 @@
+"""Hooks of mkdocs: add the pages that the program writes about itself to the handbook."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mkdocs.structure.files import File
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from reference import write_reference
+
+from pipeline.models import list_effects
+
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Every effect has its place in the contents, in the order of a command's way."""
+    (effects,) = (section["Effects"] for section in config.nav or [] if "Effects" in section)
+    effects += [f"effects/{kind.id}.md" for kind in list_effects()]
+    return config
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the generated pages; one that is written by hand as well is an error of mkdocs."""
+    for path, text in write_reference().items():
+        files.append(File.generated(config, path, content=text))
+    return files
