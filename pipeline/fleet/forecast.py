@@ -94,6 +94,11 @@ class Forecast:
         """The effects at their expected values, in the order of a command's way."""
         return self._make([number.value for number in self.numbers])
 
+    @property
+    def prior(self) -> dict[str, tuple[float, float]]:
+        """Mean and standard deviation of every number by label, for a fit."""
+        return {number.label: (number.value, number.deviation) for number in self.numbers}
+
     def draw(self, which: int) -> tuple[Effect, ...]:
         """The effects at one draw of all numbers."""
         return self._make([float(number.draws[which]) for number in self.numbers])

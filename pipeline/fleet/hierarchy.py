@@ -107,9 +107,11 @@ def fit_fleet(estimates: pl.DataFrame) -> FleetModel:
     if bound:
         notes.append(f"numbers at a bound of the search are left out: of {', '.join(bound)} in some runs")
     numbers = []
-    for (vehicle, effect, parameter), rows in take_numbers(known).partition_by(
-        "vehicle", "effect", "parameter", as_dict=True, maintain_order=True
-    ).items():
+    for (vehicle, effect, parameter), rows in (
+        take_numbers(known)
+        .partition_by("vehicle", "effect", "parameter", as_dict=True, maintain_order=True)
+        .items()
+    ):
         if rows["named"].any():
             numbers.append(_fit_number(str(vehicle), str(effect), str(parameter), rows))
     numbers.sort(key=lambda one: (one.vehicle, -one.named, one.effect, one.parameter))
