@@ -218,7 +218,8 @@ def fit_part(
 
 def measure_loss(part: Part, weights: Weights, residual: Floats, state: State, free: Sequence[Free]) -> float:
     """Mean cost of a window, with its share of what the prior costs."""
-    return weights.loss(residual) + part.prior.cost(state, free) / residual.shape[0]
+    prior: float = part.prior.cost(state, free) / residual.shape[0]
+    return weights.loss(residual) + prior
 
 
 def solve_step(

@@ -23,6 +23,8 @@ _HUBER = 3.0
 _GAUSSIAN = 1.4826
 _SHORTEST_BLOCK_S = 6.0
 _TAUS = 5.0
+SHORTEST_TIME_S = _SHORTEST_BLOCK_S / _TAUS
+"""Residuals are taken to repeat each other for as long at least [s]."""
 _DELAY_STEP = 5e-3
 _RISEN = 1.92
 _LONGEST_S = 20.0
@@ -132,7 +134,7 @@ def estimate_part(part: Part, fit: PartFit) -> Estimates:
     if rows.size and part.prior.numbers:
         freedom = np.inf
         scale = np.outer(size[rows], size[rows])
-        spread = part.prior.repeats * np.linalg.inv(total[np.ix_(rows, rows)] / scale) / scale
+        spread = part.prior.excess * np.linalg.inv(total[np.ix_(rows, rows)] / scale) / scale
     elif rows.size and pieces > 1:
         spread = _jackknife(normals, gradients, rows, size)
     if spread is not None:

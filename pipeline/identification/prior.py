@@ -1,8 +1,8 @@
 """What is known of a model's numbers before a run is seen: observations of the numbers themselves.
 
 A number with mean m and standard deviation s adds ((value - m) / s)^2 to the cost of a fit, as one more
-observation (maximum a posteriori). Residuals repeat each other in time, so that n of them tell as much as
-n / repeats that do not; the prior is weighed up by `repeats` in place of weighing all of them down.
+observation (maximum a posteriori). Residuals repeat each other in time and are larger than noise, so that their summed
+cost says more than they know; the prior is weighed up by that `excess`, in place of weighing them all down.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ class Prior:
 
     Attributes:
         numbers: mean and standard deviation by label ``effect.name``, deviations positive.
-        repeats: how many residuals tell as much as one that repeats no other.
+        excess: cost of residuals that says as much as a cost of one would if they were independent and no
+            larger than noise.
     """
 
     numbers: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    repeats: float = 1.0
+    excess: float = 1.0
 
     def cost(self, state: State, free: Sequence[Free]) -> float:
         """Cost of a state's free numbers, on the scale of the summed cost of residuals."""
@@ -43,12 +44,13 @@ class Prior:
     def pull(self, state: State, free: Sequence[Free]) -> Floats:
         """Half the fall of that cost with each number, shape (p,)."""
         values = np.array([state.get(number) for number in free])
-        return self.weigh(free) * (self.means(free, values) - values)
+        pull: Floats = self.weigh(free) * (self.means(free, values) - values)
+        return pull
 
     def weigh(self, free: Sequence[Free]) -> Floats:
         """Information on each number, zero where nothing is known, shape (p,)."""
         known = [self._find(number) for number in free]
-        return np.array([0.0 if one is None else self.repeats / one[1] ** 2 for one in known])
+        return np.array([0.0 if one is None else self.excess / one[1] ** 2 for one in known])
 
     def means(self, free: Sequence[Free], values: Floats) -> Floats:
         """Means, the values themselves where nothing is known, shape (p,)."""
