@@ -156,26 +156,38 @@ def drop(  # noqa: D417 - the shared options document themselves
 
 
 def fit(  # noqa: D417 - the shared options document themselves
-    model: Path,
+    model: Path | None = None,
     /,
     *,
     spoken: Spoken,
     predict: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
     afresh: bool = False,
+    first: str | None = None,
+    prior: Literal["fleet"] | None = None,
 ) -> int:
     """Fit a model's values; with --predict, show what carries over to other runs.
 
     Args:
-        model: the model file.
+        model: the model file. With --prior it may be missing, or be left out: the model is then what the
+            fleet lets expect.
         predict: logs or runs that the fit must not see, to be predicted with it.
         afresh: forget the values there are and search anew.
+        first: fit the first seconds of driving only, for example 20s.
+        prior: fleet: count what the other runs of the vehicle in the results folder say of its numbers.
     """
-    file = open_model(model, trust_code=spoken.trust_code)
+    from pipeline.cli.model_prior import expect_model, read_seconds, require_model  # noqa: PLC0415 - heavy
+
+    first_s = None if first is None else read_seconds(first)
+    if prior is not None and (model is None or not model.exists()):
+        quiet = spoken.quiet or spoken.json
+        file = expect_model(spoken.on, spoken.input, spoken.out, quiet=quiet)
+    else:
+        file = open_model(require_model(model), trust_code=spoken.trust_code)
     changed = file
     if afresh:
         neutral = [effect.change(**{p.name: p.neutral for p in effect.parameters}) for effect in file.model]
         changed = replace(file, model=file.model.swap(*neutral), intervals={})
-    return _change(model, file, changed, spoken, predict=predict or ())
+    return _change(model, file, changed, spoken, predict=predict or (), first_s=first_s, prior=prior)
 
 
 def compare(  # noqa: D417 - the shared options document themselves
@@ -261,20 +273,23 @@ def _write(path: Path, text: str) -> None:
 
 
 def _change(
-    path: Path,
+    path: Path | None,
     before: ModelFile,
     after: ModelFile,
     spoken: On,
     *,
     predict: Sequence[str] = (),
     keep_if_rises: bool = False,
+    first_s: float | None = None,
+    prior: Literal["fleet"] | None = None,
 ) -> int:
     """Judge a model before and after a change, fit it, write its file, and print.
 
     Raises:
         MotionError: ``error_rises``, with ``keep_if_rises``: the file stays as it is.
     """
-    from pipeline.identification.inputs import choose_input  # noqa: PLC0415 - heavy
+    from pipeline.cli.model_prior import cut_first, tie_to_fleet  # noqa: PLC0415 - heavy
+    from pipeline.identification.inputs import choose_input  # noqa: PLC0415
     from pipeline.identification.judgement import judge_model, note_fit  # noqa: PLC0415
     from pipeline.identification.problem import Problem  # noqa: PLC0415
     from pipeline.identification.transfer import carry_over  # noqa: PLC0415
@@ -285,16 +300,23 @@ def _change(
     after, gathered = _gather(spoken, after, [*spoken.on, *predict])
     runs, others = gathered[: len(spoken.on)], gathered[len(spoken.on) :]
     chosen = choose_input(runs, spoken.input, after.model, last=_last_input(before))
-    problem = Problem(runs, after.model.vehicle, chosen.source)
+    problem = Problem(
+        runs if first_s is None else cut_first(runs, first_s), after.model.vehicle, chosen.source
+    )
+    if prior is not None:
+        problem = tie_to_fleet(problem, after.model, spoken.out)
     model_before = replace(before.model, vehicle=after.model.vehicle)
     old = judge_model(problem, model_before, per_run=before.per_run)
     new_one = old
     if after.model.effects != before.model.effects:
         new_one = judge_model(problem, after.model, per_run=after.per_run)
     if keep_if_rises:
-        _require_no_rise(path, old, new_one)
+        _require_no_rise(str(path), old, new_one)
     written = note_fit(after, new_one)
-    write_model(written, path)
+    said = {"first_s": first_s, "prior": prior}
+    written = replace(written, fit={**written.fit, **{key: value for key, value in said.items() if value}})
+    if path is not None:
+        write_model(written, path)
     terrains = [run.terrain for run in runs]
     carried = carry_over(written.model, others, chosen.source, fitted_on=terrains) if others else []
     warnings = [text for text in (chosen.warning, *(item.warning for item in carried)) if text]
@@ -309,7 +331,7 @@ def _change(
     return CLEAN
 
 
-def _require_no_rise(path: Path, old: Judgement, new_one: Judgement) -> None:
+def _require_no_rise(path: str, old: Judgement, new_one: Judgement) -> None:
     from pipeline.identification.describe import describe_rises  # noqa: PLC0415 - heavy
     from pipeline.identification.ladder import CHANCE  # noqa: PLC0415
     from pipeline.runs.errors import MotionError  # noqa: PLC0415
@@ -320,7 +342,7 @@ def _require_no_rise(path: Path, old: Judgement, new_one: Judgement) -> None:
         raise MotionError(
             "error_rises",
             f"with {', '.join(added)} {' and '.join(rises)} on data not seen: the model is as it was",
-            where=str(path),
+            where=path,
             hint="Take something else, or give --anyway",
         )
 
@@ -345,7 +367,7 @@ def _terrains(file: ModelFile) -> list[str]:
 
 
 def _as_json(
-    path: Path,
+    path: Path | None,
     old: Judgement,
     new_one: Judgement,
     chosen: InputChoice,
@@ -364,7 +386,7 @@ def _as_json(
     problem, fitted = new_one.problem, new_one.fitted
     floor = _choose_floor(old, new_one)
     return {
-        "model": str(path),
+        "model": None if path is None else str(path),
         "input": chosen.source.value,
         "input_reason": chosen.reason,
         "runs": list(problem.names),
