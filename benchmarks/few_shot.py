@@ -18,8 +18,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
+import polars as pl
 
 from pipeline.analysis.fleet import find_estimates
+from pipeline.analysis.prediction import predict_deployment
 from pipeline.core.errors import SlipError
 from pipeline.fleet.forecast import forecast_vehicle
 from pipeline.identification.comparison import Input
@@ -33,7 +35,9 @@ from pipeline.runs.cut import cut_run, find_driven
 from pipeline.store import Store
 
 if TYPE_CHECKING:
+    from pipeline.analysis.prediction import Expected
     from pipeline.identification.fit import Fitted
+    from pipeline.store import Manifest
 
 SECONDS = (5.0, 20.0, 60.0)
 LEFT_S = 60.0
@@ -60,6 +64,8 @@ class Row:
     few: tuple[float, ...]
     alone: tuple[float, ...]
     own: float
+    expected: tuple[Expected, Expected]
+    was: tuple[float, float]
 
 
 def judge(task: Task) -> Row | str:
@@ -93,6 +99,8 @@ def _judge(task: Task) -> Row:
             continue
         few.append(carry(rest, fit_with_prior(first, model, forecast.prior)))
         alone.append(carry(rest, fit_model(first, fresh, exact=True)))
+    expected = predict_deployment(store, forecast)
+    whole = Problem([run], vehicle, source)
     own = hold_out(rest, fit_model(rest, model, exact=True))
     return Row(
         task,
@@ -101,7 +109,18 @@ def _judge(task: Task) -> Row:
         tuple(few),
         tuple(alone),
         own.pooled.t_mrmse_m,
+        (expected.median_modulus, expected.t_mrmse_m),
+        (
+            measure_slip(manifest, task.source),
+            score(whole, whole.start_state(model.effects)).pooled.t_mrmse_m,
+        ),
     )
+
+
+def measure_slip(manifest: Manifest, source: str) -> float:
+    """Median slip modulus of a run [m/s]."""
+    rows = manifest.read("aggregates").filter(pl.col("subset") == "all", pl.col("input") == source)
+    return float(rows["median_modulus"].item())
 
 
 def carry(rest: Problem, fitted: Fitted) -> float:
@@ -142,6 +161,18 @@ def show(rows: list[Row]) -> None:
             end="",
         )
     print()
+    for place, what in enumerate(("median modulus of the slip [m/s]", "error over 2 s of the prior [m]")):
+        print(f"\n{what}: expected, was")
+        held = 0
+        for row in rows:
+            expected, was = row.expected[place], row.was[place]
+            inside = expected.interval.low <= was <= expected.interval.high
+            held += inside
+            print(
+                f"{Path(row.task.run).name:<52}{expected.value:>8.3f} [{expected.interval.low:.3f}, "
+                f"{expected.interval.high:.3f}]{was:>9.3f}{'' if inside else '  outside'}"
+            )
+        print(f"{held} of {len(rows)} inside")
 
 
 def main() -> None:

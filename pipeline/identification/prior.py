@@ -1,8 +1,8 @@
 """What is known of a model's numbers before a run is seen: observations of the numbers themselves.
 
 A number with mean m and standard deviation s adds ((value - m) / s)^2 to the cost of a fit, as one more
-observation (maximum a posteriori). Residuals repeat each other in time and are larger than noise: their cost says more
-than they know. The prior is weighed up by that `excess`, in place of weighing all of them down.
+observation (maximum a posteriori). Residuals repeat each other in time and are larger than noise, so that
+they say less than their summed cost. The prior is weighed up by that `excess`.
 """
 
 from __future__ import annotations
