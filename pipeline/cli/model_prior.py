@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from pipeline.runs.recording import MotionRun
     from pipeline.vehicles import Vehicle
 
+# Half of a 95 % interval is so many standard deviations.
+_HALF = 1.959964
 _SECONDS = re.compile(r"(\d+(?:\.\d+)?)\s*s?")
 
 
@@ -113,3 +115,16 @@ def tie_to_fleet(problem: Problem, model: Model, out: Path) -> Problem:
 
     forecast = forecast_runs(problem.runs, model.vehicle, problem.source.value, out)
     return tie_to_prior(problem, model, forecast.prior)
+
+
+def prior_as_json(problem: Problem) -> dict[str, dict[str, object]]:
+    """What was known of the numbers before the fit, by label: value and 95 % interval; empty if nothing."""
+    from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
+
+    found: dict[str, dict[str, object]] = {}
+    for label, (mean, deviation) in problem.parts[0].prior.numbers.items():
+        effect, _, name = label.partition(".")
+        half = _HALF * deviation
+        unit = find_effect(effect)().parameter(name).unit
+        found[label] = {"value": mean, "low": mean - half, "high": mean + half, "unit": unit}
+    return found

@@ -9,6 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
+from pipeline.cli.model_prior import (
+    cut_first,
+    expect_model,
+    prior_as_json,
+    read_seconds,
+    require_model,
+    tie_to_fleet,
+)
 from pipeline.cli.model_trust import TrustCode, open_model, trust, trusted, untrust
 from pipeline.cli.output import CLEAN, print_json, print_lines, say
 
@@ -175,8 +183,6 @@ def fit(  # noqa: D417 - the shared options document themselves
         first: fit the first seconds of driving only, for example 20s.
         prior: fleet: count what the other runs of the vehicle in the results folder say of its numbers.
     """
-    from pipeline.cli.model_prior import expect_model, read_seconds, require_model  # noqa: PLC0415 - heavy
-
     first_s = None if first is None else read_seconds(first)
     if prior is not None and (model is None or not model.exists()):
         quiet = spoken.quiet or spoken.json
@@ -288,8 +294,7 @@ def _change(
     Raises:
         MotionError: ``error_rises``, with ``keep_if_rises``: the file stays as it is.
     """
-    from pipeline.cli.model_prior import cut_first, tie_to_fleet  # noqa: PLC0415 - heavy
-    from pipeline.identification.inputs import choose_input  # noqa: PLC0415
+    from pipeline.identification.inputs import choose_input  # noqa: PLC0415 - heavy
     from pipeline.identification.judgement import judge_model, note_fit  # noqa: PLC0415
     from pipeline.identification.problem import Problem  # noqa: PLC0415
     from pipeline.identification.transfer import carry_over  # noqa: PLC0415
@@ -405,6 +410,7 @@ def _as_json(
         },
         "noise_floor": errors_as_json(floor),
         "parameters": parameters_as_json(fitted.model, new_one.estimates),
+        "prior": prior_as_json(problem),
         "correlated": correlations_as_json(new_one.estimates),
         "timing": [
             {
@@ -457,7 +463,9 @@ def _describe(old: Judgement, new_one: Judgement, chosen: InputChoice) -> list[s
     if chosen.warning:
         lines.append(chosen.warning)
     parameters = parameters_as_json(new_one.fitted.model, new_one.estimates)
-    return [*lines, "", "parameters", *describe_parameters(parameters)]
+    prior = prior_as_json(new_one.problem)
+    lines += ["", "parameters", *describe_parameters(parameters)]
+    return [*lines, "", "known before", *describe_parameters(prior)] if prior else lines
 
 
 def _choose_floor(old: Judgement, new_one: Judgement) -> Errors:

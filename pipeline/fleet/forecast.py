@@ -179,11 +179,11 @@ def _choose_effects(rows: pl.DataFrame, source: str) -> list[Effect]:
     """Effects that more than half of the runs name and that can act on the input."""
     most = rows["run"].n_unique() / 2.0
     named = rows.filter("named").group_by("effect").agg(pl.col("run").n_unique().alias("runs"))
-    chosen = [find_effect(name)() for name in named.filter(pl.col("runs") > most)["effect"].sort()]
-    return [
+    effects = [find_effect(name)() for name in named.filter(pl.col("runs") > most)["effect"].sort()]
+    chosen = [
         effect
-        for effect in chosen
+        for effect in effects
         if (source == "command" or effect.place > Place.DRIVE)
         and not any(parameter.relative_to in _OF_ONE_RUN for parameter in effect.parameters)
-        and not any(effect.id in other.contains for other in chosen)
     ]
+    return [effect for effect in chosen if not any(effect.id in other.contains for other in chosen)]

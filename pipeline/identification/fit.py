@@ -280,7 +280,7 @@ def _descend(
             residual,
             weights,
             damping,
-            part.prior.weigh(movable),
+            part.prior.weigh(state, movable),
             part.prior.pull(state, movable),
         )
         trial = state.move(movable, step.tolist())

@@ -92,13 +92,13 @@ def refit(part: Part, fit: PartFit, train: Flags) -> State:
     smooth, state, residual = fit.smooth, fit.state, fit.residual
     if not smooth or not train.any():
         return state
-    weights, jacobian = _take(fit.weights, train), fit.jacobian[train][:, :, smooth]
+    weights, jacobian, hold = _take(fit.weights, train), fit.jacobian[train][:, :, smooth], _hold(fit)
     free = [fit.free[place] for place in smooth]
-    hold = _hold(fit) + part.prior.weigh(free)
     loss = measure_loss(part, weights, residual[train], state, free)
     for _ in range(_CHORD_STEPS):
         pull = part.prior.pull(state, free)
-        step, _ = solve_step(jacobian, residual[train], weights, hold=hold, pull=pull)
+        held = hold + part.prior.weigh(state, free)
+        step, _ = solve_step(jacobian, residual[train], weights, hold=held, pull=pull)
         moved = state.move(free, step.tolist())
         trial = part.find_residuals(moved)
         new = measure_loss(part, weights, trial[train], moved, free)

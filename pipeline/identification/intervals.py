@@ -123,7 +123,7 @@ def estimate_part(part: Part, fit: PartFit) -> Estimates:
     block = join_blocks(part, fit)
     pieces = int(block.max()) + 1
     normals, gradients = _sum_blocks(fit, block, pieces)
-    total = normals.sum(axis=0) + np.diag(part.prior.weigh(fit.free))
+    total = normals.sum(axis=0) + np.diag(part.prior.weigh(fit.state, fit.free))
     size = np.sqrt(np.maximum(np.diag(total), 0.0))
     observable = size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)
     rows = np.flatnonzero(observable)

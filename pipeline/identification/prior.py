@@ -1,8 +1,10 @@
 """What is known of a model's numbers before a run is seen: observations of the numbers themselves.
 
-A number with mean m and standard deviation s adds ((value - m) / s)^2 to the cost of a fit, as one more
-observation (maximum a posteriori). Residuals repeat each other in time and are larger than noise, so that
-they say less than their summed cost. The prior is weighed up by that `excess`.
+A number z standard deviations from its mean adds f log(1 + z^2 / f) to the cost of a fit, as one more
+observation (maximum a posteriori): z^2 where it is near, as of a normal distribution, and less where the run
+contradicts what was known, as of Student's t with few degrees of freedom f. Residuals repeat each other in
+time and are larger than noise, so that they say less than their summed cost. The prior is weighed up by that
+`excess`.
 """
 
 from __future__ import annotations
@@ -20,10 +22,13 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+# Degrees of freedom: what was known is forgotten where a run lies several deviations off.
+_FREEDOM = 4.0
+
 
 @dataclass(frozen=True)
 class Prior:
-    """Normal distributions of numbers that all runs share.
+    """Distributions of numbers that all runs share.
 
     Attributes:
         numbers: mean and standard deviation by label ``effect.name``, deviations positive.
@@ -38,24 +43,26 @@ class Prior:
         """Cost of a state's free numbers, on the scale of the summed cost of residuals."""
         if not self.numbers:
             return 0.0
-        values = np.array([state.get(number) for number in free])
-        return float(np.sum(self.weigh(free) * (self.means(free, values) - values) ** 2))
+        away, known = self._compare(state, free)
+        return self.excess * float(np.sum(_FREEDOM * np.log1p(known * away**2 / _FREEDOM)))
+
+    def weigh(self, state: State, free: Sequence[Free]) -> Floats:
+        """Information on each number, zero where nothing is known, shape (p,)."""
+        away, known = self._compare(state, free)
+        information: Floats = self.excess * known / (1.0 + known * away**2 / _FREEDOM)
+        return information
 
     def pull(self, state: State, free: Sequence[Free]) -> Floats:
-        """Half the fall of that cost with each number, shape (p,)."""
-        values = np.array([state.get(number) for number in free])
-        pull: Floats = self.weigh(free) * (self.means(free, values) - values)
+        """Half the fall of the cost with each number, shape (p,)."""
+        pull: Floats = self.weigh(state, free) * self._compare(state, free)[0]
         return pull
 
-    def weigh(self, free: Sequence[Free]) -> Floats:
-        """Information on each number, zero where nothing is known, shape (p,)."""
-        known = [self._find(number) for number in free]
-        return np.array([0.0 if one is None else self.excess / one[1] ** 2 for one in known])
-
-    def means(self, free: Sequence[Free], values: Floats) -> Floats:
-        """Means, the values themselves where nothing is known, shape (p,)."""
-        known = [self._find(number) for number in free]
-        return np.array([v if one is None else one[0] for one, v in zip(known, values.tolist(), strict=True)])
+    def _compare(self, state: State, free: Sequence[Free]) -> tuple[Floats, Floats]:
+        """Way from each number to its mean, and one over its variance; zeros where nothing is known."""
+        pairs = [self._find(number) for number in free]
+        away = [0.0 if one is None else one[0] - state.get(n) for one, n in zip(pairs, free, strict=True)]
+        known = [0.0 if one is None else 1.0 / one[1] ** 2 for one in pairs]
+        return np.array(away), np.array(known)
 
     def _find(self, number: Free) -> tuple[float, float] | None:
         return None if number.run is not None else self.numbers.get(number.label)
