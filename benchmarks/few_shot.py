@@ -1,11 +1,12 @@
 """A terrain left out: what the fleet expects there, and what a few seconds of driving add.
 
-Run: python benchmarks/few_shot.py RESULTS [--input command|measured] [--vehicle V] [--jobs N]. RESULTS are
-analyzed and diagnosed recordings (slip batch LOGS --out RESULTS). Every terrain of a vehicle is left out in
-turn. The model is that which the other runs let expect; printed is its error over 2 s on all that was driven
-after the first minute, in metres: of the ideal model, of the expected numbers (prior), of fits to the first
-5, 20 and 60 s with the prior and without, and of its own fit to that rest, on stretches held out. Then what
-`slip predict` expected of the run: median modulus of the slip and error over 2 s, and what they were.
+Run: python benchmarks/few_shot.py RESULTS [--input command|measured] [--leave terrain|run] [--vehicle V]
+[--jobs N]. RESULTS are analyzed and diagnosed recordings (slip batch LOGS --out RESULTS). Every terrain of a
+vehicle, or every run alone, is left out in turn. The model is that which the other runs let expect. Printed
+is its error over 2 s on all that was driven after the first minute, in metres: of the ideal model, of the
+expected numbers (prior), of fits to the first 5, 20 and 60 s with the prior and without, and of its own fit
+to that rest, on stretches held out. Then what `slip predict` expected of the run: median modulus of the slip
+and error over 2 s, and what they were.
 """
 
 from __future__ import annotations
@@ -45,13 +46,14 @@ LEFT_S = 60.0
 
 @dataclass(frozen=True)
 class Task:
-    """A run to judge, without the runs on its terrain."""
+    """A run to judge, without the runs on its terrain or without itself."""
 
     results: Path
     run: str
     vehicle: str
     terrain: str
     source: Literal["command", "measured"]
+    leave: Literal["terrain", "run"]
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,8 @@ def judge(task: Task) -> Row | str:
 def _judge(task: Task) -> Row:
     store = Store(task.results)
     estimates = find_estimates(store)
-    others = estimates.filter((estimates["vehicle"] != task.vehicle) | (estimates["terrain"] != task.terrain))
+    gone = {"run": task.run} if task.leave == "run" else {"vehicle": task.vehicle, "terrain": task.terrain}
+    others = estimates.filter(~pl.all_horizontal(pl.col(name) == value for name, value in gone.items()))
     forecast = forecast_vehicle(others, task.vehicle, task.terrain, task.source)
     manifest = store.manifest(task.run)
     if manifest is None:
@@ -128,10 +131,15 @@ def carry(rest: Problem, fitted: Fitted) -> float:
     return score(rest, fitted.state).pooled.t_mrmse_m
 
 
-def list_tasks(results: Path, source: Literal["command", "measured"], only: str | None) -> list[Task]:
+def list_tasks(
+    results: Path,
+    source: Literal["command", "measured"],
+    leave: Literal["terrain", "run"],
+    only: str | None,
+) -> list[Task]:
     runs = find_estimates(Store(results)).select("run", "vehicle", "terrain").unique().sort("run")
     return [
-        Task(results, run, vehicle, terrain, source)
+        Task(results, run, vehicle, terrain, source, leave)
         for run, vehicle, terrain in runs.iter_rows()
         if terrain != "unknown" and only in {None, vehicle}
     ]
@@ -179,11 +187,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("results", type=Path)
     parser.add_argument("--input", choices=("command", "measured"), default="command")
+    parser.add_argument("--leave", choices=("terrain", "run"), default="terrain")
     parser.add_argument("--vehicle")
     parser.add_argument("--jobs", type=int, default=2)
     chosen = parser.parse_args()
     source = cast("Literal['command', 'measured']", chosen.input)
-    tasks = list_tasks(chosen.results, source, chosen.vehicle)
+    leave = cast("Literal['terrain', 'run']", chosen.leave)
+    tasks = list_tasks(chosen.results, source, leave, chosen.vehicle)
     with multiprocessing.get_context("spawn").Pool(chosen.jobs) as pool:
         judged = pool.map(judge, tasks, chunksize=1)
     for note in judged:

@@ -101,8 +101,8 @@ class _Driven:
 def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Prediction:
     """Drive the commands of the vehicle's runs with draws of the model expected on a terrain.
 
-    A draw is a run that may come: its numbers are drawn, its commands are those of one of the runs, and what
-    the model leaves is what that run's own model left, sized as drawn from all runs (`statistics.posterior`
+    A draw is a run that may come: its numbers are drawn, its commands are those of a run (`weigh_runs`), and
+    what the model leaves is what that run's own model left, sized as drawn from all runs (`statistics.posterior`
     on its logarithm). The error of the forecast is that of its expected numbers against the draw, with what
     is left added in squares; the slip is that of the draw.
 
@@ -120,13 +120,13 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
         logs, np.sqrt(0.5 / np.array(length)), terrains, forecast.terrain,
         size=_USUAL_LOG_RATIO, count=DRAWS, rng=rng,
     ).run  # fmt: skip
-    here = [place for place, name in enumerate(terrains) if name == forecast.terrain]
+    there = np.array([name == forecast.terrain for name in terrains])
+    choices = rng.choice(len(runs), DRAWS, p=weigh_runs(there)).tolist()
     numbers: Floats = np.empty((DRAWS, 3))
     known = [_predict(run, forecast.effects) for run in runs]
     ideal = [_predict(run, ()) for run in runs]
     for which, size in enumerate(sizes.tolist()):
-        # Where runs know the terrain, their residuals stand for what comes there.
-        choice = (here or range(len(runs)))[which % (len(here) or len(runs))]
+        choice = choices[which]
         run = runs[choice]
         effects = forecast.draw(which)
         truth = _predict(run, effects)
@@ -136,9 +136,24 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
         modulus = np.linalg.norm(slip * run.scale, axis=1)
         numbers[which] = (*(math.hypot(error, math.exp(size)) for error in errors), np.nanmedian(modulus))
     error, without, modulus_median = (_bound(column) for column in numbers.T)
-    used = tuple(runs[place].manifest.run for place in (here or range(len(runs))))
+    used = tuple(run.manifest.run for run in runs)
     vehicle = runs[0].comparison.context.vehicle
     return Prediction(forecast, vehicle, error, without, modulus_median, used)
+
+
+def weigh_runs(there: NDArray[np.bool_]) -> Floats:
+    """How likely the next run is driven as each of these was, shape (n,).
+
+    As one of the n on its terrain with chance n / (n + 1), else as one on others (Blackwell and MacQueen,
+    Annals of Statistics 1, 1973): few runs on a terrain do not show all that may be driven there.
+
+    Args:
+        there: which runs are on the terrain, shape (n,), n >= 1.
+    """
+    count, others = int(there.sum()), int((~there).sum())
+    if min(count, others) == 0:
+        return np.full(there.size, 1.0 / there.size)
+    return np.where(there, 1.0 / (count + 1), 1.0 / (count + 1) / others)
 
 
 def _bound(draws: Floats) -> Expected:

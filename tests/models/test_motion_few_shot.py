@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 
+from pipeline.analysis.prediction import weigh_runs
 from pipeline.cli import main
 from pipeline.identification import Input, Problem, estimate_intervals, fit_model, score
 from pipeline.identification.few_shot import fit_with_prior, tie_to_prior
@@ -206,3 +207,11 @@ def test_what_cannot_be_fitted_is_said_in_one_line(
     code, _, error = run_slip(capsys, "model", "fit", *on, *more)
     assert code == 1
     assert words in error.splitlines()[-1]
+
+
+def test_few_runs_on_a_terrain_leave_it_open_how_it_will_be_driven() -> None:
+    one, five = weigh_runs(np.array([True, False, False])), weigh_runs(np.array([True] * 5 + [False]))
+    assert one.tolist() == pytest.approx([0.5, 0.25, 0.25])
+    assert five.tolist() == pytest.approx([1 / 6] * 6)
+    for alike in (np.ones(4, dtype=bool), np.zeros(4, dtype=bool)):
+        assert weigh_runs(alike).tolist() == [0.25] * 4
