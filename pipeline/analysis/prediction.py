@@ -102,8 +102,8 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
     """Drive the commands of the vehicle's runs with draws of the model expected on a terrain.
 
     A draw is a run that may come: its numbers are drawn, its commands are those of a run (`weigh_runs`), and
-    what the model leaves is what that run's own model left, sized as drawn from all runs (`statistics.posterior`
-    on its logarithm). The error of the forecast is that of its expected numbers against the draw, with what
+    what the model leaves is what that run's own model left, sized as drawn from all runs (`draw_run` on its
+    logarithm). The error of the forecast is that of its expected numbers against the draw, with what
     is left added in squares; the slip is that of the draw.
 
     Args:
