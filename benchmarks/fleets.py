@@ -27,7 +27,7 @@ from pipeline.core.errors import SlipError
 from pipeline.diagnosis import diagnose_runs
 from pipeline.diagnosis.subject import Recording
 from pipeline.fleet.hierarchy import decide_level, fit_fleet
-from pipeline.fleet.statistics import Interval, split_levels
+from pipeline.fleet.statistics import Interval, draw_run, split_levels
 from pipeline.simulate import find_vehicle, simulate_run
 
 TERRAINS = ("asphalt", "gravel", "sand", "ice")
@@ -211,12 +211,17 @@ def play_driven(fleets: int, seed: int, jobs: int) -> None:
 
 
 def play_drawn(fleets: int, seed: int) -> None:
-    """Estimates drawn by size: spread between terrains, or distance from doing nothing, in run scatters."""
-    print(f"{'hidden as':<10}{'size':>6}{'right':>8}{'open':>8}{'wrong':>8}{'common':>9}{'terrain':>9}")
+    """Estimates drawn by size: spread between terrains, or distance from doing nothing, in run scatters.
+
+    The last columns say how often intervals hold: of the common value, of terrains, and of the number that a
+    run to come has, on a terrain with runs and on a new one.
+    """
+    heads = "".join(f"{name:>9}" for name in ("common", "terrain", "run", "run new"))
+    print(f"{'hidden as':<10}{'size':>6}{'right':>8}{'open':>8}{'wrong':>8}{heads}")
     for level in LEVELS:
         for size in (1.0, 2.0, 4.0, 8.0):
             told: Counter[str] = Counter()
-            held, asked = [0, 0], [0, 0]
+            held, asked = [0, 0, 0, 0], [0, 0, 0, 0]
             for number in range(fleets):
                 rng = np.random.default_rng([seed, number, LEVELS.index(level), int(size)])
                 terrains = np.repeat(TERRAINS, rng.integers(3, 6, len(TERRAINS)))
@@ -235,6 +240,14 @@ def play_drawn(fleets: int, seed: int) -> None:
                     if interval is not None:
                         asked[min(place, 1)] += 1
                         held[min(place, 1)] += interval.low <= value <= interval.high
+                # A run that comes, on a terrain that is known and on one that is not.
+                new = size * float(rng.normal()) if level == "terrain" else 0.0
+                comes = ((TERRAINS[-1], truth[TERRAINS[-1]]), ("mud", centre + new))
+                for place, (name, mean) in enumerate(comes, start=2):
+                    drawn = draw_run(values, errors, terrains.tolist(), name, size=size, count=400, rng=rng)
+                    low, high = np.quantile(drawn.run, (0.025, 0.975))
+                    asked[place] += 1
+                    held[place] += bool(low <= mean + share * float(rng.normal()) <= high)
             rates = [told[level], told["open"], fleets - told[level] - told["open"]]
             shares = "".join(f"{rate / fleets:>8.1%}" for rate in rates)
             holds = "".join(f"{h / max(a, 1):>9.1%}" for h, a in zip(held, asked, strict=True))

@@ -76,7 +76,7 @@ def find_material(
     kept: dict[str, Manifest] = {}
     holders: dict[str, str] = {}
     for manifest in survey.manifests:
-        digest = _read_digest(manifest)
+        digest = read_digest(manifest)
         reason = _doubt(manifest, tables)
         if digest in holders:
             reason = f"the same recording as {holders[digest]}"
@@ -142,7 +142,8 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
     return ""
 
 
-def _read_digest(manifest: Manifest) -> str:
+def read_digest(manifest: Manifest) -> str:
+    """SHA-256 of the log of a run; its name where that is not known."""
     log = manifest.details.get("log")
     return str(log.get("sha256")) if isinstance(log, dict) else manifest.run
 

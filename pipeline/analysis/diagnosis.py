@@ -111,7 +111,7 @@ def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
         manifest.run,
         (manifest.tables, manifest.read),
         log if isinstance(log, dict) else {},
-        _read_length_scale(manifest),
+        read_length_scale(manifest),
     )
     return load_vehicle(manifest), recording
 
@@ -141,7 +141,7 @@ def _make_recording(
     )
 
 
-def _read_length_scale(manifest: Manifest) -> float:
+def read_length_scale(manifest: Manifest) -> float:
     """Length scale of the slip modulus that a run was analyzed with [m]."""
     configuration = manifest.details.get("configuration")
     slip = configuration.get("slip") if isinstance(configuration, dict) else None

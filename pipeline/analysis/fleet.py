@@ -7,14 +7,14 @@ import json
 import math
 from typing import TYPE_CHECKING
 
-from pipeline.analysis.compared_runs import find_material
+import polars as pl
+
+from pipeline.analysis.compared_runs import find_material, read_digest
 from pipeline.analysis.errors import JobError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
-
-    import polars as pl
 
     from pipeline.analysis.compared_runs import ComparedRuns
     from pipeline.fleet.hierarchy import FleetModel, FleetNumber
@@ -48,6 +48,30 @@ def fit_results(store: Store) -> tuple[FleetModel, tuple[str, ...]]:
     model = fit_fleet(compared.scan("estimates").collect())
     notes = (*compared.notes, *model.notes)
     return FleetModel(model.numbers, model.runs, notes), _list_keys(compared)
+
+
+def find_estimates(store: Store, *, without: Sequence[str] = ()) -> pl.DataFrame:
+    """Rows of `estimates` of the runs that a fleet model takes.
+
+    Args:
+        store: the results.
+        without: SHA-256 of recordings that do not count: what is to be predicted is not known.
+
+    Raises:
+        JobError: ``nothing_to_fit``: there are none.
+    """
+    compared = _find_runs(store)
+    known = {
+        run: manifest for run, manifest in compared.manifests.items() if read_digest(manifest) not in without
+    }
+    if not known:
+        raise JobError(
+            "nothing_to_fit",
+            "no other run has estimates" if compared.manifests else "no run has estimates",
+            where=str(store.root),
+            hint="Analyze logs with their diagnosis: slip analyze LOG..., or slip batch.",
+        )
+    return compared.scan("estimates").filter(pl.col("run").is_in(list(known))).collect()
 
 
 def _find_runs(store: Store) -> ComparedRuns:
@@ -145,8 +169,6 @@ def _describe_number(number: FleetNumber) -> dict[str, object]:
 
 def tabulate_fleet(model: FleetModel, keys: tuple[str, ...]) -> pl.DataFrame:
     """The table `fleet`."""
-    import polars as pl  # noqa: PLC0415 - heavy
-
     from schemas import contract_of  # noqa: PLC0415 - brings a table library along
 
     rows: list[Mapping[str, object]] = []

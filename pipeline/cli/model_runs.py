@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 
 def gather_runs(
-    names: Sequence[str], vehicle: Vehicle, owner: Owner | None, out: Path, *, quiet: bool
+    names: Sequence[str], vehicle: Vehicle | None, owner: Owner | None, out: Path, *, quiet: bool
 ) -> tuple[Vehicle, list[MotionRun]]:
     """Runs by name of a log or of a stored run, read with one vehicle's geometry; results stay as they are.
 
     Args:
         names: paths of logs, or names of runs in the results folder.
-        vehicle: of the model.
+        vehicle: of the model; None for that of the first run.
         owner: whose geometry counts where the run's is another one.
         out: results folder.
         quiet: tell nothing on stderr.
@@ -47,7 +47,7 @@ def gather_runs(
             manifests.append(opened.manifest)
         notes += [opened.note] if opened.note and not quiet else []
     known = {found.run: load_vehicle(found) for found in manifests}
-    chosen = agree_on_vehicle(vehicle, known, owner)
+    chosen = agree_on_vehicle(vehicle or next(iter(known.values())), known, owner)
     for note in notes:
         say(f"slip: {note}")
     return chosen, [load_motion_run(manifest, chosen) for manifest in manifests]

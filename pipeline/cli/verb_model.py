@@ -9,6 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
+from pipeline.cli.model_prior import (
+    cut_first,
+    expect_model,
+    prior_as_json,
+    read_seconds,
+    require_model,
+    tie_to_fleet,
+)
 from pipeline.cli.model_trust import TrustCode, open_model, trust, trusted, untrust
 from pipeline.cli.output import CLEAN, print_json, print_lines, say
 
@@ -157,26 +165,36 @@ def drop(  # noqa: D417 - the shared options document themselves
 
 
 def fit(  # noqa: D417 - the shared options document themselves
-    model: Path,
+    model: Path | None = None,
     /,
     *,
     spoken: Spoken,
     predict: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
     afresh: bool = False,
+    first: str | None = None,
+    prior: Literal["fleet"] | None = None,
 ) -> int:
     """Fit a model's values; with --predict, show what carries over to other runs.
 
     Args:
-        model: the model file.
+        model: the model file. With --prior it may be missing, or be left out: the model is then what the
+            fleet lets expect.
         predict: logs or runs that the fit must not see, to be predicted with it.
         afresh: forget the values there are and search anew.
+        first: fit the first seconds of driving only, for example 20s.
+        prior: fleet: count what the other runs of the vehicle in the results folder say of its numbers.
     """
-    file = open_model(model, trust_code=spoken.trust_code)
+    first_s = None if first is None else read_seconds(first)
+    if prior is not None and (model is None or not model.exists()):
+        quiet = spoken.quiet or spoken.json
+        file = expect_model(spoken.on, spoken.input, spoken.out, quiet=quiet)
+    else:
+        file = open_model(require_model(model), trust_code=spoken.trust_code)
     changed = file
     if afresh:
         neutral = [effect.change(**{p.name: p.neutral for p in effect.parameters}) for effect in file.model]
         changed = replace(file, model=file.model.swap(*neutral), intervals={})
-    return _change(model, file, changed, spoken, predict=predict or ())
+    return _change(model, file, changed, spoken, predict=predict or (), first_s=first_s, prior=prior)
 
 
 def compare(  # noqa: D417 - the shared options document themselves
@@ -262,13 +280,15 @@ def _write(path: Path, text: str) -> None:
 
 
 def _change(
-    path: Path,
+    path: Path | None,
     before: ModelFile,
     after: ModelFile,
     spoken: On,
     *,
     predict: Sequence[str] = (),
     keep_if_rises: bool = False,
+    first_s: float | None = None,
+    prior: Literal["fleet"] | None = None,
 ) -> int:
     """Judge a model before and after a change, fit it, write its file, and print.
 
@@ -286,16 +306,23 @@ def _change(
     after, gathered = _gather(spoken, after, [*spoken.on, *predict])
     runs, others = gathered[: len(spoken.on)], gathered[len(spoken.on) :]
     chosen = choose_input(runs, spoken.input, after.model, last=_last_input(before))
-    problem = Problem(runs, after.model.vehicle, chosen.source)
+    problem = Problem(
+        runs if first_s is None else cut_first(runs, first_s), after.model.vehicle, chosen.source
+    )
+    if prior is not None:
+        problem = tie_to_fleet(problem, after.model, spoken.out)
     model_before = replace(before.model, vehicle=after.model.vehicle)
     old = judge_model(problem, model_before, per_run=before.per_run)
     new_one = old
     if after.model.effects != before.model.effects:
         new_one = judge_model(problem, after.model, per_run=after.per_run)
     if keep_if_rises:
-        _require_no_rise(path, old, new_one)
+        _require_no_rise(str(path), old, new_one)
     written = note_fit(after, new_one)
-    write_model(written, path)
+    said = {"first_s": first_s, "prior": prior}
+    written = replace(written, fit={**written.fit, **{key: value for key, value in said.items() if value}})
+    if path is not None:
+        write_model(written, path)
     terrains = [run.terrain for run in runs]
     carried = carry_over(written.model, others, chosen.source, fitted_on=terrains) if others else []
     warnings = [text for text in (chosen.warning, *(item.warning for item in carried)) if text]
@@ -310,7 +337,7 @@ def _change(
     return CLEAN
 
 
-def _require_no_rise(path: Path, old: Judgement, new_one: Judgement) -> None:
+def _require_no_rise(path: str, old: Judgement, new_one: Judgement) -> None:
     from pipeline.identification.describe import describe_rises  # noqa: PLC0415 - heavy
     from pipeline.identification.ladder import CHANCE  # noqa: PLC0415
     from pipeline.runs.errors import MotionError  # noqa: PLC0415
@@ -321,7 +348,7 @@ def _require_no_rise(path: Path, old: Judgement, new_one: Judgement) -> None:
         raise MotionError(
             "error_rises",
             f"with {', '.join(added)} {' and '.join(rises)} on data not seen: the model is as it was",
-            where=str(path),
+            where=path,
             hint="Take something else, or give --anyway",
         )
 
@@ -346,7 +373,7 @@ def _terrains(file: ModelFile) -> list[str]:
 
 
 def _as_json(
-    path: Path,
+    path: Path | None,
     old: Judgement,
     new_one: Judgement,
     chosen: InputChoice,
@@ -365,7 +392,7 @@ def _as_json(
     problem, fitted = new_one.problem, new_one.fitted
     floor = _choose_floor(old, new_one)
     return {
-        "model": str(path),
+        "model": None if path is None else str(path),
         "input": chosen.source.value,
         "input_reason": chosen.reason,
         "runs": list(problem.names),
@@ -384,6 +411,7 @@ def _as_json(
         },
         "noise_floor": errors_as_json(floor),
         "parameters": parameters_as_json(fitted.model, new_one.estimates),
+        "prior": prior_as_json(problem),
         "correlated": correlations_as_json(new_one.estimates),
         "timing": [
             {
@@ -436,7 +464,9 @@ def _describe(old: Judgement, new_one: Judgement, chosen: InputChoice) -> list[s
     if chosen.warning:
         lines.append(chosen.warning)
     parameters = parameters_as_json(new_one.fitted.model, new_one.estimates)
-    return [*lines, "", "parameters", *describe_parameters(parameters)]
+    prior = prior_as_json(new_one.problem)
+    lines += ["", "parameters", *describe_parameters(parameters)]
+    return [*lines, "", "known before", *describe_parameters(prior)] if prior else lines
 
 
 def _choose_floor(old: Judgement, new_one: Judgement) -> Errors:

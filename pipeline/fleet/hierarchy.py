@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, cast
 
 import polars as pl
 
+from pipeline.fleet.runs import UNKNOWN
 from pipeline.fleet.statistics import find_outlier, split_levels
 from pipeline.models.catalogue import find_effect
 from pipeline.models.level import Level
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 SURE = 0.01
 """A difference is taken for one below this chance: of ten numbers of a vehicle, nine fleets in ten show none
 that are not there."""
-_UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True)
@@ -99,23 +99,19 @@ def fit_fleet(estimates: pl.DataFrame) -> FleetModel:
         estimates: rows of the table `estimates` of all runs.
     """
     notes = []
-    known = estimates.filter(pl.col("terrain") != _UNKNOWN)
+    known = estimates.filter(pl.col("terrain") != UNKNOWN)
     lost = sorted(set(estimates["run"]) - set(known["run"]))
     if lost:
         notes.append(f"left out, terrain unknown: {', '.join(lost)}")
     bound = known.filter(pl.col("at_bound")).select("effect").to_series().unique().sort().to_list()
     if bound:
         notes.append(f"numbers at a bound of the search are left out: of {', '.join(bound)} in some runs")
-    led = (
-        known.filter(~pl.col("at_bound"))
-        .with_columns(pl.col("input").cast(pl.String))
-        .sort("run", "effect", "parameter", "input")
-        .unique(["run", "effect", "parameter"], keep="first", maintain_order=True)
-    )
     numbers = []
-    for (vehicle, effect, parameter), rows in led.partition_by(
-        "vehicle", "effect", "parameter", as_dict=True, maintain_order=True
-    ).items():
+    for (vehicle, effect, parameter), rows in (
+        take_numbers(known)
+        .partition_by("vehicle", "effect", "parameter", as_dict=True, maintain_order=True)
+        .items()
+    ):
         if rows["named"].any():
             numbers.append(_fit_number(str(vehicle), str(effect), str(parameter), rows))
     numbers.sort(key=lambda one: (one.vehicle, -one.named, one.effect, one.parameter))
@@ -126,11 +122,18 @@ def fit_fleet(estimates: pl.DataFrame) -> FleetModel:
     return FleetModel(tuple(numbers), dict(sorted(runs.items())), tuple(notes))
 
 
+def take_numbers(estimates: pl.DataFrame) -> pl.DataFrame:
+    """Rows of `estimates` that count: known terrain, not at a bound, of two inputs the command."""
+    return (
+        estimates.filter(pl.col("terrain") != UNKNOWN, ~pl.col("at_bound"))
+        .with_columns(pl.col("input").cast(pl.String))
+        .sort("run", "effect", "parameter", "input")
+        .unique(["run", "effect", "parameter"], keep="first", maintain_order=True)
+    )
+
+
 def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -> FleetNumber:
-    kept, odd = rows, []
-    while (place := _find_odd(kept)) is not None:
-        odd.append(str(kept["run"][place]))
-        kept = kept.filter(pl.col("run") != odd[-1])
+    kept, odd = leave_out_odd(rows)
     fit = split_levels(kept["value"], kept["standard_error"], kept["terrain"].to_list())
     neutral = find_effect(effect)().parameter(parameter).neutral
     level, because = decide_level(fit, neutral)
@@ -149,8 +152,17 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
         fit=fit,
         named=int(rows["named"].sum()),
         runs=tuple(kept["run"].to_list()),
-        odd=tuple(odd),
+        odd=odd,
     )
+
+
+def leave_out_odd(rows: pl.DataFrame) -> tuple[pl.DataFrame, tuple[str, ...]]:
+    """Rows of one number without runs that stand apart from the others, and the names of those."""
+    odd: list[str] = []
+    while (place := _find_odd(rows)) is not None:
+        odd.append(str(rows["run"][place]))
+        rows = rows.filter(pl.col("run") != odd[-1])
+    return rows, tuple(odd)
 
 
 def _find_odd(rows: pl.DataFrame) -> int | None:

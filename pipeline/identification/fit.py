@@ -46,7 +46,7 @@ class PartFit:
         residual: its residuals, shape (n, 3).
         jacobian: change of the prediction with each free number, shape (n, 3, p).
         weights: what a residual costs.
-        loss: mean cost under these weights.
+        loss: mean cost under these weights, that of the prior included.
     """
 
     state: State
@@ -216,8 +216,19 @@ def fit_part(
     return fit
 
 
+def measure_loss(part: Part, weights: Weights, residual: Floats, state: State, free: Sequence[Free]) -> float:
+    """Mean cost of a window, with its share of what the prior costs."""
+    prior: float = part.prior.cost(state, free) / residual.shape[0]
+    return weights.loss(residual) + prior
+
+
 def solve_step(
-    jacobian: Floats, residual: Floats, weights: Weights, damping: float = 0.0, hold: Floats | float = 0.0
+    jacobian: Floats,
+    residual: Floats,
+    weights: Weights,
+    damping: float = 0.0,
+    hold: Floats | float = 0.0,
+    pull: Floats | float = 0.0,
 ) -> tuple[Floats, Floats]:
     """One weighted least squares step.
 
@@ -227,6 +238,7 @@ def solve_step(
         weights: cost of residuals.
         damping: Levenberg-Marquardt damping relative to the diagonal.
         hold: information that speaks for staying where each number is, shape (p,).
+        pull: information that speaks for a change, times that change, shape (p,).
 
     Returns:
         The step, shape (p,), and the normal matrix, shape (p, p).
@@ -237,7 +249,7 @@ def solve_step(
     normal = np.asarray(rows.T @ rows, dtype=np.float64)
     size = np.diag(normal) + 1e-12
     stiff = normal + np.diag(size * (damping + 1e-9) + hold)
-    step = np.asarray(np.linalg.solve(stiff, rows.T @ target), dtype=np.float64)
+    step = np.asarray(np.linalg.solve(stiff, rows.T @ target + pull), dtype=np.float64)
     return step, normal
 
 
@@ -247,24 +259,37 @@ def _descend(
     iterations, enough = until
     both = enough < _ENOUGH
     residual = part.find_residuals(state)
-    loss = weights.loss(residual)
+    loss = measure_loss(part, weights, residual, state, free)
     smooth = [place for place, number in enumerate(free) if number.is_smooth]
     jacobian = part.differentiate(state, residual, free, both_sides=both)
     if not smooth:
         return PartFit(state, free, residual, jacobian, weights, loss)
     damping, is_fresh = 1e-4, True
     for _ in range(iterations):
-        moving = [place for place in smooth if not _pushes_out(state, free[place], jacobian, residual, place)]
+        pull = part.prior.pull(state, free)
+        moving = [
+            place
+            for place in smooth
+            if not _pushes_out(state, free[place], jacobian[:, :, place], residual, float(pull[place]))
+        ]
         if not moving:
             break
-        step, _ = solve_step(jacobian[:, :, moving], residual, weights, damping)
+        movable = [free[place] for place in moving]
+        step, _ = solve_step(
+            jacobian[:, :, moving],
+            residual,
+            weights,
+            damping,
+            part.prior.weigh(state, movable),
+            part.prior.pull(state, movable),
+        )
+        trial = state.move(movable, step.tolist())
         # What the step promises, were the model linear: where that is nothing, the fit is done.
-        promised = weights.loss(residual - jacobian[:, :, moving] @ step)
-        if (loss - promised) / max(loss, 1e-12) < 0.5 * enough:
+        linear = residual - jacobian[:, :, moving] @ step
+        if (loss - measure_loss(part, weights, linear, trial, free)) / max(loss, 1e-12) < 0.5 * enough:
             break
-        trial = state.move([free[place] for place in moving], step.tolist())
         after = part.find_residuals(trial)
-        reached = weights.loss(after)
+        reached = measure_loss(part, weights, after, trial, free)
         if reached > loss:
             if not is_fresh:
                 jacobian = part.differentiate(state, residual, free, both_sides=both)
@@ -286,12 +311,12 @@ def _descend(
     return PartFit(state, free, residual, jacobian, weights, loss)
 
 
-def _pushes_out(state: State, number: Free, jacobian: Floats, residual: Floats, place: int) -> bool:
+def _pushes_out(state: State, number: Free, column: Floats, residual: Floats, prior: float) -> bool:
     """Whether a number stands at its bound and wants to go beyond."""
     value, (low, high) = state.get(number), number.bounds
     if low < value < high:
         return False
-    pull = float(np.sum(jacobian[:, :, place] * residual))
+    pull = float(np.sum(column * residual)) + prior
     return (value <= low and pull < 0.0) or (value >= high and pull > 0.0)
 
 
@@ -306,11 +331,12 @@ def _walk_grid(part: Part, fit: PartFit, number: Free) -> State | None:
         for at in (best - width, best - 0.5 * width, best + 0.5 * width, best + width):
             if not number.bounds[0] <= at <= number.bounds[1]:
                 continue
-            residual = part.find_residuals(fit.state.set(number, at))
+            moved = fit.state.set(number, at)
+            residual = part.find_residuals(moved)
             if others:
                 step, _ = solve_step(fit.jacobian[:, :, others], residual, weights)
                 residual = residual - fit.jacobian[:, :, others] @ step
-            loss = weights.loss(residual)
+            loss = measure_loss(part, weights, residual, moved, fit.free)
             if loss < best_loss:
                 best, best_loss = at, loss
         width /= 3.0

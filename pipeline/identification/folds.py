@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.identification.fit import PartFit, solve_step
+from pipeline.identification.fit import PartFit, measure_loss, solve_step
 from pipeline.identification.weights import Weights
 
 if TYPE_CHECKING:
@@ -93,12 +93,15 @@ def refit(part: Part, fit: PartFit, train: Flags) -> State:
     if not smooth or not train.any():
         return state
     weights, jacobian, hold = _take(fit.weights, train), fit.jacobian[train][:, :, smooth], _hold(fit)
-    loss = weights.loss(residual[train])
+    free = [fit.free[place] for place in smooth]
+    loss = measure_loss(part, weights, residual[train], state, free)
     for _ in range(_CHORD_STEPS):
-        step, _ = solve_step(jacobian, residual[train], weights, hold=hold)
-        moved = state.move([fit.free[place] for place in smooth], step.tolist())
+        pull = part.prior.pull(state, free)
+        held = hold + part.prior.weigh(state, free)
+        step, _ = solve_step(jacobian, residual[train], weights, hold=held, pull=pull)
+        moved = state.move(free, step.tolist())
         trial = part.find_residuals(moved)
-        new = weights.loss(trial[train])
+        new = measure_loss(part, weights, trial[train], moved, free)
         if new >= loss:
             break
         state, residual, loss = moved, trial, new

@@ -23,6 +23,8 @@ _HUBER = 3.0
 _GAUSSIAN = 1.4826
 _SHORTEST_BLOCK_S = 6.0
 _TAUS = 5.0
+SHORTEST_TIME_S = _SHORTEST_BLOCK_S / _TAUS
+"""Residuals are taken to repeat each other for as long at least [s]."""
 _DELAY_STEP = 5e-3
 _RISEN = 1.92
 _LONGEST_S = 20.0
@@ -93,7 +95,8 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
     makes the interval wide (delete-a-group jackknife; Shao and Tu, The Jackknife and Bootstrap, 1995, and
     CR3 of cluster-robust regression). Blocks are command steps; where those are short against the
     correlation of the residuals, several are joined, to at least five integrated autocorrelation times and
-    six seconds. The interval is symmetric, with Student's t for the number of blocks.
+    six seconds. The interval is symmetric, with Student's t for the number of blocks. With a prior, which is
+    for runs of few blocks, it is that of the posterior, normal at its top (Laplace).
 
     Args:
         problem: the runs.
@@ -120,18 +123,24 @@ def estimate_part(part: Part, fit: PartFit) -> Estimates:
     block = join_blocks(part, fit)
     pieces = int(block.max()) + 1
     normals, gradients = _sum_blocks(fit, block, pieces)
-    total = normals.sum(axis=0)
+    total = normals.sum(axis=0) + np.diag(part.prior.weigh(fit.state, fit.free))
     size = np.sqrt(np.maximum(np.diag(total), 0.0))
     observable = size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)
     rows = np.flatnonzero(observable)
     errors = np.full(count, np.nan)
     correlation = np.full((count, count), np.nan)
-    if rows.size and pieces > 1:
+    freedom: float = max(pieces - 1, 1)
+    spread: Floats | None = None
+    if rows.size and part.prior.numbers:
+        freedom = np.inf
+        scale = np.outer(size[rows], size[rows])
+        spread = part.prior.excess * np.linalg.inv(total[np.ix_(rows, rows)] / scale) / scale
+    elif rows.size and pieces > 1:
         spread = _jackknife(normals, gradients, rows, size)
+    if spread is not None:
         errors[rows] = np.sqrt(np.diag(spread))
         deviation = np.maximum(np.outer(errors[rows], errors[rows]), 1e-300)
         correlation[np.ix_(rows, rows)] = spread / deviation
-    freedom = max(pieces - 1, 1)
     wide = float(student.ppf(0.975, freedom))
     errors[rows] = np.hypot(errors[rows], _carry_clocks(part, fit, total, rows, size))
     items = []
@@ -178,8 +187,7 @@ def _widen(part: Part, fit: PartFit, number: Free) -> float:
     """
     value, (low, high) = fit.state.get(number), number.bounds
     base = _sum_losses(fit, fit.residual)
-    stride = float(np.median(np.diff(part.times.mean(axis=1))))
-    repeats = max(integrate_correlation(part, fit) / max(stride, 1e-3), 1.0)
+    repeats = count_repeats(part, fit)
     ends = []
     for side in (-1.0, 1.0):
         width = number.step / 16.0
@@ -210,6 +218,12 @@ def join_blocks(part: Part, fit: PartFit) -> Integers:
         last_run, last_block = run, block
         joined[index] = number
     return joined
+
+
+def count_repeats(part: Part, fit: PartFit) -> float:
+    """How many residuals tell as much as one that repeats no other: correlation time over their distance."""
+    stride = float(np.median(np.diff(part.times.mean(axis=1))))
+    return max(integrate_correlation(part, fit) / max(stride, 1e-3), 1.0)
 
 
 def integrate_correlation(part: Part, fit: PartFit) -> float:

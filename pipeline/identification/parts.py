@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.identification.prior import NO_PRIOR, Prior
 from pipeline.identification.state import State
 from pipeline.identification.weights import measure_noise
 from pipeline.models.effect import Place
@@ -59,8 +60,10 @@ class Part(ABC):
         live: whether the input moves the vehicle during a window or just before, shape (n,).
         least: spread below which a residual is rounding of stamps [m/s, m/s, rad/s], shape (3,).
         way: from where to where, in words.
+        prior: what is known of numbers before.
     """
 
+    prior: Prior = NO_PRIOR
     channels: tuple[int, ...] = (0, 1, 2)
     way: str
 

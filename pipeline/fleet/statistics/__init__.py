@@ -38,6 +38,7 @@ from pipeline.fleet.statistics.permutation import (
     permute_studentized,
     smallest_p,
 )
+from pipeline.fleet.statistics.posterior import Draws, draw_run
 from pipeline.fleet.statistics.ranks import mann_whitney
 
 __all__ = [
@@ -47,6 +48,7 @@ __all__ = [
     "Blocks",
     "Change",
     "Comparison",
+    "Draws",
     "GroupMean",
     "Interval",
     "LevelFit",
@@ -64,6 +66,7 @@ __all__ = [
     "compare_runs",
     "count_effective",
     "cut_blocks",
+    "draw_run",
     "find_changes",
     "find_outlier",
     "integrated_time",

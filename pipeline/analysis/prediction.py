@@ -1,0 +1,262 @@
+"""Before driving there: the model, the slip and the error over 2 s that a fleet's runs let expect."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from pipeline.analysis.diagnosis import read_length_scale
+from pipeline.analysis.errors import JobError
+from pipeline.analysis.fleet import find_estimates
+from pipeline.fleet import read_day
+from pipeline.fleet.forecast import DRAWS, make_effects
+from pipeline.fleet.statistics import Interval, draw_run
+from pipeline.identification.comparison import Comparison, Input
+from pipeline.identification.predict import predict_at_from, predict_from
+from pipeline.models.catalogue import find_effect
+from pipeline.models.effect import Place
+from pipeline.models.forward import Timing
+from pipeline.models.model import Model
+from pipeline.models.model_file import ModelFile
+from pipeline.report.motion_run import load_motion_run, load_vehicle
+from pipeline.runs.errors import MotionError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pipeline.fleet.forecast import Forecast
+    from pipeline.models.effect import Effect
+    from pipeline.store import Manifest, Store
+    from pipeline.vehicles import Vehicle
+
+    Floats = NDArray[np.float64]
+
+MOST_RUNS = 8
+"""Runs whose commands stand for those to come: more make the answer slower and hardly another."""
+_LEVEL = 0.95
+_BLOCK_S = 10.0
+_ENDS = (0.025, 0.5, 0.975)
+# Residuals of one run are half or twice those of another where they differ much.
+_USUAL_LOG_RATIO = math.log(2.0)
+
+
+@dataclass(frozen=True)
+class Expected:
+    """A number to expect: its median, and the interval that holds 95 of 100 runs."""
+
+    value: float
+    interval: Interval
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What to expect of a run on a terrain.
+
+    Attributes:
+        forecast: the model.
+        vehicle: its geometry, of the newest run.
+        t_mrmse_m: error over 2 s of the forecast model [m].
+        ideal_t_mrmse_m: that of the ideal model [m].
+        median_modulus: median slip modulus [m/s].
+        runs_used: runs whose commands and residuals stand for those to come.
+    """
+
+    forecast: Forecast
+    vehicle: Vehicle
+    t_mrmse_m: Expected
+    ideal_t_mrmse_m: Expected
+    median_modulus: Expected
+    runs_used: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Driven:
+    """A run of the fleet: what was commanded, and what its own model leaves.
+
+    Attributes:
+        manifest: its results.
+        comparison: the run, fed with the input.
+        error_m: error of its own model over 2 s.
+        times: of its slip [s], shape (n,).
+        ideal: ideal velocity there, shape (n, 3); `left` what its own model leaves of the measured one.
+        scale: of the modulus [m/s, m/s, m/s over rad/s], shape (3,).
+    """
+
+    manifest: Manifest
+    comparison: Comparison
+    error_m: float
+    times: Floats
+    ideal: Floats
+    left: Floats
+    scale: Floats
+
+
+def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Prediction:
+    """Drive the commands of the vehicle's runs with draws of the model expected on a terrain.
+
+    A draw is a run that may come: its numbers are drawn, its commands are those of a run (`weigh_runs`), and
+    what the model leaves is what that run's own model left, sized as drawn from all runs (`draw_run` on its
+    logarithm). The error of the forecast is that of its expected numbers against the draw, with what
+    is left added in squares; the slip is that of the draw.
+
+    Args:
+        store: the results.
+        forecast: of the vehicle on the terrain.
+        seed: of the draws.
+    """
+    runs = _load_runs(store, forecast)
+    rng = np.random.default_rng(seed)
+    logs = np.log([max(run.error_m, 1e-6) for run in runs])
+    length = [max(run.comparison.run.duration_s / _BLOCK_S, 1.0) for run in runs]
+    terrains = [str(run.manifest.details.get("terrain")) for run in runs]
+    sizes = draw_run(
+        logs, np.sqrt(0.5 / np.array(length)), terrains, forecast.terrain,
+        size=_USUAL_LOG_RATIO, count=DRAWS, rng=rng,
+    ).run  # fmt: skip
+    there = np.array([name == forecast.terrain for name in terrains])
+    choices = rng.choice(len(runs), DRAWS, p=weigh_runs(there)).tolist()
+    numbers: Floats = np.empty((DRAWS, 3))
+    known = [_predict(run, forecast.effects) for run in runs]
+    ideal = [_predict(run, ()) for run in runs]
+    for which, size in enumerate(sizes.tolist()):
+        choice = choices[which]
+        run = runs[choice]
+        effects = forecast.draw(which)
+        truth = _predict(run, effects)
+        errors = [_measure_gap(truth, side) for side in (known[choice], ideal[choice])]
+        grown = math.exp(size - float(logs[choice]))
+        slip = run.ideal - predict_at_from(run.comparison, effects, Timing(), run.times) - grown * run.left
+        modulus = np.linalg.norm(slip * run.scale, axis=1)
+        numbers[which] = (*(math.hypot(error, math.exp(size)) for error in errors), np.nanmedian(modulus))
+    error, without, modulus_median = (_bound(column) for column in numbers.T)
+    used = tuple(run.manifest.run for run in runs)
+    vehicle = runs[0].comparison.context.vehicle
+    return Prediction(forecast, vehicle, error, without, modulus_median, used)
+
+
+def weigh_runs(there: NDArray[np.bool_]) -> Floats:
+    """How likely the next run is driven as each of these was, shape (n,).
+
+    As one of the n on its terrain with chance n / (n + 1), else as one on others (Blackwell and MacQueen,
+    Annals of Statistics 1, 1973): few runs on a terrain do not show all that may be driven there.
+
+    Args:
+        there: which runs are on the terrain, shape (n,), n >= 1.
+    """
+    count, others = int(there.sum()), int((~there).sum())
+    if min(count, others) == 0:
+        return np.full(there.size, 1.0 / there.size)
+    return np.where(there, 1.0 / (count + 1), 1.0 / (count + 1) / others)
+
+
+def _bound(draws: Floats) -> Expected:
+    low, middle, high = np.quantile(draws, _ENDS).tolist()
+    return Expected(middle, Interval(low, high, _LEVEL))
+
+
+def _predict(run: _Driven, effects: Sequence[Effect]) -> NDArray[np.complex128]:
+    """Positions of predictions over 2 s [m], by prediction and time since its start."""
+    poses = predict_from(run.comparison, effects, Timing()).poses
+    positions: NDArray[np.complex128] = poses[:, 1:, 0] + 1j * poses[:, 1:, 1]
+    return positions
+
+
+def _measure_gap(one: NDArray[np.complex128], other: NDArray[np.complex128]) -> float:
+    return float(np.sqrt(np.mean(np.abs(one - other) ** 2)))
+
+
+def _load_runs(store: Store, forecast: Forecast) -> list[_Driven]:
+    """The runs on the terrain, then others, newest first; with their own models.
+
+    Raises:
+        JobError: ``nothing_to_drive``: no run has the input.
+    """
+    named = find_estimates(store).filter(pl.col("named"), pl.col("input").cast(pl.String) == forecast.input)
+    newest = [name for side in (forecast.here, forecast.elsewhere) for name in sorted(side, key=_date)[::-1]]
+    runs: list[_Driven] = []
+    for name in newest:
+        manifest = store.manifest(name)
+        if manifest is not None and len(runs) < MOST_RUNS:
+            with contextlib.suppress(MotionError):
+                own = named.filter(pl.col("run") == name)
+                runs.append(_load_run(manifest, own, Input(forecast.input)))
+    if not runs:
+        raise JobError(
+            "nothing_to_drive",
+            f"no run of {forecast.vehicle} has the {forecast.input} input to drive again",
+            where=str(store.root),
+            hint="Choose the other input.",
+        )
+    return runs
+
+
+def _date(run: str) -> str:
+    return read_day(run) or ""
+
+
+def _load_run(manifest: Manifest, named: pl.DataFrame, source: Input) -> _Driven:
+    vehicle = load_vehicle(manifest)
+    comparison = Comparison(load_motion_run(manifest, vehicle), vehicle, source)
+    values: dict[str, dict[str, float]] = {}
+    for effect, parameter, value in named.select("effect", "parameter", "value").iter_rows():
+        low, high = find_effect(effect)().parameter(parameter).bounds
+        values.setdefault(effect, {})[parameter] = min(max(value, low), high)
+    own = tuple(e for e in make_effects(values) if source is Input.COMMAND or e.place > Place.DRIVE)
+    error = comparison.find_horizon_errors(own, Timing()).position
+    slip = manifest.read("slip").filter(~pl.col("suspect"), pl.col("input").cast(pl.String) == source.value)
+    times = slip["t"].to_numpy()
+    measured = slip.select("v_x", "v_y", "v_w").to_numpy()
+    return _Driven(
+        manifest=manifest,
+        comparison=comparison,
+        error_m=float(np.sqrt(np.mean(error**2))),
+        times=times,
+        ideal=slip.select("f_x", "f_y", "f_w").to_numpy(),
+        left=measured - predict_at_from(comparison, own, Timing(), times),
+        scale=np.array([1.0, 1.0, read_length_scale(manifest)]),
+    )
+
+
+def describe_prediction(prediction: Prediction) -> dict[str, object]:
+    """The JSON object of `slip predict`."""
+    forecast = prediction.forecast
+    effects: dict[str, dict[str, object]] = {}
+    for number in forecast.numbers:
+        low, high = number.ends
+        effects.setdefault(number.effect, {})[number.parameter] = {
+            "value": number.value, "low": low, "high": high, "unit": number.unit, "runs": number.runs,
+        }  # fmt: skip
+    return {
+        "vehicle": forecast.vehicle,
+        "terrain": forecast.terrain,
+        "input": forecast.input,
+        "effects": [{"id": effect.id, "parameters": effects[effect.id]} for effect in forecast.effects],
+        "t_mrmse_m": _describe(prediction.t_mrmse_m),
+        "ideal_t_mrmse_m": _describe(prediction.ideal_t_mrmse_m),
+        "median_modulus": _describe(prediction.median_modulus),
+        "runs_on_terrain": len(forecast.here),
+        "runs_elsewhere": len(forecast.elsewhere),
+        "runs_used": list(prediction.runs_used),
+    }
+
+
+def _describe(number: Expected) -> dict[str, float]:
+    return {"value": number.value, "low": number.interval.low, "high": number.interval.high}
+
+
+def make_model_file(prediction: Prediction) -> ModelFile:
+    """The expected model as a file, with the intervals of its numbers."""
+    forecast = prediction.forecast
+    there = f"{len(forecast.here)} runs on {forecast.terrain}, {len(forecast.elsewhere)} elsewhere"
+    return ModelFile(
+        Model(prediction.vehicle, forecast.effects),
+        intervals={number.label: number.ends for number in forecast.numbers},
+        note=f"Expected of {forecast.vehicle} on {forecast.terrain}, from {there}; not fitted to a run.",
+    )

@@ -1,0 +1,96 @@
+"""`slip predict`: what to expect of a vehicle on a terrain before driving there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, cast
+
+from cyclopts import App, Parameter
+
+from pipeline.cli.output import CLEAN, print_json, print_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+_LABEL = 26
+_WORDS = (
+    ("median_modulus", "slip, median modulus", "m/s"),
+    ("t_mrmse_m", "error over 2 s", "m"),
+    ("ideal_t_mrmse_m", "of the ideal model", "m"),
+)
+
+
+def register(app: App) -> None:
+    """Add the verb."""
+    app.command(predict)
+
+
+def predict(
+    *,
+    vehicle: str,
+    terrain: str,
+    known: Path = Path("results"),
+    input: Literal["command", "measured"] = "command",  # noqa: A002 - the word of the other verbs
+    model: Path | None = None,
+    out: Annotated[Path | None, Parameter(help="the same as --known")] = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Say what to expect of a vehicle on a terrain: its model, slip, and error over 2 s, with intervals.
+
+    Intervals hold 95 of 100 runs that may come. A terrain on which the vehicle never drove is one like the
+    others it has driven on.
+
+    Args:
+        vehicle: vehicle preset, for example warthog.
+        terrain: terrain to drive on.
+        known: results folder with diagnosed runs of the vehicle.
+        input: what the model is fed with.
+        model: model file to write.
+        out: the same as --known.
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.analysis.fleet import find_estimates  # noqa: PLC0415 - heavy
+    from pipeline.analysis.prediction import (  # noqa: PLC0415
+        describe_prediction,
+        make_model_file,
+        predict_deployment,
+    )
+    from pipeline.fleet.forecast import forecast_vehicle  # noqa: PLC0415
+    from pipeline.models.model_text import write_model  # noqa: PLC0415
+    from pipeline.store import Store  # noqa: PLC0415
+
+    store = Store(out or known)
+    prediction = predict_deployment(store, forecast_vehicle(find_estimates(store), vehicle, terrain, input))
+    if model is not None:
+        write_model(make_model_file(prediction), model)
+    content = {**describe_prediction(prediction), "model": None if model is None else str(model)}
+    if json:
+        print_json(content)
+    elif not quiet:
+        print_lines(_describe(content))
+    return CLEAN
+
+
+def _describe(content: Mapping[str, object]) -> list[str]:
+    here, elsewhere = content["runs_on_terrain"], content["runs_elsewhere"]
+    lines = [f"{content['vehicle']} on {content['terrain']}: {here} runs there, {elsewhere} elsewhere"]
+    for effect in cast("Sequence[Mapping[str, object]]", content["effects"]):
+        parameters = cast("Mapping[str, Mapping[str, object]]", effect["parameters"])
+        lines += [
+            f"  {effect['id']}.{name}".ljust(_LABEL + 2) + _bound(number, str(number["unit"]))
+            for name, number in parameters.items()
+        ]
+    if not content["effects"]:
+        lines.append("  the ideal model: most runs name no effect")
+    lines += [
+        f"{words:<{_LABEL + 2}}{_bound(cast('Mapping[str, object]', content[key]), unit)}"
+        for key, words, unit in _WORDS
+    ]
+    return lines if content["model"] is None else [*lines, f"written: {content['model']}"]
+
+
+def _bound(number: Mapping[str, object], unit: str) -> str:
+    shown = f"{number['value']:.3g}" + ("" if unit == "1" else f" {unit}")
+    return f"{shown} [{number['low']:.3g}, {number['high']:.3g}]"

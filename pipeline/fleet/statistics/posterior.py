@@ -1,0 +1,103 @@
+"""What another run would show of a number: draws from the model of levels, its spreads unknown too.
+
+    y_r = mu + a_g(r) + b_r + e_r,    a ~ N(0, group spread^2),  b ~ N(0, run spread^2),  var e_r known
+
+as in `levels`, with a flat prior on mu and a half-normal one on either spread (Gelman, Bayesian Analysis 1,
+2006). Likely spreads are weighed, not the likeliest taken, so that few runs give wide answers, one run and a
+group never seen included.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.fleet.statistics.arrays import Floats, check_values
+from pipeline.fleet.statistics.errors import StatisticsError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike
+
+# Spreads on a grid, as parts of the usual size: steps of a fifth, from far below any that matters.
+_GRID = np.geomspace(1e-3, 5.0, 48)
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Draws of a number, each of shape (n,).
+
+    Attributes:
+        group: the mean of the group.
+        run: the number in another run of that group.
+    """
+
+    group: Floats
+    run: Floats
+
+
+def draw_run(
+    values: ArrayLike,
+    errors: ArrayLike,
+    groups: Sequence[str],
+    group: str,
+    *,
+    size: float,
+    count: int,
+    rng: np.random.Generator,
+) -> Draws:
+    """Draw what another run of a group would show.
+
+    Args:
+        values: one number a run, shape (n,), n >= 1.
+        errors: standard deviations of the numbers, shape (n,), positive.
+        groups: label of each run's group, n of them.
+        group: of the other run; may be one without runs.
+        size: usual size of such numbers, which spreads seldom exceed; positive.
+        count: how many draws.
+        rng: source of chance.
+
+    Raises:
+        StatisticsError: ``too_few_values``, ``not_finite``, or ``bad_errors``: shapes differ, or an error or
+            the size is not positive.
+    """
+    y, s = check_values(values, what="values"), check_values(errors, what="errors")
+    if not y.size == s.size == len(groups) or min(s.min(), size) <= 0.0:
+        raise StatisticsError(
+            "bad_errors",
+            f"{y.size} values have {s.size} errors and {len(groups)} groups, usual size {size:g}",
+            hint="Give every value a group and a positive error, and a positive size.",
+        )
+    names = sorted(set(groups))
+    member = np.array([[name == label for label in groups] for name in names], dtype=np.float64)
+    spreads = size * _GRID
+    weight = 1.0 / (s**2 + spreads[:, None] ** 2)
+    total = weight @ member.T
+    means = (weight * y) @ member.T / total
+    rest = np.sum(weight * (y - means @ member) ** 2, axis=1)
+    within = -0.5 * (rest - np.log(weight).sum(axis=1) + np.log(total).sum(axis=1))
+    # Axes: spread between groups, spread between runs, group.
+    outer = 1.0 / (spreads[:, None, None] ** 2 + 1.0 / total)
+    mass = outer.sum(axis=2)
+    centre = (outer * means).sum(axis=2) / mass
+    away = np.sum(outer * (means - centre[:, :, None]) ** 2, axis=2)
+    likelihood = within - 0.5 * (away - np.log(outer).sum(axis=2) + np.log(mass))
+    # On a grid of equal ratios a density counts by its spread.
+    prior = np.log(spreads) - 0.5 * (spreads / size) ** 2
+    score = likelihood + prior[:, None] + prior
+    chance = np.exp(score - score.max()).ravel()
+    picked = rng.choice(chance.size, count, p=chance / chance.sum())
+    between, run = np.unravel_index(picked, score.shape)
+    common = centre[between, run] + rng.standard_normal(count) / np.sqrt(mass[between, run])
+    known = np.zeros(count)
+    pull = np.zeros(count)
+    if group in names:
+        place = names.index(group)
+        known = total[run, place]
+        pull = known * means[run, place]
+    sharp = known + 1.0 / spreads[between] ** 2
+    own = (pull + common / spreads[between] ** 2) / sharp + rng.standard_normal(count) / np.sqrt(sharp)
+    return Draws(own, own + spreads[run] * rng.standard_normal(count))

@@ -1,0 +1,78 @@
+"""A model fitted to little driving, with what is known of its numbers before."""
+
+from __future__ import annotations
+
+from copy import copy
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.identification.fit import fit_model
+from pipeline.identification.intervals import SHORTEST_TIME_S, count_repeats
+from pipeline.identification.parts import BodyPart
+from pipeline.identification.prior import Prior
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.identification.fit import Fitted, PartFit
+    from pipeline.identification.parts import Part
+    from pipeline.identification.problem import Problem
+    from pipeline.models.model import Model
+
+_ROUNDS = 2
+
+
+def tie_to_prior(problem: Problem, model: Model, numbers: Mapping[str, tuple[float, float]]) -> Problem:
+    """The problem with a prior on the model's numbers.
+
+    How often residuals repeat each other is read from those of the fit itself, which is repeated with it.
+
+    Args:
+        problem: the runs.
+        model: its effects start from their values.
+        numbers: mean and standard deviation by label ``effect.name``.
+
+    Returns:
+        The runs made ready once, shared with `problem`, with the prior in every part.
+    """
+    tied = _tie(problem, [Prior(numbers)] * len(problem.parts))
+    for _ in range(_ROUNDS):
+        fitted = fit_model(tied, model)
+        repeats = [measure_excess(part, fit) for part, fit in zip(tied.parts, fitted.fits, strict=True)]
+        tied = _tie(problem, [Prior(numbers, count) for count in repeats])
+    return tied
+
+
+def fit_with_prior(problem: Problem, model: Model, numbers: Mapping[str, tuple[float, float]]) -> Fitted:
+    """Fit a model with a prior on its numbers; see `tie_to_prior`."""
+    return fit_model(tie_to_prior(problem, model, numbers), model, exact=True)
+
+
+def measure_excess(part: Part, fit: PartFit) -> float:
+    """By how much the summed cost of residuals says more than they know.
+
+    Residuals repeat each other: by the time in which they do over the distance of two. That time is taken
+    from the residuals, and no shorter than that of the shortest blocks of `intervals.join_blocks`, since a
+    few seconds cannot show it. And they are larger than the spreads that they are weighed by where the model
+    leaves more than noise: by their mean square in these units.
+    """
+    live = fit.residual[part.live] if part.live.any() else fit.residual
+    scale = fit.weights.scale[part.live] if part.live.any() else fit.weights.scale
+    squares = np.mean((live / scale)[:, list(part.channels)] ** 2)
+    distance = float(np.median(np.diff(part.times.mean(axis=1))))
+    repeats = max(count_repeats(part, fit), SHORTEST_TIME_S / max(distance, 1e-3))
+    return repeats * max(float(squares), 1.0)
+
+
+def _tie(problem: Problem, priors: list[Prior]) -> Problem:
+    tied = copy(problem)
+    for name in ("behind_wheels", "folds", "training"):
+        tied.__dict__.pop(name, None)
+    tied.parts = tuple(copy(part) for part in problem.parts)
+    for part, prior in zip(tied.parts, priors, strict=True):
+        part.prior = prior
+    body = tied.parts[0]
+    if problem.whole is problem.parts[0] and isinstance(body, BodyPart):
+        tied.whole = body
+    return tied

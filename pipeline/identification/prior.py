@@ -1,0 +1,72 @@
+"""What is known of a model's numbers before a run is seen: observations of the numbers themselves.
+
+A number z standard deviations from its mean adds f log(1 + z^2 / f) to the cost of a fit, as one more
+observation (maximum a posteriori): z^2 where it is near, as of a normal distribution, and less where the run
+contradicts what was known, as of Student's t with few degrees of freedom f. Residuals repeat each other in
+time and are larger than noise, so that they say less than their summed cost. The prior is weighed up by that
+`excess`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.identification.state import Free, State
+
+Floats = NDArray[np.float64]
+
+# Degrees of freedom: what was known is forgotten where a run lies several deviations off.
+_FREEDOM = 4.0
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Distributions of numbers that all runs share.
+
+    Attributes:
+        numbers: mean and standard deviation by label ``effect.name``, deviations positive.
+        excess: cost of residuals that says as much as a cost of one would if they were independent and no
+            larger than noise.
+    """
+
+    numbers: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    excess: float = 1.0
+
+    def cost(self, state: State, free: Sequence[Free]) -> float:
+        """Cost of a state's free numbers, on the scale of the summed cost of residuals."""
+        if not self.numbers:
+            return 0.0
+        away, known = self._compare(state, free)
+        return self.excess * float(np.sum(_FREEDOM * np.log1p(known * away**2 / _FREEDOM)))
+
+    def weigh(self, state: State, free: Sequence[Free]) -> Floats:
+        """Information on each number, zero where nothing is known, shape (p,)."""
+        away, known = self._compare(state, free)
+        information: Floats = self.excess * known / (1.0 + known * away**2 / _FREEDOM)
+        return information
+
+    def pull(self, state: State, free: Sequence[Free]) -> Floats:
+        """Half the fall of the cost with each number, shape (p,)."""
+        pull: Floats = self.weigh(state, free) * self._compare(state, free)[0]
+        return pull
+
+    def _compare(self, state: State, free: Sequence[Free]) -> tuple[Floats, Floats]:
+        """Way from each number to its mean, and one over its variance; zeros where nothing is known."""
+        pairs = [self._find(number) for number in free]
+        away = [0.0 if one is None else one[0] - state.get(n) for one, n in zip(pairs, free, strict=True)]
+        known = [0.0 if one is None else 1.0 / one[1] ** 2 for one in pairs]
+        return np.array(away), np.array(known)
+
+    def _find(self, number: Free) -> tuple[float, float] | None:
+        return None if number.run is not None else self.numbers.get(number.label)
+
+
+NO_PRIOR = Prior()
+"""Nothing is known before."""
