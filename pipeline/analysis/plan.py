@@ -11,7 +11,7 @@ from pipeline.plan.files import list_types
 from pipeline.plan.limits import is_steered
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis import Recording, RunDiagnosis
     from pipeline.plan import Knowledge, Limits
@@ -93,12 +93,13 @@ def ask(
     return questions
 
 
-def choose_topic(vehicle: Vehicle, choices: dict[str, object], log: str) -> tuple[str, str]:
+def choose_topic(vehicle: Vehicle, choices: Mapping[str, object], log: str) -> tuple[str, str]:
     """Topic and type of the body command that a log recorded; the vehicle's usual one where it has none."""
     from pipeline.logs import open_log  # noqa: PLC0415 - heavy
 
     types = list_types(steered=is_steered(vehicle))
-    command = choices.get("command")
+    chosen = choices.get("choices")
+    command = chosen.get("command") if isinstance(chosen, dict) else None
     asked: list[str] = []
     if isinstance(command, dict):
         asked = [str(command.get("topic")), *(str(other["topic"]) for other in command.get("others", []))]

@@ -36,7 +36,7 @@ def register(app: App) -> None:
     app.command(plan)
 
 
-def plan(
+def plan(  # noqa: D417 - the runs document themselves
     runs: Annotated[
         list[str] | None, Parameter(help="logs, or runs of the results folder", negative=())
     ] = None,
@@ -154,7 +154,7 @@ def _gather(
             open_run(name, options, progress) as opened,
         ):
             vehicle, recording = read_recording(opened.manifest)
-            chosen = chosen or dict(read_choices(opened.manifest).get("choices") or {})
+            chosen = chosen or read_choices(opened.manifest)
         if opened.note and not quiet:
             say(f"slip: {opened.note}")
         lossy |= opened.lossy
@@ -236,9 +236,9 @@ def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path])
         return [*lines, "no drive on level ground within these limits answers it: no file is written"]
     limits, turn = made.limits, "rad steering" if made.steered else "rad/s"
     lines += [
-        f"drive        {made.commands.duration_s:.0f} s, at most {limits.speed_mps:g} m/s, {limits.turn:g} {turn}, "
-        f"{limits.acceleration_mps2:g} m/s2; on {made.area.length_m:g} x {made.area.width_m:g} m, the start in the "
-        f"middle, ending within {made.home_m:.1f} m of it",
+        f"drive        {made.commands.duration_s:.0f} s on {made.area.length_m:g} x {made.area.width_m:g} m",
+        f"limits       {limits.speed_mps:g} m/s, {limits.turn:g} {turn}, {limits.acceleration_mps2:g} m/s2",
+        f"place        it starts in the middle, ahead along the length, and ends within {made.home_m:.1f} m",
         f"play         ros2 bag play {files[-1]}   ({made.topic}, {made.type_name})",
         *(f"safety       {text}" for text in SAFETY),
         f"afterwards   slip plan --check {files[0]} NEW.mcap",
