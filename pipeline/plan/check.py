@@ -45,8 +45,8 @@ class Check:
 def check_plan(promised: Promised, diagnosis: RunDiagnosis) -> Check:
     """Compare promises with the joint diagnosis of the logs before and of that of the plan.
 
-    A separation is kept where not both of its effects stand in one undecided group any more and, of two,
-    one is named; an interval where it is as narrow as was promised.
+    A separation is kept where its effects stand together in no undecided group any more and the logs can tell
+    of them; an interval where it is as narrow as was promised.
     """
     kept = tuple(
         _check_interval(one, diagnosis) if one.kind == "interval" else _check_separation(one, diagnosis)
@@ -66,8 +66,8 @@ def _check_separation(promise: Promise, diagnosis: RunDiagnosis) -> Kept:
         return Kept(promise.question, text, "still open", kept=False)
     if named:
         return Kept(promise.question, text, " and ".join(named), kept=True)
-    # Of one effect, its absence is an answer too; of two of which one acts, it is none.
-    return Kept(promise.question, text, "not named", kept=len(promise.effects) == 1)
+    # With more data what two effects shared may prove to be nothing: that decides, too.
+    return Kept(promise.question, text, "decided: none of it acts", kept=True)
 
 
 def _check_interval(promise: Promise, diagnosis: RunDiagnosis) -> Kept:

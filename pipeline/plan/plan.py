@@ -113,7 +113,7 @@ class Plan:
     def to_json(self) -> dict[str, object]:
         """The promised keys of `slip plan --json`, and more."""
         return {
-            "duration_s": self.commands.duration_s,
+            "duration_s": self.commands.duration_s if self.manoeuvres else 0.0,
             "vehicle": self.vehicle,
             "runs": list(self.runs),
             "home_m": self.home_m,
