@@ -21,11 +21,11 @@ Complex = NDArray[np.complex128]
 # Of a plan, where neither the user nor the vehicle's preset says more.
 _USUAL_YAW_RATE_RADPS = 1.0
 _USUAL_STEERING_RAD = 0.4
-_USUAL_ACCELERATION_MPS2 = 1.0
+_USUAL_ACCELERATION_MPS2 = 0.5
 # Across the vehicle's way: below what tips or slides wheeled vehicles on firm ground.
 _LATERAL_MPS2 = 2.0
 # From standing to the largest turn.
-_TURN_RISE_S = 0.7
+_TURN_RISE_S = 1.0
 # Beside half of the vehicle's length, towards every edge of the area.
 _MARGIN_M = 0.5
 _SHORTEST_S = 15.0

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.diagnosis.excitation import suggest_manoeuvre
-from pipeline.models import find_effect
+from pipeline.models import find_effect, list_effects
 from pipeline.plan.choose import Chooser, Shape
 from pipeline.plan.errors import PlanError
 from pipeline.plan.limits import is_steered
 from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, Commands, join, list_manoeuvres, wait
 from pipeline.plan.questions import DECIDED_T, STRETCHES, Judge, Separation
-from pipeline.plan.rehearsal import Rehearsal
+from pipeline.plan.rehearsal import Rehearsal, start_state
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,6 +32,8 @@ Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 _MODELS = 12
+# Of effects that may act unnoticed, times the usual one: the largest does not always lead farthest.
+_SIZES = (0.7, 1.0, 1.5, 2.0)
 _STEP_S = 1.0
 # Zero commands after everything, beside the rest of the last manoeuvre.
 _TAIL_S = 1.0
@@ -175,14 +177,15 @@ def make_plan(knowledge: Knowledge, questions: Sequence[Question], request: Requ
     Raises:
         PlanError: ``no_room``, no manoeuvre fits into the area and the time.
     """
-    models = _list_models(knowledge, questions, request.seed)
+    largest = find_largest(knowledge, request.limits, request.time_s)
+    models = _list_models(knowledge, questions, largest, request.seed)
     library = list_manoeuvres(knowledge.vehicle, request.limits)
     chooser = _make_chooser(knowledge, questions, request, library, models) if questions else None
     best = _rehearse(knowledge, questions, request.area, [], models)
     for reserve in _RESERVES if chooser is not None else ():
         chosen = [library[number] for number in chooser.choose(reserve)] if chooser is not None else []
         trial = _rehearse(knowledge, questions, request.area, chosen, models)
-        if len(trial.promises) > len(best.promises):
+        if (len(trial.promises), trial.answered) > (len(best.promises), best.answered):
             best = trial
         if not best.impossible:
             break
@@ -214,6 +217,7 @@ class _Trial:
     ways: Complex
     promises: tuple[Promise, ...]
     impossible: tuple[Impossible, ...]
+    answered: float
 
 
 def _rehearse(
@@ -237,9 +241,9 @@ def _rehearse(
     starts = tuple(np.round(ends[:-1], 3).tolist())
     if not chosen:
         nothing = tuple(Impossible(one.text, one.effects, _advise(one)) for one in questions)
-        return _Trial((), starts, commands, ways, (), nothing)
-    promises, impossible = _promise(knowledge, questions, rehearsal, commands.duration_s)
-    return _Trial(tuple(chosen), starts, commands, ways, promises, impossible)
+        return _Trial((), starts, commands, ways, (), nothing, 0.0)
+    promised = _promise(knowledge, questions, rehearsal, commands.duration_s)
+    return _Trial(tuple(chosen), starts, commands, ways, *promised)
 
 
 def find_largest(knowledge: Knowledge, limits: Limits, time_s: float) -> Largest:
@@ -249,8 +253,13 @@ def find_largest(knowledge: Knowledge, limits: Limits, time_s: float) -> Largest
     return replace(largest, moments=np.linspace(0.0, time_s, largest.moments.size))
 
 
-def _list_models(knowledge: Knowledge, questions: Sequence[Question], seed: int) -> list[tuple[Effect, ...]]:
-    """Models that may be true: the base, those asked about, and draws from what is known of these."""
+def _list_models(
+    knowledge: Knowledge, questions: Sequence[Question], largest: Largest, seed: int
+) -> list[tuple[Effect, ...]]:
+    """Models that may be true: the base, those asked about, draws, and the base with one effect more.
+
+    A slow or short log may hide any effect: each of the catalogue is taken to act at sizes that are usual.
+    """
     asked = dict.fromkeys(
         model
         for question in questions
@@ -259,7 +268,33 @@ def _list_models(knowledge: Knowledge, questions: Sequence[Question], seed: int)
     supposed = list(dict.fromkeys([knowledge.base, *asked]))
     generator = np.random.default_rng(seed)
     drawn = [supposed[turn % len(supposed)].draw(generator) for turn in range(_MODELS)]
-    return [*(model.effects for model in supposed), *drawn]
+    unnoticed = dict.fromkeys(
+        _enlarge(one, times)
+        for effect in list_effects()
+        if knowledge.vehicle.kind in effect.kinds and effect.id not in knowledge.base.names
+        for one in (effect().make_usual(largest), _make_typical(effect()))
+        for times in _SIZES
+    )
+    base = start_state(knowledge.base.effects)
+    return [*(model.effects for model in supposed), *drawn, *(base.add(one).effects for one in unnoticed)]
+
+
+def _make_typical(effect: Effect) -> Effect:
+    """An effect of the size that vehicles show, whatever a plan asks for."""
+    return effect.change(
+        **{p.name: p.typical for p in effect.parameters if not p.instead_of and not p.relative_to}
+    )
+
+
+def _enlarge(effect: Effect, times: float) -> Effect:
+    """An effect so many times as far from doing nothing; of a limit, idle at infinity, a part."""
+    values = {}
+    for parameter in effect.parameters:
+        value, neutral = effect.values[parameter.name], parameter.neutral
+        if math.isfinite(value) and not math.isnan(neutral):
+            far = neutral + times * (value - neutral) if math.isfinite(neutral) else value / times
+            values[parameter.name] = min(max(far, parameter.bounds[0]), parameter.bounds[1])
+    return effect.change(**values)
 
 
 def _make_chooser(
@@ -298,13 +333,14 @@ def _make_chooser(
 
 def _promise(
     knowledge: Knowledge, questions: Sequence[Question], rehearsal: Rehearsal, duration_s: float
-) -> tuple[tuple[Promise, ...], tuple[Impossible, ...]]:
-    """What the whole plan says to every question, and since when."""
+) -> tuple[tuple[Promise, ...], tuple[Impossible, ...], float]:
+    """What the whole plan says to every question, and since when; and the shares of all answers together."""
     edges = np.arange(0.0, duration_s + _STEP_S, _STEP_S)
-    promises, impossible = [], []
+    promises, impossible, answered = [], [], 0.0
     for one in Judge(rehearsal, knowledge, edges, stretches=True).judge(questions):
         full = np.ones(edges.size - 1)
         reached, measured = one.answer(full), one.measure(full)
+        answered += reached
         if reached >= 1.0:
             promises.append(_keep_promise(one, edges, measured))
         else:
@@ -312,7 +348,7 @@ def _promise(
                 Impossible(one.question.text, one.question.effects, _explain(one, reached, measured))
             )
     promises.sort(key=lambda promise: promise.decided_after_s)
-    return tuple(promises), tuple(impossible)
+    return tuple(promises), tuple(impossible), answered
 
 
 def _keep_promise(one: Answerable, edges: Floats, measured: float) -> Promise:

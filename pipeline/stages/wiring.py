@@ -108,8 +108,12 @@ def _check_signs(sides: Mapping[str, Floats], *, body: bool) -> list[Finding]:
     wrong: dict[str, list[str]] = {}
     value = 0.0
     for place, axis in enumerate(_AXES.values()):
+        # Rest of one axis while the other moves is noise and what follows late: it has no sign.
+        axis_live = np.any([np.abs(along[place]) > 2.0 * _LIVE for along in motion.values()], axis=0)
+        if axis_live.sum() < _FEWEST:
+            continue
         signs = {
-            frozenset(pair): _correlate(motion[pair[0]][place], motion[pair[1]][place])
+            frozenset(pair): _correlate(motion[pair[0]][place][axis_live], motion[pair[1]][place][axis_live])
             for pair in combinations(motion, 2)
         }
         name = _find_odd(signs, list(motion))
