@@ -124,7 +124,11 @@ def plan(  # noqa: D417 - the runs document themselves
             seed,
         )
         made = make_plan(knowledge, questions, request)
-        files = write_plan(made, out) if made.manoeuvres else ()
+        files: tuple[Path, ...] = ()
+        if made.manoeuvres:
+            from pipeline.report.plan import render_plan  # noqa: PLC0415 - heavy
+
+            files = write_plan(made, out, render_plan(made))
     except SlipError as error:
         print_error(error)
         if json:
@@ -239,7 +243,8 @@ def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path])
         f"drive        {made.commands.duration_s:.0f} s on {made.area.length_m:g} x {made.area.width_m:g} m",
         f"limits       {limits.speed_mps:g} m/s, {limits.turn:g} {turn}, {limits.acceleration_mps2:g} m/s2",
         f"place        it starts in the middle, ahead along the length, and ends within {made.home_m:.1f} m",
-        f"play         ros2 bag play {files[-1]}   ({made.topic}, {made.type_name})",
+        f"play         ros2 bag play {files[2]}   ({made.topic}, {made.type_name})",
+        f"look         {files[-1]}",
         *(f"safety       {text}" for text in SAFETY),
         f"afterwards   slip plan --check {files[0]} NEW.mcap",
     ]

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+PAGE = "plan.html"
 _NAMES = ("plan.toml", "plan.csv", "plan.mcap")
 # Fields of speed and turn by message type.
 _FIELDS: Mapping[str, tuple[str, str]] = {
@@ -54,8 +55,13 @@ class Promised(msgspec.Struct, frozen=True):
     impossible: list[Impossible] = []
 
 
-def write_plan(plan: Plan, folder: Path) -> tuple[Path, ...]:
+def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
     """Write all files of a plan into a folder, which is made if need be.
+
+    Args:
+        plan: the plan.
+        folder: for its files.
+        page: the plan as a page to look at; none is written where it is empty.
 
     Raises:
         PlanError: ``cannot_write``, or ``wrong_type`` for a message type that cannot carry the commands.
@@ -71,7 +77,8 @@ def write_plan(plan: Plan, folder: Path) -> tuple[Path, ...]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _write_mcap(plan, mcap)
-        for path, text in ((csv, _format_csv(plan)), (toml, _format_toml(plan))):
+        pages = [(folder / PAGE, page)] if page else []
+        for path, text in ((csv, _format_csv(plan)), (toml, _format_toml(plan)), *pages):
             draft = path.with_name(f".{path.name}.part")
             draft.write_text(text, encoding="utf-8")
             draft.replace(path)
@@ -82,7 +89,7 @@ def write_plan(plan: Plan, folder: Path) -> tuple[Path, ...]:
             where=str(folder),
             hint="Choose another --to.",
         ) from None
-    return toml, csv, mcap
+    return (toml, csv, mcap, *(path for path, _ in pages))
 
 
 def read_promises(path: Path) -> Promised:
