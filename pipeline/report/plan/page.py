@@ -73,19 +73,20 @@ def _draw_ways(plan: Plan) -> Picture:
 
     def line(name: str, colour: str, opacity: float, *detail: str) -> alt.Chart:
         chart = alt.Chart(alt.NamedData(name)).mark_line(color=colour, opacity=opacity, strokeWidth=1.5)
-        return chart.encode(x=along, y=aside, order="order:Q", detail=list(detail))
+        drawn: alt.Chart = chart.encode(x=along, y=aside, order="order:Q", detail=list(detail))
+        return drawn
 
     chart = alt.layer(
         line("plan_area", theme.QUIET, 1.0),
         line("plan_ways", theme.CROSS, 0.4, "model:N"),
         line("plan_way", theme.ON_COMMAND, 1.0),
     ).properties(width=_WIDTH, height=round(_WIDTH * plan.area.width_m / plan.area.length_m))
-    drawn = {"plan_area": edge, "plan_ways": rows, "plan_way": rows.filter(pl.col("model") == 0)}
+    tables = {"plan_area": edge, "plan_ways": rows, "plan_way": rows.filter(pl.col("model") == 0)}
     words = (
-        f"From the middle of the area and back to within {plan.home_m:.1f} m: in blue as the model says that "
-        "explains the logs so far, in grey as other models say that they do not rule out."
+        f"From the middle of the area and back to within {plan.home_m:.1f} m: in blue by the model that "
+        "explains the logs so far, in grey by others that they do not rule out."
     )
-    return Picture("ways", "Where it leads", Drawing(chart, drawn, words), words)
+    return Picture("ways", "Where it leads", Drawing(chart, tables, words), words)
 
 
 def _draw_commands(plan: Plan) -> Picture:
