@@ -12,6 +12,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from pipeline.models import find_effect
 from pipeline.plan import (
     PlanError,
     Request,
@@ -26,6 +27,7 @@ from pipeline.plan.files import list_types, read_promises
 from pipeline.plan.limits import is_steered, parse_time
 from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, limit_yaw_rate, list_manoeuvres
 from pipeline.plan.plan import Plan, find_largest
+from pipeline.plan.rehearsal import Rehearsal
 from pipeline.vehicles import Vehicle, find_preset, list_presets
 
 if TYPE_CHECKING:
@@ -85,6 +87,18 @@ def test_a_plan_begins_gently_and_stays_inside_the_area(plan: Plan) -> None:
     assert plan.area.holds(plan.ways)
     assert len(plan.ways) > len(TURNING)
     assert plan.home_m <= 0.5 * plan.area.width_m
+
+
+@pytest.mark.parametrize("hidden", [{"limit": 2.0}, {"limit": 3.27}, {"limit": 5.0}])
+def test_a_plan_stays_inside_whatever_limit_of_acceleration_no_log_has_shown(
+    plan: Plan, hidden: dict[str, float]
+) -> None:
+    """Wheels that cannot follow do not retrace the way there; a plan of a slow log once left its area so."""
+    knowledge = assume(_find("husky_a200"))
+    rehearsal = Rehearsal(plan.commands, knowledge.vehicle, knowledge.senses, np.zeros(1))
+    path, _ = rehearsal.trace([find_effect("acceleration_limit")(**hidden)])
+    assert np.abs(path.real).max() < 0.5 * plan.area.length_m
+    assert np.abs(path.imag).max() < 0.5 * plan.area.width_m
 
 
 def test_the_same_request_gives_the_same_plan(plan: Plan) -> None:
