@@ -32,9 +32,9 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
     if not diagnosis:
         return [("Name the effects that are missing from the model", f"slip diagnose {name}")]
     steps = []
-    if diagnosis.get("undecided"):
-        steps.append(("Plan the drive that decides what is undecided", f"slip plan {name}"))
     if diagnosis.get("effects"):
         steps.append(("Keep the model that was named", f"slip diagnose {name} --apply model.toml"))
         steps.append(("Give it to the robot's controller", "slip model export model.toml --to ros2_control"))
+    if diagnosis.get("undecided"):
+        steps.append(("Plan the drive that decides what is undecided", f"slip plan {name}"))
     return [*steps, ("Try other effects and watch the error", "slip serve")]
