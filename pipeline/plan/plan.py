@@ -386,4 +386,5 @@ def _explain(one: Answerable, reached: float, measured: float) -> str:
 
 def _advise(question: Question) -> str:
     effects = [find_effect(name)() for name in question.effects]
-    return f"on level ground within these limits and this time next to nothing shows it; {suggest_manoeuvre(*effects)}"
+    advice = suggest_manoeuvre(*effects)
+    return f"on level ground, within these limits and this time, next to nothing shows it; {advice}"
