@@ -32,6 +32,7 @@ def simulate(  # noqa: D417 - arguments document themselves
     layout: str | None = None,
     program: str | None = None,
     platform: str | None = None,
+    play: Path | None = None,
     cases: Annotated[bool, Parameter(negative=())] = False,
     json: bool = False,
 ) -> int:
@@ -45,6 +46,7 @@ def simulate(  # noqa: D417 - arguments document themselves
         layout: layout of topics.
         program: how the vehicle is driven.
         platform: whose vehicle, topics, types and frames the log has (husky_a200, turtlebot4, ...).
+        play: commands to drive the hidden physics with in place of a program, as `slip plan` writes them.
         cases: list the cases and effects instead.
         json: print one JSON object.
     """
@@ -72,6 +74,7 @@ def simulate(  # noqa: D417 - arguments document themselves
         layout=layout,
         program=program,
         platform=platform,
+        play=play,
     )
     if json:
         print_json({"path": str(path), "effects": effects})

@@ -12,6 +12,7 @@ from pipeline.simulate.errors import SimulateError, unknown_name
 from pipeline.simulate.layouts import find_layout
 from pipeline.simulate.mujoco_vehicle import simulate_skid_steer
 from pipeline.simulate.platform_table import find_platform
+from pipeline.simulate.played import read_played
 from pipeline.simulate.record import write_log
 from pipeline.simulate.run import simulate_run
 from pipeline.simulate.scenario import Ground, ProgramName, Scenario
@@ -58,6 +59,7 @@ def simulate_case(
     layout: str | None = None,
     program: str | None = None,
     platform: str | None = None,
+    play: Path | None = None,
 ) -> Path:
     """Simulate a named case, or a plain one, with changes, and write its log.
 
@@ -72,6 +74,7 @@ def simulate_case(
         layout: a name of `LAYOUTS`.
         program: what is driven.
         platform: a name of `PLATFORMS`; brings its vehicle and topics along.
+        play: a recording of commands that are driven in place of a program, for as long as they last.
 
     Returns:
         The file that was written.
@@ -90,6 +93,8 @@ def simulate_case(
         program=program,
         platform=platform,
     )
+    if play is not None:
+        scenario = _play(scenario, play, name)
     target = out / f"{name or 'simulated'}.mcap" if out.is_dir() else out
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -104,6 +109,19 @@ def simulate_case(
             hint="Choose another --out",
         ) from problem
     return target
+
+
+def _play(scenario: Scenario, path: Path, name: str | None) -> Scenario:
+    """The scenario driven with the commands of a recording."""
+    if name is not None and find_case(name).machine is not None:
+        raise SimulateError(
+            "wrong_vehicle",
+            "a case of rigid bodies drives its own program",
+            where=name,
+            hint="Leave --play out or choose another case",
+        )
+    played = read_played(path, scenario.vehicle)
+    return replace(scenario, played=played, duration_s=max(float(played.time_s[-1]) + 0.5, 1.0))
 
 
 def make_scenario(

@@ -78,7 +78,7 @@ def simulate_run(scenario: Scenario) -> SimulatedRun:
     vehicle, seed = scenario.vehicle, scenario.seed
     effects = resolve_effects(scenario.effects, vehicle.kind)
     cells = round(scenario.duration_s / scenario.step_s)
-    commands = make_commands(
+    commands = scenario.played or make_commands(
         scenario.program, vehicle, duration_s=scenario.duration_s, generator=open_stream(seed, "program")
     )
     drive = drive_wheels(

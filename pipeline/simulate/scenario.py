@@ -11,6 +11,7 @@ from pipeline.simulate.vehicles import VEHICLES, Vehicle
 
 if TYPE_CHECKING:
     from pipeline.simulate.layouts import Layout
+    from pipeline.simulate.programs import Commands
 
 ProgramName = Literal[
     "drive_steps", "ramps", "smooth", "straight", "circle", "spins", "slalom", "stop_and_go", "teleop"
@@ -266,6 +267,8 @@ class Scenario:
         ground_input: whether ground effects act on the drive's v0, w0 (``drive``) or, as another plausible
             order of nature, on what body inertia made of them (``inertia``).
         step_s: integration step.
+        played: commands that are driven in place of the program's; they count from their first one. None for
+            the program.
         start_pose: x [m], y [m], yaw [rad] at the start.
     """
 
@@ -285,6 +288,7 @@ class Scenario:
     ground_input: Literal["drive", "inertia"] = "drive"
     step_s: float = 0.001
     start_pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    played: Commands | None = None
 
     def __post_init__(self) -> None:
         for name, value, low, high in (

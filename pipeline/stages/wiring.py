@@ -33,6 +33,8 @@ _LIVE: Final = 0.05
 _FEWEST: Final = 100
 _RELATED: Final = 0.5
 """Least correlation whose sign is believed; on recordings of snow and ice it is 0.6 and more."""
+_AXIS_LIVE: Final = 0.1
+"""Share of the usual largest speed of a side that moving ahead, or turning, must have to have a sign."""
 _USUAL: Final = 0.95
 """Share of the samples that are no outliers of the localization."""
 _LEAST_SCALE: Final = 0.04
@@ -105,11 +107,16 @@ def _check_one_sign(sides: Mapping[str, Floats]) -> list[Finding]:
 def _check_signs(sides: Mapping[str, Floats], *, body: bool) -> list[Finding]:
     """The one of command, wheels and poses that contradicts the others, ahead or in turning."""
     motion = {name: (side.sum(axis=1), side[:, 1] - side[:, 0]) for name, side in sides.items()}
+    least = _AXIS_LIVE * max(float(np.quantile(np.abs(side), _USUAL)) for side in sides.values())
     wrong: dict[str, list[str]] = {}
     value = 0.0
     for place, axis in enumerate(_AXES.values()):
+        # Rest of one axis while the other moves is noise and what follows late: it has no sign.
+        axis_live = np.any([np.abs(along[place]) > least for along in motion.values()], axis=0)
+        if axis_live.sum() < _FEWEST:
+            continue
         signs = {
-            frozenset(pair): _correlate(motion[pair[0]][place], motion[pair[1]][place])
+            frozenset(pair): _correlate(motion[pair[0]][place][axis_live], motion[pair[1]][place][axis_live])
             for pair in combinations(motion, 2)
         }
         name = _find_odd(signs, list(motion))

@@ -129,6 +129,20 @@ def test_every_fault_is_told_apart_on_a_sample(tmp_path: Path, monkeypatch: pyte
     check_all(*gather(SAMPLE, tmp_path, monkeypatch))
 
 
+@pytest.mark.parametrize(("turning", "told"), [(0.02, []), (0.5, ["sides_exchanged"])])
+def test_turning_that_is_no_more_than_a_rest_has_no_sign(
+    turning: float, told: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A vehicle that follows late still turns back while the command already stands."""
+    samples, vehicle = gather(SAMPLE, tmp_path, monkeypatch)
+    assert samples.command is not None
+    swing = turning * np.sign(np.sin(np.arange(samples.command.shape[0])))
+    command, velocity = samples.command.copy(), samples.velocity.copy()
+    command[:, 2], velocity[:, 2] = swing, -swing
+    changed = replace(samples, command=command, velocity=velocity, measured=None)
+    assert [found.id for found in check_wiring(changed, vehicle)] == told
+
+
 def test_without_commands_the_poses_tell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     samples, vehicle = gather(SAMPLE, tmp_path, monkeypatch)
     track_m = vehicle.track_width_m or 1.0

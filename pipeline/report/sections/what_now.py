@@ -35,4 +35,6 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
     if diagnosis.get("effects"):
         steps.append(("Keep the model that was named", f"slip diagnose {name} --apply model.toml"))
         steps.append(("Give it to the robot's controller", "slip model export model.toml --to ros2_control"))
+    if diagnosis.get("undecided"):
+        steps.append(("Plan the drive that decides what is undecided", f"slip plan {name}"))
     return [*steps, ("Try other effects and watch the error", "slip serve")]

@@ -1,0 +1,212 @@
+"""Plans in closed loop: a poor first log, its diagnosis, a plan, a drive of it with the hidden physics.
+
+    python benchmarks/plan_game.py --draws 12 [--seed 1] [--out scores.jsonl]
+
+Each draw hides one to three effects in a simulated vehicle and drives it poorly. The plan is driven by
+the simulator, which shares no code with the plan's models; then both logs are diagnosed together. One line a
+draw, then the rates.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.diagnosis import read_recording
+from pipeline.analysis.options import Options
+from pipeline.analysis.plan import ALL, ask, study
+from pipeline.core.errors import SlipError
+from pipeline.diagnosis import Named, Recording  # noqa: TC001
+from pipeline.plan import (
+    Plan,
+    Request,
+    check_plan,
+    choose_limits,
+    make_plan,
+    parse_area,
+    read_promises,
+    write_plan,
+)
+from pipeline.simulate import (
+    Disturbance,
+    PoseSensor,
+    Program,
+    Scenario,
+    find_vehicle,
+    make_scenario,
+    simulate_run,
+    write_log,
+)
+from pipeline.simulate.played import read_played
+from pipeline.vehicles import Vehicle  # noqa: TC001
+
+VEHICLES = ("husky", "jackal", "marmotte", "car")
+# What a plan on level ground can show; sizes are the simulator's usual ones times 0.7 to 1.3.
+DIFFERENTIAL = (
+    "effective_track", "icr_offset", "lateral_skid", "wheel_asymmetry", "drive_lag", "transport_delay",
+    "body_inertia", "yaw_misalignment", "lateral_drift", "turning_resistance", "acceleration_limit",
+    "deadband",
+)  # fmt: skip
+CAR = ("steering_offset", "steering_gain", "steering_lag", "understeer", "drive_lag", "lateral_skid")
+PROGRAMS = ("straight", "circle", "smooth")
+_AREAS = {"car": "80x60m"}
+_SECONDS = 60.0
+
+
+@dataclass
+class Score:
+    """What became of one draw."""
+
+    seed: int
+    vehicle: str
+    program: str
+    truth: list[str]
+    first: list[str]
+    undecided: list[list[str]]
+    promised: int = 0
+    kept: int = 0
+    pairs: int = 0
+    decided: int = 0
+    joint: list[str] | None = None
+    wrong: list[str] | None = None
+    left_area: bool = False
+    duration_s: float = 0.0
+    plan_s: float = 0.0
+    error: str = ""
+
+
+def draw_scenario(seed: int) -> tuple[str, Scenario]:
+    """A vehicle with hidden effects, driven poorly for half a minute."""
+    generator = np.random.default_rng([seed, 17])
+    name = str(generator.choice(VEHICLES))
+    pool = CAR if name == "car" else DIFFERENTIAL
+    ids = generator.choice(pool, size=int(generator.integers(1, 4)), replace=False).tolist()
+    scenario = make_scenario(None, {i: {} for i in ids}, seed=seed, duration_s=30.0, vehicle=name)
+    effects = {
+        i: {
+            key: value * float(generator.uniform(0.7, 1.3)) if value != 1.0 else value
+            for key, value in values.items()
+        }
+        if isinstance(values, dict)
+        else values
+        for i, values in scenario.effects.items()
+    }
+    program = Program(str(generator.choice(PROGRAMS)), speed_scale=0.4, turn_scale=0.4)  # type: ignore[arg-type]
+    noise = float(generator.uniform(0.002, 0.006))
+    return name, replace(
+        scenario,
+        effects=effects,
+        program=program,
+        pose=PoseSensor(noise_m=noise, noise_rad=0.5 * noise),
+        disturbance=Disturbance(0.01 * find_vehicle(name).max_speed_mps, 0.005, 0.5),
+    )
+
+
+def play(seed: int, folder: Path) -> Score:
+    """One draw, from the poor log to the joint diagnosis."""
+    name, scenario = draw_scenario(seed)
+    score = Score(seed, name, scenario.program.name, sorted(scenario.effects), [], [])
+    try:
+        vehicle, before = _record(scenario, folder / "before.mcap")
+        studied = study([before], vehicle)
+        score.first = [effect.id for effect in studied.diagnosis.effects]
+        score.undecided = [list(group.candidates) for group in studied.diagnosis.undecided]
+        begun = time.perf_counter()
+        problem = studied.knowledge.problem
+        limits = choose_limits(
+            vehicle,
+            None if problem is None else problem.largest,
+            speed_mps=4.0 if name == "car" else None,
+        )
+        questions = ask(studied.knowledge, [ALL], limits, _SECONDS, studied.diagnosis)
+        area = parse_area(_AREAS.get(name, "20x10m"), vehicle)
+        type_name = (
+            "ackermann_msgs/msg/AckermannDriveStamped" if name == "car" else "geometry_msgs/msg/TwistStamped"
+        )
+        request = Request(limits, area, _SECONDS, (before.name,), "/cmd", type_name, seed)
+        plan = make_plan(studied.knowledge, questions, request)
+        score.plan_s = round(time.perf_counter() - begun, 1)
+        score.duration_s = plan.commands.duration_s
+        if plan.manoeuvres:
+            _drive(plan, scenario, vehicle, before, folder, score)
+    except SlipError as error:
+        score.error = str(error)
+    return score
+
+
+def _drive(
+    plan: Plan, scenario: Scenario, vehicle: Vehicle, before: Recording, folder: Path, score: Score
+) -> None:
+    path = write_plan(plan, folder / "plan")[-1]
+    played = read_played(path, scenario.vehicle)
+    driven = replace(
+        scenario, played=played, duration_s=float(played.time_s[-1]) + 0.5, seed=scenario.seed + 500_000
+    )
+    way = simulate_run(driven).truth.path.position
+    score.left_area = bool(
+        (np.abs(way[:, 0]) > 0.5 * plan.area.length_m).any()
+        or (np.abs(way[:, 1]) > 0.5 * plan.area.width_m).any()
+    )
+    _, after = _record(driven, folder / "after.mcap")
+    diagnosis = study([before, after], vehicle).diagnosis
+    check = check_plan(read_promises(folder / "plan"), diagnosis)
+    score.promised, score.kept = len(check.kept), sum(one.kept for one in check.kept)
+    score.joint = [effect.id for effect in diagnosis.effects]
+    truth = set(score.truth)
+    score.wrong = [effect.id for effect in diagnosis.effects if not _is_true(effect, truth)]
+    for group in score.undecided:
+        if truth & set(group):
+            score.pairs += 1
+            score.decided += any(_is_true(e, truth & set(group)) for e in diagnosis.effects)
+
+
+def _is_true(effect: Named, truth: set[str]) -> bool:
+    return bool({effect.id, *effect.equivalent_to} & truth)
+
+
+def _record(scenario: Scenario, path: Path) -> tuple[Vehicle, Recording]:
+    write_log(simulate_run(scenario), path)
+    options = Options(out=path.parent / "results", report=False, diagnosis=False)
+    return read_recording(analyze_log(path, options).manifest)
+
+
+def main() -> None:
+    """Play and count."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--draws", type=int, default=12)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path)
+    asked = parser.parse_args()
+    scores = []
+    for seed in range(asked.seed, asked.seed + asked.draws):
+        with tempfile.TemporaryDirectory(prefix="slip-") as folder:
+            score = play(seed, Path(folder))
+        scores.append(score)
+        print(json.dumps(asdict(score)), flush=True)
+        if asked.out is not None:
+            with asked.out.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(asdict(score)) + "\n")
+    driven = [score for score in scores if score.joint is not None]
+    print(f"draws {len(scores)}, errors {sum(bool(s.error) for s in scores)}, plans driven {len(driven)}")
+    print(f"undecided groups that hold a hidden effect, decided for it: {_rate(driven, 'decided', 'pairs')}")
+    print(f"promises kept: {_rate(driven, 'kept', 'promised')}")
+    print(f"drives with a wrong name: {sum(bool(s.wrong) for s in driven)} of {len(driven)}")
+    print(f"drives that left the area: {sum(s.left_area for s in driven)} of {len(driven)}")
+    print(f"slowest plan: {max((s.plan_s for s in scores), default=0.0)} s")
+
+
+def _rate(scores: list[Score], part: str, whole: str) -> str:
+    return f"{sum(getattr(s, part) for s in scores)} of {sum(getattr(s, whole) for s in scores)}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,251 @@
+"""`slip plan`: what to drive next, as commands to play, and whether a drive kept what its plan promised."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+from cyclopts.types import PositiveFloat
+
+from pipeline.cli.choices import Choices, build_options
+from pipeline.cli.output import (
+    CLEAN,
+    FAILED,
+    LOSSY,
+    describe_error,
+    print_error,
+    print_json,
+    print_lines,
+    say,
+    show_progress,
+)
+from pipeline.core.errors import SlipError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.analysis.options import Options
+    from pipeline.diagnosis import Recording, RunDiagnosis
+    from pipeline.plan import Knowledge, Plan
+    from pipeline.vehicles import Vehicle
+
+
+def register(app: App) -> None:
+    """Add the verb."""
+    app.command(plan)
+
+
+def plan(  # noqa: D417 - the runs document themselves
+    runs: Annotated[
+        list[str] | None, Parameter(help="logs, or runs of the results folder", negative=())
+    ] = None,
+    /,
+    *,
+    vehicle: str | None = None,
+    wanted: Annotated[
+        list[str] | None, Parameter(name="--for", help="undecided, all, or ids of effects", negative=())
+    ] = None,
+    time: str = "60s",
+    area: str = "20x10m",
+    max_speed: PositiveFloat | None = None,
+    max_yaw_rate: PositiveFloat | None = None,
+    max_acceleration: PositiveFloat | None = None,
+    topic: str | None = None,
+    type_name: Annotated[str | None, Parameter(name="--type")] = None,
+    check: Path | None = None,
+    seed: int = 0,
+    config: Path | None = None,
+    results: Path = Path("results"),
+    out: Path = Path("plan"),
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Plan the drive that decides what the logs so far could not; a robot can play it.
+
+    Args:
+        vehicle: vehicle preset; without any log the plan looks for all of its effects.
+        wanted: what to decide; by default what is undecided in the runs.
+        time: longest duration, for example 60s or 2min.
+        area: free ground: length along the heading at the start, and width; the start is its middle.
+        max_speed: [m/s].
+        max_yaw_rate: [rad/s].
+        max_acceleration: [m/s2].
+        topic: on which the commands will be played (default: as the run recorded them).
+        type_name: message type of that topic.
+        check: plan.toml, or the plan's folder, to compare with the log that came of it.
+        seed: of the draws from what is known.
+        config: configuration file of the logs.
+        results: results folder of the runs.
+        out: folder of the plan.
+        json: print one JSON object.
+        quiet: print no progress and no summary.
+    """
+    options = build_options(Choices(vehicle=vehicle, config=config, out=results))
+    at_work = runs[0] if runs else str(check or vehicle or "plan")
+    try:
+        names = list(runs or [])
+        if check is not None:
+            return _check(check, names, options, json=json, quiet=quiet)
+        from pipeline.analysis.plan import UNDECIDED, ask, choose_topic, study  # noqa: PLC0415 - heavy
+        from pipeline.plan import Request, choose_limits, make_plan, parse_area, write_plan  # noqa: PLC0415
+        from pipeline.plan.limits import parse_time  # noqa: PLC0415 - heavy
+
+        seconds = parse_time(time)
+        diagnosis, lossy = None, False
+        if names:
+            found, recordings, chosen, lossy = _gather(names, options, quiet=quiet or json)
+            # Before a diagnosis that takes its time.
+            place = parse_area(area, found)
+            with show_progress(names[0], quiet=quiet or json) as progress:
+                progress("diagnosis")
+                studied = study(recordings, found)
+            diagnosis, knowledge = studied.diagnosis, studied.knowledge
+            usual = choose_topic(found, chosen, recordings[0].path)
+        else:
+            found, knowledge = _assume(vehicle)
+            recordings, place = [], parse_area(area, found)
+            usual = choose_topic(found, {}, "")
+        limits = choose_limits(
+            found,
+            None if knowledge.problem is None else knowledge.problem.largest,
+            speed_mps=max_speed,
+            yaw_rate_radps=max_yaw_rate,
+            acceleration_mps2=max_acceleration,
+        )
+        questions = ask(knowledge, wanted or [UNDECIDED], limits, seconds, diagnosis)
+        request = Request(
+            limits,
+            place,
+            seconds,
+            tuple(recording.name for recording in recordings),
+            topic or usual[0],
+            type_name or usual[1],
+            seed,
+        )
+        made = make_plan(knowledge, questions, request)
+        files: tuple[Path, ...] = ()
+        if made.manoeuvres:
+            from pipeline.report.plan import render_plan  # noqa: PLC0415 - heavy
+
+            files = write_plan(made, out, render_plan(made))
+    except SlipError as error:
+        print_error(error)
+        if json:
+            print_json({"errors": [describe_error(at_work, error)]})
+        return FAILED
+    if json:
+        print_json({**made.to_json(), "files": [str(file) for file in files], "errors": []})
+    elif not quiet:
+        print_lines(_describe(made, diagnosis, files))
+    return LOSSY if lossy else CLEAN
+
+
+def _gather(
+    names: Sequence[str], options: Options, *, quiet: bool
+) -> tuple[Vehicle, list[Recording], dict[str, object], bool]:
+    """Recordings of one vehicle, and what was chosen in the first of them."""
+    from pipeline.analysis.diagnosis import read_choices, read_recording  # noqa: PLC0415 - heavy
+    from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
+
+    vehicles: list[Vehicle] = []
+    recordings: list[Recording] = []
+    chosen: dict[str, object] = {}
+    lossy = False
+    for name in names:
+        with (
+            show_progress(Path(name).name, quiet=quiet) as progress,
+            open_run(name, options, progress) as opened,
+        ):
+            vehicle, recording = read_recording(opened.manifest)
+            chosen = chosen or read_choices(opened.manifest)
+        if opened.note and not quiet:
+            say(f"slip: {opened.note}")
+        lossy |= opened.lossy
+        if recording.sha256 and any(recording.sha256 == known.sha256 for known in recordings):
+            continue
+        vehicles.append(vehicle)
+        recordings.append(recording)
+    if any(vehicle != vehicles[0] for vehicle in vehicles):
+        raise SlipError(
+            "several_vehicles",
+            "the runs are of different vehicles, and a plan is for one",
+            where=", ".join(recording.name for recording in recordings),
+            hint="Give runs of one vehicle.",
+        )
+    return vehicles[0], recordings, chosen, lossy
+
+
+def _assume(name: str | None) -> tuple[Vehicle, Knowledge]:
+    from pipeline.plan import assume  # noqa: PLC0415 - heavy
+    from pipeline.vehicles import find_preset, list_presets  # noqa: PLC0415 - heavy
+
+    vehicle = None if name is None else find_preset(name)
+    if vehicle is None:
+        known = ", ".join(preset.id for preset in list_presets())
+        raise SlipError(
+            "no_vehicle",
+            "a plan needs a run or a vehicle" if name is None else f"no preset is called {name!r}",
+            hint=f"Give a log, a run, or --vehicle as one of {known}.",
+        )
+    return vehicle, assume(vehicle)
+
+
+def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet: bool) -> int:
+    """Promises against the joint diagnosis of the runs before and the drive."""
+    from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy
+    from pipeline.plan import check_plan, read_promises  # noqa: PLC0415 - heavy
+
+    promised = read_promises(path)
+    if not names:
+        raise SlipError(
+            "no_log", "a check needs the log that was driven", where=str(path), hint="Give it as well."
+        )
+    before = [name for name in promised.runs if name not in names]
+    vehicle, recordings, _, lossy = _gather([*before, *names], options, quiet=quiet)
+    with show_progress(names[0], quiet=quiet or json) as progress:
+        progress("diagnosis")
+        diagnosis = diagnose_runs(recordings, vehicle).runs[0]
+    checked = check_plan(promised, diagnosis)
+    following = f"slip plan {' '.join([*before, *names])}"
+    if json:
+        print_json({**checked.to_json(), "next": following if diagnosis.undecided else None, "errors": []})
+    elif not quiet:
+        rows = [
+            f"{'kept' if one.kept else 'NOT KEPT':<9} {one.question}: promised {one.promised}, {one.measured}"
+            for one in checked.kept
+        ]
+        rows += [f"open      {text}" for text in checked.open]
+        print_lines([*(rows or ["the plan promised nothing"]), *_next_lines(diagnosis, following)])
+    return LOSSY if lossy else CLEAN
+
+
+def _next_lines(diagnosis: RunDiagnosis, following: str) -> list[str]:
+    return [f"next      {following}"] if diagnosis.undecided else []
+
+
+def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path]) -> list[str]:
+    """The plan on one screen."""
+    from pipeline.plan import SAFETY  # noqa: PLC0415 - heavy
+
+    if not made.manoeuvres and not made.impossible:
+        what = "" if diagnosis is None else ": everything that was found is decided and known to 5 %"
+        return [f"nothing is open{what}"]
+    lines = []
+    for one in made.promises:
+        how = f"t = {one.expected:.1f}" if one.kind == "separation" else f"+- {one.expected:.2g}"
+        lines.append(f"after {one.decided_after_s:3.0f} s  {one.question} ({how})")
+    lines += [f"cannot       {one.question}: {one.because}" for one in made.impossible]
+    if not made.manoeuvres:
+        return [*lines, "no drive on level ground within these limits answers it: no file is written"]
+    limits, turn = made.limits, "rad steering" if made.steered else "rad/s"
+    lines += [
+        f"drive        {made.commands.duration_s:.0f} s on {made.area.length_m:g} x {made.area.width_m:g} m",
+        f"limits       {limits.speed_mps:g} m/s, {limits.turn:g} {turn}, {limits.acceleration_mps2:g} m/s2",
+        f"place        it starts in the middle, ahead along the length, and ends within {made.home_m:.1f} m",
+        f"play         ros2 bag play {files[2]}   ({made.topic}, {made.type_name})",
+        f"look         {files[-1]}",
+        *(f"safety       {text}" for text in SAFETY),
+        f"afterwards   slip plan --check {files[0]} NEW.mcap",
+    ]
+    return lines

@@ -1,0 +1,82 @@
+"""Questions: of what a diagnosis left undecided, of numbers that are not known well, of effects by name."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models import find_effect, list_effects
+from pipeline.plan.errors import PlanError
+from pipeline.plan.questions import INTERVAL_SHARE, Precision, Separation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from pipeline.models.evidence import Largest
+    from pipeline.plan.knowledge import Hypothesis, Knowledge
+
+_NORMAL_95 = 1.96
+
+
+def ask_undecided(knowledge: Knowledge, groups: Iterable[Sequence[str]]) -> list[Separation]:
+    """Which of the candidates of each group acts: the first against every other, each fitted to the logs."""
+    found = []
+    for group in groups:
+        rest = [effect for effect in knowledge.base.effects if effect.id not in group]
+        first, *others = [knowledge.suppose([*rest, find_effect(name)()]) for name in group]
+        found += [
+            Separation(f"{group[0]} or {name}", (group[0], name), (first, other))
+            for name, other in zip(group[1:], others, strict=True)
+        ]
+    return found
+
+
+def ask_numbers(model: Hypothesis) -> list[Precision]:
+    """How large each number of a model is, of those that are not known to five percent yet."""
+    spread = np.sqrt(np.diag(np.linalg.inv(model.information))) if model.free else np.zeros(0)
+    found = []
+    for place, number in enumerate(model.free):
+        parameter = find_effect(number.effect)().parameter(number.name)
+        size = max(abs(float(model.values[place])), _size_of_name(parameter.typical, parameter.neutral))
+        goal = INTERVAL_SHARE * size
+        if _NORMAL_95 * float(spread[place]) > goal:
+            unit = "" if number.unit == "1" else f" {number.unit}"
+            text = f"{number.label} within {goal:.2g}{unit}"
+            found.append(Precision(text, (number.effect,), model, place, goal))
+    return found
+
+
+def _size_of_name(typical: float, neutral: float) -> float:
+    """A usual size: numbers near nothing need no better share of themselves."""
+    return abs(typical - (neutral if math.isfinite(neutral) else 0.0))
+
+
+def ask_presence(knowledge: Knowledge, names: Iterable[str], largest: Largest) -> list[Separation]:
+    """Whether effects act that the logs could not show: of a usual size each, against their absence.
+
+    Raises:
+        PlanError: ``wrong_vehicle``, one does not exist on this kind of vehicle.
+        MotionError: ``unknown_effect``.
+    """
+    found = []
+    for name in names:
+        effect = find_effect(name)
+        if knowledge.vehicle.kind not in effect.kinds:
+            raise PlanError(
+                "wrong_vehicle",
+                f"{name} exists on {' or '.join(effect.kinds)} vehicles only",
+                where=knowledge.vehicle.id,
+                hint="Choose another effect.",
+            )
+        if name in knowledge.base.names:
+            continue
+        with_it = knowledge.base.extend(effect().make_usual(largest))
+        found.append(Separation(f"whether {name} acts", (name,), (with_it, knowledge.base), both_ways=False))
+    return found
+
+
+def list_names(knowledge: Knowledge) -> tuple[str, ...]:
+    """Every effect of the catalogue that exists on the vehicle."""
+    return tuple(effect.id for effect in list_effects() if knowledge.vehicle.kind in effect.kinds)

@@ -1,0 +1,143 @@
+"""Choice of manoeuvres: greedy by what is answered in a second, then improved by exchange."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.plan.limits import Area
+    from pipeline.plan.questions import Answerable
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_ROUNDS = 2
+_NOTHING = 1e-4
+# Every model ends within this share of the area's shorter side of its start.
+_HOME_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The way of a manoeuvre from the origin, by model.
+
+    Attributes:
+        path: positions x + iy [m], shape (models, n).
+        heading: at the end [rad], shape (models,).
+    """
+
+    path: Complex
+    heading: Floats
+
+
+class Chooser:
+    """Sequences of manoeuvres.
+
+    Args:
+        questions: with one group of windows a manoeuvre.
+        durations: of the manoeuvres [s], shape (k,).
+        shapes: their ways, all of the same models.
+        area: where all of these must stay.
+        time_s: longest sequence.
+    """
+
+    def __init__(
+        self,
+        questions: Sequence[Answerable],
+        durations: Floats,
+        shapes: Sequence[Shape],
+        area: Area,
+        time_s: float,
+    ) -> None:
+        self.questions = questions
+        self.durations = durations
+        self.shapes = shapes
+        self.area = area
+        self.time_s = time_s
+        self.reserve = 1.0
+        self._answers: dict[tuple[int, ...], float] = {}
+
+    def choose(self, reserve: float = 1.0) -> list[int]:
+        """Manoeuvres in the order in which they answer most; empty where none says anything.
+
+        Args:
+            reserve: factor by which more is asked: manoeuvres do not quite add up, and stretches of driving
+                do not begin where manoeuvres do.
+        """
+        self.reserve = reserve
+        self._answers.clear()
+        chosen: list[int] = []
+        while True:
+            best = self._find_next(chosen)
+            if best is None:
+                break
+            chosen.append(best)
+        for _ in range(_ROUNDS):
+            if not self._exchange(chosen):
+                break
+        return chosen
+
+    def add_up(self, chosen: Sequence[int]) -> float:
+        """Sum of the shares of all questions that these manoeuvres answer."""
+        key = tuple(sorted(chosen))
+        if key not in self._answers:
+            weight = np.bincount(np.array(key, dtype=np.int64), minlength=self.durations.size).astype(
+                np.float64
+            )
+            self._answers[key] = sum(question.answer(weight, self.reserve) for question in self.questions)
+        return self._answers[key]
+
+    def _find_next(self, chosen: list[int]) -> int | None:
+        now = self.add_up(chosen)
+        left = self.time_s - float(self.durations[chosen].sum())
+        rates = [
+            (self.add_up([*chosen, one]) - now) / float(self.durations[one])
+            for one in range(self.durations.size)
+        ]
+        for one in np.argsort(rates)[::-1].tolist():
+            if rates[one] < _NOTHING:
+                return None
+            if self.durations[one] <= left and self.fits([*chosen, one]):
+                return int(one)
+        return None
+
+    def _exchange(self, chosen: list[int]) -> bool:
+        """Replace or leave out one manoeuvre after the other where that answers more, or as much sooner."""
+        changed = False
+        for place in reversed(range(len(chosen))):
+            rest = chosen[:place] + chosen[place + 1 :]
+            spent = float(self.durations[rest].sum())
+            best, trial = self._rank(chosen), chosen
+            for one in (None, *range(self.durations.size)):
+                other = rest if one is None else [*chosen[:place], one, *chosen[place + 1 :]]
+                if one is not None and spent + self.durations[one] > self.time_s:
+                    continue
+                rank = self._rank(other)
+                if rank > best and self.fits(other):
+                    best, trial = rank, other
+            if trial is not chosen:
+                chosen[:] = trial
+                changed = True
+        return changed
+
+    def _rank(self, chosen: Sequence[int]) -> tuple[float, float]:
+        return round(self.add_up(chosen), 3), -float(self.durations[list(chosen)].sum())
+
+    def fits(self, chosen: Sequence[int]) -> bool:
+        """Whether all models stay inside the area and end near their start."""
+        at = np.zeros(self.shapes[0].heading.size, dtype=np.complex128)
+        heading = np.zeros(at.size)
+        for one in chosen:
+            shape = self.shapes[one]
+            way = at[:, None] + np.exp(1j * heading)[:, None] * shape.path
+            if not self.area.holds(way):
+                return False
+            at, heading = way[:, -1], heading + shape.heading
+        home = _HOME_SHARE * min(self.area.length_m, self.area.width_m)
+        return bool((np.abs(at) <= home).all())

@@ -1,0 +1,180 @@
+"""A plan's files: `plan.toml` to read, `plan.csv`, and `plan.mcap` to play."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+
+from pipeline.core.toml import TomlError, parse_toml
+from pipeline.logs import LogWriter
+from pipeline.plan.errors import PlanError
+from pipeline.plan.manoeuvres import RATE_HZ
+from pipeline.plan.plan import SAFETY, Impossible, Plan, Promise
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+PAGE = "plan.html"
+_NAMES = ("plan.toml", "plan.csv", "plan.mcap")
+# Fields of speed and turn by message type.
+_FIELDS: Mapping[str, tuple[str, str]] = {
+    "geometry_msgs/msg/Twist": ("linear.x", "angular.z"),
+    "geometry_msgs/msg/TwistStamped": ("twist.linear.x", "twist.angular.z"),
+    "ackermann_msgs/msg/AckermannDrive": ("speed", "steering_angle"),
+    "ackermann_msgs/msg/AckermannDriveStamped": ("drive.speed", "drive.steering_angle"),
+}
+# A player shifts log times to now; stamps begin at a round moment so that the same plan has the same bytes.
+_START_NS = 1_700_000_000_000_000_000
+_SECOND = 1_000_000_000
+
+
+def list_types(*, steered: bool) -> tuple[str, ...]:
+    """Message types of commands: of a steering angle, or of a yaw rate."""
+    return tuple(name for name in _FIELDS if ("Ackermann" in name) == steered)
+
+
+class Promised(msgspec.Struct, frozen=True):
+    """What `plan.toml` promised, to be checked against what came out.
+
+    Attributes:
+        vehicle: id of the vehicle.
+        runs: names of the runs that the plan was made from.
+        promises, impossible: as of the plan.
+    """
+
+    vehicle: str
+    runs: list[str] = []
+    promises: list[Promise] = []
+    impossible: list[Impossible] = []
+
+
+def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
+    """Write all files of a plan into a folder, which is made if need be.
+
+    Args:
+        plan: the plan.
+        folder: for its files.
+        page: the plan as a page to look at; none is written where it is empty.
+
+    Raises:
+        PlanError: ``cannot_write``, or ``wrong_type`` for a message type that cannot carry the commands.
+    """
+    if plan.type_name not in list_types(steered=plan.steered):
+        raise PlanError(
+            "wrong_type",
+            f"commands of this vehicle cannot be written as {plan.type_name}",
+            where=plan.topic,
+            hint=f"Give --type as one of {', '.join(list_types(steered=plan.steered))}.",
+        )
+    toml, csv, mcap = (folder / name for name in _NAMES)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_mcap(plan, mcap)
+        pages = [(folder / PAGE, page)] if page else []
+        for path, text in ((csv, _format_csv(plan)), (toml, _format_toml(plan)), *pages):
+            draft = path.with_name(f".{path.name}.part")
+            draft.write_text(text, encoding="utf-8")
+            draft.replace(path)
+    except OSError as error:
+        raise PlanError(
+            "cannot_write",
+            f"the plan cannot be written ({error.strerror})",
+            where=str(folder),
+            hint="Choose another --to.",
+        ) from None
+    return (toml, csv, mcap, *(path for path, _ in pages))
+
+
+def read_promises(path: Path) -> Promised:
+    """What a `plan.toml`, or the folder that holds it, promises.
+
+    Raises:
+        PlanError: ``no_plan``, it is not there or no plan.
+    """
+    file = path / _NAMES[0] if path.is_dir() else path
+    try:
+        return msgspec.convert(parse_toml(file.read_text(encoding="utf-8")), Promised)
+    except OSError as error:
+        what = f"the plan cannot be read ({error.strerror})"
+    except (UnicodeDecodeError, TomlError, msgspec.ValidationError) as error:
+        what = f"this is no plan: {error}"
+    raise PlanError("no_plan", what, where=str(file), hint="Give the folder that `slip plan` wrote.")
+
+
+def _write_mcap(plan: Plan, path: Path) -> None:
+    speed, turn = _FIELDS[plan.type_name]
+    stamps = _START_NS + np.round(plan.commands.times * _SECOND).astype(np.int64)
+    fields: dict[str, NDArray[np.float64]] = {speed: plan.commands.speed, turn: plan.commands.turn}
+    stamped = plan.type_name.endswith("Stamped")
+    with LogWriter(path) as writer:
+        writer.write_columns(
+            plan.topic, plan.type_name, stamps, fields, header_time=stamps if stamped else None
+        )
+        writer.metadata("safety", {"text": " ".join(SAFETY)})
+
+
+def _format_csv(plan: Plan) -> str:
+    turn = "steering_rad" if plan.steered else "yaw_rate_radps"
+    rows = zip(
+        plan.commands.times.tolist(), plan.commands.speed.tolist(), plan.commands.turn.tolist(), strict=True
+    )
+    lines = [f"time_s,speed_mps,{turn}", *(f"{t:.3f},{v:.6f},{w:.6f}" for t, v, w in rows)]
+    return "\n".join(lines) + "\n"
+
+
+def _format_toml(plan: Plan) -> str:
+    turn = "max_steering_rad" if plan.steered else "max_yaw_rate_radps"
+    lines = ["# What to drive next. `slip plan --check` compares what came out with these promises."]
+    lines += [f"# {line}" for line in SAFETY]
+    lines += _format_table(
+        {
+            "vehicle": plan.vehicle,
+            "runs": list(plan.runs),
+            "topic": plan.topic,
+            "type": plan.type_name,
+            "rate_hz": RATE_HZ,
+            "duration_s": plan.commands.duration_s,
+        }
+    )
+    lines += ["", "[limits]"]
+    lines += _format_table(
+        {
+            "max_speed_mps": plan.limits.speed_mps,
+            turn: plan.limits.turn,
+            "max_acceleration_mps2": plan.limits.acceleration_mps2,
+            "max_lateral_acceleration_mps2": plan.limits.lateral_mps2,
+        }
+    )
+    lines += ["", "# The start is the middle; the first side lies along the heading at the start.", "[area]"]
+    lines += _format_table(
+        {
+            "length_m": plan.area.length_m,
+            "width_m": plan.area.width_m,
+            "margin_m": plan.area.margin_m,
+            "home_m": plan.home_m,
+        }
+    )
+    for name, start in plan.manoeuvres:
+        lines += ["", "[[manoeuvre]]", *_format_table({"name": name, "start_s": start})]
+    for key, items in (("promises", plan.promises), ("impossible", plan.impossible)):
+        for item in items:
+            lines += ["", f"[[{key}]]", *_format_table(msgspec.to_builtins(item))]
+    return "\n".join(lines) + "\n"
+
+
+def _format_table(table: Mapping[str, object]) -> list[str]:
+    """Lines of TOML: its strings and lists of strings are those of JSON."""
+    return [f"{key} = {_format_value(value)}" for key, value in table.items()]
+
+
+def _format_value(value: object) -> str:
+    if isinstance(value, float) and math.isfinite(value):
+        return repr(round(value, 6))
+    return json.dumps(value, ensure_ascii=False)

@@ -1,0 +1,203 @@
+"""What is known before a drive: models that may be true, how well their numbers are known, and the noise.
+
+A hypothesis is a model with values. What the logs so far say of its numbers is an information matrix: that of
+the fit, over the variance of its weighted residuals times the number of neighbours that repeat each of them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.identification import Input, Problem, fit_model
+from pipeline.identification.intervals import integrate_correlation
+from pipeline.models import Model
+from pipeline.plan.errors import PlanError
+from pipeline.plan.limits import is_steered
+from pipeline.plan.rehearsal import Senses, read_senses, start_state
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.identification.fit import Fitted, PartFit
+    from pipeline.identification.parts import Part
+    from pipeline.identification.state import Free
+    from pipeline.models import Effect
+    from pipeline.runs import MotionRun
+    from pipeline.vehicles import Vehicle
+
+Floats = NDArray[np.float64]
+
+# Without a log: spread of a window's residual [m/s, m/s, rad/s], and windows that repeat each other.
+_USUAL_NOISE = (0.02, 0.02, 0.02)
+_OVERLAP = 2.0
+# How badly the clock of a log that is still to come is known [s].
+_CLOCK_S = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A model that may be true; each is itself alone.
+
+    Attributes:
+        effects: with their values.
+        free: its numbers, one a row of `information`.
+        information: of the logs so far and of what is usual, shape (p, p).
+    """
+
+    effects: tuple[Effect, ...]
+    free: tuple[Free, ...]
+    information: Floats
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Ids of its effects."""
+        return frozenset(effect.id for effect in self.effects)
+
+    @property
+    def values(self) -> Floats:
+        """Its numbers, shape (p,)."""
+        state = start_state(self.effects)
+        return np.array([state.get(number) for number in self.free])
+
+    def extend(self, effect: Effect) -> Hypothesis:
+        """The model with one effect more, of which the logs say nothing."""
+        both = _assume(start_state(self.effects).add(effect).effects)
+        old = {number.label: index for index, number in enumerate(self.free)}
+        rows = [index for index, number in enumerate(both.free) if number.label in old]
+        mine = [old[both.free[index].label] for index in rows]
+        information = both.information.copy()
+        information[np.ix_(rows, rows)] = self.information[np.ix_(mine, mine)]
+        return replace(both, information=information)
+
+    def draw(self, generator: np.random.Generator) -> tuple[Effect, ...]:
+        """Effects whose numbers are drawn from what is known of them, held to their bounds."""
+        if not self.free:
+            return self.effects
+        root = np.linalg.cholesky(self.information)
+        spread = np.linalg.solve(root.T, generator.standard_normal(len(self.free)))
+        return start_state(self.effects).move(self.free, spread.tolist()).effects
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """Where a plan starts from.
+
+    Attributes:
+        vehicle: geometry.
+        senses: sensors of the next log.
+        base: the model that explains the logs so far; the ideal one without logs.
+        noise: deviation of a window's residual by part and channel, larger by what repeats it; infinite in
+            channels that say nothing, shape (parts, 3).
+        problem: the logs so far; None without.
+    """
+
+    vehicle: Vehicle
+    senses: Senses
+    base: Hypothesis
+    noise: Floats
+    problem: Problem | None = None
+
+    @property
+    def driven_s(self) -> float:
+        """Length of the logs so far [s]."""
+        return 0.0 if self.problem is None else sum(run.duration_s for run in self.problem.runs)
+
+    def suppose(self, effects: Sequence[Effect]) -> Hypothesis:
+        """These effects, fitted to the logs so far where there are any; neutral values are searched."""
+        if self.problem is None:
+            return _assume(tuple(effects))
+        return _inform(fit_model(self.problem, Model(self.problem.vehicle, tuple(effects))))
+
+
+def learn(runs: Sequence[MotionRun], vehicle: Vehicle, effects: Sequence[Effect] = ()) -> Knowledge:
+    """What runs of one vehicle say.
+
+    Args:
+        runs: the logs so far.
+        vehicle: geometry.
+        effects: what was named in them; fitted once more, to all of them together.
+
+    Raises:
+        PlanError: ``no_command``, a run does not say what was asked of the vehicle.
+        MotionError: a run is too short.
+    """
+    for run in runs:
+        if run.commands is None:
+            raise PlanError(
+                "no_command",
+                "the log has no commands, which a plan would be made of",
+                where=run.name,
+                hint="Record the command topic, or plan for the vehicle alone with --vehicle.",
+            )
+    # The steering of a car that stands cannot be read off its motion: the whole way serves.
+    used = [replace(run, wheels=None) for run in runs]
+    if not is_steered(vehicle) and all(run.wheels is not None for run in runs):
+        used = list(runs)
+    problem = Problem(used, vehicle, Input.COMMAND)
+    fitted = fit_model(problem, Model(problem.vehicle, tuple(effects)))
+    noise = [_measure_noise(part, fit) for part, fit in zip(problem.parts, fitted.fits, strict=True)]
+    return Knowledge(problem.vehicle, read_senses(used), _inform(fitted), np.array(noise), problem)
+
+
+def assume(vehicle: Vehicle) -> Knowledge:
+    """What is known of a vehicle that was not driven yet: poses alone, of usual noise."""
+    noise = np.sqrt(_OVERLAP) * np.array([_USUAL_NOISE])
+    senses = Senses(track_multiplier=vehicle.controller_track_multiplier)
+    return Knowledge(vehicle, senses, _assume(()), noise)
+
+
+def _assume(effects: tuple[Effect, ...]) -> Hypothesis:
+    free = tuple(number for number in start_state(effects).list_free(()) if number.is_smooth)
+    return Hypothesis(effects, free, np.diag(_expect(effects, free)))
+
+
+def _inform(fitted: Fitted) -> Hypothesis:
+    """A fitted model, the clocks of its runs averaged out of what is known of its numbers."""
+    effects = fitted.state.effects
+    free = tuple(number for number in start_state(effects).list_free(()) if number.is_smooth)
+    place = {number.label: index for index, number in enumerate(free)}
+    total = np.diag(_expect(effects, free))
+    for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
+        columns = fit.jacobian[:, :, fit.smooth] * fit.weights.factors(fit.residual)[:, :, None]
+        normal = np.einsum("ncp,ncq->pq", columns, columns) / _inflate(part, fit)
+        numbers = [fit.free[index] for index in fit.smooth]
+        mine = [index for index, number in enumerate(numbers) if number.effect]
+        clocks = [index for index, number in enumerate(numbers) if not number.effect]
+        known = normal[np.ix_(mine, mine)]
+        if clocks:
+            cross, own = normal[np.ix_(mine, clocks)], normal[np.ix_(clocks, clocks)]
+            known = known - cross @ np.linalg.solve(own + np.eye(len(clocks)) / _CLOCK_S**2, cross.T)
+        at = [place[numbers[index].label] for index in mine]
+        total[np.ix_(at, at)] += known
+    return Hypothesis(effects, free, total)
+
+
+def _expect(effects: Sequence[Effect], free: Sequence[Free]) -> Floats:
+    """Information of what is usual: a number is off by about its own size, or by a usual one, shape (p,)."""
+    found = {effect.id: effect for effect in effects}
+    spread = []
+    for number in free:
+        parameter = found[number.effect].parameter(number.name)
+        neutral = parameter.neutral if math.isfinite(parameter.neutral) else 0.0
+        value = found[number.effect].values[number.name]
+        spread.append(max(abs(value - neutral), abs(parameter.typical - neutral), parameter.step))
+    return np.array(spread, dtype=np.float64) ** -2.0
+
+
+def _inflate(part: Part, fit: PartFit) -> float:
+    """Variance of weighted residuals times the number of neighbours that repeat each of them."""
+    rest = fit.weights.weigh(fit.residual)[part.live][:, list(part.channels)]
+    stride = float(np.median(np.diff(part.times.mean(axis=1))))
+    repeats = max(integrate_correlation(part, fit) / max(stride, 1e-3), 1.0)
+    return max(float(np.mean(rest**2)), 1e-12) * repeats
+
+
+def _measure_noise(part: Part, fit: PartFit) -> Floats:
+    """Deviation of a window's residual by channel, as if windows were independent, shape (3,)."""
+    middle = np.median(fit.weights.scale, axis=0)
+    return np.asarray(middle * math.sqrt(_inflate(part, fit)), dtype=np.float64)

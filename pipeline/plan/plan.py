@@ -1,0 +1,390 @@
+"""A plan: manoeuvres chosen for questions, and what the whole of it promises."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.diagnosis.excitation import suggest_manoeuvre
+from pipeline.models import find_effect, list_effects
+from pipeline.plan.choose import Chooser, Shape
+from pipeline.plan.errors import PlanError
+from pipeline.plan.limits import is_steered
+from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, Commands, join, list_manoeuvres, wait
+from pipeline.plan.questions import DECIDED_T, STRETCHES, Judge, Separation
+from pipeline.plan.rehearsal import Rehearsal, start_state
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.models import Effect
+    from pipeline.models.evidence import Largest
+    from pipeline.plan.knowledge import Knowledge
+    from pipeline.plan.limits import Area, Limits
+    from pipeline.plan.manoeuvres import Manoeuvre
+    from pipeline.plan.questions import Answerable, Question
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_MODELS = 12
+# Of effects that may act unnoticed, times the usual one: the largest does not always lead farthest.
+_SIZES = (0.7, 1.0, 1.5, 2.0)
+_STEP_S = 1.0
+# Zero commands after everything, beside the rest of the last manoeuvre.
+_TAIL_S = 1.0
+# By which more is asked of single manoeuvres until the whole keeps what is asked of it.
+_RESERVES = (1.1, 1.4, 1.8)
+# Of the answer, in driving time: below it more of the same would take ten times as long.
+_HOPELESS = 0.1
+
+SAFETY = (
+    "This drives a real robot without looking: no obstacle and no error stops it.",
+    "Play it with the wheels lifted first. Then clear the area, and keep an emergency stop at hand.",
+    f"It begins with {LEAD_S:g} s of zero commands and obeys the limits that it states.",
+)
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What a plan answers.
+
+    Attributes:
+        question: in words.
+        effects: what it is about.
+        kind: `separation` by a block t, or `interval` by the half-width of a 95 % interval.
+        decided_after_s: since the start of the plan.
+        expected: block t, or half-width in the number's unit, at the end of the plan.
+        goal: what is promised of it: at least this t, at most this half-width.
+        unit: of `expected`.
+    """
+
+    question: str
+    effects: tuple[str, ...]
+    kind: Literal["separation", "interval"]
+    decided_after_s: float
+    expected: float
+    goal: float
+    unit: str = "1"
+
+
+@dataclass(frozen=True)
+class Impossible:
+    """A question that the plan leaves open, and why."""
+
+    question: str
+    effects: tuple[str, ...]
+    because: str
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Commands with what they promise.
+
+    Attributes:
+        vehicle: id of the vehicle.
+        runs: names of the logs it was made from.
+        manoeuvres: names and starts [s] of what is driven.
+        commands: all of them, zeros first.
+        limits, area: that it obeys.
+        promises, impossible: by question.
+        topic, type_name: on which the commands are played.
+        steered: whether a turn is a steering angle.
+        home_m: largest distance of any model's end from the start.
+        ways: of the models, base first, positions x + iy [m] 20 times a second, shape (models, n).
+    """
+
+    vehicle: str
+    runs: tuple[str, ...]
+    manoeuvres: tuple[tuple[str, float], ...]
+    commands: Commands = field(repr=False)
+    limits: Limits
+    area: Area
+    promises: tuple[Promise, ...]
+    impossible: tuple[Impossible, ...]
+    topic: str
+    type_name: str
+    steered: bool
+    home_m: float
+    ways: Complex = field(repr=False)
+
+    def to_json(self) -> dict[str, object]:
+        """The promised keys of `slip plan --json`, and more."""
+        return {
+            "duration_s": self.commands.duration_s if self.manoeuvres else 0.0,
+            "vehicle": self.vehicle,
+            "runs": list(self.runs),
+            "home_m": self.home_m,
+            "limits": asdict(self.limits) | {"yaw_rate_radps": _finite(self.limits.yaw_rate_radps)},
+            "area": asdict(self.area),
+            "safety": list(SAFETY),
+            "topic": self.topic,
+            "type": self.type_name,
+            "manoeuvres": [{"name": name, "start_s": start} for name, start in self.manoeuvres],
+            "promises": [
+                {
+                    "question": one.question,
+                    "effects": list(one.effects),
+                    "decided_after_s": one.decided_after_s,
+                    ("expected_t" if one.kind == "separation" else "interval_after_s"): one.expected,
+                }
+                for one in self.promises
+            ],
+            "impossible": [
+                {"question": one.question, "effects": list(one.effects), "because": one.because}
+                for one in self.impossible
+            ],
+        }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of a plan.
+
+    Attributes:
+        limits, area: to obey.
+        time_s: longest duration, the zero commands at the start included.
+        runs: names of the logs that the knowledge comes from.
+        topic, type_name: on which the commands will be played.
+        seed: of the draws from what is known.
+    """
+
+    limits: Limits
+    area: Area
+    time_s: float
+    runs: tuple[str, ...] = ()
+    topic: str = "/cmd_vel"
+    type_name: str = "geometry_msgs/msg/Twist"
+    seed: int = 0
+
+
+def make_plan(knowledge: Knowledge, questions: Sequence[Question], request: Request) -> Plan:
+    """Choose manoeuvres that answer questions, and say what the whole of them promises.
+
+    Args:
+        knowledge: where the plan starts from.
+        questions: to answer.
+        request: time, area and limits.
+
+    Raises:
+        PlanError: ``no_room``, no manoeuvre fits into the area and the time.
+    """
+    largest = find_largest(knowledge, request.limits, request.time_s)
+    models = _list_models(knowledge, questions, largest, request.seed)
+    library = list_manoeuvres(knowledge.vehicle, request.limits)
+    chooser = _make_chooser(knowledge, questions, request, library, models) if questions else None
+    best = _rehearse(knowledge, questions, request.area, [], models)
+    for reserve in _RESERVES if chooser is not None else ():
+        chosen = [library[number] for number in chooser.choose(reserve)] if chooser is not None else []
+        trial = _rehearse(knowledge, questions, request.area, chosen, models)
+        if (len(trial.promises), trial.answered) > (len(best.promises), best.answered):
+            best = trial
+        if not best.impossible:
+            break
+    commands, ways = best.commands, best.ways
+    return Plan(
+        vehicle=knowledge.vehicle.id,
+        runs=request.runs,
+        manoeuvres=tuple((one.name, at) for one, at in zip(best.manoeuvres, best.starts, strict=True)),
+        commands=commands,
+        limits=request.limits,
+        area=request.area,
+        promises=best.promises,
+        impossible=best.impossible,
+        topic=request.topic,
+        type_name=request.type_name,
+        steered=is_steered(knowledge.vehicle),
+        home_m=float(np.abs(ways[:, -1]).max()),
+        ways=ways,
+    )
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """Manoeuvres, rehearsed as a whole; see `Plan`."""
+
+    manoeuvres: tuple[Manoeuvre, ...]
+    starts: tuple[float, ...]
+    commands: Commands
+    ways: Complex
+    promises: tuple[Promise, ...]
+    impossible: tuple[Impossible, ...]
+    answered: float
+
+
+def _rehearse(
+    knowledge: Knowledge,
+    questions: Sequence[Question],
+    area: Area,
+    chosen: Sequence[Manoeuvre],
+    models: Sequence[tuple[Effect, ...]],
+) -> _Trial:
+    """The longest beginning of a sequence that stays inside the area, and what it promises."""
+    chosen = list(chosen)
+    while True:
+        commands = join([wait(LEAD_S), *(one.commands for one in chosen), wait(_TAIL_S)])
+        ends = LEAD_S + np.cumsum([0.0, *(one.commands.duration_s for one in chosen)])
+        rehearsal = Rehearsal(commands, knowledge.vehicle, knowledge.senses, ends)
+        ways = np.array([rehearsal.trace(effects)[0] for effects in models])
+        # What lasts beyond the rest between two manoeuvres is known only now.
+        if not chosen or area.holds(ways):
+            break
+        chosen.pop()
+    starts = tuple(np.round(ends[:-1], 3).tolist())
+    if not chosen:
+        nothing = tuple(Impossible(one.text, one.effects, _advise(one)) for one in questions)
+        return _Trial((), starts, commands, ways, (), nothing, 0.0)
+    promised = _promise(knowledge, questions, rehearsal, commands.duration_s)
+    return _Trial(tuple(chosen), starts, commands, ways, *promised)
+
+
+def find_largest(knowledge: Knowledge, limits: Limits, time_s: float) -> Largest:
+    """What plans within these limits ask for at most, of which usual sizes of effects are shares."""
+    library = join([one.commands for one in list_manoeuvres(knowledge.vehicle, limits)])
+    largest = Rehearsal(library, knowledge.vehicle, knowledge.senses, np.zeros(1)).largest
+    return replace(largest, moments=np.linspace(0.0, time_s, largest.moments.size))
+
+
+def _list_models(
+    knowledge: Knowledge, questions: Sequence[Question], largest: Largest, seed: int
+) -> list[tuple[Effect, ...]]:
+    """Models that may be true: the base, those asked about, draws, and the base with one effect more.
+
+    A slow or short log may hide any effect: each of the catalogue is taken to act at sizes that are usual.
+    """
+    asked = dict.fromkeys(
+        model
+        for question in questions
+        for model in (question.models if isinstance(question, Separation) else (question.model,))
+    )
+    supposed = list(dict.fromkeys([knowledge.base, *asked]))
+    generator = np.random.default_rng(seed)
+    drawn = [supposed[turn % len(supposed)].draw(generator) for turn in range(_MODELS)]
+    unnoticed = dict.fromkeys(
+        _enlarge(one, times)
+        for effect in list_effects()
+        if knowledge.vehicle.kind in effect.kinds and effect.id not in knowledge.base.names
+        for one in (effect().make_usual(largest), _make_typical(effect()))
+        for times in _SIZES
+    )
+    base = start_state(knowledge.base.effects)
+    return [*(model.effects for model in supposed), *drawn, *(base.add(one).effects for one in unnoticed)]
+
+
+def _make_typical(effect: Effect) -> Effect:
+    """An effect of the size that vehicles show, whatever a plan asks for."""
+    return effect.change(
+        **{p.name: p.typical for p in effect.parameters if not p.instead_of and not p.relative_to}
+    )
+
+
+def _enlarge(effect: Effect, times: float) -> Effect:
+    """An effect so many times as far from doing nothing; of a limit, idle at infinity, a part."""
+    values = {}
+    for parameter in effect.parameters:
+        value, neutral = effect.values[parameter.name], parameter.neutral
+        if math.isfinite(value) and not math.isnan(neutral):
+            far = neutral + times * (value - neutral) if math.isfinite(neutral) else value / times
+            values[parameter.name] = min(max(far, parameter.bounds[0]), parameter.bounds[1])
+    return effect.change(**values)
+
+
+def _make_chooser(
+    knowledge: Knowledge,
+    questions: Sequence[Question],
+    request: Request,
+    library: Sequence[Manoeuvre],
+    models: Sequence[tuple[Effect, ...]],
+) -> Chooser:
+    """The library with what each manoeuvre says to each question, and where it leads."""
+    durations = np.array([one.commands.duration_s for one in library])
+    edges = np.concatenate(([0.0], np.cumsum(durations)))
+    rehearsal = Rehearsal(
+        join([one.commands for one in library]), knowledge.vehicle, knowledge.senses, edges[:-1]
+    )
+    ways = [rehearsal.trace(effects) for effects in models]
+    shapes = []
+    for begin, end in zip((edges[:-1] * RATE_HZ).round(), (edges[1:] * RATE_HZ).round(), strict=True):
+        rows = slice(int(begin), int(end) + 1)
+        paths = np.array([path[rows] for path, _ in ways])
+        turned = np.array([heading[rows] for _, heading in ways])
+        own = np.exp(-1j * turned[:, :1]) * (paths - paths[:, :1])
+        shapes.append(Shape(own, turned[:, -1] - turned[:, 0]))
+    answerable = Judge(rehearsal, knowledge, edges).judge(questions)
+    time_s = request.time_s - LEAD_S - _TAIL_S
+    chooser = Chooser(answerable, durations, shapes, request.area, time_s)
+    if not any(chooser.fits([one]) for one in np.flatnonzero(durations <= time_s).tolist()):
+        raise PlanError(
+            "no_room",
+            "no manoeuvre fits into the area and the time",
+            where=f"{request.area.length_m:g} x {request.area.width_m:g} m, {request.time_s:g} s",
+            hint="Give a larger --area or --time, or a lower --max-speed.",
+        )
+    return chooser
+
+
+def _promise(
+    knowledge: Knowledge, questions: Sequence[Question], rehearsal: Rehearsal, duration_s: float
+) -> tuple[tuple[Promise, ...], tuple[Impossible, ...], float]:
+    """What the whole plan says to every question, and since when; and the shares of all answers together."""
+    edges = np.arange(0.0, duration_s + _STEP_S, _STEP_S)
+    promises, impossible, answered = [], [], 0.0
+    for one in Judge(rehearsal, knowledge, edges, stretches=True).judge(questions):
+        full = np.ones(edges.size - 1)
+        reached, measured = one.answer(full), one.measure(full)
+        answered += reached
+        if reached >= 1.0:
+            promises.append(_keep_promise(one, edges, measured))
+        else:
+            impossible.append(
+                Impossible(one.question.text, one.question.effects, _explain(one, reached, measured))
+            )
+    promises.sort(key=lambda promise: promise.decided_after_s)
+    return tuple(promises), tuple(impossible), answered
+
+
+def _keep_promise(one: Answerable, edges: Floats, measured: float) -> Promise:
+    count = edges.size - 1
+    low, high = 0, count
+    while low < high:
+        middle = (low + high) // 2
+        if one.answer((np.arange(count) < middle).astype(np.float64)) >= 1.0:
+            high = middle
+        else:
+            low = middle + 1
+    question = one.question
+    after = float(edges[high])
+    if isinstance(question, Separation):
+        return Promise(question.text, question.effects, "separation", after, measured, DECIDED_T)
+    number = question.model.free[question.number]
+    return Promise(question.text, question.effects, "interval", after, measured, question.goal, number.unit)
+
+
+def _explain(one: Answerable, reached: float, measured: float) -> str:
+    """Why a question stays open."""
+    question = one.question
+    if reached >= _HOPELESS:
+        enough = measured >= DECIDED_T if isinstance(question, Separation) else measured <= question.goal
+        if enough:
+            return f"fewer than {STRETCHES:g} stretches of the plan show it: more time or room is needed"
+        what = (
+            f"t = {measured:.1f} of {DECIDED_T:g}"
+            if isinstance(question, Separation)
+            else f"+- {measured:.2g} where {question.goal:.2g} is asked"
+        )
+        return f"the plan reaches {what}: more time or room is needed"
+    return _advise(question)
+
+
+def _advise(question: Question) -> str:
+    effects = [find_effect(name)() for name in question.effects]
+    advice = suggest_manoeuvre(*effects)
+    return f"on level ground, within these limits and this time, next to nothing shows it; {advice}"

@@ -1,0 +1,262 @@
+"""What a plan is to answer, and what each manoeuvre says to it.
+
+Two models are separated by what is left of the difference of their predictions once the wrong one has been
+refitted to the right one's motion, the logs so far included (T-optimality; Atkinson and Fedorov, Biometrika
+62, 1975). A loss that falls by c weighted squares has a block t of sqrt(c) / 2 on average. A number is known
+as well as the information on it says (A-optimality). Both are sums over windows: manoeuvres that begin and
+end at rest add up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from pipeline.plan.rehearsal import start_state
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.identification import Free, Problem
+    from pipeline.plan.knowledge import Hypothesis, Knowledge
+    from pipeline.plan.rehearsal import Rehearsal
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# The diagnosis decides between two that were found at 1.6; a t scatters about its mean by one, and here it is
+# to be decided nearly always.
+DECIDED_T = 5.0
+STRETCHES = 3.0
+"""Stretches of driving that must speak for a decision: of two nobody knows the spread."""
+STRETCH_S = 10.0
+INTERVAL_SHARE = 0.05
+# Of the jackknife of intervals: command steps are joined to at least six seconds.
+_BLOCK_S = 7.0
+_CLOCK_S = 0.05
+
+
+@dataclass(frozen=True)
+class Separation:
+    """Which of two models is true.
+
+    Attributes:
+        text: the question.
+        effects: ids of what it is about.
+        models: the two; each is supposed to be true in turn, the other refitted.
+        both_ways: whether either may be true; else only the first.
+    """
+
+    text: str
+    effects: tuple[str, ...]
+    models: tuple[Hypothesis, Hypothesis]
+    both_ways: bool = True
+
+
+@dataclass(frozen=True)
+class Precision:
+    """How large a number of a model is.
+
+    Attributes:
+        text: the question.
+        effects: id of its effect.
+        model: that has it.
+        number: which row of the model's information.
+        goal: half-width of its 95 % interval to reach.
+    """
+
+    text: str
+    effects: tuple[str, ...]
+    model: Hypothesis
+    number: int
+    goal: float
+
+
+Question = Separation | Precision
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What groups of windows say to one model, in units of the noise.
+
+    Attributes:
+        normal: information on its numbers and the clock by group, shape (k, q, q).
+        pull: product of derivatives and difference to the truth, shape (k, q); zero where it is the truth.
+        power: squared difference to the truth, shape (k,).
+        prior: information of the logs so far, shape (q, q).
+    """
+
+    normal: Floats
+    pull: Floats
+    power: Floats
+    prior: Floats
+
+    def separate(self, weight: Floats) -> Floats:
+        """Squared difference that a refit leaves in each group, shape (k,).
+
+        Args:
+            weight: how often each group is driven, shape (k,).
+        """
+        pull = weight @ self.pull
+        total = self.prior + np.tensordot(weight, self.normal, 1)
+        step = np.linalg.solve(total, pull)
+        left = self.power - 2.0 * self.pull @ step + self.normal @ step @ step
+        return np.maximum(np.asarray(left, dtype=np.float64), 0.0)
+
+    def spread(self, weight: Floats, number: int) -> float:
+        """Standard error of a number of the model."""
+        total = self.prior + np.tensordot(weight, self.normal, 1)
+        return float(np.sqrt(np.linalg.inv(total)[number, number]))
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Groups of windows that are driven, or not, as a whole.
+
+    Attributes:
+        seconds: how long each is [s], shape (k,).
+        stretch: number of the stretch of driving of each, of which a block t needs several, shape (k,).
+        before_s: driven in the logs so far [s].
+    """
+
+    seconds: Floats
+    stretch: Integers
+    before_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Answerable:
+    """A question with what groups of windows say to it."""
+
+    question: Question
+    evidence: tuple[Evidence, ...] = field(repr=False)
+    groups: Groups = field(repr=False)
+
+    def measure(self, weight: Floats) -> float:
+        """Expected block t of a separation; half-width of a number's 95 % interval."""
+        if isinstance(self.question, Separation):
+            return 0.5 * float(np.sqrt(min(weight @ one.separate(weight) for one in self.evidence)))
+        return self._widen(weight) * self.evidence[0].spread(weight, self.question.number)
+
+    def answer(self, weight: Floats, reserve: float = 1.0) -> float:
+        """Share of what is asked, in time: one when it is answered.
+
+        Args:
+            weight: how often each group is driven, shape (k,).
+            reserve: factor by which more is asked, of t, of stretches and of the interval's width.
+        """
+        if isinstance(self.question, Precision):
+            shown = self.evidence[0].normal[:, self.question.number, self.question.number]
+            share = (self.question.goal / reserve / self.measure(weight)) ** 2
+            return min(share, 1.0) * self._spread_out(weight, shown, reserve)
+        shares = []
+        for one in self.evidence:
+            left = one.separate(weight)
+            decided = 0.25 * float(weight @ left) / (reserve * DECIDED_T) ** 2
+            shares.append(min(decided, 1.0) * self._spread_out(weight, left, reserve))
+        return min(shares)
+
+    def _spread_out(self, weight: Floats, shown: Floats, reserve: float) -> float:
+        """Share of the stretches that a decision needs, by what each group shows, shape (k,)."""
+        # A group that is driven twice stands in two stretches.
+        first, again = np.minimum(weight, 1.0) * shown, np.maximum(weight - 1.0, 0.0)
+        sums = np.bincount(self.groups.stretch, first)
+        power = float(np.sum(sums**2) + np.sum(again * shown**2))
+        if power <= 0.0:
+            return 0.0
+        stretches = min(float(weight @ shown) ** 2 / power, float(weight @ self.groups.seconds) / STRETCH_S)
+        return min(stretches / (reserve * STRETCHES), 1.0)
+
+    def _widen(self, weight: Floats) -> float:
+        """Half-width over standard error: Student's t of the blocks that the jackknife will have."""
+        seconds = self.groups.before_s + float(weight @ self.groups.seconds)
+        return float(stdtrit(max(seconds / _BLOCK_S - 1.0, 1.0), 0.975))
+
+
+class Judge:
+    """What rehearsed commands say to hypotheses.
+
+    Args:
+        rehearsal: the commands.
+        knowledge: the noise, and the model whose poses and headings stand for the measured ones.
+        edges: times [s] between which windows belong to one group, shape (k + 1,).
+        stretches: whether these follow each other, so that several stand in one stretch of driving; else each
+            is driven on its own.
+    """
+
+    def __init__(
+        self, rehearsal: Rehearsal, knowledge: Knowledge, edges: Floats, *, stretches: bool = False
+    ) -> None:
+        self.problem: Problem = rehearsal.prepare(knowledge.base.effects)
+        self.noise = knowledge.noise
+        self.size = edges.size - 1
+        stretch = edges[:-1] // STRETCH_S if stretches else np.arange(self.size)
+        self.groups = Groups(np.diff(edges), stretch.astype(np.int64), knowledge.driven_s)
+        self._group = [
+            np.clip(np.searchsorted(edges, part.times[:, 1], side="left") - 1, 0, self.size - 1)
+            for part in self.problem.parts
+        ]
+        self._known: dict[Hypothesis, tuple[list[Floats], tuple[Free, ...], list[Floats]]] = {}
+
+    def judge(self, questions: Sequence[Question]) -> list[Answerable]:
+        """Every question with the evidence of every group."""
+        return [Answerable(question, self._collect(question), self.groups) for question in questions]
+
+    def _collect(self, question: Question) -> tuple[Evidence, ...]:
+        if isinstance(question, Precision):
+            return (self._weigh(question.model, question.model),)
+        one, other = question.models
+        first = self._weigh(other, one)
+        return (first, self._weigh(one, other)) if question.both_ways else (first,)
+
+    def _weigh(self, model: Hypothesis, truth: Hypothesis) -> Evidence:
+        """What windows say to a model while another one is true."""
+        predicted, free, jacobians = self._look(model)
+        true = self._look(truth)[0]
+        size = len(free)
+        normal, pull = np.zeros((self.size, size, size)), np.zeros((self.size, size))
+        power = np.zeros(self.size)
+        for rest, own, columns, group, noise in zip(
+            true, predicted, jacobians, self._group, self.noise, strict=True
+        ):
+            # Residuals are measured less predicted: their difference is that of the predictions.
+            apart = (own - rest) / noise
+            rows = columns / noise[:, None]
+            np.add.at(power, group, (apart**2).sum(axis=1))
+            np.add.at(pull, group, np.einsum("ncp,nc->np", rows, apart))
+            np.add.at(normal, group, np.einsum("ncp,ncq->npq", rows, rows))
+        prior = np.zeros((size, size))
+        known = len(model.free)
+        prior[:known, :known] = model.information
+        prior[known:, known:] = np.eye(size - known) / _CLOCK_S**2
+        return Evidence(normal, pull, power, prior)
+
+    def _look(self, model: Hypothesis) -> tuple[list[Floats], tuple[Free, ...], list[Floats]]:
+        """Residuals by part, free numbers with the clocks, and derivatives by part."""
+        if model not in self._known:
+            state = start_state(model.effects)
+            delays = {name: None for part in self.problem.parts for name in part.delays}
+            free = state.list_free(tuple(delays))
+            clocks = tuple(number for number in free if not number.effect)
+            numbers = (*model.free, *clocks)
+            residuals = [part.find_residuals(state) for part in self.problem.parts]
+            jacobians = []
+            for part, residual in zip(self.problem.parts, residuals, strict=True):
+                columns = np.zeros((*residual.shape, len(numbers)))
+                mine = [
+                    index
+                    for index, number in enumerate(numbers)
+                    if (
+                        any(e.id == number.effect and part.owns(e) for e in model.effects)
+                        if number.effect
+                        else number.name in part.delays
+                    )
+                ]
+                columns[:, :, mine] = part.differentiate(state, residual, [numbers[i] for i in mine])
+                jacobians.append(columns)
+            self._known[model] = (residuals, numbers, jacobians)
+        return self._known[model]

@@ -1,0 +1,7 @@
+"""The page of `slip plan`: where it leads, what it asks, and what it promises."""
+
+from __future__ import annotations
+
+from pipeline.report.plan.page import render_plan
+
+__all__ = ["render_plan"]

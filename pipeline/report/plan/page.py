@@ -1,0 +1,106 @@
+"""A plan to look at before it is driven."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import altair as alt
+import numpy as np
+import polars as pl
+
+from pipeline.plan import SAFETY
+from pipeline.report import theme
+from pipeline.report.elements import Picture
+from pipeline.report.figures import Drawing
+from pipeline.report.page import render_figures
+
+if TYPE_CHECKING:
+    from pipeline.plan import Plan
+
+# One pose in so many, and so many ways beside the base's.
+_EVERY = 4
+_MOST_WAYS = 24
+_WIDTH = 640
+
+
+def render_plan(plan: Plan) -> str:
+    """The whole page as HTML; it asks the network for nothing."""
+    area, limits = plan.area, plan.limits
+    turn = f"{limits.turn:.3g} {'rad of steering' if plan.steered else 'rad/s'}"
+    return render_figures(
+        "report/templates/plan.html",
+        [_draw_ways(plan), _draw_commands(plan)],
+        title="What to drive next",
+        facts=[
+            plan.vehicle,
+            f"{plan.commands.duration_s:.0f} s",
+            f"{area.length_m:g} x {area.width_m:g} m",
+            f"at most {limits.speed_mps:.3g} m/s, {turn}, {limits.acceleration_mps2:.3g} m/s2",
+        ],
+        safety=SAFETY,
+        play=f"ros2 bag play plan.mcap ({plan.topic}, {plan.type_name})",
+        promises=[
+            f"after {one.decided_after_s:.0f} s: {one.question} "
+            + (f"(t = {one.expected:.1f})" if one.kind == "separation" else f"(+- {one.expected:.2g})")
+            for one in plan.promises
+        ],
+        impossible=[f"{one.question}: {one.because}" for one in plan.impossible],
+        manoeuvres=[f"{start:.0f} s: {name}" for name, start in plan.manoeuvres],
+    )
+
+
+def _draw_ways(plan: Plan) -> Picture:
+    """The way that is expected, those of other models, and the area."""
+    ways = plan.ways[:: max(len(plan.ways) // _MOST_WAYS, 1), ::_EVERY]
+    rows = pl.concat(
+        pl.DataFrame(
+            {"x": way.real, "y": way.imag, "model": np.full(way.size, number), "order": np.arange(way.size)}
+        )
+        for number, way in enumerate(ways)
+    )
+    half_x, half_y = 0.5 * plan.area.length_m, 0.5 * plan.area.width_m
+    edge = pl.DataFrame(
+        {
+            "x": [-half_x, half_x, half_x, -half_x, -half_x],
+            "y": [-half_y, -half_y, half_y, half_y, -half_y],
+            "order": [0, 1, 2, 3, 4],
+        }
+    )
+    along = alt.X(
+        "x:Q", title="ahead of the start [m]", scale=alt.Scale(domain=[-half_x, half_x], nice=False)
+    )
+    aside = alt.Y("y:Q", title="to the left [m]", scale=alt.Scale(domain=[-half_y, half_y], nice=False))
+
+    def line(name: str, colour: str, opacity: float, *detail: str) -> alt.Chart:
+        chart = alt.Chart(alt.NamedData(name)).mark_line(color=colour, opacity=opacity, strokeWidth=1.5)
+        drawn: alt.Chart = chart.encode(x=along, y=aside, order="order:Q", detail=list(detail))
+        return drawn
+
+    chart = alt.layer(
+        line("plan_area", theme.QUIET, 1.0),
+        line("plan_ways", theme.CROSS, 0.4, "model:N"),
+        line("plan_way", theme.ON_COMMAND, 1.0),
+    ).properties(width=_WIDTH, height=round(_WIDTH * plan.area.width_m / plan.area.length_m))
+    tables = {"plan_area": edge, "plan_ways": rows, "plan_way": rows.filter(pl.col("model") == 0)}
+    words = (
+        f"From the middle of the area and back to within {plan.home_m:.1f} m: in blue by the model that "
+        "explains the logs so far, in grey by others that they do not rule out."
+    )
+    return Picture("ways", "Where it leads", Drawing(chart, tables, words), words)
+
+
+def _draw_commands(plan: Plan) -> Picture:
+    """Commanded speed and turn over time."""
+    turn = "steering [rad]" if plan.steered else "yaw rate [rad/s]"
+    rows = pl.DataFrame({"t": plan.commands.times, "speed": plan.commands.speed, "turn": plan.commands.turn})
+    panels = [
+        alt.Chart(alt.NamedData("plan_commands"))
+        .mark_line(color=theme.ON_COMMAND, strokeWidth=1.5)
+        .encode(x=alt.X("t:Q", title="time [s]"), y=alt.Y(f"{name}:Q", title=title))
+        .properties(width=_WIDTH, height=110)
+        for name, title in (("speed", "speed [m/s]"), ("turn", turn))
+    ]
+    words = f"Speed and {turn.partition(' [')[0]} that are asked for over {plan.commands.duration_s:.0f} s."
+    return Picture(
+        "commands", "What it asks", Drawing(alt.vconcat(*panels), {"plan_commands": rows}, ""), words
+    )

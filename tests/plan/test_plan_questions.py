@@ -1,0 +1,144 @@
+"""What a plan expects of evidence, and that a drive with hidden physics brings it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.diagnosis import Named, RunDiagnosis, Value
+from pipeline.diagnosis.undecided import Undecided
+from pipeline.models import find_effect
+from pipeline.plan import assume, check_plan
+from pipeline.plan.files import Promised
+from pipeline.plan.knowledge import Hypothesis
+from pipeline.plan.plan import Promise
+from pipeline.plan.questions import DECIDED_T, Answerable, Evidence, Groups, Separation
+from pipeline.vehicles import find_preset
+
+
+def test_what_a_refit_leaves_is_the_residual_of_least_squares() -> None:
+    generator = np.random.default_rng(1)
+    groups, rows, numbers = 4, 30, 3
+    columns = generator.standard_normal((groups, rows, numbers))
+    apart = generator.standard_normal((groups, rows))
+    weak = 1e-9 * np.eye(numbers)
+    evidence = Evidence(
+        np.einsum("grp,grq->gpq", columns, columns),
+        np.einsum("grp,gr->gp", columns, apart),
+        (apart**2).sum(axis=1),
+        weak,
+    )
+    _, left, *_ = np.linalg.lstsq(columns.reshape(-1, numbers), apart.reshape(-1), rcond=None)
+    assert evidence.separate(np.ones(groups)).sum() == pytest.approx(float(left[0]), rel=1e-6)
+
+
+def test_a_decision_needs_several_stretches_however_large_one_is() -> None:
+    model = Hypothesis((), (), np.zeros((0, 0)))
+    question = Separation("a or b", ("a", "b"), (model, model), both_ways=False)
+    plenty = np.array([1e6, 1.0, 1.0, 1.0])
+    evidence = Evidence(np.zeros((4, 0, 0)), np.zeros((4, 0)), plenty, np.zeros((0, 0)))
+    groups = Groups(np.full(4, 10.0), np.arange(4))
+    assert Answerable(question, (evidence,), groups).measure(np.ones(4)) > DECIDED_T
+    assert Answerable(question, (evidence,), groups).answer(np.ones(4)) < 0.5
+    even = Evidence(np.zeros((4, 0, 0)), np.zeros((4, 0)), np.full(4, 1e3), np.zeros((0, 0)))
+    assert Answerable(question, (even,), groups).answer(np.ones(4)) == 1.0
+    assert Answerable(question, (even,), groups).answer(np.array([1.0, 1.0, 0.0, 0.0])) < 1.0
+
+
+def test_draws_stay_inside_the_bounds_and_spread_as_is_known() -> None:
+    vehicle = find_preset("husky_a200")
+    assert vehicle is not None
+    lag = find_effect("drive_lag")(tau=0.3)
+    model = assume(vehicle).suppose([lag])
+    generator = np.random.default_rng(0)
+    drawn = [next(iter(model.draw(generator)[0].values.values())) for _ in range(300)]
+    assert min(drawn) >= lag.parameter("tau").bounds[0]
+    assert np.std(drawn) > 0.1
+
+
+def _diagnose(effects: tuple[str, ...] = (), undecided: tuple[tuple[str, ...], ...] = ()) -> RunDiagnosis:
+    named = tuple(
+        Named(
+            name,
+            {"k": Value(1.5, 1.48, 1.52, "1")},
+            0.5,
+            (),
+            (),
+            corrected=False,
+            way="command",
+            selected=1.0,
+            motion="",
+        )
+        for name in effects
+    )
+    return RunDiagnosis(
+        "run", "command", effects=named, undecided=tuple(Undecided(one, "turn") for one in undecided)
+    )
+
+
+def test_promises_are_checked_against_what_came_out() -> None:
+    pair = Promise("a or b", ("a", "b"), "separation", 20.0, 6.0, 5.0)
+    narrow = Promise("a.k within 0.03", ("a",), "interval", 20.0, 0.02, 0.03)
+    tight = Promise("a.k within 0.01", ("a",), "interval", 20.0, 0.01, 0.01)
+    promised = Promised("husky", [], [pair, narrow, tight])
+    assert [one.kept for one in check_plan(promised, _diagnose(("a",))).kept] == [True, True, False]
+    still = check_plan(promised, _diagnose((), (("a", "b"),)))
+    assert [one.kept for one in still.kept] == [False, False, False]
+    assert still.open == ("a or b: turn",)
+
+
+def _run(*arguments: str | Path, code: int = 0) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "pipeline", *map(str, arguments)], check=False, capture_output=True, text=True
+    )
+    assert done.returncode == code, done.stderr
+    return done.stdout if code == 0 else done.stderr
+
+
+def test_a_plan_for_nothing_says_what_it_needs(tmp_path: Path) -> None:
+    assert "--vehicle" in _run("plan", "--out", tmp_path / "plan", code=1)
+    assert "this is no plan" not in _run("plan", "--check", tmp_path / "gone", "x.mcap", code=1)
+    (tmp_path / "plan.toml").write_text("vehicle = 3\n", encoding="utf-8")
+    assert "this is no plan" in _run("plan", "--check", tmp_path / "plan.toml", "x.mcap", code=1)
+    assert not (tmp_path / "plan").exists()
+
+
+@pytest.mark.long
+def test_a_circle_leaves_open_what_the_plan_then_decides(tmp_path: Path) -> None:
+    """Log, plan, drive of the plan with the hidden physics, check: as a user does it."""
+    hidden = [
+        argument
+        for effect in ("effective_track=1.6", "drive_lag=0.25", "icr_offset=0.08")
+        for argument in ("--effect", effect)
+    ]
+    before, after, folder = tmp_path / "circle.mcap", tmp_path / "drive.mcap", tmp_path / "plan"
+    _run(
+        "simulate", *hidden, "--program", "circle", "--vehicle", "husky", "--duration", "40", "--out", before
+    )
+    made = json.loads(_run("plan", before, "--results", tmp_path / "results", "--out", folder, "--json"))
+    pairs = [one for one in made["promises"] if "expected_t" in one]
+    assert any("icr_offset" in one["effects"] for one in pairs)
+    assert made["topic"] == "/controller/cmd_vel"
+    assert made["duration_s"] <= 60.0
+    _run(
+        "simulate",
+        *hidden,
+        "--vehicle",
+        "husky",
+        "--seed",
+        "5",
+        "--play",
+        folder / "plan.mcap",
+        "--out",
+        after,
+    )
+    checked = json.loads(_run("plan", "--check", folder, after, "--results", tmp_path / "results", "--json"))
+    assert len(checked["kept"]) == len(made["promises"])
+    assert all(one["kept"] for one in checked["kept"])
+    assert {one["measured"] for one in checked["kept"] if "or" in one["question"].split()} == {"icr_offset"}
+    assert checked["next"] is None
