@@ -254,29 +254,15 @@ def export(  # noqa: D417 - the options document themselves
         to: ros2_control, nav2, autoware, vesc, px4, robot_localization, gazebo, json or python.
     """
     from pipeline.models.export import export_model, read_current  # noqa: PLC0415 - heavy
+    from pipeline.models.model_text import write_text  # noqa: PLC0415
 
     used = None if current is None else read_current(current, to)
     text = export_model(open_model(model, trust_code=trust_code), to, used)
     if out is None:
         sys.stdout.write(text)
     else:
-        _write(out, text)
+        write_text(out, text, code="export_unwritable")
     return CLEAN
-
-
-def _write(path: Path, text: str) -> None:
-    from pipeline.runs.errors import MotionError  # noqa: PLC0415 - heavy
-    from pipeline.store.files import replace_file  # noqa: PLC0415
-
-    try:
-        replace_file(path, text.encode())
-    except OSError as error:
-        raise MotionError(
-            "export_unwritable",
-            f"cannot be written: {error.strerror}",
-            where=str(path),
-            hint="Check the folder and its permissions.",
-        ) from None
 
 
 def _change(

@@ -86,14 +86,15 @@ def summarize(
         judgements |= _judge_ways(context, [source], [*found, *terms], open_ids)
     judgement = judgements.get(source.value)
     told = [e for e in found if not e.searched_as & open_ids and e.id not in known]
-    small = [effect for effect in told if judgement is not None and _is_immaterial(effect, judgement)]
-    immaterial = tuple(_describe(effect, context, ways, judgement) for effect in small)
-    if small:
-        found, told = ([effect for effect in some if effect not in small] for some in (found, told))
+    described = tuple(_describe(effect, context, ways, judgement) for effect in _order(told, judgement))
+    immaterial = tuple(effect for effect in described if effect.moves and not effect.moves.is_material)
+    if immaterial:
+        small = {effect.id for effect in immaterial}
+        found, told = ([effect for effect in some if effect.id not in small] for some in (found, told))
         judgements = _judge_ways(context, inputs, [*found, *terms], open_ids)
         judgement = judgements.get(source.value)
+        described = tuple(_describe(effect, context, ways, judgement) for effect in _order(told, judgement))
     unexplained = residual_structure.describe(ways)
-    described = tuple(_describe(effect, context, ways, judgement) for effect in _order(told, judgement))
     named = tuple(effect for effect in described if _doubt(effect) is None)
     named = residual_structure.mark_tentative(_mark_idle(named, judgements), ways, unexplained)
     part, start = context.problem.whole, body.search.start
@@ -144,12 +145,6 @@ def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Con
     findings += _note_brevity(context, common)
     runs = cast("Sequence[Mapping[str, Json]]", common.timing["runs"])
     return replace(common, run=recording.name, findings=tuple(findings), timing=runs[number])
-
-
-def _is_immaterial(effect: Effect, judgement: Judgement) -> bool:
-    """Whether a planner would not miss an effect of the model."""
-    moves = measure_moves(judgement, effect)
-    return moves is not None and not moves.is_material
 
 
 def _doubt(effect: Named) -> str | None:

@@ -66,13 +66,9 @@ def measure_excess(part: Part, fit: PartFit) -> float:
 
 
 def _tie(problem: Problem, priors: list[Prior]) -> Problem:
-    tied = copy(problem)
-    for name in ("behind_wheels", "folds", "training"):
-        tied.__dict__.pop(name, None)
-    tied.parts = tuple(copy(part) for part in problem.parts)
-    for part, prior in zip(tied.parts, priors, strict=True):
+    parts = tuple(copy(part) for part in problem.parts)
+    for part, prior in zip(parts, priors, strict=True):
         part.prior = prior
-    body = tied.parts[0]
-    if problem.whole is problem.parts[0] and isinstance(body, BodyPart):
-        tied.whole = body
-    return tied
+    body = parts[0]
+    whole = body if problem.whole is problem.parts[0] and isinstance(body, BodyPart) else problem.whole
+    return problem.with_parts(whole, parts)

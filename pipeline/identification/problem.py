@@ -117,12 +117,16 @@ class Problem:
                 where=", ".join(self.names),
                 hint="Choose the other input.",
             )
+        found = self.with_parts(body, (body,))
+        found.source, found.comparisons = Input.MEASURED, body.comparisons
+        return found
+
+    def with_parts(self, whole: BodyPart, parts: tuple[Part, ...]) -> Problem:
+        """The same runs with other parts; nothing that was worked out for the former is taken over."""
         found = copy(self)
-        # What was worked out for the other input must not be taken over.
         for name in ("behind_wheels", "folds", "training"):
             found.__dict__.pop(name, None)
-        found.source = Input.MEASURED
-        found.comparisons, found.whole, found.parts = body.comparisons, body, (body,)
+        found.whole, found.parts = whole, parts
         return found
 
     @property

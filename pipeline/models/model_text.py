@@ -42,12 +42,20 @@ def write_model(file: ModelFile, path: Path) -> None:
     Raises:
         MotionError: ``model_unwritable``; ``model_incomplete``, see `format_model`.
     """
-    text = format_model(file)
+    write_text(path, format_model(file), code="model_unwritable")
+
+
+def write_text(path: Path, text: str, *, code: str) -> None:
+    """Write a text in one moment.
+
+    Raises:
+        MotionError: with this code, where the file cannot be written.
+    """
     try:
         replace_file(path, text.encode())
     except OSError as error:
         raise MotionError(
-            "model_unwritable",
+            code,
             f"cannot be written: {error.strerror}",
             where=str(path),
             hint="Check the folder and its permissions.",

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from pipeline.vehicles import Vehicle
 
 Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 FAULTS: Final = ("sides_exchanged", "wheel_sign", "pose_mirrored", "wheel_dead")
 """Findings of which one makes every fit meaningless."""
@@ -39,7 +38,7 @@ _USUAL: Final = 0.95
 """Share of the samples that are no outliers of the localization."""
 _LEAST_SCALE: Final = 0.04
 """Smallest difference of the sides' scales that is told: unequal tyres and motors reach 0.035."""
-_AXES: Final = {0: "ahead", 2: "turning"}
+_AXES: Final = ("ahead", "turning")
 
 
 def check_wiring(samples: Samples, vehicle: Vehicle) -> list[Finding]:
@@ -110,7 +109,7 @@ def _check_signs(sides: Mapping[str, Floats], *, body: bool) -> list[Finding]:
     least = _AXIS_LIVE * max(float(np.quantile(np.abs(side), _USUAL)) for side in sides.values())
     wrong: dict[str, list[str]] = {}
     value = 0.0
-    for place, axis in enumerate(_AXES.values()):
+    for place, axis in enumerate(_AXES):
         # Rest of one axis while the other moves is noise and what follows late: it has no sign.
         axis_live = np.any([np.abs(along[place]) > least for along in motion.values()], axis=0)
         if axis_live.sum() < _FEWEST:
