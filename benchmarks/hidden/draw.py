@@ -37,8 +37,13 @@ from pipeline.simulate import (
     write_log,
 )
 
-Category = Literal["single", "small", "sets", "empty", "poor", "odd", "rigid", "equipped"]
-CATEGORIES: tuple[Category, ...] = ("single", "small", "sets", "empty", "poor", "odd", "rigid", "equipped")
+Category = Literal[
+    "single", "small", "sets", "empty", "poor", "odd", "rigid", "equipped", "cars", "natural", "late"
+]
+# New ones go last: a category draws by its place.
+CATEGORIES: tuple[Category, ...] = (
+    "single", "small", "sets", "empty", "poor", "odd", "rigid", "equipped", "cars", "natural", "late",
+)  # fmt: skip
 
 DIFFERENTIAL = (
     "wheel_radius", "wheel_asymmetry", "effective_track", "icr_offset", "icr_lateral", "lateral_skid",
@@ -50,6 +55,7 @@ DIFFERENTIAL = (
 CAR = ("steering_offset", "steering_gain", "steering_lag", "understeer")
 # Asked for by name only, so that every seed draws what it always drew.
 SENSED = ("steering_sensor_offset",)
+AT_SPEED = ("speed_track",)
 EMPTY = ("plain", "jumps", "noisy", "tilted")
 MACHINERY = ("track", "payload", "small_wheels", "slope", "slow_motors", "low_grip")
 _CARS = 0.1
@@ -58,14 +64,26 @@ _EQUIPMENT = ("effective_track", "drive_lag")
 _MORE = tuple(name for name in DIFFERENTIAL if name not in {*_EQUIPMENT, "turn_lag"})
 _POOR = tuple(name for name in DIFFERENTIAL if name != "slope_drift")
 POOLS: dict[str, tuple[str, ...]] = {
-    "single": DIFFERENTIAL + CAR + SENSED,
-    "small": DIFFERENTIAL + CAR + SENSED,
+    "single": DIFFERENTIAL + CAR + SENSED + AT_SPEED,
+    "small": DIFFERENTIAL + CAR + SENSED + AT_SPEED,
     "equipped": (*_MORE, "nothing"),
     "empty": EMPTY,
     "poor": _POOR + CAR,
     "odd": tuple(sorted(ODD)),
     "rigid": MACHINERY,
+    "natural": (*DIFFERENTIAL, "nothing"),
+    "late": (*(name for name in DIFFERENTIAL if name != "clock_offset"), "nothing"),
 }
+_CAR_SETS = (
+    ("drive_lag", "steering_lag"), ("transport_delay", "icr_offset"), ("transport_delay", "understeer"),
+    ("understeer", "drive_lag", "steering_lag"), ("steering_offset", "drive_lag"), ("icr_offset",),
+    ("steering_lag", "transport_delay"), ("steering_gain", "icr_offset", "drive_lag"),
+    ("wheel_radius", "steering_lag"), ("acceleration_limit", "steering_lag"),
+    ("understeer", "steering_gain"), ("steering_offset", "icr_offset"),
+)  # fmt: skip
+# How far ahead of the rear axle base_link stands: a small car's quarter, a sedan's middle [m].
+_CAR_MIDDLE_M = (0.3, 1.35)
+_NOTHING = 0.4
 
 
 @dataclass(frozen=True)
@@ -116,6 +134,9 @@ def draw_riddle(category: Category, seed: int, effect: str | None = None) -> Rid
         "poor": _draw_poor,
         "odd": _draw_odd,
         "rigid": _draw_rigid,
+        "cars": lambda g, s, _e: _draw_cars(g, s),
+        "natural": _draw_natural,
+        "late": _draw_late,
     }
     if effect is None:
         return maker[category](np.random.default_rng([CATEGORIES.index(category), seed]), seed, None)
@@ -165,6 +186,7 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         "slope_drift": {"k": 0.6 * size},
         "lateral_drift": {"c": sign * 0.06 * size * small},
         "yaw_drift": {"c": sign * 0.07 * size},
+        "speed_track": {"k": sign * 0.15 * size / speed},
         "time_drift": {"k": 0.15 * size},
         "terrain_change": {"k_v": 1.0 - 0.2 * size, "k_w": 1.0 - 0.25 * size},
         "drive_lag": {"tau": 0.6 * size},
@@ -329,6 +351,52 @@ def _draw_odd(draw: np.random.Generator, seed: int, effect: str | None) -> Riddl
     scene = replace(scene, extra=odd.make(scene.vehicle), duration_s=max(scene.duration_s, 180.0))
     answer = Answer("odd", odd=name, channel=odd.channels, program=scene.program.name)
     return Riddle(scene, answer)
+
+
+def _draw_cars(draw: np.random.Generator, seed: int) -> Riddle:
+    """Cars: one to three effects, of timing above all; many record neither encoders nor a gyro."""
+    names = _CAR_SETS[int(draw.integers(len(_CAR_SETS)))]
+    scene = _draw_scene(draw, seed, CAR[0])
+    asked = {name: draw_size(name, scene, float(draw.uniform(0.7, 1.0)), draw) for name in names}
+    if "icr_offset" in asked:
+        asked["icr_offset"] = {"x_icr": -float(draw.uniform(*_CAR_MIDDLE_M))}
+    sensors = str(draw.choice(["all", "no encoders", "poses only"]))
+    if sensors != "all":
+        scene = replace(scene, encoders=None, imu=scene.imu if sensors == "no encoders" else None)
+    answer = Answer("cars", asked, program=scene.program.name, note=sensors)
+    return Riddle(replace(scene, effects=asked), answer)
+
+
+def _draw_natural(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:
+    """A minute or two of driving as people drive, over ground that moves the vehicle at random."""
+    chosen = effect or _draw_one_or_none(draw, POOLS["natural"])
+    scene = _draw_scene(draw, seed)
+    rough = float(draw.choice([1.0, 3.0]))
+    scene = replace(
+        scene,
+        program=replace(scene.program, name=str(draw.choice(["smooth", "teleop", "stop_and_go"]))),  # type: ignore[arg-type]
+        disturbance=Disturbance(0.03 * rough, 0.05 * rough),
+    )
+    asked = {} if chosen == "nothing" else {chosen: draw_size(chosen, scene, 1.0, draw)}
+    scene = _excite(scene, chosen, draw)
+    scene = replace(scene, duration_s=float(draw.uniform(60.0, 120.0)), effects=asked)
+    return Riddle(scene, Answer("natural", asked, program=scene.program.name, note=f"rough {rough:g}"))
+
+
+def _draw_late(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:
+    """Poses that are late, wander, and are repeated until the next scan is through."""
+    chosen = effect or _draw_one_or_none(draw, POOLS["late"])
+    scene = _excite(_draw_scene(draw, seed), chosen, draw)
+    asked = {} if chosen == "nothing" else {chosen: draw_size(chosen, scene, 1.0, draw)}
+    asked["clock_offset"] = {"d": float(draw.uniform(0.1, 0.4))}
+    pose = replace(scene.pose, rate_hz=20.0, update_hz=float(draw.choice([5.0, 10.0])), drift_m=0.02)
+    scene = replace(scene, pose=pose, effects=asked)
+    return Riddle(scene, Answer("late", asked, program=scene.program.name, note=chosen))
+
+
+def _draw_one_or_none(draw: np.random.Generator, pool: tuple[str, ...]) -> str:
+    """One of a pool, or nothing as often as a log of the field may have nothing to find."""
+    return "nothing" if draw.random() < _NOTHING else str(draw.choice(pool[:-1]))
 
 
 def _draw_rigid(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:

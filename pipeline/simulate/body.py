@@ -82,7 +82,11 @@ def move_body(
     if vehicle.moves_sideways:
         v_x = v_x + effects.value("lateral_skid", "c") * aside * around
         v_y = v_y - effects.value("roller_slip", "k") * aside * np.abs(aside)
-    v_w = v_w + effects.value("yaw_drift", "c") * turning
+    v_w = (
+        v_w
+        + effects.value("speed_track", "k") * np.abs(along) * around
+        + effects.value("yaw_drift", "c") * turning
+    )
     shaken = _shake(disturbance, turning, drive.step_s, generator)
     v_x, v_y, v_w = v_x + shaken[0], v_y + shaken[1], v_w + shaken[2]
     v_y = v_y - effects.value("icr_offset", "x_icr") * v_w

@@ -110,6 +110,7 @@ _SPECS: tuple[EffectSpec, ...] = (
     EffectSpec("roller_slip", "v_y -= k s0 |s0|", _one("k", "s/m", 0.0, 0.3), _SIDEWAYS),
     EffectSpec("speed_slip", "v_x -= k v0 |v0|", _one("k", "s/m", 0.0, 0.08)),
     EffectSpec("turning_resistance", "v_x -= k v0 |w0|", _one("k", "s", 0.0, 0.24)),
+    EffectSpec("speed_track", "v_w += k |v0| w0", _one("k", "s/m", 0.0, 0.05), _SKID),
     EffectSpec(
         "slope_drift",
         "v_x += k sin(pitch), v_y -= k cos(pitch) sin(roll), while the wheels turn",

@@ -33,11 +33,19 @@ from pipeline.simulate.streams import open_stream
 
 CATALOGUE_IDS = {
     *("wheel_radius", "wheel_asymmetry", "effective_track", "icr_offset", "icr_lateral", "lateral_skid"),
-    *("speed_slip", "turning_resistance", "slope_drift", "lateral_drift", "yaw_drift", "time_drift"),
+    *(
+        "speed_slip",
+        "speed_track",
+        "turning_resistance",
+        "slope_drift",
+        "lateral_drift",
+        "yaw_drift",
+        "time_drift",
+    ),
     *("terrain_change", "drive_lag", "turn_lag", "transport_delay", "body_speed_limit", "body_turn_limit"),
     *("turn_droop", "acceleration_limit", "wheel_speed_limit", "deadband", "body_inertia", "heading_skew"),
     *("yaw_misalignment", "lever_arm", "clock_offset"),
-    *("lateral_scale", "roller_slip"),
+    *("lateral_scale", "roller_slip", "speed_track"),
     *("steering_offset", "steering_gain", "steering_lag", "steering_sensor_offset", "understeer"),
 }
 

@@ -55,6 +55,7 @@ INERTIA = 1.0 + (0.5 * W0) ** 2
         ({"lateral_skid": 0.1}, (V0, -0.1 * V0 * W0, W0)),
         ({"speed_slip": 0.08}, (V0 - 0.08 * V0**2, 0, W0)),
         ({"turning_resistance": 0.24}, (V0 - 0.24 * V0 * W0, 0, W0)),
+        ({"speed_track": 0.2}, (V0, 0, W0 + 0.2 * V0 * W0)),
         ({"lateral_drift": 0.05}, (V0, 0.05, W0)),
         ({"yaw_drift": 0.06}, (V0, 0, W0 + 0.06)),
         ({"terrain_change": {"k_v": 0.8, "k_w": 0.7, "at_s": 10.0}}, (0.8 * V0, 0, 0.7 * W0)),

@@ -2,7 +2,8 @@
 
     v_y += -x_icr * w
 
-w is the yaw rate of the model. x_icr [m], -0.08 to 0.24, positive ahead; a load at the back moves it back.
+w is the yaw rate of the model. x_icr [m], -0.08 to 0.24, positive ahead; a load at the back moves it back. A
+car turns about its rear axle, to -1.35 behind a base_link in its middle.
 Spin on the spot and drive curves.
 
 Source: Mandow et al., IROS 2007, the longitudinal coordinate of the instantaneous centres of rotation.
@@ -31,12 +32,16 @@ class IcrOffset(LinearEffect):
         Parameter(
             "x_icr",
             "m",
-            (-1.0, 1.0),
+            (-2.0, 2.0),
             0.0,
             "centre of rotation ahead of base_link",
             0.12,
             least=Least(0.004, MOUNTING),
-            plausible=Plausible(-0.6, 0.6, "wider than the -0.08 to 0.24 m that were seen"),
+            plausible=Plausible(
+                -1.6,
+                0.6,
+                "wider than -0.08 to 0.24 m; the middle of a sedan is 1.35 m ahead of its rear axle",
+            ),
         ),
     )
     needs = (Excitation.TURNING,)
