@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.diagnosis import residual_structure
+from pipeline.diagnosis.context import measure_exceeded
 from pipeline.diagnosis.diagnosis import Named, RunDiagnosis
 from pipeline.diagnosis.error_regions import map_errors, pick_regions
 from pipeline.diagnosis.estimates import list_estimates
 from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.materiality import measure_moves
 from pipeline.diagnosis.naming_rules import join_classes, list_equivalents
-from pipeline.diagnosis.plausibility import find_implausible
+from pipeline.diagnosis.plausibility import find_exceeded, find_implausible
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.values import list_values, read_clock
 from pipeline.identification import Input
@@ -95,7 +96,9 @@ def summarize(
         judgement = judgements.get(source.value)
         described = tuple(_describe(effect, context, ways, judgement) for effect in _order(told, judgement))
     unexplained = residual_structure.describe(ways)
-    named = tuple(effect for effect in described if _doubt(effect) is None)
+    exceeded = measure_exceeded(context)
+    doubts = {effect.id: _doubt(effect, exceeded) for effect in described}
+    named = tuple(effect for effect in described if doubts[effect.id] is None)
     named = residual_structure.mark_tentative(_mark_idle(named, judgements), ways, unexplained)
     part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
@@ -117,7 +120,7 @@ def summarize(
         unexplained=unexplained,
         findings=(
             *_note_cut(body.search.selection.budget),
-            *_note_doubts(described),
+            *_note_doubts(doubts),
             *(_note_idle(effect) for effect in idle),
         ),
         ladder=() if judgement is None else tuple(_rungs(judgement)),
@@ -147,9 +150,11 @@ def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Con
     return replace(common, run=recording.name, findings=tuple(findings), timing=runs[number])
 
 
-def _doubt(effect: Named) -> str | None:
+def _doubt(effect: Named, exceeded: Mapping[str, float]) -> str | None:
     """Why an effect with its numbers is none of a vehicle's; None where it may well be one."""
-    return find_implausible(_restore(effect.id, effect.parameters))
+    restored = _restore(effect.id, effect.parameters)
+    highs = {name: value.high for name, value in effect.parameters.items()}
+    return find_implausible(restored) or find_exceeded(restored, highs, exceeded)
 
 
 def _restore(name: str, values: Mapping[str, Value]) -> Effect:
@@ -157,11 +162,10 @@ def _restore(name: str, values: Mapping[str, Value]) -> Effect:
     return find_effect(name)().change(**{key: value.value for key, value in values.items()})
 
 
-def _note_doubts(described: Sequence[Named]) -> list[Mapping[str, Json]]:
-    doubts = [(effect.id, _doubt(effect)) for effect in described]
+def _note_doubts(doubts: Mapping[str, str | None]) -> list[Mapping[str, Json]]:
     return [
         {"id": "implausible_effect", "text": text, "where": name, "severity": "warning"}
-        for name, text in doubts
+        for name, text in doubts.items()
         if text is not None
     ]
 

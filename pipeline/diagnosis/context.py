@@ -5,13 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipeline.diagnosis.errors import DiagnosisError
+from pipeline.diagnosis.plausibility import EXCEEDED_SHARE
 from pipeline.identification.comparison import Input
 from pipeline.identification.problem import Problem
 from pipeline.models.catalogue import list_effects
 from pipeline.models.effect import Place
 from pipeline.models.evidence import LEAST_DELAY_S, Evidence
 from pipeline.runs.errors import MotionError
+from pipeline.runs.signals import find_fastest_wheel, name_inputs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,6 +25,8 @@ if TYPE_CHECKING:
     from pipeline.models.evidence import Largest
     from pipeline.runs.recording import MotionRun
     from pipeline.vehicles import Vehicle
+
+Floats = NDArray[np.float64]
 
 _FEWEST_WINDOWS = 60
 _DRIVETRAIN = frozenset({Place.COMMAND, Place.DRIVE})
@@ -122,6 +129,22 @@ def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Conte
             hint=f"{_FEWEST_WINDOWS} are needed: drive longer, or check the poses with `slip inspect`.",
         )
     return Context(problem)
+
+
+def measure_exceeded(context: Context) -> dict[str, float]:
+    """What measured wheels exceed in `EXCEEDED_SHARE` of the time: `speed`, `turn`, `wheel`."""
+    found: dict[str, list[Floats]] = {}
+    for run in context.runs:
+        if run.wheels is not None:
+            inputs = name_inputs(run.wheels, context.vehicle)
+            forward, _, around = context.vehicle.kinematics.asked(inputs, context.vehicle)
+            series = {"speed": forward, "turn": around, "wheel": find_fastest_wheel(run.wheels)}
+            for name, values in series.items():
+                found.setdefault(name, []).append(np.abs(values))
+    return {
+        name: float(np.quantile(np.concatenate(values), 1.0 - EXCEEDED_SHARE))
+        for name, values in found.items()
+    }
 
 
 def is_late(run: MotionRun) -> bool:

@@ -5,11 +5,19 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from pipeline.models.effect import Effect, Parameter
     from pipeline.models.evidence import Evidence
 
 _AT_BOUND = 1e-3
+# Wheels run over their limit by no more: rounding of encoders and a motor that overshoots.
+_OVERSHOOT = 1.05
+EXCEEDED_SHARE = 0.1
+"""In so much of the time no limit is exceeded."""
 
 
 def is_nameable(effect: Effect, evidence: Evidence) -> bool:
@@ -46,6 +54,26 @@ def _is_at_bound(value: float, parameter: Parameter) -> bool:
     low, high = parameter.bounds
     margin = _AT_BOUND * (high - low) if math.isfinite(high - low) else 0.0
     return value <= low + margin < parameter.neutral or value >= high - margin > parameter.neutral
+
+
+def find_exceeded(effect: Effect, highs: Mapping[str, float], exceeded: Mapping[str, float]) -> str | None:
+    """In words that measured wheels contradict a limit, None where they keep it.
+
+    Args:
+        effect: with its values.
+        highs: upper end of the interval by parameter, NaN where there is none.
+        exceeded: what measured wheels exceed in `EXCEEDED_SHARE` of the time, see `context.measure_exceeded`.
+    """
+    for parameter in effect.parameters:
+        most = exceeded.get(parameter.relative_to)
+        value, high = effect.values[parameter.name], highs.get(parameter.name, math.nan)
+        if most is not None and most > _OVERSHOOT * max(value, float(np.nan_to_num(high))):
+            return (
+                f"{effect.id}: {parameter.name} = {value:.3g} {parameter.unit} is no limit: measured wheels "
+                f"exceed {most:.3g} {parameter.unit} in {EXCEEDED_SHARE:.0%} of the time; it may stand for "
+                "another cause"
+            )
+    return None
 
 
 def find_implausible(effect: Effect) -> str | None:

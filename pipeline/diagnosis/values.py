@@ -39,10 +39,20 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
 
 
 def read_clock(effect: Effect, runs: Sequence[MotionRun]) -> dict[str, Value]:
-    """How late poses were by the gyro's clock: no fit of the motion moves it, its error is the gyro's."""
+    """How late poses were by the gyro's clock: no fit of the motion moves it, its error is the gyro's.
+
+    It is known no better than it varies in a run, nor than to half a sample of the gyro, whose stamp may be
+    that of its begin or its end; and where poses are repeated until the next one is computed, that one may be
+    as old as the time between two of them when it is first published.
+    """
     (parameter,) = effect.parameters
     value = effect.values[parameter.name]
-    errors = [run.gyro_fit.delay_error_s for run in runs if run.gyro_fit is not None]
-    half = _SURE * float(np.sqrt(np.mean(np.square(errors)) / len(errors)))
-    half = half if np.isfinite(half) else math.nan
-    return {parameter.name: Value(value, value - half, value + half, parameter.unit)}
+    variances, older = [], 0.0
+    for run in runs:
+        if run.gyro_fit is not None and run.gyro is not None:
+            sampling = 0.5 * float(np.median(np.diff(run.gyro[0]))) / _SURE
+            spread = run.alignment.latency_spread_s
+            variances.append(run.gyro_fit.delay_error_s**2 + spread**2 + sampling**2)
+            older = max(older, run.repeats_s)
+    half = _SURE * math.sqrt(float(np.mean(variances)) / len(variances)) if variances else math.nan
+    return {parameter.name: Value(value, value - half - older, value + half, parameter.unit)}

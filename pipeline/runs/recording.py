@@ -30,6 +30,7 @@ Integers = NDArray[np.int64]
 
 _DEAD = 1e-9
 _LONGEST_WAIT = 1.5
+_REPEATED_SHARE = 0.2
 _ROLLS = 0.3
 _NUMBERS = (
     "hold_time",
@@ -150,6 +151,8 @@ class MotionRun:
         barred: times [s] of samples in bad stretches or without a live command.
         duration_s: length of the run.
         alignment: how the recording was put right.
+        repeats_s: time between two published poses where they are repeated until the next one is
+            computed [s]; zero where each is new.
     """
 
     name: str
@@ -164,6 +167,7 @@ class MotionRun:
     barred: Floats
     duration_s: float
     alignment: Alignment
+    repeats_s: float = 0.0
 
     @property
     def gyro_fit(self) -> GyroFit | None:
@@ -243,7 +247,15 @@ def make_run(
         barred=barred,
         duration_s=float(streams[-1]),
         alignment=alignment,
+        repeats_s=_measure_repeats(tables["poses"]),
     )
+
+
+def _measure_repeats(poses: pl.DataFrame) -> float:
+    """See `MotionRun.repeats_s`."""
+    held = poses["held"].mean()
+    repeated = isinstance(held, float) and held > _REPEATED_SHARE
+    return float(np.median(np.diff(poses["t"].to_numpy()))) if repeated else 0.0
 
 
 def read_alignment(table: pl.DataFrame) -> Alignment:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.options import Options
 from pipeline.diagnosis import Diagnosis, Recording, diagnose_runs
-from pipeline.diagnosis.plausibility import find_implausible, is_nameable
+from pipeline.diagnosis.plausibility import find_exceeded, find_implausible, is_nameable
 from pipeline.diagnosis.words import describe, list_lines
 from pipeline.models import Model, find_effect, read_model
 from pipeline.models.evidence import Evidence, Largest
@@ -294,6 +295,18 @@ def test_a_log_without_encoders_and_gyro_is_answered_from_the_command_alone(tmp_
     (run,) = _diagnose(scenario, tmp_path).runs
     assert [effect.id for effect in run.effects] == ["transport_delay"]
     assert "clock_offset" in run.effects[0].equivalent_to
+
+
+@pytest.mark.parametrize(
+    ("name", "of"),
+    [("wheel_speed_limit", "wheel"), ("body_turn_limit", "turn"), ("body_speed_limit", "speed")],
+)
+def test_a_limit_that_measured_wheels_exceed_is_none(name: str, of: str) -> None:
+    limit = find_effect(name)(limit=2.0)
+    assert "exceed 2.5" in str(find_exceeded(limit, {"limit": 2.3}, {of: 2.5}))
+    assert find_exceeded(limit, {"limit": 2.4}, {of: 2.5}) is None
+    assert find_exceeded(limit, {"limit": math.nan}, {of: 2.05}) is None
+    assert find_exceeded(limit, {}, {"another": 9.0}) is None
 
 
 def test_a_diagnosis_is_the_same_each_time(tmp_path: Path) -> None:
