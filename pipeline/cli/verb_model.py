@@ -244,6 +244,11 @@ def export(  # noqa: D417 - the options document themselves
     current: Annotated[
         Path | None, Parameter(help="vesc, px4: the robot's file of parameters, which is corrected")
     ] = None,
+    on: Annotated[
+        list[str] | None,
+        Parameter(help="robot_localization: logs or runs whose held-out errors count", consume_multiple=True),
+    ] = None,
+    results: Annotated[Path, Parameter(help="results folder of --on")] = Path("results"),
     out: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
     trust_code: TrustCode = False,
 ) -> int:
@@ -253,15 +258,30 @@ def export(  # noqa: D417 - the options document themselves
         model: the model file.
         to: ros2_control, nav2, autoware, vesc, px4, robot_localization, gazebo, json or python.
     """
-    from pipeline.models.export import export_model, read_current  # noqa: PLC0415 - heavy
+    from pipeline.models.export import export_model, read_current, require_errors  # noqa: PLC0415 - heavy
 
     used = None if current is None else read_current(current, to)
-    text = export_model(open_model(model, trust_code=trust_code), to, used)
+    file = open_model(model, trust_code=trust_code)
+    if on:
+        require_errors(to)
+        file = _judge_measured(file, On(on=on, out=results))
+    text = export_model(file, to, used)
     if out is None:
         sys.stdout.write(text)
     else:
         _write(out, text)
     return CLEAN
+
+
+def _judge_measured(file: ModelFile, spoken: On) -> ModelFile:
+    """The model as `slip model fit --input measured` would write it; its own file stays."""
+    from pipeline.identification.comparison import Input  # noqa: PLC0415 - heavy
+    from pipeline.identification.judgement import judge_model, note_fit  # noqa: PLC0415
+    from pipeline.identification.problem import Problem  # noqa: PLC0415
+
+    file, runs = _gather(spoken, file, spoken.on)
+    problem = Problem(runs, file.model.vehicle, Input.MEASURED)
+    return note_fit(file, judge_model(problem, file.model, per_run=file.per_run))
 
 
 def _write(path: Path, text: str) -> None:
