@@ -40,6 +40,13 @@ EXPECTED: dict[str, tuple[str, str, str, str, str]] = {
         "dingo_o",
         "robot_description",
     ),
+    "ridgeback": (
+        "/r100_0042/platform/cmd_vel_unstamped",
+        "/r100_0042/platform/joint_states",
+        "/r100_0042/lidar/icp_odom",
+        "ridgeback",
+        "robot_description",
+    ),
     "rosbot_xl_mecanum": (
         "/cmd_vel",
         "/joint_states",
