@@ -207,6 +207,20 @@ def test_wheels_of_another_scale_than_the_motion_are_told(
         assert taken.finding(found).value == pytest.approx(value, rel=0.03)
 
 
+@pytest.mark.parametrize(
+    ("radius", "effects", "found"),
+    [(0.2, {}, {"wheel_radius_wrong"}), (0.165, {"wheel_radius": 0.8}, set()), (0.175, {}, set())],
+)
+def test_a_body_command_tells_a_small_error_of_the_radius_from_ground_that_slips(
+    drive: TakeThrough, radius: float, effects: dict[str, float], found: set[str]
+) -> None:
+    scenario = replace(PLAIN, effects=effects, recording=Recording(layout="husky_body_command"))
+    taken = drive(scenario, {"vehicle": {"wheel_radius_m": radius}})
+    assert {"wheel_radius_wrong", "unit_wrong"} & taken.ids() == found
+    if found:
+        assert taken.finding("wheel_radius_wrong").value == pytest.approx(0.165, rel=0.03)
+
+
 def test_wheels_in_turns_a_minute_are_recognized(drive: TakeThrough) -> None:
     taken = drive(replace(PLAIN, encoders=Encoders(gain=60.0 / (2.0 * np.pi))), {})
     assert "rpm" in taken.finding("unit_wrong").text
