@@ -24,6 +24,7 @@ from pipeline.simulate.platforms import (
     twist,
 )
 from pipeline.simulate.published import Published, Q, Source
+from pipeline.simulate.unitree_table import UNITREE_PLATFORMS
 from pipeline.simulate.vehicles import Vehicle
 
 _TICKS = 508.8
@@ -460,6 +461,7 @@ PLATFORMS: dict[str, Platform] = {
         ),
     ),
     **MECANUM_PLATFORMS,
+    **UNITREE_PLATFORMS,
 }
 
 

@@ -8,6 +8,7 @@ of
 - ``number``: one field; what it is of says ``quantity`` or the topic's name;
 - ``joints``, ``pose``, ``imu``: fields of wheels by name, of a pose, of a gyro;
 - ``fix``, ``ground_velocity``: a place on Earth, a velocity east and north;
+- ``text``: a field with a JSON object, whose numbers are called ``field.key``;
 - ``stamp``: when the data were taken, where there is no header.
 
 ``pairs`` lists topics that belong together by name.
@@ -122,6 +123,14 @@ class ImuFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     convention: Convention = "flu"
 
 
+class TextFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A field with a JSON object; messages in which the field `tag` is another number say something else."""
+
+    field: str
+    tag: str
+    value: int
+
+
 class StampField(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A time: a structure of seconds and nanoseconds, or a count of ticks."""
 
@@ -139,6 +148,7 @@ class MessageType(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fix: FixFields | None = None
     ground_velocity: GroundVelocityFields | None = None
     imu: ImuFields | None = None
+    text: TextFields | None = None
     stamp: StampField | None = None
 
 
