@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 from pipeline.simulate.errors import unknown_name
+from pipeline.simulate.farm_ng_table import FARM_NG_PLATFORMS
 from pipeline.simulate.mecanum_table import MECANUM_PLATFORMS
 from pipeline.simulate.platforms import (
     Fields,
@@ -462,6 +463,7 @@ PLATFORMS: dict[str, Platform] = {
     ),
     **MECANUM_PLATFORMS,
     **UNITREE_PLATFORMS,
+    **FARM_NG_PLATFORMS,
 }
 
 

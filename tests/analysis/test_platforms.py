@@ -54,6 +54,7 @@ EXPECTED: dict[str, tuple[str, str, str, str, str]] = {
         "rosbot_xl_mecanum",
         "robot_description",
     ),
+    "amiga": ("/canbus/twist", "/canbus/state", "/filter/state", "fitted_body", "fitted"),
     "go2_w": ("/api/sport/request", "/lf/lowstate", "/Odometry", "fitted_go2_w", "fitted"),
     "youbot": ("/cmd_vel", "/joint_states", "/tf", "youbot", "robot_description"),
     "jackal": (

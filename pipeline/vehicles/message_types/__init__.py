@@ -170,7 +170,9 @@ class Pair(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def plain_type(type_name: str) -> str:
-    """ROS 1 and ROS 2 spellings of a type made one: `sensor_msgs/Imu`."""
+    """ROS 1, ROS 2 and protobuf spellings of a type made one: `sensor_msgs/Imu`."""
+    if "/" not in type_name and "." in type_name:
+        return "/".join(type_name.rsplit(".", 1))
     return type_name.replace("/msg/", "/")
 
 
