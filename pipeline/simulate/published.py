@@ -175,6 +175,11 @@ def _of_wheels(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     series |= dict(wheels.corners or {})
     series |= {f"{place}_angle": angle for place, angle in (wheels.corner_angles or {}).items()}
     series |= {f"{side}_turns": series[f"{side}_angle"] / _TURN for side in ("left", "right")}
+    if run.imu is not None:
+        # Where one message holds both.
+        for name, values in (("rate", run.imu.rates), ("force", run.imu.accelerations)):
+            for i, axis in enumerate("xyz"):
+                series[f"{name}_{axis}"] = np.interp(wheels.time_s, run.imu.time_s, values[:, i])
     return wheels.time_s, wheels.time_s + _LATE_S, series
 
 

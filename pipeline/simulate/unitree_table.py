@@ -37,7 +37,11 @@ UNITREE_PLATFORMS: dict[str, Platform] = {
                 "/lf/lowstate",
                 "unitree_go/msg/LowState",
                 "wheels",
-                {"motor_state[].dq": _MOTORS},
+                {
+                    "motor_state[].dq": _MOTORS,
+                    "imu_state.gyroscope": tuple(Q(f"rate_{axis}") for axis in "xyz"),
+                    "imu_state.accelerometer": tuple(Q(f"force_{axis}") for axis in "xyz"),
+                },
                 stamp="none",
             ),
             Published(
