@@ -119,7 +119,7 @@ def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> int:
             where=source.name,
             hint="Copy the file again in binary mode",
         )
-    if _FARM_NG in source.read_at(0, 2 * len(_FARM_NG)):
+    if alike < len(rec.MAGIC) - 2 and _FARM_NG in source.read_at(0, 2 * len(_FARM_NG)):
         raise LogError(
             "not_mcap",
             "it is a recording of farm-ng's event recorder, whose messages have no definitions in the file",

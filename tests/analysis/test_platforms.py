@@ -157,6 +157,7 @@ def test_requests_of_another_kind_are_no_commands(tmp_path: Path) -> None:
     record("go2_w", tmp_path)
     options = Options(out=tmp_path / "out", report=False, through="extract")
     commands = analyze_log(tmp_path / "run.mcap", options).manifest.read("commands")
+    # One more leans the body.
     (requests,) = read_topics(tmp_path / "run.mcap", [Wanted("/api/sport/request")]).topics
     assert commands.height == len(requests) - 1
     assert not ((commands["body_x"] - 0.3).abs() + (commands["body_w"] - 0.5).abs() < 1e-9).any()

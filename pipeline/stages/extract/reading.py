@@ -156,32 +156,41 @@ def _recorded_fields(kind: str, fields: Iterable[str]) -> tuple[str, ...]:
 
 
 def with_texts(columns: TopicColumns) -> TopicColumns:
-    """A topic with the numbers of its JSON texts as columns of their own; other messages are left out."""
+    """A topic with the numbers of its JSON texts as columns of their own; other messages are left out.
+
+    Raises:
+        StageError: ``field_not_a_text``.
+    """
     text = find_type(columns.type_name).text
     column = None if text is None else columns.fields.get(text.field)
-    if text is None or not isinstance(column, Strings):
+    if text is None or column is None:
         return columns
-    objects = [_read_numbers(value) for value in column.values]
-    keys = sorted(set[str]().union(*objects))
-    table = np.array([[found.get(key, np.nan) for key in keys] for found in objects])
-    chosen = (numbers(columns, text.tag) == text.value) & (column.codes >= 0)
-    rows = np.flatnonzero(chosen)
-    fields = {f"{text.field}.{key}": table[column.codes[rows], place] for place, key in enumerate(keys)}
-    times = (columns.log_time, columns.publish_time)
-    log_time, publish_time = (series[rows] for series in times)
-    header = None if columns.header_time is None else columns.header_time[rows]
-    return replace(columns, log_time=log_time, publish_time=publish_time, header_time=header, fields=fields)
+    if not isinstance(column, Strings):
+        raise StageError(
+            "field_not_a_text",
+            f"the field {text.field!r} is no text",
+            where=columns.topic,
+            hint="Name another topic.",
+        )
+    # The last row is that of messages without a text, whose code is -1.
+    table = np.array([_read_numbers(value, text.keys) for value in (*column.values, "")])[column.codes]
+    here = (numbers(columns, text.tag) == text.value) & np.isfinite(table).all(axis=1)
+    return replace(
+        columns,
+        log_time=columns.log_time[here],
+        publish_time=columns.publish_time[here],
+        header_time=None if columns.header_time is None else columns.header_time[here],
+        fields={f"{text.field}.{key}": table[here, place] for place, key in enumerate(text.keys)},
+    )
 
 
-def _read_numbers(text: str) -> dict[str, float]:
-    """The numbers of a JSON object by key; none where it is something else."""
+def _read_numbers(text: str, keys: Iterable[str]) -> list[float]:
+    """Numbers of a JSON object by key; NaN where it is something else."""
     try:
         found = json.loads(text)
-    except (ValueError, RecursionError):
-        return {}
-    if not isinstance(found, dict):
-        return {}
-    return {str(key): float(value) for key, value in found.items() if isinstance(value, int | float)}
+        return [float(found[key]) for key in keys]
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+        return [np.nan for _ in keys]
 
 
 def _stamp_fields(kind: str) -> tuple[str, ...]:

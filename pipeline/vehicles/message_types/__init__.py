@@ -124,9 +124,13 @@ class ImuFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TextFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A field with a JSON object; messages in which the field `tag` is another number say something else."""
+    """A field with a JSON object that has some `keys`.
+
+    Messages in which the field `tag` is another number, or a key is no number, say something else.
+    """
 
     field: str
+    keys: tuple[str, ...]
     tag: str
     value: int
 
