@@ -17,6 +17,7 @@ from pipeline.cli.model_prior import (
     require_model,
     tie_to_fleet,
 )
+from pipeline.cli.model_runs import gather_runs, judge_measured
 from pipeline.cli.model_trust import TrustCode, open_model, trust, trusted, untrust
 from pipeline.cli.output import CLEAN, print_json, print_lines, say
 
@@ -258,30 +259,16 @@ def export(  # noqa: D417 - the options document themselves
         model: the model file.
         to: ros2_control, nav2, autoware, vesc, px4, robot_localization, gazebo, json or python.
     """
-    from pipeline.models.export import export_model, read_current, require_errors  # noqa: PLC0415 - heavy
+    from pipeline.models.export import export_model, read_current  # noqa: PLC0415 - heavy
 
     used = None if current is None else read_current(current, to)
     file = open_model(model, trust_code=trust_code)
-    if on:
-        require_errors(to)
-        file = _judge_measured(file, On(on=on, out=results))
-    text = export_model(file, to, used)
+    text = export_model(judge_measured(file, to, on, results) if on else file, to, used)
     if out is None:
         sys.stdout.write(text)
     else:
         _write(out, text)
     return CLEAN
-
-
-def _judge_measured(file: ModelFile, spoken: On) -> ModelFile:
-    """The model as `slip model fit --input measured` would write it; its own file stays."""
-    from pipeline.identification.comparison import Input  # noqa: PLC0415 - heavy
-    from pipeline.identification.judgement import judge_model, note_fit  # noqa: PLC0415
-    from pipeline.identification.problem import Problem  # noqa: PLC0415
-
-    file, runs = _gather(spoken, file, spoken.on)
-    problem = Problem(runs, file.model.vehicle, Input.MEASURED)
-    return note_fit(file, judge_model(problem, file.model, per_run=file.per_run))
 
 
 def _write(path: Path, text: str) -> None:
@@ -375,8 +362,6 @@ def _require_no_rise(path: str, old: Judgement, new_one: Judgement) -> None:
 
 def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFile, list[MotionRun]]:
     """Runs, and the file with the vehicle whose geometry counts."""
-    from pipeline.cli.model_runs import gather_runs  # noqa: PLC0415 - heavy
-
     quiet = spoken.quiet or spoken.json
     vehicle, runs = gather_runs(names, file.model.vehicle, spoken.vehicle_of, spoken.out, quiet=quiet)
     return replace(file, model=replace(file.model, vehicle=vehicle)), runs
