@@ -256,9 +256,14 @@ def _check_contradiction(told: Recognized | None, vehicle: Vehicle, source: Vehi
     differing = list_contradictions(told.vehicle, vehicle)
     if not differing:
         return []
+    named = f"{vehicle.name} was named: check --vehicle"
+    if source != "flag":
+        named = (
+            f"run.toml or the log's record says otherwise of {vehicle.name}: check [vehicle], or --vehicle"
+        )
     text = (
         f"the log looks like a {told.vehicle.name} (by its {told.source.replace('_', ' ')}: "
-        f"{', '.join(differing)}), but {vehicle.name} was named: check --vehicle"
+        f"{', '.join(differing)}), but {named}"
     )
     return [Finding("vehicle_contradiction", "warning", text, where="vehicle")]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.analysis.geometry import Owner
+    from pipeline.models.model_file import ModelFile
     from pipeline.runs.recording import MotionRun
     from pipeline.vehicles import Vehicle
 
@@ -51,3 +53,27 @@ def gather_runs(
     for note in notes:
         say(f"slip: {note}")
     return chosen, [load_motion_run(manifest, chosen) for manifest in manifests]
+
+
+def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path) -> ModelFile:
+    """A model as `slip model fit --input measured` would write it, for a target that writes held-out errors.
+
+    Args:
+        file: the model; its own file stays.
+        target: name of the target.
+        names: paths of logs, or names of runs in the results folder.
+        out: results folder.
+
+    Raises:
+        MotionError: the target writes none, or a run has no measured wheels; others as `gather_runs`.
+    """
+    from pipeline.identification.comparison import Input  # noqa: PLC0415 - heavy
+    from pipeline.identification.judgement import judge_model, note_fit  # noqa: PLC0415
+    from pipeline.identification.problem import Problem  # noqa: PLC0415
+    from pipeline.models.export import require_errors  # noqa: PLC0415
+
+    require_errors(target)
+    vehicle, runs = gather_runs(names, file.model.vehicle, None, out, quiet=False)
+    file = replace(file, model=replace(file.model, vehicle=vehicle))
+    problem = Problem(runs, vehicle, Input.MEASURED)
+    return note_fit(file, judge_model(problem, file.model, per_run=file.per_run))

@@ -17,6 +17,7 @@ from pipeline.cli.model_prior import (
     require_model,
     tie_to_fleet,
 )
+from pipeline.cli.model_runs import gather_runs, judge_measured
 from pipeline.cli.model_trust import TrustCode, open_model, trust, trusted, untrust
 from pipeline.cli.output import CLEAN, print_json, print_lines, say
 
@@ -244,6 +245,11 @@ def export(  # noqa: D417 - the options document themselves
     current: Annotated[
         Path | None, Parameter(help="vesc, px4: the robot's file of parameters, which is corrected")
     ] = None,
+    on: Annotated[
+        list[str] | None,
+        Parameter(help="robot_localization: logs or runs whose held-out errors count", consume_multiple=True),
+    ] = None,
+    results: Annotated[Path, Parameter(help="results folder of --on")] = Path("results"),
     out: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
     trust_code: TrustCode = False,
 ) -> int:
@@ -257,7 +263,8 @@ def export(  # noqa: D417 - the options document themselves
     from pipeline.models.model_text import write_text  # noqa: PLC0415
 
     used = None if current is None else read_current(current, to)
-    text = export_model(open_model(model, trust_code=trust_code), to, used)
+    file = open_model(model, trust_code=trust_code)
+    text = export_model(judge_measured(file, to, on, results) if on else file, to, used)
     if out is None:
         sys.stdout.write(text)
     else:
@@ -341,8 +348,6 @@ def _require_no_rise(path: str, old: Judgement, new_one: Judgement) -> None:
 
 def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFile, list[MotionRun]]:
     """Runs, and the file with the vehicle whose geometry counts."""
-    from pipeline.cli.model_runs import gather_runs  # noqa: PLC0415 - heavy
-
     quiet = spoken.quiet or spoken.json
     vehicle, runs = gather_runs(names, file.model.vehicle, spoken.vehicle_of, spoken.out, quiet=quiet)
     return replace(file, model=replace(file.model, vehicle=vehicle)), runs

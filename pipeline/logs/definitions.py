@@ -131,6 +131,30 @@ FIELDS: Final[dict[str, str]] = {
     "uint8 control_mode; uint16 error_code; float64 battery_voltage; "
     "scout_msgs/ScoutActuatorState[4] actuator_states; bool light_control_enabled; "
     "scout_msgs/ScoutLightState front_light_state; scout_msgs/ScoutLightState rear_light_state",
+    "unitree_api/Request": "unitree_api/RequestHeader header; string parameter; uint8[] binary",
+    "unitree_api/RequestHeader": "unitree_api/RequestIdentity identity; unitree_api/RequestLease lease; "
+    "unitree_api/RequestPolicy policy",
+    "unitree_api/RequestIdentity": "int64 id; int64 api_id",
+    "unitree_api/RequestLease": "int64 id",
+    "unitree_api/RequestPolicy": "int32 priority; bool noreply",
+    "unitree_go/BmsState": "uint8 version_high; uint8 version_low; uint8 status; uint8 soc; int32 current; "
+    "uint16 cycle; int8[2] bq_ntc; int8[2] mcu_ntc; uint16[15] cell_vol",
+    "unitree_go/IMUState": "float32[4] quaternion; float32[3] gyroscope; float32[3] accelerometer; "
+    "float32[3] rpy; int8 temperature",
+    "unitree_go/LowState": "uint8[2] head; uint8 level_flag; uint8 frame_reserve; uint32[2] sn; "
+    "uint32[2] version; uint16 bandwidth; unitree_go/IMUState imu_state; "
+    "unitree_go/MotorState[20] motor_state; unitree_go/BmsState bms_state; int16[4] foot_force; "
+    "int16[4] foot_force_est; uint32 tick; uint8[40] wireless_remote; uint8 bit_flag; float32 adc_reel; "
+    "int8 temperature_ntc1; int8 temperature_ntc2; float32 power_v; float32 power_a; "
+    "uint16[4] fan_frequency; uint32 reserve; uint32 crc",
+    "unitree_go/MotorState": "uint8 mode; float32 q; float32 dq; float32 ddq; float32 tau_est; "
+    "float32 q_raw; float32 dq_raw; float32 ddq_raw; int8 temperature; uint32 lost; uint32[2] reserve",
+    "unitree_go/SportModeState": "unitree_go/TimeSpec stamp; uint32 error_code; "
+    "unitree_go/IMUState imu_state; uint8 mode; float32 progress; uint8 gait_type; "
+    "float32 foot_raise_height; float32[3] position; float32 body_height; float32[3] velocity; "
+    "float32 yaw_speed; float32[4] range_obstacle; int16[4] foot_force; float32[12] foot_position_body; "
+    "float32[12] foot_speed_body",
+    "unitree_go/TimeSpec": "int32 sec; uint32 nanosec",
     "vesc_msgs/VescState": "float64 voltage_input; float64 temperature_pcb; float64 current_motor; "
     "float64 current_input; float64 speed; float64 duty_cycle; float64 charge_drawn; "
     "float64 charge_regen; float64 energy_drawn; float64 energy_regen; float64 displacement; "

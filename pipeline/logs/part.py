@@ -104,6 +104,10 @@ def is_finished(path: Path) -> bool:
         return size >= 2 * len(rec.MAGIC) and stream.read() == rec.MAGIC
 
 
+_FARM_NG: Final = b"\x0a\x08protobuf"
+"""How the address in the first event begins, behind its length."""
+
+
 def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> int:
     if head == rec.MAGIC:
         return len(rec.MAGIC)
@@ -114,6 +118,13 @@ def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> int:
             "a text-mode copy has changed the file's line ends and with them its data",
             where=source.name,
             hint="Copy the file again in binary mode",
+        )
+    if alike < len(rec.MAGIC) - 2 and _FARM_NG in source.read_at(0, 2 * len(_FARM_NG)):
+        raise LogError(
+            "not_mcap",
+            "it is a recording of farm-ng's event recorder, whose messages have no definitions in the file",
+            where=source.name,
+            hint="Write them into an .mcap: farm_ng.core's EventsFileReader, and mcap_protobuf's Writer",
         )
     if alike < len(rec.MAGIC) - 2:
         raise LogError(

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pipeline.models.model_file import ModelFile
     from pipeline.models.target import Current, Target
 
-__all__ = ["export_model", "find_target", "list_targets", "read_current"]
+__all__ = ["export_model", "find_target", "list_targets", "read_current", "require_errors"]
 
 
 @functools.cache
@@ -73,6 +73,21 @@ def read_current(path: Path, name: str) -> Current:
         ) from None
     except MotionError as error:
         raise MotionError(error.code, error.what, where=str(path), hint=error.hint) from None
+
+
+def require_errors(name: str) -> None:
+    """Make sure that a target writes held-out errors, for which a log may be named.
+
+    Raises:
+        MotionError: ``unknown_target``; ``no_errors_written``.
+    """
+    if not find_target(name).has_errors:
+        raise MotionError(
+            "no_errors_written",
+            f"{name} holds no errors of a log: what it says stands in the model",
+            where="--on",
+            hint="Leave --on away; to fit the model to a log first: slip model fit MODEL --on LOG.",
+        )
 
 
 def export_model(file: ModelFile, name: str, current: Current | None = None) -> str:

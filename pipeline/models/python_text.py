@@ -25,9 +25,9 @@ import math
 
 VEHICLE = {name}
 R = {radius}  # wheel radius [m]
-B = {track}  # track width [m]
+B = {track}  # width over which a difference between the sides turns it [m]
 WHEELBASE = {wheelbase}  # [m]
-MULTIPLIER = {multiplier}  # of the controller's track
+MULTIPLIER = {multiplier}  # of the controller's width
 
 
 def approach(value, target, most):
@@ -40,12 +40,24 @@ def sign(value):
     return (value > 0.0) - (value < 0.0)
 
 
+def split(left, right, sideways):
+    """Speeds of the wheels: front left, front right, rear left, rear right."""
+    return [left - sideways, right + sideways, left + sideways, right - sideways]
+
+
+def join(wheels):
+    """The inverse of `split`."""
+    a, b, c, d = wheels
+    return (a + c) / 2.0, (b + d) / 2.0, (b - a + c - d) / 4.0
+
+
 def predict(commands, until_s, step_s=0.005, pose=(0.0, 0.0, 0.0), roll=0.0, pitch=0.0):
     """Predict the motion of a vehicle that stands at the start.
 
     Args:
         commands: (time [s], left, right) wheel speeds [rad/s] in order of time, held until the next; on a
-            car (time, axle, axle, steering [rad]).
+            car (time, axle, axle, steering [rad]); on mecanum and omni wheels (time, left, right, sideways),
+            sides' means and the speed that moves the vehicle to the left [rad/s].
         until_s: end of the prediction [s], from zero.
         step_s: integration step [s].
         pose: x [m], y [m], yaw [rad] at the start.
@@ -62,7 +74,8 @@ def predict(commands, until_s, step_s=0.005, pose=(0.0, 0.0, 0.0), roll=0.0, pit
         t = (number + 0.5) * step_s
         while index + 1 < len(commands) and commands[index + 1][0] <= t - {delay}:
             index += 1
-        _, left, right, steering = (*commands[index], 0.0)[:4] if index >= 0 else (0.0, 0.0, 0.0, 0.0)'''
+        _, left, right, aside = (*commands[index], 0.0)[:4] if index >= 0 else (0.0, 0.0, 0.0, 0.0)
+        steering, sideways = {third}'''
 _TAIL = """
         middle = yaw + v_w * step_s / 2.0
         x += (v_x * math.cos(middle) - v_y * math.sin(middle)) * step_s
@@ -85,7 +98,7 @@ def write_function(model: Model) -> str:
         if place is Place.KINEMATICS:
             parts.append(_roll(vehicle.kind))
         if place is Place.BODY:
-            parts.append("\n        v_x, v_y, v_w = v0, 0.0, w0")
+            parts.append("\n        v_x, v_y, v_w = v0, s0, w0")
         parts += [_write_step(effect, vehicle.kind) for effect in model if effect.place is place]
     lever_m = vehicle.kinematics.lever_m(vehicle)
     if lever_m:
@@ -111,13 +124,6 @@ def _write_step(effect: Effect, kind: str) -> str:
 
 def _write_head(model: Model) -> str:
     vehicle, text = model.vehicle, _HEAD
-    if vehicle.kinematics.has_inputs("sideways"):
-        raise MotionError(
-            "not_exportable",
-            f"{vehicle.name} is {vehicle.kind}, and the Python function knows no sideways motion",
-            where=vehicle.id,
-            hint="Export --to json.",
-        )
     delay = math.fsum(
         effect.values[parameter.name]
         for effect in model
@@ -127,13 +133,15 @@ def _write_head(model: Model) -> str:
     state = [name for effect in model for name in effect.python_state]
     for key, number in (
         ("radius", vehicle.wheel_radius_m),
-        ("track", vehicle.track_width_m or 1.0),
+        ("track", vehicle.kinematics.turning_width_m(vehicle)),
         ("wheelbase", vehicle.wheelbase_m or 1.0),
         ("multiplier", vehicle.controller_track_multiplier),
         ("delay", delay),
     ):
         text = text.replace(f"{{{key}}}", _number(number))
     text = text.replace("{state}", "".join(f"\n    {name} = 0.0" for name in state))
+    moves_sideways = vehicle.kinematics.has_inputs("sideways")
+    text = text.replace("{third}", "0.0, aside" if moves_sideways else "aside, 0.0")
     # The name last: what stands in it is not looked at again.
     return text.replace("{name}", ascii(vehicle.name))
 
@@ -141,10 +149,10 @@ def _write_head(model: Model) -> str:
 def _roll(kind: str) -> str:
     turning = "f_x * math.tan(steering) / WHEELBASE" if kind == "ackermann" else "R * (right - left) / B"
     return f"""
-        turning = 1.0 if R * max(abs(left), abs(right)) > 0.01 else 0.0
+        turning = 1.0 if R * (max(abs(left), abs(right)) + abs(sideways)) > 0.01 else 0.0
         f_x = R * (left + right) / 2.0
         f_w = {turning}
-        v0, w0 = f_x, f_w"""
+        v0, s0, w0 = f_x, R * sideways, f_w"""
 
 
 def _number(value: float) -> str:

@@ -25,6 +25,7 @@ class Target:
         write: makes the text of a model file and of parameters that the robot has now, by name.
         corrects: names of those it reads; none where all its numbers are absolute.
         read_current: reads them out of the text of the robot's file.
+        has_errors: whether it writes held-out errors, which a log may be named for.
     """
 
     name: str
@@ -33,3 +34,4 @@ class Target:
     write: Callable[[ModelFile, Current], str]
     corrects: tuple[str, ...] = ()
     read_current: Callable[[str], Current] | None = None
+    has_errors: bool = False

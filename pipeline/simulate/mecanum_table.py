@@ -29,27 +29,46 @@ _ROSBOT_XL = Vehicle(
     max_sideways_mps=0.8,
     controller_track_multiplier=0.95,
 )
+_R100 = Vehicle(
+    "r100",
+    "mecanum",
+    0.0759,
+    0.551,
+    0.638,
+    1.0,
+    max_turn_radps=1.5,
+    max_sideways_mps=1.0,
+    controller_track_multiplier=0.9924,
+)
 _YOUBOT = VEHICLES["youbot"]
-_SPACE = "/do100_0042"
+
+
+def _clearpath(model: str, vehicle: Vehicle) -> Platform:
+    # clearpathrobotics/clearpath_common: control.launch.py, localization.launch.py
+    space = f"/{model}_0042"
+    return Platform(
+        vehicle,
+        (
+            twist(f"{space}/platform/cmd_vel_unstamped", sideways=True),
+            twist(f"{space}/joy_teleop/cmd_vel", source="wish", sideways=True),
+            mecanum_joints(
+                f"{space}/platform/joint_states", {place: f"{place}_wheel_joint" for place in CORNERS}
+            ),
+            odometry(f"{space}/platform/odom", "odometry", "odom", "base_link", sideways=True),
+            odometry(f"{space}/platform/odom/filtered", "filter", "odom", "base_link", sideways=True),
+            transform(f"{space}/tf", "filter", "odom", "base_link"),
+            odometry(f"{space}/lidar/icp_odom", "localization", "map", "base_link"),
+            imu(f"{space}/sensors/imu_0/data"),
+            describe(f"{space}/robot_description", model, vehicle, "{}_wheel_joint", CORNERS),
+        ),
+    )
+
 
 MECANUM_PLATFORMS: dict[str, Platform] = {
-    # clearpathrobotics/clearpath_common: control.launch.py, localization.launch.py, config/do100/control.yaml
-    "dingo_o": Platform(
-        _DO100,
-        (
-            twist(f"{_SPACE}/platform/cmd_vel_unstamped", sideways=True),
-            twist(f"{_SPACE}/joy_teleop/cmd_vel", source="wish", sideways=True),
-            mecanum_joints(
-                f"{_SPACE}/platform/joint_states", {place: f"{place}_wheel_joint" for place in CORNERS}
-            ),
-            odometry(f"{_SPACE}/platform/odom", "odometry", "odom", "base_link", sideways=True),
-            odometry(f"{_SPACE}/platform/odom/filtered", "filter", "odom", "base_link", sideways=True),
-            transform(f"{_SPACE}/tf", "filter", "odom", "base_link"),
-            odometry(f"{_SPACE}/lidar/icp_odom", "localization", "map", "base_link"),
-            imu(f"{_SPACE}/sensors/imu_0/data"),
-            describe(f"{_SPACE}/robot_description", "do100", _DO100, "{}_wheel_joint", CORNERS),
-        ),
-    ),
+    # config/do100/control.yaml
+    "dingo_o": _clearpath("do100", _DO100),
+    # config/r100/control/omni_4wd.yaml: the sum .59 over .5945 of the description
+    "ridgeback": _clearpath("r100", _R100),
     # husarion/rosbot_ros: ROS_API.md, rosbot_controller/config/rosbot_xl/mecanum_drive_controller.yaml
     "rosbot_xl_mecanum": Platform(
         _ROSBOT_XL,

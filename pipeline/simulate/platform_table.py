@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 from pipeline.simulate.errors import unknown_name
+from pipeline.simulate.farm_ng_table import FARM_NG_PLATFORMS
 from pipeline.simulate.mecanum_table import MECANUM_PLATFORMS
 from pipeline.simulate.platforms import (
     Fields,
@@ -24,6 +25,7 @@ from pipeline.simulate.platforms import (
     twist,
 )
 from pipeline.simulate.published import Published, Q, Source
+from pipeline.simulate.unitree_table import UNITREE_PLATFORMS
 from pipeline.simulate.vehicles import Vehicle
 
 _TICKS = 508.8
@@ -460,6 +462,8 @@ PLATFORMS: dict[str, Platform] = {
         ),
     ),
     **MECANUM_PLATFORMS,
+    **UNITREE_PLATFORMS,
+    **FARM_NG_PLATFORMS,
 }
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.simulate.description import describe_robot
 from pipeline.simulate.layouts import Layout, PoseTopic
-from pipeline.simulate.published import Published, Q, Source
+from pipeline.simulate.published import Published, Q, Source, Value
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _XYZ, _XYZW = "xyz", "xyzw"
 
-Fields = dict[str, Q | tuple[Q, ...] | str | list[str] | float]
+Fields = dict[str, Value]
 
 
 @dataclass(frozen=True)

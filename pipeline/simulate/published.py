@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
@@ -66,6 +67,16 @@ class Q:
 
 
 @dataclass(frozen=True)
+class Json:
+    """A text with a JSON object of quantities by key."""
+
+    numbers: Mapping[str, Q]
+
+
+Value = Q | Json | tuple[Q, ...] | str | list[str] | float
+
+
+@dataclass(frozen=True)
 class Published:
     """A topic.
 
@@ -76,7 +87,7 @@ class Published:
             and the velocity of its sensor over ground; ``correction``, the transform from
             the localization's frame to the odometry's; ``imu``; ``once`` at the start; ``wish``, a body
             command that the controller never gets.
-        fields: by field path a quantity, several for an array, or a constant.
+        fields: by field path a quantity, several for an array, a text of them, or a constant.
         every: one message in so many is published.
         stamp: ``header``; ``none``; or the field that holds the time, ``timestamp`` in microseconds.
     """
@@ -84,7 +95,7 @@ class Published:
     topic: str
     type_name: str
     source: Source
-    fields: Mapping[str, Q | tuple[Q, ...] | str | list[str] | float] = field(default_factory=dict)
+    fields: Mapping[str, Value] = field(default_factory=dict)
     every: int = 1
     stamp: str = "header"
 
@@ -108,7 +119,10 @@ def publish(run: SimulatedRun, topics: tuple[Published, ...]) -> list[Sheet]:
     return sheets
 
 
-def _fill(value: Q | tuple[Q, ...] | str | list[str] | float, series: Series, kept: slice) -> Field:
+def _fill(value: Value, series: Series, kept: slice) -> Field:
+    if isinstance(value, Json):
+        columns = [_take(each, series, kept).tolist() for each in value.numbers.values()]
+        return [json.dumps(dict(zip(value.numbers, row, strict=True))) for row in zip(*columns, strict=True)]
     if isinstance(value, tuple):
         return np.stack([_take(each, series, kept) for each in value], axis=1)
     return _take(value, series, kept) if isinstance(value, Q) else value
@@ -161,6 +175,11 @@ def _of_wheels(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     series |= dict(wheels.corners or {})
     series |= {f"{place}_angle": angle for place, angle in (wheels.corner_angles or {}).items()}
     series |= {f"{side}_turns": series[f"{side}_angle"] / _TURN for side in ("left", "right")}
+    if run.imu is not None:
+        # Where one message holds both.
+        for name, values in (("rate", run.imu.rates), ("force", run.imu.accelerations)):
+            for i, axis in enumerate("xyz"):
+                series[f"{name}_{axis}"] = np.interp(wheels.time_s, run.imu.time_s, values[:, i])
     return wheels.time_s, wheels.time_s + _LATE_S, series
 
 

@@ -17,6 +17,7 @@ from pipeline.simulate.messages import (
     static_sheets,
     wheel_sheets,
 )
+from pipeline.simulate.protobuf import is_protobuf, write_protobuf
 from pipeline.simulate.published import publish
 from pipeline.simulate.stamps import stamp_headers, stamp_times
 
@@ -59,6 +60,9 @@ def write_log(run: SimulatedRun, path: Path) -> None:
             *decoy_sheets(run),
         ]
     )
+    if layout.topics and all(is_protobuf(topic.type_name) for topic in layout.topics):
+        write_protobuf(cut_gaps(run, sheets), scenario.clock, path)
+        return
     with LogWriter(path) as writer:
         for sheet in cut_gaps(run, sheets):
             header = None if sheet.header_s is None else stamp_headers(scenario.clock, sheet.header_s)

@@ -13,7 +13,7 @@ from pipeline.analysis.choice import Choice, choose
 from pipeline.analysis.errors import JobError
 from pipeline.analysis.log_setup import describe_subject
 from pipeline.analysis.options import Options
-from pipeline.logs import open_log
+from pipeline.logs import Wanted, open_log, read_topics
 from pipeline.simulate import PLATFORMS, simulate_case
 from pipeline.vehicles import load_configuration
 
@@ -40,6 +40,13 @@ EXPECTED: dict[str, tuple[str, str, str, str, str]] = {
         "dingo_o",
         "robot_description",
     ),
+    "ridgeback": (
+        "/r100_0042/platform/cmd_vel_unstamped",
+        "/r100_0042/platform/joint_states",
+        "/r100_0042/lidar/icp_odom",
+        "ridgeback",
+        "robot_description",
+    ),
     "rosbot_xl_mecanum": (
         "/cmd_vel",
         "/joint_states",
@@ -47,6 +54,8 @@ EXPECTED: dict[str, tuple[str, str, str, str, str]] = {
         "rosbot_xl_mecanum",
         "robot_description",
     ),
+    "amiga": ("/canbus/twist", "/canbus/state", "/filter/state", "fitted_body", "fitted"),
+    "go2_w": ("/api/sport/request", "/lf/lowstate", "/Odometry", "fitted_go2_w", "fitted"),
     "youbot": ("/cmd_vel", "/joint_states", "/tf", "youbot", "robot_description"),
     "jackal": (
         "/j100_0042/platform/cmd_vel_unstamped",
@@ -142,6 +151,16 @@ def test_hidden_effects_of_a_platform_are_named(name: str, tmp_path: Path) -> No
 @pytest.mark.parametrize("name", PLATFORMS)
 def test_hidden_effects_of_every_platform_are_named(name: str, tmp_path: Path) -> None:
     assert try_platform(name, tmp_path).named
+
+
+def test_requests_of_another_kind_are_no_commands(tmp_path: Path) -> None:
+    record("go2_w", tmp_path)
+    options = Options(out=tmp_path / "out", report=False, through="extract")
+    commands = analyze_log(tmp_path / "run.mcap", options).manifest.read("commands")
+    # One more leans the body.
+    (requests,) = read_topics(tmp_path / "run.mcap", [Wanted("/api/sport/request")]).topics
+    assert commands.height == len(requests) - 1
+    assert not ((commands["body_x"] - 0.3).abs() + (commands["body_w"] - 0.5).abs() < 1e-9).any()
 
 
 def test_an_odometry_of_the_wheels_is_never_preferred_and_says_what_it_is(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -341,3 +342,13 @@ def test_the_index_tells_what_a_log_holds(tmp_path: Path) -> None:
     assert {channel.type_name for channel in index.channels} == {FLOAT, JOINTS, TEXT}
     assert isinstance(read_topics(path, [Wanted("/joints")]).topics[0].fields["name"], RaggedStrings)
     assert io.BytesIO(path.read_bytes()).read(5) == b"\x89MCAP"
+
+
+def test_a_recording_of_farm_ng_is_named_and_how_it_can_be_read(tmp_path: Path) -> None:
+    uri = b"\x0a\x08protobuf\x12\x05amiga\x1a\x0c/canbus/twist"
+    event = b"\x0a" + bytes([len(uri)]) + uri + b"\x18\x05"
+    path = tmp_path / "log.0000.bin"
+    path.write_bytes(struct.pack("<I", len(event)) + event + b"\x0d\x00\x00\x80\x3f")
+    with pytest.raises(LogError, match="farm-ng") as error:
+        open_log(path)
+    assert "mcap_protobuf" in error.value.hint

@@ -23,7 +23,6 @@ from pipeline.models.export import export_model, find_target, list_targets, read
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.formula.formula_effect import make_parameter
 from pipeline.runs import MotionError
-from pipeline.vehicles import list_presets
 
 if TYPE_CHECKING:
     from pipeline.models import Effect
@@ -405,14 +404,7 @@ def test_the_verb_writes_the_file_or_nothing(tmp_path: Path) -> None:
 
 
 def test_effects_that_move_the_vehicle_can_be_written_out() -> None:
-    """Vehicles that move sideways are refused as a whole (`not_exportable`)."""
     for kind in list_effects():
-        for vehicle in {"differential", "ackermann"} & set(kind.kinds):
+        for vehicle in kind.kinds:
             text = kind().choose_python(vehicle)
             assert (text is None) == (kind.place is Place.LOCALIZATION), kind.id
-
-
-def test_a_vehicle_that_moves_sideways_is_no_python_function() -> None:
-    youbot = next(vehicle for vehicle in list_presets() if vehicle.id == "youbot")
-    with pytest.raises(MotionError, match="knows no sideways motion"):
-        export_model(ModelFile(Model(youbot)), "python")

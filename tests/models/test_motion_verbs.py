@@ -88,6 +88,17 @@ def test_a_model_is_made_grown_asked_about_another_run_and_exported(folder: Path
     assert compared["compared"][1]["warning"]
 
     assert "wheel_separation_multiplier" in run_slip("model", "export", model, "--to", "ros2_control").stdout
+
+    # The covariance on another log is that of a fit to it, and the model's file stays.
+    export = ("model", "export", model, "--to", "robot_localization")
+    of_two = run_slip(*export, "--on", folder / "tile2.mcap", "--results", out).stdout
+    assert "tile2" in of_two
+    assert "tile1" in run_slip(*export).stdout
+    run_slip("model", "fit", model, *on_two)
+    assert run_slip(*export).stdout == of_two
+    refused = run_slip("model", "export", model, "--to", "nav2", "--on", folder / "tile2.mcap", check=False)
+    assert refused.returncode == 1
+    assert refused.stderr.startswith("slip: --on: nav2 holds no errors of a log")
     assert "effective_track" in run_slip("model", "show", model).stdout
 
 

@@ -12,14 +12,14 @@ from msgspec import structs
 from stage_logs import FIELD, PLAIN, TakeThrough
 
 from pipeline.analysis.choice import Choice, choose
-from pipeline.logs import LogWriter, Ragged, RaggedStrings, TopicColumns, open_log, read_topics
+from pipeline.logs import LogWriter, Ragged, RaggedStrings, Strings, TopicColumns, open_log, read_topics
 from pipeline.simulate import Clock, Encoders, PoseSensor, Recording, Scenario, simulate_run, write_log
 from pipeline.simulate.cases import make_scenario
 from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.extract.clocks import Recorded, align_clocks
 from pipeline.stages.extract.drive import read_joints, read_pair, unwrap_counter
 from pipeline.stages.extract.geometry import fit_controller
-from pipeline.stages.extract.reading import read_pose_topic
+from pipeline.stages.extract.reading import read_pose_topic, with_texts
 from pipeline.vehicles import Configuration, DriveForm, DriveSection, find_preset, load_configuration
 
 SECOND = 10**9
@@ -207,6 +207,20 @@ def test_wheels_of_another_scale_than_the_motion_are_told(
         assert taken.finding(found).value == pytest.approx(value, rel=0.03)
 
 
+@pytest.mark.parametrize(
+    ("radius", "effects", "found"),
+    [(0.2, {}, {"wheel_radius_wrong"}), (0.165, {"wheel_radius": 0.8}, set()), (0.175, {}, set())],
+)
+def test_a_body_command_tells_a_small_error_of_the_radius_from_ground_that_slips(
+    drive: TakeThrough, radius: float, effects: dict[str, float], found: set[str]
+) -> None:
+    scenario = replace(PLAIN, effects=effects, recording=Recording(layout="husky_body_command"))
+    taken = drive(scenario, {"vehicle": {"wheel_radius_m": radius}})
+    assert {"wheel_radius_wrong", "unit_wrong"} & taken.ids() == found
+    if found:
+        assert taken.finding("wheel_radius_wrong").value == pytest.approx(0.165, rel=0.03)
+
+
 def test_wheels_in_turns_a_minute_are_recognized(drive: TakeThrough) -> None:
     taken = drive(replace(PLAIN, encoders=Encoders(gain=60.0 / (2.0 * np.pi))), {})
     assert "rpm" in taken.finding("unit_wrong").text
@@ -287,3 +301,18 @@ def test_a_pose_whose_heading_does_not_follow_the_gyro_loses(tmp_path: Path, sta
     chosen = look(tmp_path / "run.mcap")
     assert str(chosen.sources.pose) == "/other"
     assert "not the gyro's" in chosen.ratings[1].reason
+
+
+def test_texts_that_are_no_objects_of_numbers_are_left_out() -> None:
+    texts = ('{"x": 1, "y": 0, "z": -0.5}', '{"x": 1e999, "y": 0, "z": 0}', "", "[1, 2]", '{"x": 1, "y": 0}')
+    codes = np.array([0, 1, 2, 3, 4, -1, 0], dtype=np.int32)
+    kinds = np.array([1008, 1008, 1008, 1008, 1008, 1008, 1007])
+    times = np.arange(codes.size)
+    fields = {"parameter": Strings(codes, texts), "header.identity.api_id": kinds}
+    read = with_texts(TopicColumns("/r", 1, "unitree_api/msg/Request", times, times, None, fields, ()))
+    assert {name: column.tolist() for name, column in read.fields.items()} == {
+        "parameter.x": [1.0],
+        "parameter.y": [0.0],
+        "parameter.z": [-0.5],
+    }
+    assert read.log_time.tolist() == [0]

@@ -20,6 +20,9 @@ def list_paths(kind: MessageType) -> list[str]:
     if kind.drive is not None:
         paths += [*kind.drive.first.split("+"), *kind.drive.second.split("+")]
         paths += [kind.drive.sideways] if kind.drive.sideways else []
+    if kind.text is not None:
+        paths = [path for path in paths if not path.startswith(f"{kind.text.field}.")]
+        paths += [kind.text.field, kind.text.tag]
     if kind.number is not None:
         paths += [kind.number.field, *filter(None, [kind.number.per_turn])]
     if kind.joints is not None:
@@ -45,7 +48,8 @@ def list_paths(kind: MessageType) -> list[str]:
 def test_every_field_is_one_of_the_type(name: str) -> None:
     leaves = field_names(name)
     indexed = re.compile(r"\[\d+\]$")
-    wrong = [path for path in list_paths(find_type(name)) if indexed.sub("", path) not in leaves]
+    paths = [path for each in list_paths(find_type(name)) for path in Signal("", each).fields()]
+    wrong = [path for path in paths if indexed.sub("", path) not in leaves]
     assert wrong == []
 
 

@@ -46,12 +46,12 @@ class AccelerationLimit(DriveEffect):
     )
     needs = (Excitation.CHANGES, Excitation.LARGE)
     confused_with = ("drive_lag", "body_inertia")
-    python_state = ("limited_left", "limited_right")
+    python_state = ("limited",)
     python = """
         most = {limit} * step_s
-        limited_left = approach(limited_left, left, most)
-        limited_right = approach(limited_right, right, most)
-        left, right = limited_left, limited_right"""
+        wheels = split(left, right, sideways)
+        limited = [approach(was, wheel, most) for was, wheel in zip(limited or [0.0] * 4, wheels)]
+        left, right, sideways = join(limited)"""
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""

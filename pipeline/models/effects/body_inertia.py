@@ -56,7 +56,7 @@ class BodyInertia(BodyEffect):
         keep = math.exp(-step_s / {tau}) if {tau} > 0.0 else 0.0
         slide_w = w0 + (slide_w - w0) * keep
         turn = slide_w * step_s
-        ahead, aside = v0 + (slide_x - v0) * keep, slide_y * keep
+        ahead, aside = v0 + (slide_x - v0) * keep, s0 + (slide_y - s0) * keep
         slide_x = ahead * math.cos(turn) + aside * math.sin(turn)
         slide_y = aside * math.cos(turn) - ahead * math.sin(turn)
         v_x, v_y, v_w = slide_x, slide_y, slide_w"""

@@ -48,8 +48,8 @@ class Deadband(CommandEffect):
     needs = (Excitation.SMALL,)
     confused_with = ("turn_droop",)
     python = """
-        left = 0.0 if R * abs(left) < {d} else left
-        right = 0.0 if R * abs(right) < {d} else right"""
+        wheels = split(left, right, sideways)
+        left, right, sideways = join([0.0 if R * abs(wheel) < {d} else wheel for wheel in wheels])"""
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""

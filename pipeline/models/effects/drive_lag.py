@@ -48,12 +48,13 @@ class DriveLag(DriveEffect):
     equivalent_to = ("body_inertia",)
     equivalent_when = "never turning, or only turning on the spot"
     same_in_one_motion = ("turn_lag",)
-    python_state = ("lag_left", "lag_right")
+    python_state = ("lag_left", "lag_right", "lag_sideways")
     python = """
         keep = math.exp(-step_s / {tau}) if {tau} > 0.0 else 0.0
         lag_left = left + (lag_left - left) * keep
         lag_right = right + (lag_right - right) * keep
-        left, right = lag_left, lag_right"""
+        lag_sideways = sideways + (lag_sideways - sideways) * keep
+        left, right, sideways = lag_left, lag_right, lag_sideways"""
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""

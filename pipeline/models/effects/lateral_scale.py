@@ -54,6 +54,8 @@ class LateralScale(KinematicEffect):
     )
     needs = (Excitation.SIDEWAYS,)
     confused_with = ("roller_slip", "wheel_radius")
+    python = """
+        s0 = {k} * s0"""
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""

@@ -44,6 +44,7 @@ class LateralSkid(LinearEffect):
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("icr_offset", "body_inertia", "heading_skew", "drive_lag")
     python = """
+        v_x = v_x + {c} * s0 * w0
         v_y = v_y - {c} * v0 * w0"""
 
     def describe_motion(self, vehicle: Vehicle) -> str:

@@ -44,6 +44,8 @@ class RollerSlip(LinearEffect):
     )
     needs = (Excitation.SIDEWAYS, Excitation.SPEED_SPREAD)
     confused_with = ("lateral_scale",)
+    python = """
+        v_y = v_y - {k} * s0 * abs(s0)"""
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""

@@ -90,7 +90,7 @@ class TerrainChange(KinematicEffect):
         beyond = "x > {at_x}" if math.isfinite(self.values["at_x"]) else "t >= {at_s}"
         return f"""
         if {beyond}:
-            v0, w0 = {{k_v}} * v0, {{k_w}} * w0"""
+            v0, s0, w0 = {{k_v}} * v0, {{k_v}} * s0, {{k_w}} * w0"""
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

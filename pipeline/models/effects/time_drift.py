@@ -40,7 +40,7 @@ class TimeDrift(KinematicEffect):
     confused_with = ("terrain_change", "wheel_radius")
     python = """
         fade = 1.0 - {k} * t / until_s
-        v0, w0 = fade * v0, fade * w0"""
+        v0, s0, w0 = fade * v0, fade * s0, fade * w0"""
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""

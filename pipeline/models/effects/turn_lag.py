@@ -70,10 +70,11 @@ class TurnLag(DriveEffect):
     confused_with = ("drive_lag", "transport_delay", "turn_droop")
     same_in_one_motion = ("drive_lag",)
     contains = ("drive_lag",)
-    python_state = ("lag_mean", "lag_difference")
+    python_state = ("lag_mean", "lag_difference", "lag_aside")
     python = """
         keep = math.exp(-step_s / {tau_mean}) if {tau_mean} > 0.0 else 0.0
         lag_mean = (left + right) / 2.0 + (lag_mean - (left + right) / 2.0) * keep
+        sideways = lag_aside = sideways + (lag_aside - sideways) * keep
         keep = math.exp(-step_s / {tau_diff}) if {tau_diff} > 0.0 else 0.0
         lag_difference = right - left + (lag_difference - (right - left)) * keep
         left, right = lag_mean - lag_difference / 2.0, lag_mean + lag_difference / 2.0"""

@@ -46,8 +46,8 @@ class WheelSpeedLimit(CommandEffect):
     needs = (Excitation.LARGE,)
     confused_with = ("body_speed_limit", "body_turn_limit")
     python = """
-        left = max(-{limit}, min({limit}, left))
-        right = max(-{limit}, min({limit}, right))"""
+        wheels = split(left, right, sideways)
+        left, right, sideways = join([max(-{limit}, min({limit}, wheel)) for wheel in wheels])"""
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""

@@ -91,7 +91,7 @@ def _find_step(file: ModelFile, known: Collection[Quantity]) -> _Step:
         "not_fitted",
         "the model was never fitted: it has no held-out errors to make a covariance of",
         where="fit.ladder",
-        hint="Fit it first: slip model fit MODEL --on LOG --input measured.",
+        hint="Name a log: --on LOG, or fit it first: slip model fit MODEL --on LOG --input measured.",
     )
 
 
@@ -108,7 +108,7 @@ def _warn(file: ModelFile, step: _Step, known: Collection[Quantity]) -> list[str
     lines = []
     if file.fit.get("input") != "measured":
         lines.append(
-            "fitted on commands; for odometry of encoders: slip model fit MODEL --on LOG --input measured"
+            "fitted on commands; for odometry of encoders: --on LOG, whose measured wheels then count"
         )
     unseen = " ".join(effect.id for effect in file.model if not _is_seen(effect, known))
     if unseen and len(step.effects) < len(file.model.effects):
@@ -122,4 +122,5 @@ TARGET = Target(
     "cra-ros-pkg/robot_localization 3.6, params/ekf.yaml and preparing_sensor_data.rst; the filter takes "
     "covariances from the messages, which ros-controls/ros2_controllers fills from twist_covariance_diagonal",
     write,
+    has_errors=True,
 )

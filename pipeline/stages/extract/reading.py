@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -80,7 +81,7 @@ def find_sideways_share(topics: Iterable[TopicColumns], source: DriveSource | No
     for columns in topics:
         if source is not None and columns.topic == source.signals[0].topic:
             signal = sideways_field(source, {columns.topic: columns.type_name})
-            return asks_sideways(numbers(columns, signal.field)) if signal is not None else 0.0
+            return asks_sideways(numbers(with_texts(columns), signal.field)) if signal is not None else 0.0
     return 0.0
 
 
@@ -136,12 +137,60 @@ def list_wanted(
         fields = by_topic.setdefault(signal.topic, [])
         if signal.field not in fields:
             fields.append(signal.field)
-    wanted = [Wanted(topic, (*fields, *_stamp_fields(types[topic]))) for topic, fields in by_topic.items()]
+    wanted = [Wanted(topic, _recorded_fields(types[topic], fields)) for topic, fields in by_topic.items()]
     return wanted + _list_wanted_transforms(every, types)
 
 
 def _is_by_satellites(source: DriveSource | PoseSource) -> bool:
     return isinstance(source, PoseSource) and source.content is not PoseContent.POSE
+
+
+def _recorded_fields(kind: str, fields: Iterable[str]) -> tuple[str, ...]:
+    """The fields of the messages themselves, stamps included, that named ones are made of."""
+    text = find_type(kind).text
+    names = (*fields, *_stamp_fields(kind))
+    if text is None:
+        return names
+    kept = [name for name in names if not name.startswith(f"{text.field}.")]
+    return (*kept, text.field, text.tag)
+
+
+def with_texts(columns: TopicColumns) -> TopicColumns:
+    """A topic with the numbers of its JSON texts as columns of their own; other messages are left out.
+
+    Raises:
+        StageError: ``field_not_a_text``.
+    """
+    text = find_type(columns.type_name).text
+    column = None if text is None else columns.fields.get(text.field)
+    if text is None or column is None:
+        return columns
+    if not isinstance(column, Strings):
+        raise StageError(
+            "field_not_a_text",
+            f"the field {text.field!r} is no text",
+            where=columns.topic,
+            hint="Name another topic.",
+        )
+    # The last row is that of messages without a text, whose code is -1.
+    table = np.array([_read_numbers(value, text.keys) for value in (*column.values, "")])[column.codes]
+    here = (numbers(columns, text.tag) == text.value) & np.isfinite(table).all(axis=1)
+    return replace(
+        columns,
+        log_time=columns.log_time[here],
+        publish_time=columns.publish_time[here],
+        header_time=None if columns.header_time is None else columns.header_time[here],
+        fields={f"{text.field}.{key}": table[here, place] for place, key in enumerate(text.keys)},
+    )
+
+
+def _read_numbers(text: str, keys: Iterable[str]) -> list[float]:
+    """Numbers of a JSON object by key; NaN where it is something else."""
+    try:
+        found = json.loads(text)
+        return [float(found[key]) for key in keys]
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+        return [np.nan for _ in keys]
 
 
 def _stamp_fields(kind: str) -> tuple[str, ...]:
@@ -166,7 +215,11 @@ def _list_wanted_transforms(
 
 
 def with_stamps(columns: TopicColumns) -> TopicColumns:
-    """A topic with the stamps of its type in the place of a header's, where it has no header."""
+    """A topic with the stamps of its type in the place of a header's, where it has no header.
+
+    Numbers in texts become columns.
+    """
+    columns = with_texts(columns)
     stamp = find_type(columns.type_name).stamp
     if columns.header_time is not None or stamp is None:
         return columns

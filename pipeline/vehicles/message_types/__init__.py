@@ -8,6 +8,7 @@ of
 - ``number``: one field; what it is of says ``quantity`` or the topic's name;
 - ``joints``, ``pose``, ``imu``: fields of wheels by name, of a pose, of a gyro;
 - ``fix``, ``ground_velocity``: a place on Earth, a velocity east and north;
+- ``text``: a field with a JSON object, whose numbers are called ``field.key``;
 - ``stamp``: when the data were taken, where there is no header.
 
 ``pairs`` lists topics that belong together by name.
@@ -122,6 +123,18 @@ class ImuFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     convention: Convention = "flu"
 
 
+class TextFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A field with a JSON object that has some `keys`.
+
+    Messages in which the field `tag` is another number, or a key is no number, say something else.
+    """
+
+    field: str
+    keys: tuple[str, ...]
+    tag: str
+    value: int
+
+
 class StampField(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A time: a structure of seconds and nanoseconds, or a count of ticks."""
 
@@ -139,6 +152,7 @@ class MessageType(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fix: FixFields | None = None
     ground_velocity: GroundVelocityFields | None = None
     imu: ImuFields | None = None
+    text: TextFields | None = None
     stamp: StampField | None = None
 
 
@@ -160,7 +174,9 @@ class Pair(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def plain_type(type_name: str) -> str:
-    """ROS 1 and ROS 2 spellings of a type made one: `sensor_msgs/Imu`."""
+    """ROS 1, ROS 2 and protobuf spellings of a type made one: `sensor_msgs/Imu`."""
+    if "/" not in type_name and "." in type_name:
+        return "/".join(type_name.rsplit(".", 1))
     return type_name.replace("/msg/", "/")
 
 
