@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: ablate hidden-effect hidden-table mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs few-shot fleets format fuzz inspect lock map pictures plan-game platforms samples \
+.PHONY: ablate hidden-effect hidden-table inject mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs few-shot fleets format fuzz inspect lock map pictures plan-game platforms samples \
 	serve test test-long trend wheel
 
 help: ## print this list
@@ -139,6 +139,9 @@ few-shot: $(VENV)/.ready-dev ## a terrain of OUT left out: error of what the fle
 
 fleets: $(VENV)/.ready-dev ## simulated fleets: is what is hidden said to be the vehicle's, the ground's, a run's [ARGS="--fleets 4"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/fleets.py $$ARGS
+
+inject: $(VENV)/.ready-dev ## faults and effects injected into the real recordings: recovered, told, missed [ARGS="--logs sand"]
+	$(BIN)/python benchmarks/inject.py $$ARGS
 
 plan-game: $(VENV)/.ready-dev ## plans in closed loop: a poor log, a plan, its drive with hidden physics [ARGS="--draws 24"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/plan_game.py $$ARGS

@@ -1,0 +1,302 @@
+"""What is injected into recordings: faults of sensors and wiring, and effects with their formulas.
+
+Each change takes the tables of a run as they were extracted and returns changed ones. It uses numpy and
+polars alone: nothing here knows how the tool looks for what is injected.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Tables = Mapping[str, pl.DataFrame]
+Change = Callable[[Tables, "Drive"], Tables]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Geometry of the differential drive: wheel radius and track width [m]."""
+
+    radius_m: float
+    track_m: float
+
+
+@dataclass(frozen=True)
+class Injection:
+    """A change and what must come of it.
+
+    Attributes:
+        name: in the table.
+        change: of the extracted tables.
+        findings: any of them tells of the fault; empty where none is expected.
+        numbers: by ``effect.parameter`` the number that must be named, from that of the unchanged recording
+            (or from the neutral one); any of them will do.
+        same: the answer must stay what it was.
+        both: needs the way from command to wheels.
+    """
+
+    name: str
+    change: Change
+    findings: tuple[str, ...] = ()
+    numbers: Mapping[str, Callable[[float], float]] = field(default_factory=dict)
+    same: bool = False
+    both: bool = False
+
+
+def list_injections() -> list[Injection]:
+    """All of them."""
+    shift = _add
+    return [
+        Injection("sides of the wheels swapped", _on("wheels", _swap), ("sides_exchanged",)),
+        Injection("sides of the commands swapped", _on("commands", _swap), ("sides_exchanged",), both=True),
+        Injection("left encoder dead", _on("wheels", lambda t: _scale(t, left=0.0)), ("wheel_dead",)),
+        Injection(
+            "left encoder x .95", _on("wheels", lambda t: _scale(t, left=0.95)), ("wheel_scale",),
+            {"wheel_asymmetry.e": shift(-0.051)}, both=True,
+        ),
+        Injection("left encoder backward", _on("wheels", lambda t: _scale(t, left=-1.0)), ("wheel_sign",)),
+        Injection(
+            "wheels x 1.05", _on("wheels", lambda t: _scale(t, 1.05, 1.05)), ("wheel_radius_wrong",),
+            {"wheel_radius.k": lambda k: k / 1.05},
+        ),
+        Injection(
+            "commands x 1.5", _on("commands", lambda t: _scale(t, 1.5, 1.5)), ("command_scale",), both=True
+        ),
+        Injection(
+            "commands .2 s early", _on("commands", lambda t: _later(t, -0.2)), (),
+            {"transport_delay.d": shift(0.2)}, both=True,
+        ),
+        Injection("gyro negated", _on("imu", lambda t: t.with_columns(-pl.col("rate_z"))), same=True),
+        Injection("map turned and moved", _map_moved, same=True),
+        Injection("poses at 5 Hz", _on("poses", _thin), same=True),
+        Injection("1 cm of noise", _on("poses", _noisy), same=True),
+        Injection(
+            "poses .15 s late", _on("poses", lambda t: _later(t, 0.15)), (), {"clock_offset.d": shift(0.15)}
+        ),
+        Injection("heading .1 s late", _heading_late, (), {"heading_skew.d": shift(0.1)}),
+        Injection("poses from the wheels", _from_wheels, ("pose_from_wheels",)),
+        Injection("misalignment 3 deg", _misaligned, (), {"yaw_misalignment.psi": shift(math.radians(3.0))}),
+        Injection(
+            "lever arm .3 m", _lever, (),
+            {"icr_offset.x_icr": shift(-0.3), "lever_arm.l_x": shift(0.3)},
+        ),
+        Injection(
+            "skid .1 s", _moved(lambda m: (0.0, -0.1 * m.v * m.w, 0.0)), (), {"lateral_skid.c": shift(0.1)}
+        ),
+        Injection(
+            "resistance .15 s", _moved(lambda m: (-0.15 * m.v * np.abs(m.w), 0.0, 0.0)), (),
+            {"turning_resistance.k": shift(0.15)},
+        ),
+        Injection(
+            "speed slip .03 s/m", _moved(lambda m: (-0.03 * m.v * np.abs(m.v), 0.0, 0.0)), (),
+            {"speed_slip.k": shift(0.03)},
+        ),
+        Injection(
+            "track x 1.2", _moved(lambda m: (0.0, 0.0, m.w / 1.2 - m.w)), (),
+            {"effective_track.k": lambda k: 1.2 * k},
+        ),
+        Injection(
+            "track at speed +.05", _moved(lambda m: (0.0, 0.0, 0.05 * np.abs(m.v) * m.w)), (),
+            {"speed_track.k": shift(0.05)},
+        ),
+        Injection(
+            "gains .8 and .7 half-way", _moved(_half_way), (),
+            {"terrain_change.k_v": lambda k: 0.8 * k, "terrain_change.k_w": lambda k: 0.7 * k},
+        ),
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What an effect acts on, between each pose and the next, each of shape (n,).
+
+    Attributes:
+        v: forward speed of the ideal vehicle by its measured wheels [m/s].
+        w: yaw rate of the poses [rad/s].
+        done: share of the run that is over.
+    """
+
+    v: Floats
+    w: Floats
+    done: Floats
+
+
+def _add(change: float) -> Callable[[float], float]:
+    return lambda value: value + change
+
+
+def _on(name: str, change: Callable[[pl.DataFrame], pl.DataFrame]) -> Change:
+    """A change of one table, where the run has it."""
+    return lambda tables, _: {**tables, name: change(tables[name])} if name in tables else tables
+
+
+def _swap(table: pl.DataFrame) -> pl.DataFrame:
+    changed = table.with_columns(pl.col("right").alias("left"), pl.col("left").alias("right"))
+    return changed.with_columns(-pl.col("body_w")) if "body_w" in table.columns else changed
+
+
+def _scale(table: pl.DataFrame, left: float = 1.0, right: float = 1.0) -> pl.DataFrame:
+    changed = table.with_columns(pl.col("left") * left, pl.col("right") * right)
+    if "body_x" not in table.columns:
+        return changed
+    # Only scaled alike: what the controller was told goes with what it made of it.
+    return changed.with_columns(pl.col("body_x") * left, pl.col("body_w") * left)
+
+
+def _later(table: pl.DataFrame, late_s: float) -> pl.DataFrame:
+    nanoseconds = round(late_s * 1e9)
+    return table.with_columns(pl.col("t") + late_s, pl.col("stamp") + nanoseconds)
+
+
+def _thin(poses: pl.DataFrame) -> pl.DataFrame:
+    """Poses no nearer to each other than a fifth of a second."""
+    kept, last = [], -np.inf
+    for time in poses["t"].to_list():
+        kept.append(time - last >= 0.199)
+        last = time if kept[-1] else last
+    return poses.filter(pl.Series(kept))
+
+
+def _noisy(poses: pl.DataFrame) -> pl.DataFrame:
+    noise = np.random.default_rng(5).normal(0.0, 0.01, (2, poses.height))
+    # A pose that is repeated is repeated with its noise.
+    fresh = np.maximum.accumulate(np.where(poses["held"].to_numpy(), 0, np.arange(poses.height)))
+    return poses.with_columns(pl.col("x") + noise[0][fresh], pl.col("y") + noise[1][fresh])
+
+
+def _read_yaw(poses: pl.DataFrame) -> Floats:
+    x, y, z, w = (poses[f"q_{axis}"].to_numpy() for axis in "xyzw")
+    yaw: Floats = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return yaw
+
+
+def _turn(poses: pl.DataFrame, angle: Floats | float, *, in_map: bool) -> pl.DataFrame:
+    """Poses whose attitude is turned about the map's z axis, or about their own."""
+    x, y, z, w = (poses[f"q_{axis}"].to_numpy() for axis in "xyzw")
+    sine, cosine = np.sin(0.5 * np.asarray(angle)), np.cos(0.5 * np.asarray(angle))
+    side = 1.0 if in_map else -1.0
+    turned = {
+        "q_x": cosine * x - side * sine * y,
+        "q_y": cosine * y + side * sine * x,
+        "q_z": cosine * z + sine * w,
+        "q_w": cosine * w - sine * z,
+    }
+    return poses.with_columns(pl.Series(name, values) for name, values in turned.items())
+
+
+def _map_moved(tables: Tables, _: Drive) -> Tables:
+    poses = tables["poses"]
+    place = (poses["x"].to_numpy() + 1j * poses["y"].to_numpy()) * np.exp(1.2j) + (100.0 - 50.0j)
+    turned = _turn(poses, 1.2, in_map=True)
+    return {**tables, "poses": turned.with_columns(pl.Series("x", place.real), pl.Series("y", place.imag))}
+
+
+def _misaligned(tables: Tables, _: Drive) -> Tables:
+    return {**tables, "poses": _turn(tables["poses"], math.radians(3.0), in_map=False)}
+
+
+def _lever(tables: Tables, _: Drive) -> Tables:
+    poses = tables["poses"]
+    arm = 0.3 * np.exp(1j * _read_yaw(poses))
+    moved = poses.with_columns(pl.col("x") + arm.real, pl.col("y") + arm.imag)
+    return {**tables, "poses": moved}
+
+
+def _heading_late(tables: Tables, _: Drive) -> Tables:
+    poses = tables["poses"]
+    change = np.zeros(poses.height)
+    for rows in _list_segments(poses):
+        times, yaw = poses["t"].to_numpy()[rows], np.unwrap(_read_yaw(poses)[rows])
+        change[rows] = np.interp(times - 0.1, times, yaw) - yaw
+    return {**tables, "poses": _turn(poses, change, in_map=True)}
+
+
+def _from_wheels(tables: Tables, drive: Drive) -> Tables:
+    """Poses that are integrated wheels under another name."""
+    wheels, poses = tables["wheels"], tables["poses"]
+    times = wheels["t"].to_numpy()
+    left, right = (drive.radius_m * wheels[side].to_numpy() for side in ("left", "right"))
+    step = np.diff(times)
+    yaw = np.concatenate(([0.0], np.cumsum((right - left)[:-1] / drive.track_m * step)))
+    walked = 0.5 * (left + right)[:-1] * step * np.exp(0.5j * (yaw[1:] + yaw[:-1]))
+    place = np.concatenate(([0.0], np.cumsum(walked)))
+    at = poses["t"].to_numpy()
+    seen = np.interp(at, times, yaw)
+    none = np.zeros(at.size)
+    columns = {
+        "x": np.interp(at, times, place.real), "y": np.interp(at, times, place.imag), "z": none,
+        "q_x": none, "q_y": none, "q_z": np.sin(0.5 * seen), "q_w": np.cos(0.5 * seen),
+    }  # fmt: skip
+    return {
+        **tables,
+        "poses": poses.with_columns(pl.Series(name, values) for name, values in columns.items()),
+    }
+
+
+def _half_way(motion: Motion) -> tuple[Floats, float, Floats]:
+    later = motion.done > 0.5
+    return -0.2 * motion.v * later, 0.0, -0.3 * motion.w * later
+
+
+def _moved(push: Callable[[Motion], tuple[Floats | float, Floats | float, Floats | float]]) -> Change:
+    """A body velocity v_x, v_y, v_w added to the motion: poses are integrated again, the gyro follows."""
+
+    def change(tables: Tables, drive: Drive) -> Tables:
+        poses, wheels = tables["poses"], tables["wheels"]
+        times, yaw = poses["t"].to_numpy(), _read_yaw(poses)
+        place = poses["x"].to_numpy() + 1j * poses["y"].to_numpy()
+        moments, speed = wheels["t"].to_numpy(), np.zeros(0)
+        speed = 0.5 * drive.radius_m * (wheels["left"].to_numpy() + wheels["right"].to_numpy())
+        spans = (float(times[0]), float(times[-1] - times[0]))
+        turned, new_place = np.zeros(times.size), place.copy()
+        rates: list[tuple[Floats, Floats]] = []
+        for rows in _list_segments(poses):
+            # Between two poses that are new: those between them repeat the one before.
+            held = poses["held"].to_numpy()[rows]
+            fresh = rows[np.flatnonzero(~held | (np.arange(rows.size) == 0))]
+            step = np.diff(times[fresh])
+            angle = np.unwrap(yaw[fresh])
+            middle = 0.5 * (times[fresh][1:] + times[fresh][:-1])
+            motion = Motion(
+                np.interp(middle, moments, speed), np.diff(angle) / step, (middle - spans[0]) / spans[1]
+            )
+            x, y, w = (np.broadcast_to(np.asarray(part, dtype=float), step.shape) for part in push(motion))
+            own = np.diff(place[fresh]) * np.exp(-1j * 0.5 * (angle[1:] + angle[:-1]))
+            added = np.concatenate(([0.0], np.cumsum(w * step)))
+            heading = angle + added
+            walked = (own + (x + 1j * y) * step) * np.exp(1j * 0.5 * (heading[1:] + heading[:-1]))
+            path = place[fresh[0]] + np.concatenate(([0.0], np.cumsum(walked)))
+            owner = np.searchsorted(fresh, rows, side="right") - 1
+            turned[rows], new_place[rows] = added[owner], path[owner]
+            rates.append((middle, w))
+        moved = _turn(poses, turned, in_map=True).with_columns(
+            pl.Series("x", new_place.real), pl.Series("y", new_place.imag)
+        )
+        if "imu" not in tables:
+            return {**tables, "poses": moved}
+        middle, w = (np.concatenate(columns) for columns in zip(*rates, strict=True))
+        imu = tables["imu"]
+        ratio = _measure_gyro_sign(imu, times, yaw)
+        felt = imu["rate_z"].to_numpy() + ratio * np.interp(imu["t"].to_numpy(), middle, w)
+        return {**tables, "poses": moved, "imu": imu.with_columns(pl.Series("rate_z", felt))}
+
+    return change
+
+
+def _measure_gyro_sign(imu: pl.DataFrame, times: Floats, yaw: Floats) -> float:
+    """Which way the gyro is mounted: the sign of its correlation with the turning of the poses."""
+    rate = np.gradient(np.unwrap(yaw), times)
+    rate = np.convolve(np.clip(rate, -3.0, 3.0), np.ones(20) / 20.0, "same")
+    seen = np.interp(times, imu["t"].to_numpy(), imu["rate_z"].to_numpy())
+    return float(np.sign(np.sum(np.convolve(seen, np.ones(20) / 20.0, "same") * rate)))
+
+
+def _list_segments(poses: pl.DataFrame) -> list[NDArray[np.int64]]:
+    segment = poses["segment"].to_numpy()
+    return [np.flatnonzero(segment == number) for number in np.unique(segment)]

@@ -1,0 +1,121 @@
+"""What is injected into recordings is what its name says, and is judged as it should be."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import polars as pl
+import pytest
+from inject import Answer, judge
+from injections import Drive, Injection, Tables, list_injections
+
+DRIVE = Drive(0.1, 0.5)
+BY_NAME = {injection.name: injection for injection in list_injections()}
+
+
+@pytest.fixture
+def tables() -> Tables:
+    """A vehicle that does what its wheels do: 1 m/s, .5 rad/s, in a map in which it starts at (3, -2)."""
+    times = np.arange(0.0, 20.0, 0.05)
+    yaw = 0.3 + 0.5 * times
+    place = 3.0 - 2.0j + (np.exp(1j * yaw) - np.exp(0.3j)) / 0.5j
+    stamps = (times * 1e9).astype(np.int64)
+    still = np.zeros(times.size)
+    poses = pl.DataFrame(
+        {
+            "t": times, "stamp": stamps, "segment": np.zeros(times.size, dtype=np.int32),
+            "x": place.real, "y": place.imag, "z": still,
+            "q_x": still, "q_y": still, "q_z": np.sin(0.5 * yaw), "q_w": np.cos(0.5 * yaw),
+            "held": np.zeros(times.size, dtype=bool),
+        }
+    )  # fmt: skip
+    wheels = pl.DataFrame(
+        {
+            "t": times, "stamp": stamps,
+            "left": np.full(times.size, (1.0 - 0.25 * 0.5) / 0.1),
+            "right": np.full(times.size, (1.0 + 0.25 * 0.5) / 0.1),
+        }
+    )  # fmt: skip
+    imu = pl.DataFrame({"t": times, "rate_z": np.full(times.size, -0.5)})
+    commands = wheels.with_columns(pl.lit(1.0).alias("body_x"), pl.lit(0.5).alias("body_w"))
+    return {"poses": poses, "wheels": wheels, "commands": commands, "imu": imu}
+
+
+def find_velocity(poses: pl.DataFrame) -> tuple[complex, float]:
+    """Mean body velocity v_x + j v_y [m/s] and yaw rate [rad/s] by differences of poses."""
+    yaw = np.unwrap(2.0 * np.arctan2(poses["q_z"].to_numpy(), poses["q_w"].to_numpy()))
+    times = poses["t"].to_numpy()
+    moved = np.diff(poses["x"].to_numpy() + 1j * poses["y"].to_numpy())
+    own = moved * np.exp(-0.5j * (yaw[1:] + yaw[:-1])) / np.diff(times)
+    return complex(own.mean()), float((yaw[-1] - yaw[0]) / (times[-1] - times[0]))
+
+
+@pytest.mark.parametrize(
+    ("name", "velocity", "turning"),
+    [
+        ("map turned and moved", 1.0, 0.5),
+        ("poses at 5 Hz", 1.0, 0.5),
+        ("poses from the wheels", 1.0, 0.5),
+        ("misalignment 3 deg", np.exp(-1j * math.radians(3.0)), 0.5),
+        ("lever arm .3 m", 1.0 + 0.3j * 0.5, 0.5),
+        ("skid .1 s", 1.0 - 0.1j * 0.5, 0.5),
+        ("resistance .15 s", 1.0 - 0.15 * 0.5, 0.5),
+        ("speed slip .03 s/m", 0.97, 0.5),
+        ("track x 1.2", 1.0, 0.5 / 1.2),
+        ("track at speed +.05", 1.0, 0.525),
+        ("gains .8 and .7 half-way", 0.9, 0.425),
+    ],
+)
+def test_poses_move_as_the_effect_says(name: str, velocity: complex, turning: float, tables: Tables) -> None:
+    changed = BY_NAME[name].change(tables, DRIVE)
+    found, turned = find_velocity(changed["poses"])
+    assert found == pytest.approx(velocity, abs=2e-3)
+    assert turned == pytest.approx(turning, abs=2e-3)
+    # An inverted gyro feels the same turning, by its own sign.
+    felt = float(changed["imu"]["rate_z"].mean())  # type: ignore[arg-type]
+    assert felt == pytest.approx(-turning, abs=5e-3)
+
+
+def test_the_rest_changes_one_table_alone(tables: Tables) -> None:
+    for name, table in (
+        ("sides of the wheels swapped", "wheels"),
+        ("left encoder dead", "wheels"),
+        ("wheels x 1.05", "wheels"),
+        ("commands x 1.5", "commands"),
+        ("commands .2 s early", "commands"),
+        ("gyro negated", "imu"),
+        ("1 cm of noise", "poses"),
+        ("poses .15 s late", "poses"),
+    ):
+        changed = BY_NAME[name].change(tables, DRIVE)
+        differing = [key for key in tables if not changed[key].equals(tables[key])]
+        assert differing == [table], name
+
+
+def test_a_heading_that_is_late_is_that_of_before(tables: Tables) -> None:
+    late = BY_NAME["heading .1 s late"].change(tables, DRIVE)["poses"]
+    yaw = np.unwrap(2.0 * np.arctan2(late["q_z"].to_numpy(), late["q_w"].to_numpy()))
+    assert yaw[-1] == pytest.approx(0.3 + 0.5 * (late["t"][-1] - 0.1), abs=1e-6)
+
+
+def test_answers_are_judged() -> None:
+    track = Injection("t", lambda tables, _: tables, (), {"effective_track.k": lambda k: 1.2 * k})
+    plain = Answer({"effective_track.k": (1.5, 0.01)}, (), (), ())
+
+    def name(value: float, **more: float) -> Answer:
+        numbers = {"effective_track.k": (value, 0.01), **{f"{key}.k": (v, 0.01) for key, v in more.items()}}
+        return Answer(numbers, (), (), ())
+
+    assert judge(track, plain, name(1.81)) == ("recovered", [])
+    assert judge(track, plain, name(1.5)) == ("missed", [])
+    assert judge(track, plain, name(1.8, speed_slip=0.1)) == ("recovered", ["speed_slip"])
+    assert judge(track, plain, name(1.8, speed_slip=0.1), {"speed_slip"}) == ("recovered", [])
+    assert judge(track, plain, Answer({}, (), ("effective_track",), ()))[0] == "undecided"
+    assert judge(track, plain, Answer({}, (), (), ("effective_track",)))[0] == "cannot"
+    told = Injection("f", lambda tables, _: tables, ("wheel_dead",))
+    assert judge(told, plain, Answer({}, ("wheel_dead",), (), ())) == ("told", [])
+    same = Injection("s", lambda tables, _: tables, same=True)
+    assert judge(same, plain, plain)[0] == "recovered"
+    assert judge(same, plain, Answer({}, (), (), ()))[0] == "missed"
+    assert judge(same, plain, name(1.6))[0] == "missed"
