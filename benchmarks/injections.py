@@ -80,7 +80,8 @@ def list_injections() -> list[Injection]:
             "poses .15 s late", _on("poses", lambda t: _later(t, 0.15)), (), {"clock_offset.d": shift(0.15)}
         ),
         Injection("heading .1 s late", _heading_late, (), {"heading_skew.d": shift(0.1)}),
-        Injection("poses from the wheels", _from_wheels, ("pose_from_wheels",)),
+        Injection("poses from the wheels", _from_wheels(0.5), ("pose_from_wheels",)),
+        Injection("poses from the wheels, Euler's", _from_wheels(1.0), ("pose_from_wheels",)),
         Injection("misalignment 3 deg", _misaligned, (), {"yaw_misalignment.psi": shift(math.radians(3.0))}),
         Injection(
             "lever arm .3 m", _lever, (),
@@ -133,7 +134,12 @@ def _add(change: float) -> Callable[[float], float]:
 
 def _on(name: str, change: Callable[[pl.DataFrame], pl.DataFrame]) -> Change:
     """A change of one table, where the run has it."""
-    return lambda tables, _: {**tables, name: change(tables[name])} if name in tables else tables
+
+    def changed(tables: Tables, _: Drive) -> Tables:
+        has_any = name in tables and not tables[name].is_empty()
+        return {**tables, name: change(tables[name])} if has_any else tables
+
+    return changed
 
 
 def _swap(table: pl.DataFrame) -> pl.DataFrame:
@@ -217,26 +223,33 @@ def _heading_late(tables: Tables, _: Drive) -> Tables:
     return {**tables, "poses": _turn(poses, change, in_map=True)}
 
 
-def _from_wheels(tables: Tables, drive: Drive) -> Tables:
-    """Poses that are integrated wheels under another name."""
-    wheels, poses = tables["wheels"], tables["poses"]
-    times = wheels["t"].to_numpy()
-    left, right = (drive.radius_m * wheels[side].to_numpy() for side in ("left", "right"))
-    step = np.diff(times)
-    yaw = np.concatenate(([0.0], np.cumsum((right - left)[:-1] / drive.track_m * step)))
-    walked = 0.5 * (left + right)[:-1] * step * np.exp(0.5j * (yaw[1:] + yaw[:-1]))
-    place = np.concatenate(([0.0], np.cumsum(walked)))
-    at = poses["t"].to_numpy()
-    seen = np.interp(at, times, yaw)
-    none = np.zeros(at.size)
-    columns = {
-        "x": np.interp(at, times, place.real), "y": np.interp(at, times, place.imag), "z": none,
-        "q_x": none, "q_y": none, "q_z": np.sin(0.5 * seen), "q_w": np.cos(0.5 * seen),
-    }  # fmt: skip
-    return {
-        **tables,
-        "poses": poses.with_columns(pl.Series(name, values) for name, values in columns.items()),
-    }
+def _from_wheels(share: float) -> Change:
+    """Poses that are integrated wheels under another name.
+
+    Args:
+        share: of each turn before a step is taken: a half goes along the arc, a whole one is Euler's way.
+    """
+
+    def change(tables: Tables, drive: Drive) -> Tables:
+        wheels, poses = tables["wheels"], tables["poses"]
+        times = wheels["t"].to_numpy()
+        left, right = (drive.radius_m * wheels[side].to_numpy() for side in ("left", "right"))
+        step = np.diff(times)
+        yaw = np.concatenate(([0.0], np.cumsum((right - left)[:-1] / drive.track_m * step)))
+        along = (1.0 - share) * yaw[:-1] + share * yaw[1:]
+        walked = 0.5 * (left + right)[:-1] * step * np.exp(1j * along)
+        place = np.concatenate(([0.0], np.cumsum(walked)))
+        at = poses["t"].to_numpy()
+        seen = np.interp(at, times, yaw)
+        none = np.zeros(at.size)
+        columns = {
+            "x": np.interp(at, times, place.real), "y": np.interp(at, times, place.imag), "z": none,
+            "q_x": none, "q_y": none, "q_z": np.sin(0.5 * seen), "q_w": np.cos(0.5 * seen),
+        }  # fmt: skip
+        made = poses.with_columns(pl.Series(name, values) for name, values in columns.items())
+        return {**tables, "poses": made}
+
+    return change
 
 
 def _half_way(motion: Motion) -> tuple[Floats, float, Floats]:
@@ -278,7 +291,7 @@ def _moved(push: Callable[[Motion], tuple[Floats | float, Floats | float, Floats
         moved = _turn(poses, turned, in_map=True).with_columns(
             pl.Series("x", new_place.real), pl.Series("y", new_place.imag)
         )
-        if "imu" not in tables:
+        if "imu" not in tables or tables["imu"].is_empty():
             return {**tables, "poses": moved}
         middle, w = (np.concatenate(columns) for columns in zip(*rates, strict=True))
         imu = tables["imu"]

@@ -23,6 +23,9 @@ _FEWEST = 100
 _SPAN = 0.5
 _FEWEST_SPANS = 20
 _SIDEWAYS = 1e-4
+_HALF_STEP = 0.06
+"""Half the time between two steps of slow odometry [s]."""
+_UNEVEN = 0.05
 _ROUNDING = 5e-3
 _ROUNDING_ANY_WAY = 1e-3
 """Of a vehicle that moves sideways no lack of such motion tells an odometry: its ways must fit better."""
@@ -45,7 +48,8 @@ def check_independence(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     moving = known & (np.abs(np.nan_to_num(samples.measured)) > _LIVE).any(axis=1)
     sideways = samples.velocity[moving, 1] - samples.measured[moving, 1]
     is_driven = vehicle.kinematics.has_inputs("sideways")
-    if sideways.size < _FEWEST or (not is_driven and float(np.median(np.abs(sideways))) > _SIDEWAYS):
+    swing = samples.measured[moving, 0] * samples.measured[moving, 2]
+    if sideways.size < _FEWEST or not (is_driven or _keeps_straight(sideways, swing)):
         return []
     ahead, aside, turning = _share_beside_wheels(samples, samples.measured, known)
     moved = [share for share in (ahead, aside if is_driven else None) if share is not None]
@@ -59,6 +63,20 @@ def check_independence(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         "not a localization, and the slip is zero by construction: draw no conclusion from it"
     )
     return [Finding("pose_from_wheels", "error", text, where="pose", value=share)]
+
+
+def _keeps_straight(sideways: Floats, swing: Floats) -> bool:
+    """Whether there is no motion sideways, but for that of steps along the heading before or after each turn.
+
+    Args:
+        sideways: speed beside the wheels' [m/s], shape (n,).
+        swing: speed times yaw rate of the wheels: such steps drift by half a step's time of it, shape (n,).
+    """
+    if float(np.median(np.abs(sideways))) <= _SIDEWAYS:
+        return True
+    (half_step,), rest = fit_robustly(swing[:, None], sideways)
+    drift = float(np.median(np.abs(half_step * swing)))
+    return abs(half_step) <= _HALF_STEP and float(np.median(np.abs(rest))) <= max(_UNEVEN * drift, _SIDEWAYS)
 
 
 def _share_beside_wheels(
