@@ -1,7 +1,7 @@
-"""What system identification asks of residuals: do they repeat themselves, do they still follow the input?
+"""What system identification asks of residuals: do they repeat themselves, do they follow the input?
 
-Residuals of a model that lacks nothing are white and uncorrelated with its input (Ljung, System Identification,
-section 16.6). Windows that overlap share data: only lags of whole windows are looked at.
+Residuals of a model that lacks nothing are white and uncorrelated with its input (Ljung, System
+Identification, section 16.6). Windows that overlap share data: only lags of whole windows are looked at.
 """
 
 from __future__ import annotations
@@ -50,8 +50,9 @@ def cross_correlate(times: Floats, signal: Floats, residual: Floats) -> tuple[Fl
         residual: at the windows, shape (n,).
 
     Returns:
-        Lags [s] from `-LONGEST_S` to `LONGEST_S` and correlations, shape (k,) each, and the bound that 95 % of
-        residuals would keep that repeat themselves as this one does and know nothing of the input (Bartlett).
+        Lags [s] from `-LONGEST_S` to `LONGEST_S` and correlations, shape (k,) each, and the bound that 95 %
+        of residuals would keep that repeat themselves as this one does and know nothing of the input
+        (Bartlett).
     """
     given, values = _standardise(signal, clip=False), _standardise(residual)
     longest = _longest(times)
@@ -85,9 +86,7 @@ def _count_apart(times: Floats) -> float:
     return times.size / _stride(times)
 
 
-def _correlate(
-    times: Floats, before: Floats, after: Floats, lags: Sequence[int]
-) -> tuple[Floats, Floats]:
+def _correlate(times: Floats, before: Floats, after: Floats, lags: Sequence[int]) -> tuple[Floats, Floats]:
     """Mean products of windows and of those that many strides later, for lags with enough pairs."""
     stride, step = _stride(times), float(np.median(np.diff(times)))
     found = []

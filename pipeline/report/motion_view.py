@@ -27,9 +27,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 COMPONENTS = ("x", "y", "w")
-SIGNALS = {
-    name: VARIABLES[name] for name in ("f_x", "f_y", "f_w", "f_x_f_w", "a_x", "a_w", "roll", "pitch")
-}
+SIGNALS = {name: VARIABLES[name] for name in ("f_x", "f_y", "f_w", "f_x_f_w", "a_x", "a_w", "roll", "pitch")}
 
 _ARC_EVERY_S = 4.0
 _ARC_RATE_HZ = 10.0

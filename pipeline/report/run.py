@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from pipeline.diagnosis.subject import FATAL
+
 if TYPE_CHECKING:
     import polars as pl
 
@@ -61,6 +63,11 @@ class RunReport:
         """Errors over 2 s, ``t`` [m] and ``r`` [rad], of the ideal model and with each named effect more."""
         rungs = objects_in(self.diagnosis, "ladder")
         return [{"t": number_in(rung, "t_mrmse_m"), "r": number_in(rung, "r_mrmse_rad")} for rung in rungs]
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether a finding makes every fit to the run meaningless, so that the diagnosis names nothing."""
+        return any(finding.get("id") in FATAL for finding in self.items("findings"))
 
     @property
     def undecided(self) -> list[tuple[str, str]]:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from pipeline.report.figures.figure import Picture
     from pipeline.report.scene import Scene
 
     Correlation = tuple[NDArray[np.float64], NDArray[np.float64], float]
@@ -110,16 +109,14 @@ def describe_autocorrelation(scene: Scene) -> str:
         after = f"{values.get('ideal', 0.0):.2f} before, {values.get('model', 0.0):.2f} after"
         told.append(f"{QUANTITIES[name[-1]][0]} {after}")
     bound = float(next(iter(rows.values()))["high"][0])
-    return (
-        f"Autocorrelation of residuals one second apart: {'; '.join(told)}; noise stays below {bound:.2f}."
-    )
+    return f"Autocorrelation of residuals one second apart: {'; '.join(told)}; noise stays below {bound:.2f}."
 
 
 FIGURE = Figure(
     id="autocorrelation",
     title="Does what is left repeat itself?",
     section=Section.WHY,
-    order=2,
+    order=4,
     width=Width.HALF,
     draw=draw_autocorrelation,
     describe=describe_autocorrelation,

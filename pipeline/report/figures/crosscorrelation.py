@@ -25,7 +25,7 @@ def draw_crosscorrelation(scene: Scene) -> Drawing | None:
     inputs = choose_inputs(motion)
     titles = {one: f"{QUANTITIES[one][0]} residual with {SIGNALS[inputs[one]][0]} [1]" for one in inputs}
     axis = (-LONGEST_S, "how long before the residual the input was [s]")
-    note = "Grey: where 95 % of residuals would stay that know nothing of the input. Right of zero it is the past."
+    note = "Grey: where 95 % of residuals stay that know nothing of the input. Right of zero it is the past."
     return Drawing(draw_correlations(scene, "crosscorrelation", titles, axis), rows, note)
 
 
@@ -71,7 +71,7 @@ FIGURE = Figure(
     id="crosscorrelation",
     title="Does what is left follow the input?",
     section=Section.WHY,
-    order=3,
+    order=5,
     width=Width.HALF,
     draw=draw_crosscorrelation,
     describe=describe_crosscorrelation,

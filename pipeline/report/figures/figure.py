@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 class Section(Enum):
     """The question of the page that a figure answers."""
 
+    GLANCE = "glance"
     HOW_BAD = "how-bad"
     WHERE = "where"
     WHY = "why"

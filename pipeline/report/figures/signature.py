@@ -80,7 +80,9 @@ def _name_axes(signature: Signature) -> tuple[str, str]:
     what, unit = QUANTITIES[signature.channel]
     variable, own_unit = VARIABLES[signature.variable]
     error = (
-        f"{what} error, share of the step [1]" if signature.variable == SINCE_STEP else f"{what} error [{unit}]"
+        f"{what} error, share of the step [1]"
+        if signature.variable == SINCE_STEP
+        else f"{what} error [{unit}]"
     )
     return f"{variable} [{own_unit}]", error
 
@@ -109,14 +111,13 @@ def _draw_panel(signature: Signature, colour: str) -> Picture:
 
 
 def _note(signature: Signature) -> str:
-    return f"{say_share(signature.explained)} of what it does is a function of the {VARIABLES[signature.variable][0]}."
+    variable = VARIABLES[signature.variable][0]
+    return f"{say_share(signature.explained)} of what it does is a function of the {variable}."
 
 
 def _describe(signature: Signature) -> str:
     variable, error = _name_axes(signature)
-    sizes = [
-        say_number(float(np.sqrt(np.mean(values**2)))) for values in (signature.before, signature.after)
-    ]
+    sizes = [say_number(float(np.sqrt(np.mean(values**2)))) for values in (signature.before, signature.after)]
     return (
         f"{error} against {variable}, in {signature.value.size} bins: root mean square {sizes[0]} without "
         f"{signature.effect}, {sizes[1]} with it."

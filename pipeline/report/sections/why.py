@@ -36,13 +36,14 @@ def view_why(page: Page) -> dict[str, object]:
     drivetrain, ground, cross = report.split
     signatures = {picture.title: picture for picture in page.pictures[Section.EFFECT]}
     return {
+        "refused": report.is_refused,
         "diagnosed": bool(report.diagnosis),
         "named": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in effects],
         "explained": number_in(report.diagnosis, "explained_share"),
         "table": Table("Missing from the ideal model", _HEAD, rows),
         "open": list(_list_open(report)),
         "split": None
-        if drivetrain is None or ground is None or cross is None
+        if drivetrain is None or ground is None or cross is None or report.is_refused
         else {"from_drivetrain": drivetrain > ground, "words": say_split(drivetrain, ground, cross)},
         "pictures": page.pictures[Section.WHY],
     }
@@ -51,7 +52,7 @@ def view_why(page: Page) -> dict[str, object]:
 def _view_effect(entry: Mapping[str, object], signature: object) -> dict[str, object]:
     """One named effect: what the vehicle does, what else that may be, and what was measured of it."""
     name = str(entry.get("id", ""))
-    does, _, may_be = str(entry.get("sentence") or name).partition(": ")
+    does, may_be = say_effect(entry)
     return {
         "id": name,
         "does": begin_large(does),
@@ -59,6 +60,12 @@ def _view_effect(entry: Mapping[str, object], signature: object) -> dict[str, ob
         "alike": _list_alike(entry),
         "picture": signature,
     }
+
+
+def say_effect(entry: Mapping[str, object]) -> tuple[str, str]:
+    """What the vehicle does by a named effect, and what else that may be called on other grounds."""
+    does, _, may_be = str(entry.get("sentence") or entry.get("id", "")).partition(": ")
+    return does, may_be
 
 
 def _list_alike(entry: Mapping[str, object]) -> tuple[str, str] | None:
