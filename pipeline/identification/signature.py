@@ -73,7 +73,7 @@ class Signature:
 
     Attributes:
         effect: its id.
-        channel: where it acts most, compared with what the model leaves: `x`, `y` or `w`.
+        channel: where it moves the prediction most, a radian as a metre: `x`, `y` or `w`.
         variable: key of `VARIABLES`; against `SINCE_STEP` the residual is divided by the height of the step.
         explained: share of the mean square of what the effect does that is a function of the variable.
         value: middle of every bin, shape (k,).
@@ -263,18 +263,19 @@ def _bin(values: Floats, block: Integers, scale: Floats | None = None) -> _Bins:
 def _find_one(
     name: str, curve: Floats, after: Floats, by_channel: Sequence[Mapping[str, _Bins]], block: Integers
 ) -> Signature | None:
-    """The signature in the channel, and along the variable, where the effect shows most."""
-    centre = np.median(after, axis=0)
-    left = np.maximum(1.4826 * np.median(np.abs(after - centre), axis=0), 1e-6)
-    best, found = 0.0, None
-    for channel, bins in enumerate(by_channel):
+    """The signature in the channel, and along the variable, where the effect shows most.
+
+    Yaw rates count as the speed of a point one metre away, as in the modulus of slip.
+    """
+    best, found = _NOTHING, None
+    for channel, known in enumerate(by_channel):
         size = float(np.sqrt((curve[:, channel] ** 2).mean()))
-        if size < _NOTHING:
+        if size <= best:
             continue
-        shares = {key: bins[key].explain(curve[:, channel]) for key in VARIABLES}
+        shares = {key: known[key].explain(curve[:, channel]) for key in VARIABLES}
         most = max(shares.values())
-        if size / left[channel] * most > best:
-            best = float(size / left[channel] * most)
+        if size * most > best:
+            best = size * most
             variable = next(key for key, share in shares.items() if share >= (1.0 - _NEARLY) * most)
             found = channel, variable, shares[variable]
     if found is None:
@@ -282,8 +283,10 @@ def _find_one(
     channel, variable, explained = found
     bins = by_channel[channel][variable]
     # Outliers of the recording are held to six robust standard deviations.
-    limit = _CLIP * left[channel]
-    rest = np.clip(after[:, channel], centre[channel] - limit, centre[channel] + limit)[bins.inside]
+    rest = after[:, channel]
+    centre = float(np.median(rest))
+    limit = _CLIP * 1.4826 * float(np.median(np.abs(rest - centre))) + _NOTHING
+    rest = np.clip(rest, centre - limit, centre + limit)[bins.inside]
     own = curve[bins.inside, channel]
     return Signature(
         effect=name,

@@ -26,8 +26,8 @@ class Section(Enum):
     GLANCE = "glance"
     HOW_BAD = "how-bad"
     WHERE = "where"
-    WHY = "why"
     EFFECT = "effect"
+    WHY = "why"
 
 
 class Width(Enum):

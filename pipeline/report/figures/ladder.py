@@ -72,7 +72,8 @@ def _name_bound(name: str) -> alt.Chart:
         dy=alt.expr("datum.raised ? -22 : -8"),
         fontSize=11,
     )
-    return mark.encode(x=alt.X("t:Q"), y=alt.value(0), text="label:N")
+    named: alt.Chart = mark.encode(x=alt.X("t:Q"), y=alt.value(0), text="label:N")
+    return named
 
 
 def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
