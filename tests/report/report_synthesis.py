@@ -6,8 +6,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.report import RunReport
 from pipeline.identification.signature import SINCE_STEP, Signature
+from pipeline.report import RunReport
 from pipeline.report.figures import list_figures
 from pipeline.report.motion_view import MotionView
 from pipeline.report.run import mapping_in, objects_in

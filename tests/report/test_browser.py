@@ -171,9 +171,9 @@ def test_the_strip_of_the_whole_run_chooses_what_is_drawn_large(tmp_path: Path) 
     try:
         chrome.size(LAPTOP, 900)
         chrome.open((tmp_path / "page.html").as_uri())
-        chrome.wait("document.documentElement.dataset.drawn === 'yes'")
-        labels = "[...document.querySelectorAll('[data-figure={}] .role-axis-label text')].map((one) => one.textContent)"
-        large, whole = labels.format("velocities"), labels.format("navigator")
+        chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
+        words = "[...document.querySelectorAll('[data-figure={}] .role-axis-label text')].map((t) => t.{})"
+        large, whole = (words.format(name, "textContent") for name in ("velocities", "navigator"))
         first = chrome.run(large)
         strip = chrome.run(whole)
         chrome.drag("[data-figure=navigator]", (0.5, 0.3), (0.75, 0.3))

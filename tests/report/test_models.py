@@ -8,10 +8,10 @@ import pytest
 from report_synthesis import make_report
 
 from pipeline.identification import Input, Problem, State, predict
+from pipeline.identification.correlation import autocorrelate, cross_correlate
 from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.models.model_text import format_model
 from pipeline.report.diagnosed import read_model_text
-from pipeline.identification.correlation import autocorrelate, cross_correlate
 from pipeline.report.figures.budget import list_parts
 from pipeline.report.figures.ladder import list_rungs
 from pipeline.report.figures.residuals import choose_signal

@@ -288,7 +288,7 @@ def test_a_missing_or_empty_table_costs_only_its_figures(
     drawn = {str(found["data-figure"]) for _, found in outline.tags if "data-figure" in found}
     lost: dict[str, set[str]] = {
         "velocities": {"trajectory"},
-        "slip": {"modulus", "distribution", "command_space", "step_response"},
+        "slip": {"modulus", "distribution", "command_space", "navigator", "step_response"},
         "windows": {"window_norms"},
         "aggregates": {"split"},
         "findings": set(),

@@ -10,11 +10,12 @@ from pipeline.identification.correlation import FEWEST, LONGEST_S, cross_correla
 from pipeline.report.figures.autocorrelation import draw_correlations, tabulate_correlations
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
 from pipeline.report.figures.residuals import QUANTITIES
-from pipeline.report.motion_view import SIGNALS
 
 if TYPE_CHECKING:
     from pipeline.report.motion_view import MotionView
     from pipeline.report.scene import Scene
+
+_WORDS = {"f_x": "speed", "f_y": "sideways speed", "f_w": "yaw rate", "f_x_f_w": "speed \u00d7 yaw rate"}
 
 
 def draw_crosscorrelation(scene: Scene) -> Drawing | None:
@@ -23,7 +24,7 @@ def draw_crosscorrelation(scene: Scene) -> Drawing | None:
     if not rows or motion is None:
         return None
     inputs = choose_inputs(motion)
-    titles = {one: f"{QUANTITIES[one][0]} residual with {SIGNALS[inputs[one]][0]} [1]" for one in inputs}
+    titles = {one: f"{QUANTITIES[one][0]} residual with {_WORDS[inputs[one]]} [1]" for one in inputs}
     axis = (-LONGEST_S, "how long before the residual the input was [s]")
     note = "Grey: where 95 % of residuals stay that know nothing of the input. Right of zero it is the past."
     return Drawing(draw_correlations(scene, "crosscorrelation", titles, axis), rows, note)
