@@ -42,6 +42,7 @@ def render_report(report: RunReport) -> str:
         "report/templates/run.html",
         [picture for pictures in drawn.values() for picture in pictures],
         title=report.text("run") or "run",
+        catalogue=report.catalogue,
         facts=_list_facts(page),
         strip=summarise_health(report),
         sections=[(section, section.view(page)) for section in SECTIONS],

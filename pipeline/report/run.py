@@ -27,6 +27,7 @@ class RunReport:
         diagnosis: the JSON object of one run of ``slip diagnose --json``; empty where there is none.
         motion: a model of the run; None where there is none.
         peers: median slip moduli [m/s] of comparable runs by input; empty where there are none.
+        catalogue: address of the page over all runs, seen from the report; empty where there is none.
     """
 
     summary: Mapping[str, object]
@@ -34,6 +35,7 @@ class RunReport:
     diagnosis: Mapping[str, object] = field(default_factory=dict)
     motion: MotionView | None = None
     peers: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    catalogue: str = ""
 
     def table(self, name: str) -> pl.DataFrame | None:
         """A table that has rows, or None."""

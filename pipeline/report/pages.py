@@ -1,0 +1,52 @@
+"""The pages over all runs of a results folder, and the links between them: only to those that are there."""
+
+from __future__ import annotations
+
+import html
+import re
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pipeline.store import Store
+
+CATALOGUE = "index.html"
+PAGES = {
+    CATALOGUE: "All runs",
+    "comparison.html": "Compare",
+    "causes.html": "Causes",
+    "trend.html": "Trends",
+    "map.html": "Map",
+}
+_PLACE = re.compile(r'(<nav id="pages"[^>]*>).*?(</nav>)', re.DOTALL)
+
+
+def write_page(store: Store, name: str, page: str) -> Path:
+    """Write one of `PAGES`, and link it and those that are there to each other.
+
+    Raises:
+        StoreError: the disk refuses.
+    """
+    path = store.root / name
+    if not path.is_file():
+        # A new page: the others are to know of it.
+        path = store.write_results_text(name, page)
+        for other in (other for other in PAGES if other != name and (store.root / other).is_file()):
+            text = (store.root / other).read_text(encoding="utf-8")
+            store.write_results_text(other, _link(store, other, text))
+    return store.write_results_text(name, _link(store, name, page))
+
+
+def lead_up(run: str) -> str:
+    """The address of the catalogue seen from the report of a run."""
+    return "../" * (run.count("/") + 3) + CATALOGUE
+
+
+def _link(store: Store, name: str, page: str) -> str:
+    links = "".join(
+        f"<b>{title}</b>" if other == name else f'<a href="{html.escape(other)}">{title}</a>'
+        for other, title in PAGES.items()
+        if other == name or (store.root / other).is_file()
+    )
+    return _PLACE.sub(lambda found: found[1] + links + found[2], page, count=1)
