@@ -200,7 +200,7 @@ def _find_steps(signal: Floats) -> tuple[Integers, Floats]:
 
 @dataclass(frozen=True)
 class _Bins:
-    """A variable in bins of equal width with enough windows in enough blocks.
+    """A variable in bins of equal width, neighbours joined until each has windows of enough blocks.
 
     Attributes:
         inside: windows in any of them, shape (n,).
@@ -243,21 +243,41 @@ class _Bins:
 
 
 def _bin(values: Floats, block: Integers, scale: Floats | None = None) -> _Bins:
-    """A variable in bins; windows where it is NaN, and lone extremes, are left out or held to its ends."""
+    """A variable in bins; windows where it is NaN are left out, lone extremes stand in the outer bins."""
     number = np.full(values.size, -1, dtype=np.int64)
     known = np.isfinite(values)
     low, high = np.quantile(values[known], (0.005, 0.995)).tolist() if known.any() else (0.0, 0.0)
     if high - low > _NOTHING:
         place = np.clip(((values[known] - low) / (high - low) * _BINS).astype(np.int64), 0, _BINS - 1)
         width = int(block.max()) + 1
-        blocks = np.bincount(np.unique(place * width + block[known]) // width, minlength=_BINS)
-        filled = (np.bincount(place, minlength=_BINS) >= _FEWEST) & (blocks >= _FEWEST_BLOCKS)
-        number[known] = np.where(filled, np.cumsum(filled) - 1, -1)[place]
+        met = np.zeros((_BINS, width), dtype=np.int64)
+        np.add.at(met, (place, block[known]), 1)
+        number[known] = _merge(met)[place]
     inside = number >= 0
     number = number[inside]
     scale = np.ones(number.size) if scale is None else scale[inside]
     middle = np.bincount(number, values[inside]) / np.maximum(np.bincount(number), 1)
     return _Bins(inside, number, scale, middle)
+
+
+def _merge(met: Integers) -> Integers:
+    """Neighbours of bins with too few windows, or windows of too few blocks, joined to them.
+
+    Args:
+        met: windows by bin and block, shape (bins, blocks).
+
+    Returns:
+        New number of every bin, shape (bins,).
+    """
+    number, together = np.zeros(met.shape[0], dtype=np.int64), np.zeros(met.shape[1], dtype=np.int64)
+    for place, row in enumerate(met):
+        if together.sum() >= _FEWEST and np.count_nonzero(together) >= _FEWEST_BLOCKS:
+            number[place:] += 1
+            together = np.zeros_like(together)
+        together = together + row
+    if together.sum() < _FEWEST or np.count_nonzero(together) < _FEWEST_BLOCKS:
+        number = np.minimum(number, max(int(number[-1]) - 1, 0))
+    return number
 
 
 def _find_one(
