@@ -38,6 +38,11 @@ def write_page(store: Store, name: str, page: str) -> Path:
     return store.write_results_text(name, _link(store, name, page))
 
 
+def is_page(place: str) -> bool:
+    """Whether a place in a results folder, as `runs/a/b/report.html`, is that of a page."""
+    return place in PAGES or (place.startswith("runs/") and place.endswith("/report.html"))
+
+
 def lead_up(run: str) -> str:
     """The address of the catalogue seen from the report of a run."""
     return "../" * (run.count("/") + 3) + CATALOGUE
