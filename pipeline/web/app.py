@@ -139,7 +139,9 @@ class Web:
         place, root = request.scope["path"].removeprefix("/"), self._sessions.results.resolve()
         path = (root / place).resolve()
         if not (is_page(place) and path.is_relative_to(root) and path.is_file()):
-            raise WorkbenchError("no_page", "there is no such page in the results", where=place)
+            raise WorkbenchError(
+                "no_page", "the results have no such page", where=place, hint="Open / for the workbench."
+            )
         headers = {"content-security-policy": _REPORT_POLICY}
         return FileResponse(path, media_type="text/html", headers=headers)
 
