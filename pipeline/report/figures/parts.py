@@ -107,8 +107,14 @@ def name_bars(rows: str, name: str) -> NamedBars:
     words = base.transform_calculate(words=f"datum.{name} + '  \u00b7  ' + datum.told")
     return NamedBars(
         bars=base.mark_bar(size=_BAR, yOffset=_BAR_BELOW, clip=True),
-        ticks=base.mark_tick(
-            orient="vertical", color=theme.INK, thickness=1.5, size=_BAR + 3, yOffset=_BAR_BELOW
+        ticks=base.mark_point(
+            shape="stroke",
+            angle=90,
+            size=(_BAR + 3) ** 2,
+            stroke=theme.INK,
+            strokeWidth=1.5,
+            opacity=1,
+            yOffset=_BAR_BELOW,
         ),
         rules=base.mark_rule(color=theme.INK, strokeWidth=1.2, yOffset=_BAR_BELOW, y2Offset=_BAR_BELOW),
         words=words.mark_text(align="left", dy=_WORDS_ABOVE, fontSize=12).encode(
