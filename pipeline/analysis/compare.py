@@ -101,7 +101,7 @@ def compare_results(store: Store, question: Question) -> Answer:
             where=str(store.root),
             hint="Analyze logs first: slip analyze LOG... --out RESULTS --terrain NAME.",
         )
-    chosen = question.input or choose_input(runs)
+    chosen = question.input or _choose_input(runs)
     runs = add_measures(runs, measure_difficulty(_scan_slip(compared), _describe_vehicles(compared, runs)))
     quantity = "median_modulus"
     if question.as_published:
@@ -158,12 +158,7 @@ def _agree_on_scale(
     return compared, runs.filter(pl.col("run").is_in(kept)), [NOT_VALID]
 
 
-def choose_input(runs: pl.DataFrame) -> str:
-    """What u is unless somebody asks: the command where every run has one, else the measured wheels.
-
-    Args:
-        runs: ``run input``, one row a run and input.
-    """
+def _choose_input(runs: pl.DataFrame) -> str:
     on_command = runs.filter(pl.col("input") == "command")["run"].n_unique()
     return "command" if on_command == runs["run"].n_unique() else "measured"
 

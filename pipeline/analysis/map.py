@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.analysis.compare import choose_input
 from pipeline.analysis.compared_runs import find_material
 from pipeline.fleet import add_measures, gather_runs, measure_difficulty, pool_runs
 from pipeline.fleet.deployments import find_own_table, read_deployments
@@ -29,7 +28,6 @@ class DeploymentMap:
         points: those that can be placed.
         own: own datasets that can be placed.
         keys: run/generation of the runs of every own dataset.
-        input: what u is in the slip of own datasets, as in `slip compare`; empty without any.
         notes: what is not on the map, and why.
     """
 
@@ -38,11 +36,10 @@ class DeploymentMap:
     own: pl.DataFrame
     keys: tuple[str, ...]
     notes: tuple[str, ...]
-    input: str
 
 
 def draw_up_map(store: Store, table: Path | None = None) -> DeploymentMap:
-    """Place the literature and the results' datasets, whose slip is that of `slip compare`.
+    """Place the literature and the results' datasets (slip on the measured wheels where there are any).
 
     Args:
         store: the results; may be empty.
@@ -53,13 +50,12 @@ def draw_up_map(store: Store, table: Path | None = None) -> DeploymentMap:
     """
     deployments = read_deployments(table or find_own_table())
     compared = find_material(store, ("dataset",), trusted_only=True)
-    datasets, chosen_input = pl.DataFrame(), ""
+    datasets = pl.DataFrame()
     if compared.manifests:
         names = list(compared.manifests)
         runs = gather_runs(
             compared.scan("aggregates").filter(pl.col("run").is_in(names)).collect(), compared.labels
         )
-        chosen_input = choose_input(runs)
         scales = runs.unique("run").select("run", "length_scale")
         vehicles = compared.labels.select("run", "mass", "inertia").join(scales, on="run")
         slip = compared.scan("slip").filter(pl.col("run").is_in(names))
@@ -67,14 +63,12 @@ def draw_up_map(store: Store, table: Path | None = None) -> DeploymentMap:
     own, notes = _empty_own(), list(compared.notes)
     keys: tuple[str, ...] = ()
     if not datasets.is_empty():
-        first = pl.col("input") == chosen_input
-        chosen = datasets.sort(first, descending=True).unique("dataset", keep="first").sort("dataset")
-        others = chosen.filter(~first)["dataset"].to_list()
-        notes += [f"slip on the other input, for want of this one: {', '.join(others)}"] if others else []
+        # On measured wheels, slip is what the ground did; the drivetrain's share would move with the command.
+        chosen = datasets.sort("input", descending=True).unique("dataset", keep="first").sort("dataset")
         own, told = place_datasets(chosen)
         notes += told
         keys = tuple(f"{row['dataset']}: {row['keys']}" for row in chosen.iter_rows(named=True))
-    return DeploymentMap(deployments, place_deployments(deployments), own, keys, tuple(notes), chosen_input)
+    return DeploymentMap(deployments, place_deployments(deployments), own, keys, tuple(notes))
 
 
 def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None = None) -> Path:
@@ -82,14 +76,7 @@ def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None =
     from pipeline.report.deployments import picture_map, render_map  # noqa: PLC0415 - heavy
     from pipeline.report.pages import write_page  # noqa: PLC0415 - heavy
 
-    page = render_map(
-        drawn.deployments,
-        drawn.points,
-        drawn.own,
-        input_name=drawn.input,
-        notes=drawn.notes,
-        keys=drawn.keys,
-    )
+    page = render_map(drawn.deployments, drawn.points, drawn.own, notes=drawn.notes, keys=drawn.keys)
     path = write_page(store, "map.html", page)
     if figures:
         from pipeline.report.export import write_pictures  # noqa: PLC0415 - heavy

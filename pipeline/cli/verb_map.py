@@ -57,14 +57,11 @@ def draw(  # noqa: D417 - arguments document themselves
             {
                 "deployments": drawn.points.to_dicts(),
                 "datasets": drawn.own.to_dicts(),
-                "input": drawn.input or None,
                 "notes": list(drawn.notes),
                 "page": str(page),
             }
         )
     elif not quiet:
-        if drawn.input:
-            print_lines([f"slip on {drawn.input.replace('measured', 'measured wheels')}, as in slip compare"])
         print_lines(
             f"{row['dataset']:<34}{row['energy']:>10.3g} J   complexity {row['complexity']:.1f}   "
             f"slip {row['slip']:.3g} m/s   {row['zone']} risk"

@@ -9,7 +9,6 @@ import polars as pl
 from pipeline.report.deployments.figure import draw_map, number_datasets
 from pipeline.report.elements import Cell, Column, Picture, Table
 from pipeline.report.page import render_figures
-from pipeline.report.run import INPUT_WORDS
 from pipeline.report.words import say_number
 
 if TYPE_CHECKING:
@@ -46,7 +45,6 @@ def render_map(
     points: pl.DataFrame,
     own: pl.DataFrame,
     *,
-    input_name: str,
     notes: Sequence[str],
     keys: Sequence[str],
 ) -> str:
@@ -56,12 +54,10 @@ def render_map(
         deployments: the table of deployments.
         points: as of `place_deployments`.
         own: as of `place_datasets`.
-        input_name: what u is in their slip; empty without any.
         notes: what must be known.
         keys: run/generation of the runs counted, one text a dataset.
     """
     facts = [f"{deployments.height} deployments", f"{points.height} on the map", f"{own.height} own datasets"]
-    facts += [f"slip {INPUT_WORDS[input_name]}"] if input_name else []
     return render_figures(
         "report/templates/map.html",
         [picture_map(points, own)],
