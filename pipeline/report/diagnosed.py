@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.identification import Problem, State, choose_input
-from pipeline.identification.signature import find_signatures
 from pipeline.models import Timing
 from pipeline.models.model_file import parse_model
 from pipeline.report.motion_view import MotionStage, MotionView
@@ -53,8 +51,7 @@ def view_diagnosis(
     state = State(file.model.effects, (Timing(file.find_wheel_delay(run.name)),))
     places = tables["velocities"].select("t", "x", "y").sort("t") if "velocities" in tables else None
     floor = mapping_in(diagnosis, "noise_floor")
-    view = MotionStage(problem, places).view(state, objects_in(diagnosis, "ladder"), floor or None)
-    return replace(view, signatures=find_signatures(problem, state))
+    return MotionStage(problem, places).view(state, objects_in(diagnosis, "ladder"), floor or None)
 
 
 def read_model_text(diagnosis: Mapping[str, object]) -> ModelFile | None:

@@ -15,7 +15,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.identification import fit_model, predict_from
-from pipeline.identification.signature import VARIABLES, measure_variables
+from pipeline.identification.signature import VARIABLES, find_signatures, measure_variables
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -50,7 +50,7 @@ class MotionView:
         reach: one row a prediction of two seconds: ``t piece ideal model`` [m], ``ideal_yaw model_yaw``
             [rad].
         arcs: predicted paths, one every few seconds: ``t piece x y`` in the map.
-        signatures: what each of the effects does, and what the run shows of it; empty where nobody asked.
+        signatures: what each of the effects does, and what the run shows of it.
     """
 
     input: str
@@ -125,6 +125,7 @@ class MotionStage:
             velocity=self._draw_velocity(state),
             reach=self._gather_reach(comparison.find_horizon_errors(effects, timing)),
             arcs=self._draw_arcs(state),
+            signatures=find_signatures(self.problem, state),
         )
 
     def _draw_velocity(self, state: State) -> pl.DataFrame:
