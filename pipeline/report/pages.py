@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import html
+import os
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import quote
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pipeline.store import Store
 
 CATALOGUE = "index.html"
@@ -28,10 +29,9 @@ def write_page(store: Store, name: str, page: str) -> Path:
     Raises:
         StoreError: the disk refuses.
     """
-    path = store.root / name
-    if not path.is_file():
+    if not (store.root / name).is_file():
         # A new page: the others are to know of it.
-        path = store.write_results_text(name, page)
+        store.write_results_text(name, page)
         for other in (other for other in PAGES if other != name and (store.root / other).is_file()):
             text = (store.root / other).read_text(encoding="utf-8")
             store.write_results_text(other, _link(store, other, text))
@@ -46,6 +46,14 @@ def is_page(place: str) -> bool:
 def lead_up(run: str) -> str:
     """The address of the catalogue seen from the report of a run."""
     return "../" * (run.count("/") + 3) + CATALOGUE
+
+
+def lead_to(results: Path, folder: Path) -> str:
+    """The address of the catalogue seen from a folder anywhere; empty where there is none."""
+    page = results / CATALOGUE
+    if not page.is_file():
+        return ""
+    return quote(Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix())
 
 
 def _link(store: Store, name: str, page: str) -> str:

@@ -11,6 +11,7 @@ from pipeline.analysis.analyze import update_datasets
 from pipeline.analysis.map import draw_up_map, write_map
 from pipeline.analysis.trend import follow_trend, write_trend
 from pipeline.batch.ledger import Entry, Ledger
+from pipeline.report.pages import lead_to
 from pipeline.store import Store, see_log
 
 if TYPE_CHECKING:
@@ -44,6 +45,13 @@ def test_pages_link_to_those_that_are_there_and_back(tmp_path: Path) -> None:
     update_datasets(store)
     assert links_of(tmp_path / "index.html") == ["trend.html", "map.html"]
     assert links_of(tmp_path / "trend.html") == ["index.html", "map.html"]
+
+
+def test_a_page_elsewhere_leads_to_the_catalogue_that_is_there(tmp_path: Path) -> None:
+    assert lead_to(tmp_path / "none", tmp_path) == ""
+    make_results(tmp_path / "my results")
+    address = lead_to(tmp_path / "my results", tmp_path / "plans" / "one")
+    assert address == "../../my%20results/index.html"
 
 
 def test_the_catalogue_leads_to_reports_alone_and_says_why_a_log_has_no_run(tmp_path: Path) -> None:
