@@ -101,9 +101,9 @@ mysteries: $(VENV)/.ready-dev ## make the mystery logs in data_samples again, an
 platforms: $(VENV)/.ready-dev ## what comes of logs as popular platforms publish them [ARGS="turtlebot4 panther"]
 	@$(BIN)/python benchmarks/platforms.py $$ARGS
 
-reveal: $(VENV)/.ready-dev ## LOG=data_samples/mystery_1.mcap: open the seal of a mystery log
+reveal: $(VENV)/.ready ## LOG=data_samples/mystery_1.mcap: open the seal of a mystery log, beside the guess [OUT=results]
 	@[ -n "$$LOG" ] || { echo "Say which log: make reveal LOG=data_samples/mystery_1.mcap" >&2; exit 2; }
-	@$(BIN)/python benchmarks/hidden/mystery.py open "$${LOG%.mcap}.sealed"
+	@$(BIN)/python benchmarks/hidden/mystery.py reveal "$$LOG" "$$OUT"
 
 bench: bench-reader bench-analyze bench-batch bench-export bench-workbench ## all benchmarks but that on the real recordings
 

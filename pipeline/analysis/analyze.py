@@ -171,12 +171,13 @@ def _write_outputs(
     if options.report or options.figures:
         # Drawing is most of the start-up time; who wants neither does not pay for it.
         from pipeline.report import RunReport, render_report, view_diagnosis  # noqa: PLC0415
+        from pipeline.report.pages import lead_up  # noqa: PLC0415
 
         progress("report")
         tables = {name: generation.read_table(name) for name in generation.table_names}
         motion = view_diagnosis(tables, work.vehicle, diagnosis or {})
         peers = find_peers(Store(options.out), summary)
-        report = RunReport(summary, tables, diagnosis or {}, motion, peers)
+        report = RunReport(summary, tables, diagnosis or {}, motion, peers, lead_up(work.run))
         if options.report:
             generation.write_text(REPORT, render_report(report))
         if options.figures:
@@ -226,7 +227,7 @@ def _read_summary(manifest: Manifest, options: Options) -> dict[str, JSON]:
 
 
 def update_datasets(store: Store) -> None:
-    """Pool the runs of the results into `datasets.parquet`; equal content counts once.
+    """Write the catalogue, and pool the runs into `datasets.parquet`; equal content counts once.
 
     What only `slip compare` works out is null until it is asked for.
     """
@@ -234,7 +235,10 @@ def update_datasets(store: Store) -> None:
 
     from pipeline.analysis.compared_runs import find_material  # noqa: PLC0415 - heavy
     from pipeline.fleet import gather_runs, pool_runs  # noqa: PLC0415 - heavy
+    from pipeline.report.catalogue import render_catalogue  # noqa: PLC0415 - heavy
+    from pipeline.report.pages import CATALOGUE, write_page  # noqa: PLC0415 - heavy
 
+    write_page(store, CATALOGUE, render_catalogue(store))
     compared = find_material(store, ("dataset",), trusted_only=False, tables=("aggregates",))
     if not compared.manifests and not compared.notes:
         return

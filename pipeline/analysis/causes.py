@@ -164,6 +164,7 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
         figures: also write the figure to `figures/` in this format.
     """
     from pipeline.report.causes import draw_causes, render_causes  # noqa: PLC0415 - heavy
+    from pipeline.report.pages import write_page  # noqa: PLC0415 - heavy
 
     written = {}
     for name, frame in (
@@ -180,7 +181,7 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
         causes.budgets, causes.differences, input_name=causes.input, sentences=sentences, names=causes.names,
         notes=causes.notes, keys=causes.keys,
     )  # fmt: skip
-    written["causes.html"] = store.write_results_text("causes.html", page)
+    written["causes.html"] = write_page(store, "causes.html", page)
     if figures:
         from pipeline.report.export import write_pictures  # noqa: PLC0415 - heavy
 

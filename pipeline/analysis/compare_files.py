@@ -28,6 +28,7 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
         The files by name.
     """
     from pipeline.report.comparison import list_pictures, render_comparison  # noqa: PLC0415 - heavy
+    from pipeline.report.pages import write_page  # noqa: PLC0415 - heavy
 
     store.write_results_table("datasets", answer.datasets)
     store.write_results_table("comparisons", answer.comparisons)
@@ -46,7 +47,7 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
         intervals=answer.intervals,
         windows=answer.windows,
     )
-    written["comparison.html"] = store.write_results_text("comparison.html", page)
+    written["comparison.html"] = write_page(store, "comparison.html", page)
     if figures:
         from pipeline.report.export import write_pictures  # noqa: PLC0415 - heavy
 

@@ -74,9 +74,10 @@ def draw_up_map(store: Store, table: Path | None = None) -> DeploymentMap:
 def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None = None) -> Path:
     """Write `map.html`, and the figure for papers where a format is given; the path of the page."""
     from pipeline.report.deployments import picture_map, render_map  # noqa: PLC0415 - heavy
+    from pipeline.report.pages import write_page  # noqa: PLC0415 - heavy
 
     page = render_map(drawn.deployments, drawn.points, drawn.own, notes=drawn.notes, keys=drawn.keys)
-    path = store.write_results_text("map.html", page)
+    path = write_page(store, "map.html", page)
     if figures:
         from pipeline.report.export import write_pictures  # noqa: PLC0415 - heavy
 

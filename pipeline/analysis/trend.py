@@ -110,10 +110,11 @@ def _note_gaps(series: Sequence[Series], parameters: pl.DataFrame, runs: Mapping
 
 def write_trend(store: Store, trend: Trend) -> Path:
     """Write `trend.html`; its path."""
+    from pipeline.report.pages import write_page  # noqa: PLC0415 - heavy
     from pipeline.report.trend import render_trend  # noqa: PLC0415 - heavy
 
     page = render_trend(trend.series, trend.alerts, notes=trend.notes, keys=trend.keys)
-    return store.write_results_text("trend.html", page)
+    return write_page(store, "trend.html", page)
 
 
 def describe_trend(trend: Trend) -> dict[str, object]:

@@ -14,7 +14,7 @@ _NOTE = "all runs"
 POOLED = ("datasets.parquet", "index.html")
 """Files over all runs."""
 _MOST_ROUNDS = 20
-_VERSION = 1
+_VERSION = 2
 """Raised by whoever changes how the pools are made."""
 
 
@@ -63,20 +63,19 @@ def refresh_remote_pools(mirror: Mirror) -> None:
 
 
 def _hash_runs(store: Store) -> str:
-    """What the pools depend on: the runs there are, and what is made of them."""
+    """What the pools depend on: the runs there are, logs without one, and what is made of them."""
     # The contracts bring a table library along, which help and usage errors do without.
+    from pipeline.report.catalogue import list_failed  # noqa: PLC0415
     from schemas import contract_of  # noqa: PLC0415
 
     runs = [[manifest.run, manifest.key, manifest.folder.name] for manifest in store.survey().manifests]
-    return hash_json([_VERSION, contract_of("datasets").version, runs])
+    return hash_json([_VERSION, contract_of("datasets").version, runs, list_failed(store)])
 
 
 def _write_pools(store: Store) -> None:
     # A batch with nothing to do needs none of these.
     from pipeline.analysis.analyze import update_datasets  # noqa: PLC0415
     from pipeline.analysis.fleet import update_fleet  # noqa: PLC0415
-    from pipeline.batch.catalogue import render_catalogue  # noqa: PLC0415
 
     update_datasets(store)
     update_fleet(store)
-    store.write_results_text("index.html", render_catalogue(store))

@@ -126,9 +126,10 @@ def plan(  # noqa: D417 - the runs document themselves
         made = make_plan(knowledge, questions, request)
         files: tuple[Path, ...] = ()
         if made.manoeuvres:
+            from pipeline.report.pages import lead_to  # noqa: PLC0415 - heavy
             from pipeline.report.plan import render_plan  # noqa: PLC0415 - heavy
 
-            files = write_plan(made, out, render_plan(made))
+            files = write_plan(made, out, render_plan(made, lead_to(results, out)))
     except SlipError as error:
         print_error(error)
         if json:

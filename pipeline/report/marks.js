@@ -15,6 +15,7 @@ const slipMarks = (parts, { marked = () => {} } = {}) => {
 
   // The rows of what is marked, for `slipPlots`.
   const own = (name) => {
+    if (name === "shown_span" && zoom) return [{ t_start: zoom[0], t_end: zoom[1] }];
     if (name === "marked_spans") return spans.filter((span) => !fillsView(span)).map((span) => ({ ...span }));
     if (name === "marked_points") return points.map((point) => ({ ...point }));
     return null;
@@ -90,7 +91,22 @@ const slipMarks = (parts, { marked = () => {} } = {}) => {
   const setZoom = (domain) => {
     zoom = domain;
     tell();
+    feedShown();
     redraw();
+  };
+
+  const feedShown = () => {
+    for (const { view, names } of plots?.views.values() ?? [])
+      if (names.has("shown_span")) view.data("shown_span", plots.rowsOf("shown_span")).runAsync();
+  };
+
+  // The stretch that is drawn large moves by half of itself, within the strip that shows the whole run.
+  const shiftShown = (view, side) => {
+    const [shown] = plots.rowsOf("shown_span");
+    const [low, high] = view.scale("x").domain();
+    const length = shown.t_end - shown.t_start;
+    const start = Math.min(Math.max(shown.t_start + (side * length) / 2, low), Math.max(high - length, low));
+    setZoom([start, start + length]);
   };
 
   const findPanel = (view) => {
@@ -117,16 +133,25 @@ const slipMarks = (parts, { marked = () => {} } = {}) => {
     const brush = drawn?.meta.brush;
     if (!brush || event.button !== 0 || (brush === "plane" && event.pointerType === "touch")) return;
     const { view, meta } = drawn;
+    const before = zoom;
     const first = { px: event.clientX, py: event.clientY, ...locate(place, view, event) };
     const firstY = brush === "plane" ? first.y() : 0;
     let box = null;
     place.setPointerCapture(event.pointerId);
     const move = (now) => {
-      if (Math.abs(now.clientX - first.px) < 4 && !box && brush === "time") return;
+      if (Math.abs(now.clientX - first.px) < 4 && !box && brush !== "plane") return;
       const here = locate(place, view, now);
       if (brush === "time") {
         box = true;
         markTime(first.x, here.x);
+        return;
+      }
+      if (brush === "zoom") {
+        box = true;
+        const [low, high] = view.scale("x").domain();
+        const ends = [first.x, here.x].map((t) => Math.min(Math.max(t, low), high)).sort((a, b) => a - b);
+        zoom = ends[1] > ends[0] ? ends : before;
+        feedShown();
         return;
       }
       if (!box) {
@@ -147,7 +172,8 @@ const slipMarks = (parts, { marked = () => {} } = {}) => {
     const stop = () => {
       drag.abort();
       if (box instanceof Element) box.remove();
-      if (!box) clear();
+      if (brush === "zoom") setZoom(zoom);
+      else if (!box) clear();
     };
     for (const [name, act] of [["pointermove", move], ["pointerup", stop], ["pointercancel", stop]])
       place.addEventListener(name, act, { signal: drag.signal });
@@ -163,6 +189,13 @@ const slipMarks = (parts, { marked = () => {} } = {}) => {
       if (!brush) continue;
       place.classList.add(`brush-${brush}`);
       place.addEventListener("pointerdown", (event) => startDrag(place, event));
+      if (brush !== "zoom") continue;
+      place.tabIndex = 0;
+      place.addEventListener("keydown", (event) => {
+        const side = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+        const drawn = plots.views.get(place.dataset.figure);
+        if (side && drawn) shiftShown(drawn.view, side);
+      });
     }
   };
 

@@ -15,27 +15,19 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.identification import fit_model, predict_from
-from pipeline.models import Timing
+from pipeline.identification.signature import VARIABLES, find_signatures, measure_variables
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.identification import Fitted, Problem, State
     from pipeline.identification.comparison import HorizonErrors
+    from pipeline.identification.signature import Signature
 
 Floats = NDArray[np.float64]
 
 COMPONENTS = ("x", "y", "w")
-SIGNALS = {
-    "f_x": ("ideal speed", "m/s"),
-    "f_y": ("ideal sideways speed", "m/s"),
-    "f_w": ("ideal yaw rate", "rad/s"),
-    "f_x_f_w": ("ideal speed times ideal yaw rate", "m/s²"),
-    "a_x": ("change of ideal speed", "m/s²"),
-    "a_w": ("change of ideal yaw rate", "rad/s²"),
-    "roll": ("roll", "rad"),
-    "pitch": ("pitch", "rad"),
-}
+SIGNALS = {name: VARIABLES[name] for name in ("f_x", "f_y", "f_w", "f_x_f_w", "a_x", "a_w", "roll", "pitch")}
 
 _ARC_EVERY_S = 4.0
 _ARC_RATE_HZ = 10.0
@@ -58,6 +50,7 @@ class MotionView:
         reach: one row a prediction of two seconds: ``t piece ideal model`` [m], ``ideal_yaw model_yaw``
             [rad].
         arcs: predicted paths, one every few seconds: ``t piece x y`` in the map.
+        signatures: what each of the effects does, and what the run shows of it.
     """
 
     input: str
@@ -68,6 +61,7 @@ class MotionView:
     velocity: pl.DataFrame
     reach: pl.DataFrame
     arcs: pl.DataFrame
+    signatures: Sequence[Signature] = ()
 
 
 class MotionStage:
@@ -97,32 +91,8 @@ class MotionStage:
 
     @cached_property
     def _signals(self) -> dict[str, Floats]:
-        comparison = self._comparison
-        cells, around = comparison.cells, comparison.context
-        velocity = comparison.predict_velocity((), Timing())
-        times, span = comparison.windows.times, comparison.windows.span_s
-        edges = cells.locate_edges(times.ravel())
-        index = np.arange(cells.times.size + 1, dtype=np.float64)
-        middle = times.mean(axis=1)
-
-        def average(signal: Floats) -> Floats:
-            sums = np.interp(edges, index, cells.sum_up(signal)).reshape(times.shape)
-            return np.asarray((sums[:, 1] - sums[:, 0]) / span, dtype=np.float64)
-
-        def slope(signal: Floats) -> Floats:
-            ends = np.interp(times.ravel(), cells.times, signal).reshape(times.shape)
-            return np.asarray((ends[:, 1] - ends[:, 0]) / span, dtype=np.float64)
-
-        return {
-            "f_x": average(velocity.x),
-            "f_y": average(velocity.y),
-            "f_w": average(velocity.w),
-            "f_x_f_w": average(velocity.x * velocity.w),
-            "a_x": slope(velocity.x),
-            "a_w": slope(velocity.w),
-            "roll": np.interp(middle, around.times, around.attitude[:, 0]),
-            "pitch": np.interp(middle, around.times, around.attitude[:, 1]),
-        }
+        measured = measure_variables(self._comparison)
+        return {name: measured[name] for name in SIGNALS}
 
     def view(
         self, state: State, ladder: Sequence[Mapping[str, object]], floor: Mapping[str, object] | None
@@ -155,6 +125,7 @@ class MotionStage:
             velocity=self._draw_velocity(state),
             reach=self._gather_reach(comparison.find_horizon_errors(effects, timing)),
             arcs=self._draw_arcs(state),
+            signatures=find_signatures(self.problem, state),
         )
 
     def _draw_velocity(self, state: State) -> pl.DataFrame:

@@ -13,7 +13,9 @@
     to: find("mark-to"),
     set: find("mark-set"),
   });
-  const plots = slipPlots(page, { own: marks.own, zoomOf: marks.zoomOf });
+  // What the reader chose, or else the stretch that a figure shows first.
+  const zoomOf = (meta) => marks.zoomOf() ?? meta.window ?? null;
+  const plots = slipPlots(page, { own: marks.own, zoomOf });
   const places = document.querySelectorAll(".plot[data-figure]");
 
   const drawAll = async (selector = ".plot[data-figure]") => {

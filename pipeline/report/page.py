@@ -42,6 +42,7 @@ def render_report(report: RunReport) -> str:
         "report/templates/run.html",
         [picture for pictures in drawn.values() for picture in pictures],
         title=report.text("run") or "run",
+        catalogue=report.catalogue,
         facts=_list_facts(page),
         strip=summarise_health(report),
         sections=[(section, section.view(page)) for section in SECTIONS],
@@ -52,7 +53,11 @@ def draw_pictures(scene: Scene) -> dict[Section, list[Picture]]:
     """The figures there is something to draw for, by the section of the page, in its order."""
     drawn: dict[Section, list[Picture]] = {section: [] for section in Section}
     for figure in list_figures():
-        drawing = figure.draw(scene)
+        for name, panel in figure.panels(scene).items() if figure.panels else ():
+            drawn[figure.section].append(
+                Picture(f"{figure.id}-{name}", panel.title, panel.drawing, panel.words, figure.width.value)
+            )
+        drawing = None if figure.panels else figure.draw(scene)
         if drawing is not None:
             drawn[figure.section].append(
                 Picture(figure.id, figure.title, drawing, figure.describe(scene), figure.width.value)

@@ -52,8 +52,8 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false
     }
     for (const part of spec.vconcat ?? [spec]) {
       part.width = Math.floor(width);
-      const zoom = zoomOf();
-      if (zoom && spec.usermeta?.brush === "time") setDomains(part, { x: zoom });
+      const zoom = spec.usermeta?.brush === "time" ? zoomOf(spec.usermeta) : null;
+      if (zoom) setDomains(part, { x: zoom });
     }
   };
 

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from pipeline.diagnosis.subject import FATAL
+
 if TYPE_CHECKING:
     import polars as pl
 
@@ -25,6 +27,7 @@ class RunReport:
         diagnosis: the JSON object of one run of ``slip diagnose --json``; empty where there is none.
         motion: a model of the run; None where there is none.
         peers: median slip moduli [m/s] of comparable runs by input; empty where there are none.
+        catalogue: address of the page over all runs, seen from the report; empty where there is none.
     """
 
     summary: Mapping[str, object]
@@ -32,6 +35,7 @@ class RunReport:
     diagnosis: Mapping[str, object] = field(default_factory=dict)
     motion: MotionView | None = None
     peers: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    catalogue: str = ""
 
     def table(self, name: str) -> pl.DataFrame | None:
         """A table that has rows, or None."""
@@ -61,6 +65,11 @@ class RunReport:
         """Errors over 2 s, ``t`` [m] and ``r`` [rad], of the ideal model and with each named effect more."""
         rungs = objects_in(self.diagnosis, "ladder")
         return [{"t": number_in(rung, "t_mrmse_m"), "r": number_in(rung, "r_mrmse_rad")} for rung in rungs]
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether a finding makes every fit to the run meaningless, so that the diagnosis names nothing."""
+        return any(finding.get("id") in FATAL for finding in self.items("findings"))
 
     @property
     def undecided(self) -> list[tuple[str, str]]:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 _LONE_SHARE = 0.01
-_WIDEST_RATIO = 3.0
+_WIDEST_RATIO = 2.0
 _ROOM = 0.25
 
 
@@ -45,7 +45,7 @@ def find_range(lines: pl.DataFrame, usual: tuple[float, float]) -> Range:
         usual: where all but lone peaks lie.
 
     Returns:
-        The range with zero inside; peaks are cut where they would make it more than three times as wide.
+        The range with zero inside; peaks are cut where they would make it more than twice as wide.
     """
     lines = lines.drop_nulls("value")
     values = lines["value"].to_numpy()

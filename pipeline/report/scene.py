@@ -24,6 +24,7 @@ _HOLE_PERIODS = 2.5
 _WIDEST_PIXELS = 1200
 _FAR_M = 10_000.0
 _CAP_QUANTILE = 0.98
+_WORST_S = 20.0
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,20 @@ class Scene:
         return round_up(top) if top > 0.0 else 1.0
 
     @cached_property
+    def worst_span(self) -> tuple[float, float] | None:
+        """The 20 s with the most slip [s], lone peaks held; None where the run is hardly longer than that."""
+        slip, domain = self.sound_slip.get(self.report.main_input), self.time_domain
+        if slip is None or domain is None or domain[1] - domain[0] < 1.5 * _WORST_S:
+            return None
+        edges = np.arange(domain[0], domain[1] + 1.0, 1.0)
+        squared = np.minimum(slip["modulus"].to_numpy(), self.modulus_cap) ** 2
+        second = np.histogram(slip["t"].to_numpy(), edges, weights=squared)[0]
+        width = int(_WORST_S)
+        total = np.convolve(second, np.ones(width), mode="valid")
+        start = min(float(edges[int(np.argmax(total))]), domain[1] - _WORST_S)
+        return start, start + _WORST_S
+
+    @cached_property
     def origin(self) -> tuple[float, float]:
         """What is taken off the map's coordinates [m]: nothing, or the start where that is far away."""
         if self.velocities is None:
@@ -184,7 +199,7 @@ class Scene:
         for frame, column, series in lines:
             # Flat stretches go first, so that a held command keeps its edges where they were.
             line = drop_flat_rows(frame.select("t", "piece", value=pl.col(column)), "value")
-            thinned = thin_series(line, "value", bins=LINE_BINS)
+            thinned = thin_series(line, "value", bins=LINE_BINS, whole=self.worst_span)
             parts.append(break_lines(thinned, "value").with_columns(series=pl.lit(series)))
             drawn, total = drawn + thinned.height, total + line.height
             ends += usual_ends(frame[column], exact=column.startswith("f_"))

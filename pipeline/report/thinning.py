@@ -23,7 +23,9 @@ def drop_flat_rows(frame: pl.DataFrame, value: str) -> pl.DataFrame:
     return frame.filter(~(flat[0] & flat[1]).fill_null(value=False))
 
 
-def thin_series(frame: pl.DataFrame, value: str, *, bins: int) -> pl.DataFrame:
+def thin_series(
+    frame: pl.DataFrame, value: str, *, bins: int, whole: tuple[float, float] | None = None
+) -> pl.DataFrame:
     """Keep what a line needs: of every time bin the first, last, lowest and highest row.
 
     A line through them looks the same at ``bins`` pixels (Jugel et al., VLDB 2014, "M4").
@@ -32,6 +34,7 @@ def thin_series(frame: pl.DataFrame, value: str, *, bins: int) -> pl.DataFrame:
         frame: rows in order of ``t`` [s] with ``piece``, across which no line is drawn.
         value: the column that is drawn.
         bins: number of equal bins over the whole span of ``t``.
+        whole: a stretch [s] of which every row is kept.
 
     Returns:
         Rows of ``frame`` in their order; all of them when there are no more than four a bin.
@@ -41,7 +44,10 @@ def thin_series(frame: pl.DataFrame, value: str, *, bins: int) -> pl.DataFrame:
     row, column = pl.col(_ROW), pl.col(value)
     picks = [row.first(), row.last(), row.get(column.arg_min()), row.get(column.arg_max())]
     kept = _number_bins(frame, bins).group_by(_BIN, "piece").agg(pl.concat_list(picks).explode())[_ROW]
-    return frame[kept.explode().unique().sort()]
+    rows = kept.explode()
+    if whole is not None:
+        rows = rows.append(frame.with_row_index(_ROW).filter(pl.col("t").is_between(*whole))[_ROW])
+    return frame[rows.unique().sort()]
 
 
 def thin_to_peaks(frame: pl.DataFrame, value: str, *, bins: int) -> pl.DataFrame:

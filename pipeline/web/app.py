@@ -14,6 +14,7 @@ from starlette.routing import Route
 
 from pipeline.analysis.analyze import REPORT
 from pipeline.report.bundle import load_bundle
+from pipeline.report.pages import PAGES, is_page
 from pipeline.vehicles import list_presets
 from pipeline.web.answers import answer, make_handlers
 from pipeline.web.errors import WorkbenchError
@@ -71,6 +72,8 @@ class Web:
             Route("/vega.js", self.bundle),
             Route("/model.toml", self.download),
             Route("/report", self.report),
+            *(Route(f"/{name}", self.page) for name in PAGES),
+            Route("/runs/{place:path}", self.page),
             Route("/api/runs", self.runs),
             Route("/api/jobs", self.jobs),
             Route("/api/session", self.session, methods=["POST"]),
@@ -128,6 +131,17 @@ class Web:
         path = manifest.path(REPORT)
         if not path.is_file():
             raise WorkbenchError("no_report", "its report is gone", where=run, hint="Analyze the log again.")
+        headers = {"content-security-policy": _REPORT_POLICY}
+        return FileResponse(path, media_type="text/html", headers=headers)
+
+    async def page(self, request: Request) -> Response:
+        """A stored page of the results, by its place in their folder, shut off from the workbench."""
+        place, root = request.scope["path"].removeprefix("/"), self._sessions.results.resolve()
+        path = (root / place).resolve()
+        if not (is_page(place) and path.is_relative_to(root) and path.is_file()):
+            raise WorkbenchError(
+                "no_page", "the results have no such page", where=place, hint="Open / for the workbench."
+            )
         headers = {"content-security-policy": _REPORT_POLICY}
         return FileResponse(path, media_type="text/html", headers=headers)
 

@@ -11,6 +11,7 @@ from pipeline.report.figures.autocorrelation import list_autocorrelations
 from pipeline.report.figures.ladder import list_rungs
 from pipeline.report.figures.reach import list_reach
 from pipeline.report.figures.residuals import list_residuals
+from pipeline.report.figures.signature import list_signatures
 from pipeline.report.figures.step_response import list_responses
 from pipeline.report.figures.trajectory import list_arcs
 from pipeline.report.figures.velocities import model_rows
@@ -28,13 +29,23 @@ FIGURES = (
     "budget",
     "trajectory",
     "residuals",
+    "signature",
     "reach",
     "velocities",
     "autocorrelation",
     "step_response",
     "command_space",
 )
-_LIVE = (list_rungs, list_arcs, list_reach, list_residuals, list_autocorrelations, list_responses, model_rows)
+_LIVE = (
+    list_rungs,
+    list_arcs,
+    list_reach,
+    list_residuals,
+    list_autocorrelations,
+    list_responses,
+    model_rows,
+    list_signatures,
+)
 
 
 class FigureCache:

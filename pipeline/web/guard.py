@@ -5,16 +5,22 @@ asked for: once in the address, then as a cookie, or as `Authorization: Bearer` 
 site that a browser has open may send requests here too; a name that such a site owns may even resolve to this
 machine. So the host must be one that the server was started for, and whatever comes from another origin is
 refused.
+
+The stored pages of the results are shut off from the workbench, so the links between them come from nowhere
+that the browser knows: they are opened with a cookie that follows links and opens nothing else.
 """
 
 from __future__ import annotations
 
+import hashlib
 import secrets
 from typing import TYPE_CHECKING
 
 from starlette.datastructures import QueryParams
 from starlette.requests import cookie_parser
 from starlette.responses import HTMLResponse, JSONResponse
+
+from pipeline.report.pages import is_page
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -70,6 +76,7 @@ class Guard:
     def __init__(self, app: ASGIApp, token: str, hosts: tuple[str, ...] = LOOPBACK) -> None:
         self._app = app
         self._token = token
+        self._page_token = hashlib.sha256(f"pages {token}".encode()).hexdigest()
         self._hosts = frozenset(host.lower() for host in hosts)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -107,8 +114,13 @@ class Guard:
         if scope["path"] == "/" and self._is_token(QueryParams(scope["query_string"]).get("token", "")):
             welcome = HTMLResponse(_WELCOME)
             welcome.set_cookie(cookie, self._token, httponly=True, samesite="strict")
+            welcome.set_cookie(f"{cookie}-pages", self._page_token, httponly=True, samesite="lax")
             return welcome
-        if self._is_token(cookie_parser(headers.get("cookie", "")).get(cookie, "")):
+        cookies = cookie_parser(headers.get("cookie", ""))
+        if self._is_token(cookies.get(cookie, "")):
+            return None
+        opens = cookies.get(f"{cookie}-pages", "").encode()
+        if _shows_page(scope) and secrets.compare_digest(opens, self._page_token.encode()):
             return None
         return _refuse(scope, "no_token", _HOW_TO_ENTER)
 
@@ -124,7 +136,9 @@ class Guard:
             return "the request comes from another origin"
         # A link from elsewhere may open the page; it may not read, load or change anything.
         navigates = (
-            scope["method"] in _SAFE and headers.get("sec-fetch-mode") == "navigate" and scope["path"] == "/"
+            scope["method"] in _SAFE
+            and headers.get("sec-fetch-mode") == "navigate"
+            and (scope["path"] == "/" or _shows_page(scope))
         )
         if headers.get("sec-fetch-site", "same-origin") not in _OWN_SITES and not navigates:
             return "the request comes from another site"
@@ -132,6 +146,11 @@ class Guard:
         if scope["method"] not in _SAFE and origin is None and not bears:
             return "a request that changes something must say its origin"
         return ""
+
+
+def _shows_page(scope: Scope) -> bool:
+    """Whether a request only opens a stored page of the results."""
+    return scope["method"] in _SAFE and is_page(scope["path"].removeprefix("/"))
 
 
 def strip_port(host: str) -> str:

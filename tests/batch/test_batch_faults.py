@@ -67,7 +67,7 @@ def assert_whole(out: Path, undisturbed: Mapping[str, bytes], fault: Fault) -> N
 def test_memory_and_disk_fail(field: Path, tmp_path: Path, rounds: int) -> None:
     server = multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(
-        ["test_batch_faults", "pipeline.analysis.analyze", "pipeline.batch.catalogue"]
+        ["test_batch_faults", "pipeline.analysis.analyze", "pipeline.report.catalogue"]
     )
     out = tmp_path / "out"
     batch(field, tmp_path / "undisturbed")

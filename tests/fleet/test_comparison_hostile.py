@@ -14,7 +14,7 @@ from pipeline.analysis.compare import Question, compare_results
 from pipeline.analysis.compare_files import write_answer
 from pipeline.analysis.map import draw_up_map, write_map
 from pipeline.analysis.trend import follow_trend, write_trend
-from pipeline.batch.catalogue import render_catalogue
+from pipeline.report.catalogue import render_catalogue
 from pipeline.store import Store
 
 DAY_NS = 86_400_000_000_000

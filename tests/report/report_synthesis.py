@@ -6,7 +6,9 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from pipeline.identification.signature import SINCE_STEP, Signature
 from pipeline.report import RunReport
+from pipeline.report.figures import list_figures
 from pipeline.report.motion_view import MotionView
 from pipeline.report.run import mapping_in, objects_in
 from schemas import contract_of
@@ -41,6 +43,8 @@ def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
                 "parameters": {"k": {"value": 1.79, "low": 1.74, "high": 1.84, "unit": "1"}},
                 "gain": 12.4,
                 "equivalent_to": [],
+                "confused_with": ["wheel_radius"],
+                "sentence": "turns as if its wheels stood 1.93 m apart: or not; other ground tells",
             },
             {
                 "id": "drive_lag",
@@ -56,6 +60,12 @@ def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
             }
         ],
         "unobservable": ["slope_drift"],
+        "where": [
+            {
+                "region": "turning faster than 1 rad/s",
+                "text": "turning faster than 1 rad/s: 74% of the yaw error in 21% of time",
+            }
+        ],
         "unexplained": None,
         "findings": [],
         "ladder": [
@@ -93,7 +103,7 @@ def make_motion(tables: dict[str, pl.DataFrame]) -> MotionView:
     f_x, f_w = slip["f_x"].to_numpy(), slip["f_w"].to_numpy()
     rates = {"a_x": np.gradient(f_x), "a_w": np.gradient(f_w)}
     flat = {"roll": np.zeros(t.size), "pitch": np.zeros(t.size)}
-    signals = {"f_x": f_x, "f_w": f_w, "f_x_f_w": f_x * f_w, **rates, **flat}
+    signals = {"f_x": f_x, "f_y": 0.0 * f_x, "f_w": f_w, "f_x_f_w": f_x * f_w, **rates, **flat}
     velocity = {f"v_{axis}": slip[f"v_{axis}"].to_numpy() + model[f"model_{axis}"] for axis in "xyw"}
     size = slip["modulus"].to_numpy()
     track = tables["velocities"].gather_every(40).select("t", "x", "y")
@@ -116,6 +126,31 @@ def make_motion(tables: dict[str, pl.DataFrame]) -> MotionView:
             }
         ),
         arcs=track.with_columns(piece=pl.int_range(pl.len()) // 4),
+        signatures=[
+            make_signature("effective_track", "w", "f_w"),
+            make_signature("drive_lag", "x", SINCE_STEP),
+        ],
+    )
+
+
+def list_places() -> list[str]:
+    """Ids of the figures of a page of that run, in its order: one a named effect, one for every other."""
+    found: list[str] = []
+    for figure in list_figures():
+        found += (
+            [f"signature-{name}" for name in ("effective_track", "drive_lag")]
+            if figure.panels
+            else [figure.id]
+        )
+    return found
+
+
+def make_signature(effect: str, channel: str, variable: str) -> Signature:
+    """A curve that the points lie on."""
+    value = np.linspace(-1.0, 1.0, 9)
+    error = np.full(9, 0.02)
+    return Signature(
+        effect, channel, variable, 0.97, value, -0.4 * value, -0.4 * value, error, 0.0 * value, error
     )
 
 

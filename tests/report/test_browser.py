@@ -12,11 +12,10 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import TYPE_CHECKING
 
 import pytest
-from chrome import BROWSER, FLAGS
-from report_synthesis import make_report
+from chrome import BROWSER, FLAGS, Chrome
+from report_synthesis import list_places, make_report
 
 from pipeline.report import render_report
-from pipeline.report.figures import list_figures
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -58,7 +57,8 @@ PROBE = """
     seen.outside = outside();
     seen.scrolled = [...document.querySelectorAll(".table")].map(
       (table) => table.scrollWidth - table.clientWidth);
-    seen.before = labels("velocities");
+    seen.before = labels("modulus");
+    seen.large = labels("velocities");
     const empty = plot("trajectory").querySelectorAll("path").length;
     document.getElementById("mark-from").value = "10";
     document.getElementById("mark-to").value = "20";
@@ -67,7 +67,8 @@ PROBE = """
     seen.marked = document.querySelector("#marked span").textContent;
     seen.onMap = plot("trajectory").querySelectorAll("path").length - empty;
     document.getElementById("zoom-in").click();
-    await wait(() => labels("velocities").join() !== seen.before.join());
+    await wait(() => labels("modulus").join() !== seen.before.join());
+    await wait(() => labels("velocities").join() !== seen.large.join());
     seen.zoomed = labels("velocities");
     dispatchEvent(new KeyboardEvent("keydown", {key: "Escape"}));
     document.dispatchEvent(new KeyboardEvent("keydown", {key: "Escape"}));
@@ -143,7 +144,7 @@ def test_the_page_opens_without_errors_or_requests(seen: dict[str, object]) -> N
 def test_every_figure_is_drawn(seen: dict[str, object]) -> None:
     drawn = seen["drawn"]
     assert isinstance(drawn, dict)
-    assert set(drawn) == {figure.id for figure in list_figures()}
+    assert set(drawn) == set(list_places())
     assert min(drawn.values()) > 3
 
 
@@ -160,3 +161,32 @@ def test_a_marked_stretch_shows_on_the_map_and_can_be_zoomed_into(seen: dict[str
     assert "100" in seen["before"]  # type: ignore[operator]
     assert "100" not in seen["zoomed"]  # type: ignore[operator]
     assert {"12", "18"} <= set(seen["zoomed"])  # type: ignore[call-overload]
+
+
+def test_the_strip_of_the_whole_run_chooses_what_is_drawn_large(tmp_path: Path) -> None:
+    if BROWSER is None:
+        pytest.skip("no Chromium here to open the page with")
+    (tmp_path / "page.html").write_text(render_report(make_report(duration_s=120.0)), encoding="utf-8")
+    chrome = Chrome(tmp_path / "profile")
+    try:
+        chrome.size(LAPTOP, 900)
+        chrome.open((tmp_path / "page.html").as_uri())
+        chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
+        words = "[...document.querySelectorAll('[data-figure={}] .role-axis-label text')].map((t) => t.{})"
+        large, whole = (words.format(name, "textContent") for name in ("velocities", "navigator"))
+        first = chrome.run(large)
+        strip = chrome.run(whole)
+        chrome.drag("[data-figure=navigator]", (0.5, 0.3), (0.75, 0.3))
+        chrome.wait(f"{large}.join() !== {json.dumps(first)}.join()")
+        assert {"70", "80"} <= set(chrome.run(large))  # type: ignore[call-overload]
+        dragged = chrome.run(large)
+        chrome.run("document.querySelector('[data-figure=navigator]').focus()")
+        chrome.press("ArrowLeft", 37)
+        chrome.wait(f"{large}.join() !== {json.dumps(dragged)}.join()")
+        assert {"50", "60"} <= set(chrome.run(large))  # type: ignore[call-overload]
+        assert chrome.run(whole) == strip, "the strip stays whole"
+        chrome.click("#zoom-out")
+        chrome.wait(f"{large}.join() === {json.dumps(first)}.join()")
+        assert chrome.errors == []
+    finally:
+        chrome.close()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import polars as pl
 import pytest
-from report_synthesis import make_report
+from report_synthesis import list_places, make_report
 
 from pipeline.report import FORMATS, ReportError, RunReport, theme, warm_bundle, write_figures
 from pipeline.report.bundle import cache_path, load_bundle
@@ -27,7 +27,7 @@ START = {"svg": b"<svg", "pdf": b"%PDF", "png": b"\x89PNG"}
 
 @pytest.fixture(scope="module")
 def report() -> RunReport:
-    return make_report(duration_s=20.0)
+    return make_report(duration_s=40.0)
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -35,7 +35,7 @@ def test_the_figures_of_the_page_are_written_for_papers(
     report: RunReport, tmp_path: Path, kind: Literal["svg", "pdf", "png"]
 ) -> None:
     written = write_figures(report, tmp_path / "new" / "figures", kind)
-    assert [path.name for path in written] == [f"{figure.id}.{kind}" for figure in list_figures()]
+    assert [path.name for path in written] == [f"{name}.{kind}" for name in list_places()]
     assert all(path.read_bytes().startswith(START[kind]) for path in written)
 
 

@@ -8,10 +8,10 @@ import pytest
 from report_synthesis import make_report
 
 from pipeline.identification import Input, Problem, State, predict
+from pipeline.identification.correlation import autocorrelate, cross_correlate
 from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.models.model_text import format_model
 from pipeline.report.diagnosed import read_model_text
-from pipeline.report.figures.autocorrelation import correlate
 from pipeline.report.figures.budget import list_parts
 from pipeline.report.figures.ladder import list_rungs
 from pipeline.report.figures.residuals import choose_signal
@@ -57,13 +57,26 @@ def test_a_signal_that_hardly_moves_explains_nothing() -> None:
 def test_autocorrelation_tells_noise_from_structure_and_crosses_no_hole() -> None:
     rng = np.random.default_rng(7)
     t = np.arange(2000) * 0.25
-    _, noise = correlate(t, rng.normal(size=2000))
-    assert np.abs(noise[1:]).max() < 0.1
-    lags, slow = correlate(t, np.sin(t))
-    assert slow[0] == 1.0
+    lags, noise, bound = autocorrelate(t, rng.normal(size=2000))
+    assert lags == pytest.approx(np.arange(11) * 0.5), "windows that overlap are left out"
+    assert bound == pytest.approx(1.96 / np.sqrt(1000.0))
+    assert np.mean(np.abs(noise[1:]) < bound) >= 0.8
+    lags, slow, _ = autocorrelate(t, np.sin(t))
+    assert slow[0] == pytest.approx(1.0)
     assert slow[4] == pytest.approx(np.cos(lags[4]), abs=0.05)
     split = np.concatenate((t[:1000], t[1000:] + 1e6))
-    assert np.allclose(correlate(split, np.sin(t))[0], lags)
+    assert np.allclose(autocorrelate(split, np.sin(t))[0], lags)
+
+
+def test_crosscorrelation_finds_how_late_a_residual_follows_its_input() -> None:
+    rng = np.random.default_rng(8)
+    t = np.arange(2000) * 0.25
+    given = np.repeat(rng.normal(size=250), 8)
+    lags, found, bound = cross_correlate(t, given, np.roll(given, 6) + 0.1 * rng.normal(size=2000))
+    assert lags[np.argmax(found)] == pytest.approx(1.5), "the input was there first"
+    assert found.max() > 0.9
+    outside = [np.abs(cross_correlate(t, given, rng.normal(size=2000))[1]) > bound for _ in range(20)]
+    assert np.mean(outside) < 0.1
 
 
 def test_steps_are_those_of_a_command_that_rests_before_and_after() -> None:

@@ -12,10 +12,9 @@ from pathlib import Path
 import jinja2
 import polars as pl
 import pytest
-from report_synthesis import make_report
+from report_synthesis import list_places, make_report
 
 from pipeline.report import RunReport, render_report, templating
-from pipeline.report.figures import list_figures
 from pipeline.report.sections.glance import say_standing
 from pipeline.report.templating import render_template, show_text
 from pipeline.report.words import say_date, say_duration, say_number, say_share, say_split
@@ -110,8 +109,9 @@ def test_the_first_screen_answers_all_four_in_short(page: str) -> None:
     for anchor in ("how-bad", "where", "why", "what-now"):
         assert f'href="#{anchor}"' in first
     assert "off by <b>1.06 m</b>, <b>0.960 rad</b>" in first
-    assert "of the squared slip in" in first
-    assert "Missing: <b>effective_track</b>, <b>drive_lag</b>" in first
+    assert "<b>Turning faster than 1 rad/s</b>: 74% of the yaw error in 21% of time" in first
+    assert "<li>Turns as if its wheels stood 1.93 m apart</li>" in first
+    assert 'data-figure="trajectory"' in first
     assert "slip diagnose field/2026-11-02_warthog --apply model.toml" in first
     assert "To tell lateral_skid or icr_offset: drive circles" in first
     assert "of what can be explained" in first
@@ -131,7 +131,7 @@ def test_a_run_stands_beside_those_it_can_be_compared_with(report: RunReport) ->
 
 def test_every_figure_has_a_place_and_words_for_those_who_cannot_see_it(outline: Outline) -> None:
     places = {str(found["data-figure"]): found for _, found in outline.tags if "data-figure" in found}
-    assert list(places) == [figure.id for figure in list_figures()]
+    assert list(places) == list_places()
     for found in places.values():
         assert found["role"] == "img"
         assert len(str(found["aria-label"])) > 40
@@ -288,20 +288,21 @@ def test_a_missing_or_empty_table_costs_only_its_figures(
     drawn = {str(found["data-figure"]) for _, found in outline.tags if "data-figure" in found}
     lost: dict[str, set[str]] = {
         "velocities": {"trajectory"},
-        "slip": {"modulus", "distribution", "command_space", "step_response"},
+        "slip": {"modulus", "distribution", "command_space", "navigator", "step_response"},
         "windows": {"window_norms"},
         "aggregates": {"split"},
         "findings": set(),
     }
-    assert {figure.id for figure in list_figures()} - drawn == lost[gone]
+    assert set(list_places()) - drawn == lost[gone]
     assert "h2 How bad" in outline.headings
 
 
 def test_without_a_diagnosis_the_page_proposes_one_and_draws_no_model(report: RunReport) -> None:
     page = render_report(RunReport(report.summary, report.tables))
     drawn = {str(found["data-figure"]) for _, found in outline_of(page).tags if "data-figure" in found}
-    of_models = {"ladder", "budget", "residuals", "autocorrelation", "reach"}
-    assert {figure.id for figure in list_figures()} - drawn == of_models
+    signatures = {"signature-effective_track", "signature-drive_lag"}
+    of_models = {"ladder", "budget", "residuals", "autocorrelation", "crosscorrelation", "reach", *signatures}
+    assert set(list_places()) - drawn == of_models
     assert "slip diagnose" in page
     assert "slip serve" not in page
 
@@ -310,7 +311,9 @@ def test_what_a_diagnosis_names_is_told_with_its_numbers(page: str) -> None:
     told = outline_text(page)
     assert "effective_track" in told
     assert "1.740 to 1.840" in told
-    assert "the loss is 13 times as high" in told
+    assert "13 times as large" in told
+    assert "squared error of unseen data without it" in told
+    assert "Nearly the same curve under poor driving: wheel_radius." in told
     assert "lateral_skid or icr_offset: drive circles" in told
     assert "slope_drift: this log would not show it" in told
     assert "off by <b>1.06 m</b> and <b>0.960 rad</b>; with the named effects <b>0.310 m</b>" in told
@@ -350,6 +353,7 @@ def test_a_grave_finding_stands_before_the_numbers() -> None:
     page = render_report(RunReport({**report.summary, "findings": [grave]}, report.tables))
     warned = page.index("Do not draw conclusions")
     assert warned < page.index("The vehicle does not move") < page.index("median slip")
+    assert "slip compare" not in outline_text(page)
 
 
 def test_a_lone_peak_does_not_flatten_a_figure_and_is_told(page: str) -> None:

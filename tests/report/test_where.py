@@ -7,7 +7,7 @@ from report_synthesis import make_report
 
 from pipeline.report import RunReport, render_report
 from pipeline.report.scene import Scene
-from pipeline.report.sections.where import find_regions
+from pipeline.report.sections.where import find_regions, list_regions
 
 VERBS = ("Turning", "Driving")
 
@@ -38,13 +38,49 @@ def test_slip_that_is_the_same_everywhere_has_no_place() -> None:
     assert find_regions(None, VERBS) == []
 
 
-def test_suspect_stretches_carry_no_region() -> None:
-    report = make_report(duration_s=60.0)
-    told = render_report(report).split('class="regions"')[1].split("</ul>")[0]
-    wild = pl.when(pl.col("suspect")).then(pl.col("modulus") + 1e3).otherwise(pl.col("modulus"))
-    tables = {**report.tables, "slip": report.tables["slip"].with_columns(modulus=wild)}
-    page = render_report(RunReport(report.summary, tables))
-    assert page.split('class="regions"')[1].split("</ul>")[0] == told
+def test_where_is_what_the_screen_says() -> None:
+    report = make_report(duration_s=20.0)
+    told = [text for region, part in list_regions(report) for text in [f"{region}: {part}"]]
+    assert told == [entry["text"] for entry in report.diagnosis["where"]]  # type: ignore[attr-defined]
+    assert list_regions(RunReport(report.summary, report.tables)) == []
+
+
+def test_a_run_that_means_nothing_is_given_no_advice_on_models() -> None:
+    report = make_report(duration_s=20.0)
+    finding = {
+        "id": "pose_from_wheels",
+        "severity": "error",
+        "text": "the poses follow the wheels",
+        "where": "",
+    }
+    refused = {"effects": [], "ladder": [], "where": report.diagnosis["where"], "findings": [finding]}
+    page = render_report(RunReport({**report.summary, "findings": [finding]}, report.tables, refused))
+    shown = page.split("<script", 1)[0]
+    for advice in ("slip compare", "slip serve", "--apply", "slip export", "Most of the slip on command"):
+        assert advice not in shown
+    assert "a fit to this run would mean nothing" in shown
+    assert "slip inspect" in shown
+    assert "74% of the yaw error" not in shown
+
+
+def test_the_worst_stretch_is_where_most_slip_is_and_keeps_every_point() -> None:
+    report = make_report(duration_s=200.0)
+    slip = report.tables["slip"]
+    more = (
+        pl.when(pl.col("t").is_between(130.0, 150.0))
+        .then(3.0 * pl.col("modulus"))
+        .otherwise(pl.col("modulus"))
+    )
+    tables = {**report.tables, "slip": slip.with_columns(modulus=more)}
+    scene = Scene(RunReport(report.summary, tables))
+    span = scene.worst_span
+    assert span is not None
+    assert span == pytest.approx((130.0, 150.0), abs=3.0)
+    assert Scene(make_report(duration_s=25.0)).worst_span is None
+    drawn = scene.component_lines("x")
+    assert drawn is not None
+    measured = drawn.frame.filter((pl.col("series") == "velocity") & pl.col("t").is_between(*span))
+    assert measured.height == tables["velocities"].filter(pl.col("t").is_between(*span)).height
 
 
 def test_a_map_far_from_its_origin_counts_from_the_start() -> None:

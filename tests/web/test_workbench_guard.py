@@ -200,3 +200,29 @@ def test_a_port_that_cannot_be_is_named(tmp_path: Path, port: int) -> None:
         serve(tmp_path, host="127.0.0.1", port=port, tell=lambda *_: None, limits=LIMITS)
     assert caught.value.code == "no_such_port"
     assert str(port) in caught.value.where
+
+
+def test_the_cookie_that_follows_links_opens_stored_pages_and_nothing_else(workbench: Workbench) -> None:
+    path = workbench.address.removeprefix(workbench.origin)
+    _, headers, _ = workbench.request("GET", path, known=False)
+    (pages,) = [one for one in headers.get_all("Set-Cookie") or [] if f"slip-{workbench.port}-pages=" in one]
+    assert "HttpOnly" in pages
+    assert TOKEN not in pages
+    cookie = {
+        "Cookie": pages.partition(";")[0],
+        "Sec-Fetch-Site": "cross-site",
+        "Sec-Fetch-Mode": "navigate",
+    }
+    (workbench.results / "index.html").write_text("<p>all runs</p>")
+    status, headers, body = workbench.request("GET", "/index.html", known=False, headers=cookie)
+    assert (status, body) == (200, b"<p>all runs</p>")
+    assert "sandbox" in headers["content-security-policy"]
+    report = next(workbench.results.glob("runs/**/report.html")).relative_to(workbench.results)
+    assert workbench.request("GET", f"/{report.as_posix()}", known=False, headers=cookie)[0] == 200
+    for other in ("/api/runs", "/", "/page.js", f"/report?run={RUN}", "/runs/field/summary.json"):
+        assert workbench.request("GET", other, known=False, headers=cookie)[0] == 403
+    outside = workbench.results.parent / "report.html"
+    outside.write_text("not of the results")
+    status, _, body = workbench.request("GET", "/runs/../../report.html", known=False, headers=cookie)
+    assert status >= 400
+    assert b"not of the results" not in body

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import altair as alt
-import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
+from pipeline.identification.correlation import FEWEST, LONGEST_S, autocorrelate
 from pipeline.report import theme
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
@@ -16,110 +15,108 @@ from pipeline.report.figures.residuals import QUANTITIES
 from pipeline.report.motion_view import COMPONENTS
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from pipeline.report.scene import Scene
 
-Floats = NDArray[np.float64]
-
-_LONGEST_S = 5.0
-_FEWEST = 40
+    Correlation = tuple[NDArray[np.float64], NDArray[np.float64], float]
 
 
 def draw_autocorrelation(scene: Scene) -> Drawing | None:
     """A panel a channel, before and after; None without a model or with too few windows."""
-    motion = scene.report.motion
-    if motion is None or motion.residuals.height < _FEWEST:
-        return None
     rows = list_autocorrelations(scene)
+    if not rows:
+        return None
+    titles = {component: f"{QUANTITIES[component][0]} residual [1]" for component in COMPONENTS}
+    chart = draw_correlations(scene, "autocorrelation", titles, (0.0, "time between windows [s]"))
+    note = "Grey: where 95 % of white noise would stay. Outside of it for seconds: structure is left."
+    return Drawing(chart, rows, note)
+
+
+def draw_correlations(
+    scene: Scene, name: str, titles: dict[str, str], axis: tuple[float, str]
+) -> alt.VConcatChart:
+    """A panel for each of the titles, before and after, with the bounds in grey.
+
+    Args:
+        scene: the run, with a model.
+        name: of the rows, to which ``_`` and the channel are added.
+        titles: of the panels, by channel.
+        axis: where the lags begin [s], and what they are.
+    """
     panels = []
-    for component in COMPONENTS:
-        last = component == COMPONENTS[-1]
+    motion = scene.report.motion
+    for component, title in titles.items():
+        last = component == list(titles)[-1]
         x = alt.X(
             "lag:Q",
-            scale=alt.Scale(domain=[0.0, _LONGEST_S]),
-            axis=alt.Axis(title="time between windows [s]" if last else None, labels=last, grid=False),
+            scale=alt.Scale(domain=[axis[0], LONGEST_S]),
+            axis=alt.Axis(title=axis[1] if last else None, labels=last, grid=False),
         )
         y = alt.Y(
             "value:Q",
-            scale=alt.Scale(domain=[-0.6, 1.0], nice=False),
+            scale=alt.Scale(domain=[-1.0 if axis[0] else -0.6, 1.0], nice=False),
             axis=alt.Axis(title=None, values=[-0.5, 0, 0.5, 1], format=",~r", minExtent=parts.GUTTER - 10),
         )
-        name = f"autocorrelation_{component}"
-        line = alt.Chart(alt.NamedData(name)).mark_line(clip=True, strokeWidth=2)
-        drawn = line.encode(x=x, y=y, color=parts.before_and_after(motion.input))
-        zero = alt.Chart(alt.NamedData(name)).mark_rule(color=theme.QUIET, strokeWidth=0.8)
-        panels.append(
-            alt.layer(zero.encode(y=alt.datum(0.0)), drawn).properties(
-                width=480, height=96, title=alt.Title(f"{QUANTITIES[component][0]} residual [1]")
-            )
-        )
-    note = "Near zero from the first half second on: noise. Above 0.3 for seconds: structure is left."
-    return Drawing(alt.vconcat(*panels).properties(usermeta={"gutter": parts.GUTTER}), rows, note)
+        base = alt.Chart(alt.NamedData(f"{name}_{component}"))
+        colour = parts.before_and_after(motion.input if motion else "")
+        band = base.transform_filter(alt.datum.series == "model").mark_area(color=theme.SHADE, clip=True)
+        zero = base.mark_rule(color=theme.QUIET, strokeWidth=0.8).encode(y=alt.datum(0.0))
+        line = base.mark_line(clip=True, strokeWidth=2).encode(x=x, y=y, color=colour)
+        drawn = alt.layer(band.encode(x=x, y=alt.Y("low:Q"), y2="high:Q"), zero, line)
+        panels.append(drawn.properties(width=480, height=96, title=alt.Title(title)))
+    return alt.vconcat(*panels).properties(usermeta={"gutter": parts.GUTTER})
 
 
 def list_autocorrelations(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Rows ``lag value series`` of every channel, windows that overlap left out; empty without a model."""
+    """Rows ``lag value low high series`` of every channel; empty without a model or with too few windows."""
     motion = scene.report.motion
-    if motion is None:
+    if motion is None or motion.residuals.height < FEWEST:
         return {}
     t = motion.residuals["t"].to_numpy()
-    rows = {}
-    for component in COMPONENTS:
-        frames = []
-        for series in ("ideal", "model"):
-            lags, values = correlate(t, motion.residuals[f"{series}_{component}"].to_numpy())
-            frames.append(pl.DataFrame({"lag": lags, "value": values}).with_columns(series=pl.lit(series)))
-        rows[f"autocorrelation_{component}"] = pl.concat(frames)
-    return rows
+    return {
+        f"autocorrelation_{component}": tabulate_correlations(
+            {
+                series: autocorrelate(t, motion.residuals[f"{series}_{component}"].to_numpy())
+                for series in ("ideal", "model")
+            }
+        )
+        for component in COMPONENTS
+    }
 
 
-def correlate(t: Floats, residual: Floats) -> tuple[Floats, Floats]:
-    """Autocorrelation over lags up to five seconds.
-
-    Args:
-        t: middles of the windows [s], increasing.
-        residual: at the windows; pairs across a hole take no part.
-
-    Returns:
-        Lags [s] and correlations, both of shape (k,), the first at lag zero.
-    """
-    step = float(np.median(np.diff(t)))
-    centred = residual - np.median(residual)
-    limit = 6.0 * 1.4826 * float(np.median(np.abs(centred))) + 1e-12
-    centred = np.clip(centred, -limit, limit)
-    power = float(np.mean(centred**2)) + 1e-24
-    lags, values = [0.0], [1.0]
-    for lag in range(1, int(_LONGEST_S / step) + 1):
-        if lag >= t.size:
-            break
-        together = np.abs(t[lag:] - t[:-lag] - lag * step) < 0.5 * step
-        if together.sum() < _FEWEST // 2:
-            break
-        lags.append(lag * step)
-        values.append(float(np.mean(centred[lag:][together] * centred[:-lag][together])) / power)
-    return np.array(lags), np.array(values)
+def tabulate_correlations(found: dict[str, Correlation]) -> pl.DataFrame:
+    """Lags, correlations and bounds by series as rows ``lag value low high series``."""
+    frames = [
+        pl.DataFrame({"lag": lags, "value": values}).with_columns(
+            low=pl.lit(-bound), high=pl.lit(bound), series=pl.lit(series)
+        )
+        for series, (lags, values, bound) in found.items()
+    ]
+    return pl.concat(frames)
 
 
 def describe_autocorrelation(scene: Scene) -> str:
-    """The correlation after one second, before and after."""
-    motion = scene.report.motion
-    if motion is None or motion.residuals.height < _FEWEST:
+    """The correlation after one second, before and after, and the bound."""
+    rows = list_autocorrelations(scene)
+    if not rows:
         return "There is no model to draw."
-    t = motion.residuals["t"].to_numpy()
     told = []
-    for component in COMPONENTS:
-        after = []
-        for series in ("ideal", "model"):
-            lags, values = correlate(t, motion.residuals[f"{series}_{component}"].to_numpy())
-            after.append(float(np.interp(1.0, lags, values)))
-        told.append(f"{QUANTITIES[component][0]} {after[0]:.2f} before, {after[1]:.2f} after")
-    return "Autocorrelation of residuals one second apart: " + "; ".join(told) + "."
+    for name, frame in rows.items():
+        near = frame.filter((pl.col("lag") - 1.0).abs() < 0.01)  # noqa: PLR2004 - rounding
+        values = dict(near.select("series", "value").iter_rows())
+        after = f"{values.get('ideal', 0.0):.2f} before, {values.get('model', 0.0):.2f} after"
+        told.append(f"{QUANTITIES[name[-1]][0]} {after}")
+    bound = float(next(iter(rows.values()))["high"][0])
+    return f"Autocorrelation of residuals one second apart: {'; '.join(told)}; noise stays below {bound:.2f}."
 
 
 FIGURE = Figure(
     id="autocorrelation",
     title="Does what is left repeat itself?",
     section=Section.WHY,
-    order=2,
+    order=4,
     width=Width.HALF,
     draw=draw_autocorrelation,
     describe=describe_autocorrelation,

@@ -8,6 +8,7 @@ import altair as alt
 import polars as pl
 
 from pipeline.report import theme
+from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
 from pipeline.report.run import INPUT_WORDS, mapping_in, number_in, objects_in
 from pipeline.report.words import say_number, say_share
@@ -28,7 +29,6 @@ _SCHEMA = {
 }
 _LEFT = {"disturbance": "disturbance", "localization_noise": "localization noise"}
 _COLOURS = {"effect": theme.MODEL, "disturbance": theme.GROUND, "localization_noise": theme.CROSS}
-_ROOM = 2.2
 
 
 def draw_budget(scene: Scene) -> Drawing | None:
@@ -36,25 +36,28 @@ def draw_budget(scene: Scene) -> Drawing | None:
     rows = list_parts(scene)
     if rows.is_empty():
         return None
-    left = min(0.0, float(rows.select(pl.min_horizontal(pl.col("from", "to").min())).item()))
-    base = alt.Chart(alt.NamedData("budget")).encode(
-        y=alt.Y(
-            "cause:N", sort=None, axis=alt.Axis(title=None, grid=False, labelLimit=150, labelColor=theme.INK)
-        )
+    ends = rows.select(
+        low=pl.min_horizontal("from", "to", "low"), high=pl.max_horizontal("from", "to", "high")
     )
     x = alt.X(
         "from:Q",
-        scale=alt.Scale(domain=[left, _ROOM], nice=False),
-        axis=alt.Axis(title="share of the mean square slip", format="%", values=[0.0, 0.25, 0.5, 0.75, 1.0]),
+        scale=alt.Scale(
+            domain=[min(0.0, float(ends["low"].min() or 0.0)), max(1.0, float(ends["high"].max() or 1.0))],  # type: ignore[arg-type]
+            nice=False,
+        ),
+        axis=alt.Axis(
+            title="share of the mean square slip", format="%", grid=False, values=[0.0, 0.25, 0.5, 0.75, 1.0]
+        ),
     )
     colour = alt.Color(
         "kind:N", scale=alt.Scale(domain=list(_COLOURS), range=list(_COLOURS.values())), legend=None
     )
-    bars = base.mark_bar().encode(x=x, x2="to:Q", color=colour)
-    ends = base.mark_rule(color=theme.INK, strokeWidth=1.2).encode(x=alt.X("low:Q"), x2="high:Q")
-    words = base.mark_text(align="left", dx=6, fontSize=11).encode(x=alt.X("right:Q"), text="told:N")
-    rows = rows.with_columns(right=pl.max_horizontal("from", "to", pl.col("high").fill_null(0.0)))
-    chart = alt.layer(bars, ends, words).properties(width=480, height=alt.Step(26), usermeta={"gutter": 130})
+    base = parts.name_bars("budget", "cause")
+    bars = base.bars.encode(x=x, x2="to:Q", color=colour)
+    intervals = base.rules.encode(x=alt.X("low:Q"), x2="high:Q")
+    chart = alt.layer(bars, intervals, base.words).properties(
+        width=480, height=alt.Step(parts.BAR_STEP), usermeta={"gutter": 20}
+    )
     note = (
         "Numbers: share of the slip, then of the 2 s position error, of the model that the diagnosis names; "
         "fair to the order of its effects. Lines are 95 % intervals. A bar to the right makes slip larger."
@@ -113,7 +116,7 @@ FIGURE = Figure(
     id="budget",
     title="The budget: who carries the slip",
     section=Section.WHY,
-    order=5,
+    order=1,
     width=Width.HALF,
     draw=draw_budget,
     describe=describe_budget,

@@ -23,8 +23,10 @@ if TYPE_CHECKING:
 class Section(Enum):
     """The question of the page that a figure answers."""
 
+    GLANCE = "glance"
     HOW_BAD = "how-bad"
     WHERE = "where"
+    EFFECT = "effect"
     WHY = "why"
 
 
@@ -51,6 +53,15 @@ class Drawing:
 
 
 @dataclass(frozen=True)
+class Panel:
+    """One part of a figure: what it shows in a few words, how, and in a sentence."""
+
+    title: str
+    drawing: Drawing
+    words: str
+
+
+@dataclass(frozen=True)
 class Figure:
     """A figure that any run may have.
 
@@ -62,6 +73,7 @@ class Figure:
         width: how much of a wide page it takes.
         draw: the function from tables to a drawing; None when there is nothing to draw.
         describe: the same in a sentence or two, for people who cannot see it.
+        panels: of a figure that a page sets part by part: the parts by name, empty where there is nothing.
     """
 
     id: str
@@ -71,6 +83,7 @@ class Figure:
     width: Width
     draw: Callable[[Scene], Drawing | None]
     describe: Callable[[Scene], str]
+    panels: Callable[[Scene], Mapping[str, Panel]] | None = None
 
 
 @functools.cache

@@ -9,6 +9,7 @@ import polars as pl
 
 from pipeline.identification.ladder import ERRORS_OVER_2S, list_rises
 from pipeline.report import theme
+from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
 from pipeline.report.run import INPUT_WORDS, mapping_in, number_in, objects_in
 from pipeline.report.words import say_number
@@ -25,8 +26,9 @@ _SCHEMA = {
     "told": pl.String,
     "series": pl.String,
 }
-_ROOM = 2.1
-_NAME_HEIGHT = 15
+_BOUNDS = ("ceiling", "floor")
+_ROOM = 1.04
+_FAR = 0.6
 
 
 def draw_ladder(scene: Scene) -> Drawing | None:
@@ -44,22 +46,18 @@ def draw_ladder(scene: Scene) -> Drawing | None:
     x = alt.X(
         "t:Q",
         scale=alt.Scale(domain=[0.0, top * _ROOM], nice=False),
-        axis=alt.Axis(title="error over 2 s on data not seen [m]", format=",~r", tickCount=4),
+        axis=alt.Axis(title="error over 2 s on data not seen [m]", format=",~r", tickCount=5, grid=False),
     )
-    y = alt.Y(
-        "step:N",
-        sort=None,
-        scale=alt.Scale(paddingInner=0.06, paddingOuter=0.1),
-        axis=alt.Axis(title=None, grid=False, labelLimit=150, labelFontSize=12, labelColor=theme.INK),
-    )
-    base = alt.Chart(alt.NamedData("ladder")).encode(y=y)
-    bars = base.mark_bar(clip=True).encode(x=x, color=alt.Color("series:N", scale=scale, legend=None))
-    words = base.mark_text(align="left", dx=6, fontSize=11).encode(x=alt.X("t:Q"), text="told:N")
-    halo = words.mark_text(align="left", dx=6, fontSize=11, stroke=theme.PAPER, strokeWidth=4)
-    # The floor lies left of the ceiling: named one row higher, neither line crosses the other's name.
-    bounds = [*_draw_bound("ladder_ceiling", "ceiling", 1), *_draw_bound("ladder_floor", "floor", 2)]
-    chart = alt.layer(bars, *bounds, halo, words).properties(
-        width=480, height=alt.Step(30), usermeta={"gutter": 130}
+    base = parts.name_bars("ladder", "step")
+    bars = base.bars.encode(x=x, color=alt.Color("series:N", scale=scale, legend=None))
+    # A line through each bar alone, so that it crosses no words.
+    bounds = [
+        base.ticks.encode(x=alt.X(f"{word}:Q"), tooltip=[alt.Tooltip(f"{word}:Q", title=f"{word} [m]")])
+        for word in _BOUNDS
+    ]
+    names = [_name_bound(f"ladder_{word}") for word in _BOUNDS]
+    chart = alt.layer(bars, *bounds, base.words, *names).properties(
+        width=480, height=alt.Step(parts.BAR_STEP), usermeta={"gutter": 10}
     )
     note = "Ceiling: the ideal model."
     if rows["ladder_floor"].height:
@@ -67,19 +65,15 @@ def draw_ladder(scene: Scene) -> Drawing | None:
     return Drawing(chart, rows, note)
 
 
-def _draw_bound(name: str, word: str, row: int) -> list[alt.Chart]:
-    """A dashed line over all rungs and its name above them, in the given row of names."""
-    top = -_NAME_HEIGHT * row
-    base = alt.Chart(alt.NamedData(name)).encode(x="t:Q")
-    line = base.mark_rule(color=theme.INK, strokeDash=[4, 3], strokeWidth=1.5).encode(
-        y=alt.value(top),
-        y2=alt.value("height"),
-        tooltip=[alt.Tooltip("told:N", title=word)],
+def _name_bound(name: str) -> alt.Chart:
+    """The name of a bound above all bars, where its line is."""
+    mark = alt.Chart(alt.NamedData(name)).mark_text(
+        align=alt.expr("datum.right ? 'right' : 'left'"),
+        dy=alt.expr("datum.raised ? -22 : -8"),
+        fontSize=11,
     )
-    label = base.mark_text(align="left", baseline="top", dx=5, fontSize=11).encode(
-        y=alt.value(top), text="label:N"
-    )
-    return [line, label]
+    named: alt.Chart = mark.encode(x=alt.X("t:Q"), y=alt.value(0), text="label:N")
+    return named
 
 
 def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -106,10 +100,12 @@ def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
             }
         )
     highest = number_in(rungs[0], "t_mrmse_m") if rungs else None
+    bounds = {"ceiling": highest, "floor": number_in(floor, "t_mrmse_m")}
+    columns = [pl.lit(size, pl.Float64).alias(word) for word, size in bounds.items()]
+    most = max((float(str(row["t"])) for row in rows), default=0.0)
     return {
-        "ladder": pl.DataFrame(rows, schema=_SCHEMA),
-        "ladder_ceiling": _list_bound("ceiling", highest),
-        "ladder_floor": _list_bound("floor", number_in(floor, "t_mrmse_m")),
+        "ladder": pl.DataFrame(rows, schema=_SCHEMA).with_columns(columns),
+        **{f"ladder_{word}": _list_bound(word, size, most) for word, size in bounds.items()},
     }
 
 
@@ -119,10 +115,27 @@ def _describe_rises(below: Mapping[str, object], rung: Mapping[str, object]) -> 
     return f" ({' and '.join(risen)} error rises)" if risen else ""
 
 
-def _list_bound(word: str, size: float | None) -> pl.DataFrame:
-    told = f"{say_number(size)} m"
-    rows = [] if size is None else [{"t": size, "told": told, "label": f"{word} {told}"}]
-    return pl.DataFrame(rows, schema={"t": pl.Float64, "told": pl.String, "label": pl.String})
+def _list_bound(word: str, size: float | None, most: float) -> pl.DataFrame:
+    """A bound with its name, which ends at the line where there is no room behind it.
+
+    A floor so high that its name would meet the ceiling's is named one row higher.
+    """
+    told, far = f"{say_number(size)} m", size is not None and size > _FAR * most
+    found = {
+        "t": size,
+        "told": told,
+        "label": f"{word} {told}",
+        "right": far,
+        "raised": far and word == "floor",
+    }
+    schema = {
+        "t": pl.Float64,
+        "told": pl.String,
+        "label": pl.String,
+        "right": pl.Boolean,
+        "raised": pl.Boolean,
+    }
+    return pl.DataFrame([] if size is None else [found], schema=schema)
 
 
 def name_input(scene: Scene) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import altair as alt
@@ -28,6 +29,10 @@ SERIES_COLOURS = {"velocity": theme.MEASURED, **theme.INPUT_COLOURS, "model": th
 
 MARKED_SPANS = "marked_spans"
 MARKED_POINTS = "marked_points"
+SHOWN_SPAN = "shown_span"
+
+BAR_STEP = 44
+_BAR, _BAR_BELOW, _WORDS_ABOVE = 15, 9, -10
 
 _EMPTY_SPANS = pl.DataFrame(schema={"t_start": pl.Float64, "t_end": pl.Float64})
 _EMPTY_POINTS = pl.DataFrame(schema=dict.fromkeys(("t", "x", "y", "f_x", "f_w", "modulus"), pl.Float64))
@@ -71,6 +76,51 @@ def shade_spans() -> list[alt.Chart]:
         .encode(x=alt.X("t_start:Q"), x2="t_end:Q")
         for name, colour, opacity in bands
     ]
+
+
+@dataclass(frozen=True)
+class NamedBars:
+    """Bars over the whole width, each below its name and its numbers; all that varies is still to be encoded.
+
+    Attributes:
+        bars: the bars.
+        ticks: short lines across single bars.
+        rules: lines along the bars.
+        words: the names and numbers.
+    """
+
+    bars: alt.Chart
+    ticks: alt.Chart
+    rules: alt.Chart
+    words: alt.Chart
+
+
+def name_bars(rows: str, name: str) -> NamedBars:
+    """Bars named in the column ``name``, with the numbers of ``told`` behind, in the order of the rows.
+
+    Args:
+        rows: name of the rows.
+        name: of the column with the names.
+    """
+    y = alt.Y(f"{name}:N", sort=None, scale=alt.Scale(padding=0), axis=None)
+    base = alt.Chart(alt.NamedData(rows)).encode(y=y)
+    words = base.transform_calculate(words=f"datum.{name} + '  \u00b7  ' + datum.told")
+    return NamedBars(
+        bars=base.mark_bar(size=_BAR, yOffset=_BAR_BELOW, clip=True),
+        ticks=base.mark_point(
+            shape="stroke",
+            angle=90,
+            size=(_BAR + 3) ** 2,
+            stroke=theme.INK,
+            strokeWidth=1.5,
+            opacity=1,
+            yOffset=_BAR_BELOW,
+        ),
+        rules=base.mark_rule(color=theme.INK, strokeWidth=1.2, yOffset=_BAR_BELOW, y2Offset=_BAR_BELOW),
+        words=words.mark_text(align="left", dy=_WORDS_ABOVE, fontSize=12).encode(
+            x=alt.value(0), text="words:N"
+        ),
+    )
 
 
 def series_colour(names: list[str], words: dict[str, str]) -> alt.Color:
@@ -118,6 +168,11 @@ def slip_colour(scene: Scene, field: str = "modulus") -> alt.Color:
 def brush_over_time() -> dict[str, object]:
     """Tells the page that dragging sideways marks a stretch of time."""
     return {"brush": "time", "gutter": GUTTER - 11}
+
+
+def show_worst(scene: Scene) -> dict[str, object]:
+    """Tells the page to show the worst stretch alone at first; nothing where that is the whole run."""
+    return {} if scene.worst_span is None else {"window": list(scene.worst_span)}
 
 
 def brush_over_plane(x: str, y: str) -> dict[str, object]:

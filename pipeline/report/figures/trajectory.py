@@ -148,7 +148,7 @@ def describe_trajectory(scene: Scene) -> str:
 FIGURE = Figure(
     id="trajectory",
     title="On the map",
-    section=Section.WHERE,
+    section=Section.GLANCE,
     order=10,
     width=Width.HALF,
     draw=draw_trajectory,

@@ -34,7 +34,7 @@ def draw_velocities(scene: Scene) -> Drawing | None:
     rows = {f"velocity_{component}": line.frame for component, line in there.items()} | model_rows(scene)
     note = parts.tell_thinning(*there.values(), kept="first, last, lowest and highest of every bin")
     return Drawing(
-        chart.properties(usermeta=parts.brush_over_time()),
+        chart.properties(usermeta=parts.brush_over_time() | parts.show_worst(scene)),
         rows | parts.span_rows(scene),
         f"{parts.tell_bands(scene)} {note}".strip(),
     )
@@ -67,7 +67,7 @@ def model_rows(scene: Scene) -> dict[str, pl.DataFrame]:
     rows = {}
     for component in COMPONENTS:
         line = motion.velocity.select("t", "piece", value=pl.col(f"v_{component}"))
-        thinned = thin_series(drop_flat_rows(line, "value"), "value", bins=LINE_BINS)
+        thinned = thin_series(drop_flat_rows(line, "value"), "value", bins=LINE_BINS, whole=scene.worst_span)
         rows[f"model_{component}"] = break_lines(thinned, "value").with_columns(series=pl.lit("model"))
     return rows
 

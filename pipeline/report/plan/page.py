@@ -23,14 +23,20 @@ _MOST_WAYS = 24
 _WIDTH = 640
 
 
-def render_plan(plan: Plan) -> str:
-    """The whole page as HTML; it asks the network for nothing."""
+def render_plan(plan: Plan, catalogue: str = "") -> str:
+    """The whole page as HTML; it asks the network for nothing.
+
+    Args:
+        plan: what to drive.
+        catalogue: address of the page over all runs, seen from the plan's; empty where there is none.
+    """
     area, limits = plan.area, plan.limits
     turn = f"{limits.turn:.3g} {'rad of steering' if plan.steered else 'rad/s'}"
     return render_figures(
         "report/templates/plan.html",
         [_draw_ways(plan), _draw_commands(plan)],
         title="What to drive next",
+        catalogue=catalogue,
         facts=[
             plan.vehicle,
             f"{plan.commands.duration_s:.0f} s",

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.report.figures.figure import Section
 from pipeline.report.run import INPUT_WORDS, RunReport, mapping_in, number_in, objects_in
 from pipeline.report.sections.health import list_findings
 from pipeline.report.sections.what_now import list_steps
-from pipeline.report.sections.where import VERBS, find_regions
+from pipeline.report.sections.where import list_regions
+from pipeline.report.sections.why import say_effect
 from pipeline.report.words import say_number
 
 if TYPE_CHECKING:
@@ -24,8 +26,7 @@ _SPARK_BINS, _SPARK_HEIGHT = 150, 28
 def view_glance(page: Page) -> dict[str, object]:
     """Four short answers, each a link to what is behind it; above them what forbids conclusions."""
     report, name = page.report, page.report.main_input
-    effects = [str(entry.get("id", "")) for entry in objects_in(report.diagnosis, "effects")]
-    regions = find_regions(page.scene.sound_slip.get(name), VERBS[name])[:_MOST_REGIONS]
+    effects = objects_in(report.diagnosis, "effects")
     return {
         "doubts": [
             str(finding.get("text", ""))
@@ -38,9 +39,11 @@ def view_glance(page: Page) -> dict[str, object]:
         "spark_box": f"0 0 {_SPARK_BINS} {_SPARK_HEIGHT}",
         "ladder": report.ladder,
         "standing": say_standing(report),
-        "regions": regions if regions or page.scene.sound_slip else None,
+        "regions": list_regions(report, _MOST_REGIONS),
+        "pictures": page.pictures[Section.GLANCE],
+        "refused": report.is_refused,
         "diagnosed": bool(report.diagnosis),
-        "effects": effects[:_MOST_NAMES],
+        "effects": [say_effect(entry) for entry in effects[:_MOST_NAMES]],
         "more_effects": len(effects[_MOST_NAMES:]),
         "explained": number_in(report.diagnosis, "explained_share"),
         "unexplained": mapping_in(report.diagnosis, "unexplained").get("where"),

@@ -17,6 +17,8 @@ def view_what_now(page: Page) -> dict[str, object]:
 
 def list_steps(report: RunReport) -> list[tuple[str, str]]:
     """What to do, and the command that does it; the most useful first."""
+    if report.is_refused:
+        return _list_mending_steps(report)
     run = report.text("run")
     # A run that starts with a dash would be read as an option.
     name = shlex.quote(run) if not run.startswith("-") else shlex.quote(f"./{run}")
@@ -24,6 +26,15 @@ def list_steps(report: RunReport) -> list[tuple[str, str]]:
         *_list_model_steps(report, name),
         ("Set it beside other vehicles and terrains", "slip compare"),
         ("Look at slip in the viewer that plays the log", f"slip export {name} --to mcap"),
+    ]
+
+
+def _list_mending_steps(report: RunReport) -> list[tuple[str, str]]:
+    """Of a run whose numbers mean nothing as it is: look at the log, mend, analyze again."""
+    log = shlex.quote(str(report.part("log").get("path") or "run.mcap"))
+    return [
+        ("Look at what the log holds", f"slip inspect {log}"),
+        ("Mend what the findings name, then analyze again", f"slip analyze {log}"),
     ]
 
 

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from pipeline.report.figures.figure import Section
-from pipeline.report.run import INPUT_WORDS
+from pipeline.report.run import objects_in
 from pipeline.report.scales import round_up
 
 if TYPE_CHECKING:
+    from pipeline.report.run import RunReport
     from pipeline.report.sections.page import Page
 
 _MOST_REGIONS = 3
@@ -23,12 +24,18 @@ VERBS = {"command": ("Asked to turn", "Asked to drive"), "measured": ("Turning",
 
 def view_where(page: Page) -> dict[str, object]:
     """The regions that carry the slip, the linked figures, and a way to mark time without a mouse."""
-    name = page.report.main_input
-    return {
-        "regions": find_regions(page.scene.sound_slip.get(name), VERBS[name]),
-        "input": INPUT_WORDS[name],
-        "pictures": page.pictures[Section.WHERE],
-    }
+    return {"regions": list_regions(page.report), "pictures": page.pictures[Section.WHERE]}
+
+
+def list_regions(report: RunReport, most: int = 3) -> list[tuple[str, str]]:
+    """Where the error of the ideal model is, as on the screen: each region with its part of the error."""
+    if report.is_refused:
+        return []
+    found = []
+    for entry in objects_in(report.diagnosis, "where")[:most]:
+        region, text = str(entry.get("region", "")), str(entry.get("text", ""))
+        found.append((region, text.removeprefix(region).removeprefix(": ")))
+    return found
 
 
 def find_regions(slip: pl.DataFrame | None, verbs: tuple[str, str]) -> list[tuple[str, float, float]]:

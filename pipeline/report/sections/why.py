@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pipeline.diagnosis.excitation import suggest_manoeuvre
+from pipeline.models.catalogue import list_effects
 from pipeline.report.elements import Cell, Column, Table
 from pipeline.report.figures.figure import Section
 from pipeline.report.run import mapping_in, number_in, objects_in
 from pipeline.report.sections.health import list_findings
-from pipeline.report.words import say_number, say_share, say_split
+from pipeline.report.words import begin_large, say_number, say_share, say_split
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -18,7 +20,12 @@ if TYPE_CHECKING:
 
 _MANY_FOLD = 10.0
 _CHANNELS = {"x": "forward motion", "y": "sideways motion", "w": "yaw rate"}
-_HEAD = (Column("effect"), Column("value", number=True), Column("95 %", number=True), Column("without it"))
+_HEAD = (
+    Column("effect"),
+    Column("value", number=True),
+    Column("95 %", number=True),
+    Column("squared error of unseen data without it"),
+)
 
 
 def view_why(page: Page) -> dict[str, object]:
@@ -27,17 +34,48 @@ def view_why(page: Page) -> dict[str, object]:
     effects = objects_in(report.diagnosis, "effects")
     rows = [row for entry in effects for row in _list_parameters(entry)]
     drivetrain, ground, cross = report.split
+    signatures = {picture.title: picture for picture in page.pictures[Section.EFFECT]}
     return {
+        "refused": report.is_refused,
         "diagnosed": bool(report.diagnosis),
-        "named": [(entry.get("id", ""), entry.get("sentence") or "shows") for entry in effects],
+        "named": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in effects],
         "explained": number_in(report.diagnosis, "explained_share"),
         "table": Table("Missing from the ideal model", _HEAD, rows),
         "open": list(_list_open(report)),
         "split": None
-        if drivetrain is None or ground is None or cross is None
+        if drivetrain is None or ground is None or cross is None or report.is_refused
         else {"from_drivetrain": drivetrain > ground, "words": say_split(drivetrain, ground, cross)},
         "pictures": page.pictures[Section.WHY],
     }
+
+
+def _view_effect(entry: Mapping[str, object], signature: object) -> dict[str, object]:
+    """One named effect: what the vehicle does, what else that may be, and what was measured of it."""
+    name = str(entry.get("id", ""))
+    does, may_be = say_effect(entry)
+    return {
+        "id": name,
+        "does": begin_large(does),
+        "may_be": may_be,
+        "alike": _list_alike(entry),
+        "picture": signature,
+    }
+
+
+def say_effect(entry: Mapping[str, object]) -> tuple[str, str]:
+    """What the vehicle does by a named effect, and what else that may be called on other grounds."""
+    does, _, may_be = str(entry.get("sentence") or entry.get("id", "")).partition(": ")
+    return does, may_be
+
+
+def _list_alike(entry: Mapping[str, object]) -> tuple[str, str] | None:
+    """Effects that draw nearly the same curve under poor driving, and what to drive to tell them apart."""
+    alike = entry.get("confused_with")
+    known = {effect.id: effect() for effect in list_effects()}
+    names = [name for name in alike if name in known] if isinstance(alike, list | tuple) else []
+    if not names or entry.get("id") not in known:
+        return None
+    return ", ".join(names), suggest_manoeuvre(known[str(entry["id"])], *(known[name] for name in names))
 
 
 def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
@@ -68,8 +106,10 @@ def _say_gain(gain: float | None) -> str:
     if gain is None:
         return ""
     if gain >= _MANY_FOLD:
-        return f"the loss is {gain + 1.0:,.0f} times as high"
-    return f"the loss rises by {say_share(gain)}"
+        return f"{gain + 1.0:,.0f} times as large"
+    if gain < 0.0:
+        return f"{say_share(-gain)} smaller"
+    return f"{say_share(gain)} larger"
 
 
 def _list_open(report: RunReport) -> Iterator[tuple[str, str]]:

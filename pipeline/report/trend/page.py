@@ -64,7 +64,8 @@ def _picture(series: Series, name: str) -> Picture:
     steps = "; ".join(describe_step(series, step) for step in series.steps)
     unit = f" [{series.unit}]" if series.unit not in ("", "1") else ""
     words = f"{series.points.height} runs, last {series.latest:.3g}. {begin_large(steps) or 'No step'}."
-    return Picture(name, f"{series.quantity}{unit}", _draw_series(series, re.sub(r"\W", "_", name)), words)
+    drawing = _draw_series(series, re.sub(r"\W", "_", name))
+    return Picture(name, f"{series.quantity}{unit}", drawing, words, "half")
 
 
 def _draw_series(series: Series, name: str) -> Drawing:

@@ -1,7 +1,11 @@
-"""The catalogue: one offline page over all runs, with columns that sort and a box to search in."""
+"""The catalogue: one offline page over all runs, with columns that sort and a box to search in.
+
+Logs that gave no run stand below them, with the reason.
+"""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
@@ -10,6 +14,7 @@ import polars as pl
 from pipeline.report.elements import Column
 from pipeline.report.templating import read_own, render_template
 from pipeline.report.words import say_number
+from pipeline.store import LOG_NOTES
 from pipeline.store.queries import scan_table
 
 if TYPE_CHECKING:
@@ -18,6 +23,7 @@ if TYPE_CHECKING:
     from pipeline.store import Manifest, Store
 
 _REPORT = "report.html"
+_WITHOUT_RUN = ("failed", "quarantined")
 _TEXTS = ("day", "vehicle", "terrain", "dataset")
 _NUMBERS = {
     "duration_s": (Column("duration", "min", number=True), 1 / 60.0),
@@ -29,7 +35,7 @@ _NUMBERS = {
 
 
 def render_catalogue(store: Store) -> str:
-    """The page over all runs that can be read; the same results give the same text.
+    """The page over all runs that can be read, and the logs that gave none; equal results give equal text.
 
     Args:
         store: the results.
@@ -46,20 +52,33 @@ def render_catalogue(store: Store) -> str:
     rows = [
         {
             "run": row["run"],
-            "link": links[str(row["run"])],
+            "link": links.get(str(row["run"]), ""),
             "complete": row["complete"],
             "cells": list(_list_cells(row)),
         }
-        for row in _gather_rows(store, manifests)
+        for row in (_gather_rows(store, manifests) if manifests else [])
     ]
     return render_template(
-        "batch/catalogue.html",
+        "report/templates/catalogue.html",
         title="Runs",
-        style=read_own("batch/catalogue.css"),
-        scripts=[read_own("batch/catalogue.js")],
+        style=read_own("report/catalogue.css"),
+        scripts=[read_own("report/catalogue.js")],
         columns=columns,
         rows=rows,
+        failed=list_failed(store),
     )
+
+
+def list_failed(store: Store) -> list[dict[str, str]]:
+    """Logs that gave no run in batches, by path: ``path state reason hint``; those that are gone left out."""
+    found = []
+    for note in store.notes(LOG_NOTES).read_all():
+        log = note.get("log")
+        path = str(log.get("path", "")) if isinstance(log, dict) else ""
+        if note.get("state") not in _WITHOUT_RUN or not ("://" in path or Path(path).exists()):
+            continue
+        found.append({"path": path} | {key: str(note.get(key) or "") for key in ("state", "reason", "hint")})
+    return sorted(found, key=lambda one: one["path"])
 
 
 def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, object]]:
@@ -78,12 +97,12 @@ def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, 
 
 
 def _list_links(store: Store, manifests: Sequence[Manifest]) -> Mapping[str, str]:
-    """Relative address of each run's report, or of its folder where it has none."""
-    links: dict[str, str] = {}
-    for manifest in manifests:
-        place = manifest.folder / _REPORT if _REPORT in manifest.files else manifest.folder
-        links[manifest.run] = quote(place.relative_to(store.root).as_posix())
-    return links
+    """Relative address of the report of each run that has one."""
+    return {
+        manifest.run: quote((manifest.folder / _REPORT).relative_to(store.root).as_posix())
+        for manifest in manifests
+        if _REPORT in manifest.files
+    }
 
 
 def _list_cells(row: Mapping[str, object]) -> Iterator[tuple[Column, object, object]]:

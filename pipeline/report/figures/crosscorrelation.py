@@ -1,0 +1,79 @@
+"""Correlation of residuals with the input: what the model does with its input is right where none is left."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import polars as pl
+
+from pipeline.identification.correlation import FEWEST, LONGEST_S, cross_correlate
+from pipeline.report.figures.autocorrelation import draw_correlations, tabulate_correlations
+from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.residuals import QUANTITIES
+
+if TYPE_CHECKING:
+    from pipeline.report.motion_view import MotionView
+    from pipeline.report.scene import Scene
+
+_WORDS = {"f_x": "speed", "f_y": "sideways speed", "f_w": "yaw rate", "f_x_f_w": "speed \u00d7 yaw rate"}
+
+
+def draw_crosscorrelation(scene: Scene) -> Drawing | None:
+    """A panel a channel, before and after; None without a model or with too few windows."""
+    rows, motion = list_crosscorrelations(scene), scene.report.motion
+    if not rows or motion is None:
+        return None
+    inputs = choose_inputs(motion)
+    titles = {one: f"{QUANTITIES[one][0]} residual with {_WORDS[inputs[one]]} [1]" for one in inputs}
+    axis = (-LONGEST_S, "how long before the residual the input was [s]")
+    note = "Grey: where 95 % of residuals stay that know nothing of the input. Right of zero it is the past."
+    return Drawing(draw_correlations(scene, "crosscorrelation", titles, axis), rows, note)
+
+
+def choose_inputs(motion: MotionView) -> dict[str, str]:
+    """The input that each channel's residual is set beside; sideways that of turning while driving."""
+    moves_aside = bool(motion.residuals["f_y"].abs().max() or 0.0)
+    return {"x": "f_x", "y": "f_y" if moves_aside else "f_x_f_w", "w": "f_w"}
+
+
+def list_crosscorrelations(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Rows ``lag value low high series`` of every channel; empty without a model or with too few windows."""
+    motion = scene.report.motion
+    if motion is None or motion.residuals.height < FEWEST:
+        return {}
+    t = motion.residuals["t"].to_numpy()
+    return {
+        f"crosscorrelation_{component}": tabulate_correlations(
+            {
+                series: cross_correlate(
+                    t,
+                    motion.residuals[signal].to_numpy(),
+                    motion.residuals[f"{series}_{component}"].to_numpy(),
+                )
+                for series in ("ideal", "model")
+            }
+        )
+        for component, signal in choose_inputs(motion).items()
+    }
+
+
+def describe_crosscorrelation(scene: Scene) -> str:
+    """The largest correlation with the input, before and after."""
+    rows, told = list_crosscorrelations(scene), []
+    for name, frame in rows.items():
+        most = dict(frame.group_by("series").agg(pl.col("value").abs().max()).iter_rows())
+        bound = float(frame.filter(pl.col("series") == "model")["high"][0])
+        words = f"{most['ideal']:.2f} before, {most['model']:.2f} after, bound {bound:.2f}"
+        told.append(f"{QUANTITIES[name[-1]][0]} {words}")
+    return f"Largest correlation of residuals with the input within five seconds: {'; '.join(told)}."
+
+
+FIGURE = Figure(
+    id="crosscorrelation",
+    title="Does what is left follow the input?",
+    section=Section.WHY,
+    order=5,
+    width=Width.HALF,
+    draw=draw_crosscorrelation,
+    describe=describe_crosscorrelation,
+)

@@ -1,0 +1,66 @@
+"""The whole run in a strip, over which the stretch is dragged that other figures draw large."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import altair as alt
+import polars as pl
+
+from pipeline.report import theme
+from pipeline.report.figures import parts
+from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.run import INPUT_WORDS
+from pipeline.report.thinning import break_lines, thin_to_peaks
+
+if TYPE_CHECKING:
+    from pipeline.report.scene import Scene
+
+_BINS = 600
+
+
+def draw_navigator(scene: Scene) -> Drawing | None:
+    """Slip modulus over the whole run, and the stretch that is shown; None where the run is short."""
+    slip, span = scene.main_slip, scene.worst_span
+    if slip is None or span is None:
+        return None
+    peaks = thin_to_peaks(slip.select("t", "piece", "modulus"), "modulus", bins=_BINS)
+    x = parts.time_axis(scene)
+    y = alt.Y("modulus:Q", scale=alt.Scale(domain=[0.0, scene.modulus_cap], nice=False), axis=None)
+    area = alt.Chart(alt.NamedData("navigator")).mark_area(
+        color=theme.CROSS, opacity=0.6, clip=True, order=False
+    )
+    window = alt.Chart(alt.NamedData(parts.SHOWN_SPAN)).mark_rect(color=theme.MARK, opacity=0.35)
+    chart = alt.layer(area.encode(x=x, y=y), window.encode(x=alt.X("t_start:Q"), x2="t_end:Q")).properties(
+        width=parts.WIDTH, height=44, usermeta={"brush": "zoom", "gutter": 4}
+    )
+    rows = {
+        "navigator": break_lines(peaks, "modulus"),
+        parts.SHOWN_SPAN: pl.DataFrame({"t_start": [span[0]], "t_end": [span[1]]}),
+    }
+    length = span[1] - span[0]
+    note = f"Drawn large below: the {length:g} s with the most slip. Drag over the strip to draw others."
+    return Drawing(chart, rows, note)
+
+
+def describe_navigator(scene: Scene) -> str:
+    """Which stretch is the worst."""
+    span = scene.worst_span
+    if span is None:
+        return "The run is short: all of it is drawn large."
+    words = INPUT_WORDS[scene.report.main_input]
+    return (
+        f"Slip modulus {words} over the whole run. It is highest between {span[0]:.0f} s and "
+        f"{span[1]:.0f} s, which the figure below draws large; arrow keys move the stretch."
+    )
+
+
+FIGURE = Figure(
+    id="navigator",
+    title="The whole run",
+    section=Section.WHERE,
+    order=29,
+    width=Width.FULL,
+    draw=draw_navigator,
+    describe=describe_navigator,
+)

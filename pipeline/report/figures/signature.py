@@ -1,0 +1,151 @@
+"""The signature of each effect: the residual without and with it, against the variable that it acts on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import altair as alt
+import numpy as np
+import polars as pl
+
+from pipeline.identification.signature import SINCE_STEP, VARIABLES
+from pipeline.report import theme
+from pipeline.report.figures import parts
+from pipeline.report.figures.figure import Drawing, Figure, Panel, Section, Width
+from pipeline.report.figures.residuals import QUANTITIES
+from pipeline.report.words import say_number, say_share
+
+if TYPE_CHECKING:
+    from pipeline.identification.signature import Signature
+    from pipeline.report.figures.figure import Picture
+    from pipeline.report.scene import Scene
+
+_ROOM = 0.2
+_SERIES = {"before": "error without it", "after": "with it", "curve": "what it does"}
+
+
+def draw_signatures(scene: Scene) -> Drawing | None:
+    """All effects below each other; None without a model, or of one without effects."""
+    panels = list_panels(scene)
+    if not panels:
+        return None
+    chart = alt.vconcat(*(panel.drawing.chart for panel in panels.values())).resolve_scale(x="independent")
+    rows = {name: frame for panel in panels.values() for name, frame in panel.drawing.rows.items()}
+    note = "Error bars: 95 % between blocks of ten seconds."
+    return Drawing(chart.properties(usermeta={"gutter": parts.GUTTER}), rows, note)
+
+
+def list_panels(scene: Scene) -> dict[str, Panel]:
+    """A panel an effect, by its id; empty without a model."""
+    motion = scene.report.motion
+    if motion is None:
+        return {}
+    colour = theme.INPUT_COLOURS.get(motion.input, theme.QUIET)
+    return {
+        one.effect: Panel(
+            one.effect,
+            Drawing(_draw_panel(one, colour), {_name_rows(one): _tabulate(one)}, _note(one)),
+            _describe(one),
+        )
+        for one in motion.signatures
+    }
+
+
+def list_signatures(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Rows ``value mean low high series`` of every effect; empty without a model."""
+    motion = scene.report.motion
+    return {} if motion is None else {_name_rows(one): _tabulate(one) for one in motion.signatures}
+
+
+def _name_rows(signature: Signature) -> str:
+    return f"signature_{signature.effect}"
+
+
+def _tabulate(signature: Signature) -> pl.DataFrame:
+    nothing = np.full(signature.value.size, np.nan)
+    series = {
+        "curve": (signature.curve, nothing),
+        "before": (signature.before, signature.before_error),
+        "after": (signature.after, signature.after_error),
+    }
+    return pl.concat(
+        pl.DataFrame(
+            {"value": signature.value, "mean": mean, "low": mean - error, "high": mean + error}
+        ).with_columns(pl.col("low", "high").fill_nan(None), series=pl.lit(name))
+        for name, (mean, error) in series.items()
+    )
+
+
+def _name_axes(signature: Signature) -> tuple[str, str]:
+    """The variable and the residual, in words with units."""
+    what, unit = QUANTITIES[signature.channel]
+    variable, own_unit = VARIABLES[signature.variable]
+    error = (
+        f"{what} error, share of the step [1]"
+        if signature.variable == SINCE_STEP
+        else f"{what} error [{unit}]"
+    )
+    return f"{variable} [{own_unit}]", error
+
+
+def _draw_panel(signature: Signature, colour: str) -> Picture:
+    variable, error = _name_axes(signature)
+    scale = alt.Scale(domain=list(_SERIES), range=[colour, theme.MODEL, theme.INK])
+    label = " : ".join(f"datum.value === '{name}' ? '{words}'" for name, words in _SERIES.items())
+    legend = alt.Legend(title=None, labelExpr=f"{label} : datum.value", symbolType="circle", symbolSize=60)
+    shade = alt.Color("series:N", scale=scale, legend=legend)
+    x = alt.X(
+        "value:Q",
+        scale=alt.Scale(zero=False, nice=False, padding=8),
+        axis=alt.Axis(title=variable, format=",~r", tickCount=6, grid=False),
+    )
+    ends = np.concatenate((signature.before, signature.after, signature.curve, np.zeros(1)))
+    room = _ROOM * float(np.ptp(ends))
+    y = alt.Y(
+        "mean:Q",
+        scale=alt.Scale(domain=[float(ends.min()) - room, float(ends.max()) + room], nice=False),
+        axis=alt.Axis(title=None, format=",~r", tickCount=5, minExtent=parts.GUTTER - 10),
+    )
+    base = alt.Chart(alt.NamedData(_name_rows(signature)))
+    zero = base.mark_rule(color=theme.QUIET, strokeWidth=0.8).encode(y=alt.datum(0.0))
+    measured = base.transform_filter("datum.series !== 'curve'")
+    bars = measured.mark_rule(strokeWidth=1.2, clip=True).encode(
+        x=x, y=alt.Y("low:Q"), y2="high:Q", color=shade
+    )
+    points = measured.mark_circle(size=42, opacity=1).encode(x=x, y=y, color=shade)
+    curve = base.transform_filter("datum.series === 'curve'").mark_line(strokeWidth=1.8, order=False)
+    return alt.layer(zero, curve.encode(x=x, y=y, color=shade), bars, points).properties(
+        width=480, height=170, title=alt.Title(error), usermeta={"gutter": parts.GUTTER}
+    )
+
+
+def _note(signature: Signature) -> str:
+    variable = VARIABLES[signature.variable][0]
+    return f"{say_share(signature.explained)} of what it does is a function of the {variable}."
+
+
+def _describe(signature: Signature) -> str:
+    variable, error = _name_axes(signature)
+    sizes = [say_number(float(np.sqrt(np.mean(values**2)))) for values in (signature.before, signature.after)]
+    return (
+        f"{error} against {variable}, in {signature.value.size} bins: root mean square {sizes[0]} without "
+        f"{signature.effect}, {sizes[1]} with it."
+    )
+
+
+def describe_signatures(scene: Scene) -> str:
+    """Every effect's residual before and after."""
+    panels = list_panels(scene)
+    return " ".join(panel.words for panel in panels.values()) or "There is no model to draw."
+
+
+FIGURE = Figure(
+    id="signature",
+    title="What each effect does, and what was measured of it",
+    section=Section.EFFECT,
+    order=0,
+    width=Width.HALF,
+    draw=draw_signatures,
+    describe=describe_signatures,
+    panels=list_panels,
+)

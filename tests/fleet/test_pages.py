@@ -1,0 +1,72 @@
+"""Pages over all runs lead to each other and to what is there."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+from comparison_store import Run, write_run
+
+from pipeline.analysis.analyze import update_datasets
+from pipeline.analysis.map import draw_up_map, write_map
+from pipeline.analysis.trend import follow_trend, write_trend
+from pipeline.batch.ledger import Entry, Ledger
+from pipeline.report.pages import lead_to
+from pipeline.store import Store, see_log
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def make_results(folder: Path) -> Store:
+    store = Store(folder)
+    for number in range(4):
+        write_run(
+            store, Run(name=f"field/run_{number}", dataset="husky_tile", median=1.0 + number, seconds=20.0)
+        )
+    update_datasets(store)
+    return store
+
+
+def links_of(path: Path) -> list[str]:
+    nav = re.search(r'<nav id="pages"[^>]*>(.*?)</nav>', path.read_text(encoding="utf-8"))
+    assert nav is not None
+    return re.findall(r'href="([^"]+)"', nav[1])
+
+
+def test_pages_link_to_those_that_are_there_and_back(tmp_path: Path) -> None:
+    store = make_results(tmp_path)
+    assert links_of(tmp_path / "index.html") == []
+    write_map(store, draw_up_map(store))
+    assert links_of(tmp_path / "index.html") == ["map.html"]
+    assert links_of(tmp_path / "map.html") == ["index.html"]
+    write_trend(store, follow_trend(store, by=("dataset",), threshold=0.1, limits={}))
+    assert links_of(tmp_path / "map.html") == ["index.html", "trend.html"]
+    update_datasets(store)
+    assert links_of(tmp_path / "index.html") == ["trend.html", "map.html"]
+    assert links_of(tmp_path / "trend.html") == ["index.html", "map.html"]
+
+
+def test_a_page_elsewhere_leads_to_the_catalogue_that_is_there(tmp_path: Path) -> None:
+    assert lead_to(tmp_path / "none", tmp_path) == ""
+    make_results(tmp_path / "my results")
+    address = lead_to(tmp_path / "my results", tmp_path / "plans" / "one")
+    assert address == "../../my%20results/index.html"
+
+
+def test_the_catalogue_leads_to_reports_alone_and_says_why_a_log_has_no_run(tmp_path: Path) -> None:
+    log = tmp_path / "broken <b>.mcap"
+    log.write_bytes(b"nothing")
+    store = make_results(tmp_path / "results")
+    sighting = see_log(log)
+    Ledger(store).write(Entry(log=sighting, basis="", state="failed", reason="no poses", hint="Look at it."))
+    update_datasets(store)
+    page = (tmp_path / "results" / "index.html").read_text(encoding="utf-8")
+    assert "broken &lt;b&gt;.mcap" in page
+    assert "no poses" in page
+    assert "Look at it." in page
+    assert "field/run_0" in page
+    assert re.findall(r'href="([^"]+)"', page) == [], "runs without a report lead nowhere"
+    log.unlink()
+    update_datasets(store)
+    assert "no poses" not in (tmp_path / "results" / "index.html").read_text(encoding="utf-8")
