@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
@@ -34,6 +34,14 @@ def draw(  # noqa: D417 - arguments document themselves
     deployments: Annotated[
         Path | None, Parameter(help="table of deployments in place of the project's own")
     ] = None,
+    fed: Annotated[
+        Literal["command", "measured"] | None,
+        Parameter(name="--input", help="what the ideal model was fed with (default: as slip compare)"),
+    ] = None,
+    show: Annotated[
+        Literal["slip", "relative", "energy", "unpredictable", "transitory"],
+        Parameter(help="the measure of difficulty that colours own datasets"),
+    ] = "slip",
     figures: FigureFormat | None = None,
     out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
     json: bool = False,
@@ -50,13 +58,15 @@ def draw(  # noqa: D417 - arguments document themselves
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     store = Store(out or results)
-    drawn = draw_up_map(store, deployments)
+    drawn = draw_up_map(store, deployments, fed=fed, show=show)
     page = write_map(store, drawn, figures)
     if json:
         print_json(
             {
                 "deployments": drawn.points.to_dicts(),
                 "datasets": drawn.own.to_dicts(),
+                "input": drawn.input,
+                "measure": vars(drawn.measure),
                 "notes": list(drawn.notes),
                 "page": str(page),
             }
@@ -64,13 +74,18 @@ def draw(  # noqa: D417 - arguments document themselves
     elif not quiet:
         print_lines(
             f"{row['dataset']:<34}{row['energy']:>10.3g} J   complexity {row['complexity']:.1f}   "
-            f"slip {row['slip']:.3g} m/s   {row['zone']} risk"
+            f"{drawn.measure.name} {_say(row['value'], drawn.measure.unit)}   {row['zone']} risk"
             for row in drawn.own.sort("energy", descending=True).iter_rows(named=True)
         )
         print_lines(f"! {note}" for note in drawn.notes)
         placed = f"{drawn.points.height} of {drawn.deployments.height} deployments placed"
-        print_lines([f"page    {page}    ({placed})"])
+        fed_words = drawn.input.replace("measured", "measured wheels")
+        print_lines([f"page    {page}    ({placed}; {drawn.measure.name} on {fed_words})"])
     return CLEAN
+
+
+def _say(value: float | None, unit: str) -> str:
+    return "-" if value is None else f"{value:.3g}{'' if unit == '1' else f' {unit}'}"
 
 
 def add(  # noqa: D417 - arguments document themselves

@@ -38,7 +38,6 @@ class Run:
     sha256: str = ""
     start_ns: int = 1_700_000_000_000_000_000
     findings: Sequence[tuple[str, str, float | None]] = field(default=())
-    parameters: Sequence[tuple[str, str, float, str]] = field(default=())
     estimates: Sequence[tuple[str, str, float, float]] = field(default=())
     budget: pl.DataFrame | None = None
     still: bool = False
@@ -91,7 +90,6 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
         "aggregates": _aggregate(slip, run),
         "findings": _list_findings(run),
         "poses": _integrate(t, speed, turn, run.start_ns),
-        "parameters": _list_parameters(run),
     }
     if run.budget is not None:
         tables["budget"] = _complete_budget(run.budget)
@@ -187,19 +185,6 @@ def _list_findings(run: Run) -> pl.DataFrame:
         "stage": pl.String, "id": pl.String, "severity": pl.Enum(["info", "warning", "error"]),
         "text": pl.String, "where": pl.String, "t_start": pl.Float64, "t_end": pl.Float64,
         "value": pl.Float64, "count": pl.Int64,
-    }  # fmt: skip
-    return pl.DataFrame(rows, schema=schema, orient="row")
-
-
-def _list_parameters(run: Run) -> pl.DataFrame:
-    rows = [
-        {"input": "measured", "effect": effect, "parameter": name, "value": value, "low": None, "high": None,
-         "unit": unit, "at_bound": False}
-        for effect, name, value, unit in run.parameters
-    ]  # fmt: skip
-    schema = {
-        "input": _INPUTS, "effect": pl.String, "parameter": pl.String, "value": pl.Float64, "low": pl.Float64,
-        "high": pl.Float64, "unit": pl.String, "at_bound": pl.Boolean,
     }  # fmt: skip
     return pl.DataFrame(rows, schema=schema, orient="row")
 

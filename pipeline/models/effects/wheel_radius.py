@@ -46,7 +46,7 @@ class WheelRadius(KinematicEffect):
     readings = (
         Reading(Level.VEHICLE, "wheel_radius", "wheels smaller or larger than configured"),
         Reading(Level.TERRAIN, "longitudinal_slip", "wheels that turn on without grip on this ground"),
-        Reading(Level.RUN, "wheel_radius", "another tyre pressure or load in some runs"),
+        Reading(Level.RUN, "wheel_radius", "another tyre pressure or load"),
     )
 
     def describe_motion(self, vehicle: Vehicle) -> str:
