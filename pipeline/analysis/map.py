@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from pipeline.analysis.compare import choose_input, measure_runs
-from pipeline.analysis.compared_runs import find_material
+from pipeline.analysis.compared_runs import find_material, read_digest
 from pipeline.fleet import pool_runs
 from pipeline.fleet.deployments import find_own_table, read_deployments
+from pipeline.fleet.features import read_features
 from pipeline.fleet.measures import MEASURES, Measure
 from pipeline.fleet.place import place_datasets, place_deployments
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from pipeline.analysis.options import FigureFormat
@@ -45,7 +47,12 @@ class DeploymentMap:
 
 
 def draw_up_map(
-    store: Store, table: Path | None = None, *, fed: str | None = None, show: str = "slip"
+    store: Store,
+    table: Path | None = None,
+    *,
+    fed: str | None = None,
+    show: str = "slip",
+    shared: Path | None = None,
 ) -> DeploymentMap:
     """Place the literature and the results' datasets.
 
@@ -54,18 +61,27 @@ def draw_up_map(
         table: a table of deployments; by default the project's own.
         fed: what u is; None: as `compare_results` chooses it.
         show: key of `MEASURES` that colours the datasets.
+        shared: features of others, as of `slip share`; what is of the results' own logs does not count twice.
 
     Raises:
-        ComparisonError: the table is not there or breaks its schema.
+        ComparisonError: the table is not there or breaks its schema; ``bad_features``.
     """
     deployments = read_deployments(table or find_own_table())
     compared, runs, _ = measure_runs(find_material(store, ("dataset",), trusted_only=True))
     chosen = fed or ("command" if runs.is_empty() else choose_input(runs))
     own, notes = _empty_own(), list(compared.notes)
     keys: tuple[str, ...] = ()
-    if not runs.is_empty():
-        datasets = pool_runs(runs, ("dataset",)).filter(pl.col("input") == chosen).sort("dataset")
-        missing = sorted(set(runs["group"].drop_nulls()) - set(datasets["dataset"]))
+    parts = [] if runs.is_empty() else [pool_runs(runs, ("dataset",))]
+    if shared is not None:
+        parts.append(
+            _pool_shared(read_features(shared), [read_digest(m) for m in compared.manifests.values()])
+        )
+    if parts:
+        pooled = pl.concat(
+            [part.with_columns(pl.col("input").cast(pl.String)) for part in parts], how="diagonal"
+        )
+        datasets = pooled.filter(pl.col("input") == chosen).sort("dataset")
+        missing = sorted(set(pooled["dataset"]) - set(datasets["dataset"]))
         notes += (
             [f"not on the map, because there is no {chosen} input: {', '.join(missing)}"] if missing else []
         )
@@ -75,6 +91,15 @@ def draw_up_map(
     return DeploymentMap(
         deployments, place_deployments(deployments), own, keys, tuple(notes), chosen, MEASURES[show]
     )
+
+
+def _pool_shared(features: pl.DataFrame, own: Sequence[str]) -> pl.DataFrame:
+    others = features.filter(~pl.col("sha256").is_in(list(own))).with_columns(
+        pl.format("{} (shared)", "dataset").alias("group"),
+        pl.col("from_results").alias("key"),
+        pl.lit(None, pl.Float64).alias("published_norm"),
+    )
+    return pool_runs(others, ("dataset",))
 
 
 def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None = None) -> Path:
