@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -9,6 +11,7 @@ import polars as pl
 
 from pipeline.analysis.compared_runs import ComparedRuns, find_material
 from pipeline.analysis.errors import JobError
+from pipeline.core.errors import SlipError
 from pipeline.fleet import gather_runs
 from pipeline.fleet.parameter_trend import PLACES, describe_parameter, follow_parameters, say_power
 from pipeline.fleet.trend import (
@@ -28,6 +31,7 @@ if TYPE_CHECKING:
     from pipeline.fleet.parameter_trend import ParameterTrend
     from pipeline.store import Store
 
+TREND = "trend.json"
 _SLIP = {
     "median_modulus": "m/s",
     "median_window_norm": "m/s",
@@ -38,13 +42,14 @@ _SLIP = {
 
 @dataclass(frozen=True)
 class Trend:
-    """Series of every group, parameters of every vehicle, what to look at, and what must be known."""
+    """Series of groups, parameters of vehicles, what to look at, what must be known, what was asked."""
 
     series: tuple[Series, ...]
     parameters: tuple[ParameterTrend, ...]
     alerts: tuple[Alert, ...]
     keys: tuple[str, ...]
     notes: tuple[str, ...]
+    asked: Mapping[str, object]
 
 
 def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: Mapping[str, float]) -> Trend:
@@ -95,7 +100,8 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
     known = {*names, *(name.split(" (")[0] for name in names)}
     notes += [f"no run has the quantity {name!r} that a limit is for" for name in limits if name not in known]
     keys = tuple(f"{run}/{compared.manifests[run].key}" for run in dated["run"])
-    return Trend(tuple(series), parameters, tuple(alerts), keys, tuple(notes))
+    asked = {"by": list(by), "threshold": threshold, "limits": dict(limits)}
+    return Trend(tuple(series), parameters, tuple(alerts), keys, tuple(notes), asked)
 
 
 def _find_vehicles(dated: pl.DataFrame) -> dict[str, str]:
@@ -123,11 +129,29 @@ def _note_what_lacks(series: Sequence[Series], parameters: Sequence[ParameterTre
 
 
 def write_trend(store: Store, trend: Trend) -> Path:
-    """Write `trend.html`; its path."""
+    """Write `trend.html` and `trend.json`; the path of the first."""
+    content = {**describe_trend(trend), "asked": trend.asked}
+    store.write_results_text(TREND, json.dumps(content, indent=1, allow_nan=False) + "\n")
     from pipeline.report.trend import render_trend  # noqa: PLC0415 - heavy
 
     page = render_trend(trend.series, trend.parameters, trend.alerts, notes=trend.notes, keys=trend.keys)
     return store.write_results_text("trend.html", page)
+
+
+def update_trend(store: Store) -> None:
+    """Follow the trend anew, as it was asked for before, where it was; nothing else is done.
+
+    Results without any run with a date keep the trend they have, and so do those whose question cannot be
+    read.
+    """
+    path = store.root / TREND
+    if not path.is_file():
+        return
+    with contextlib.suppress(SlipError, OSError, ValueError, KeyError, TypeError, AttributeError):
+        asked = json.loads(path.read_text(encoding="utf-8"))["asked"]
+        limits = {str(name): float(value) for name, value in asked["limits"].items()}
+        by = [str(name) for name in asked["by"]]
+        write_trend(store, follow_trend(store, by, threshold=float(asked["threshold"]), limits=limits))
 
 
 def describe_trend(trend: Trend) -> dict[str, object]:

@@ -41,9 +41,10 @@ def trend(  # noqa: D417 - arguments document themselves
 ) -> int:
     """Follow slip, fitted parameters and data health over dates; exit code 4 when something moved.
 
-    Writes trend.html. Parameters are followed by vehicle, whatever ground its runs were on, from four runs
-    on; a change counts where it is more than chance allows and worth a name. Slip and health take eight runs
-    and the threshold. What moved with a parameter is told with it.
+    Writes trend.html and trend.json, which a batch keeps up to date. Parameters are followed by vehicle,
+    whatever ground its runs were on, from four runs on; a change counts where it is more than chance allows
+    and worth a name. Slip and health take eight runs and the threshold. What moved with a parameter is told
+    with it.
 
     Args:
         json: print one JSON object.

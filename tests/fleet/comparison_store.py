@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
+from pipeline.models import list_effects
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -116,6 +118,31 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
                 "dataset": run.dataset,
             }
         )
+
+
+def write_budgets(store: Store, runs: int) -> None:
+    """Runs of three vehicles on four terrains, a day each, with estimates of all numbers and budgets."""
+    rng = np.random.default_rng(0)
+    numbers = [
+        (effect.id, parameter.name)
+        for effect in list_effects()
+        for parameter in effect.parameters
+        if math.isfinite(parameter.neutral)
+    ]
+    causes = [*dict.fromkeys(effect for effect, _ in numbers[:7]), "disturbance", "localization_noise"]
+    for i in range(runs):
+        vehicle, terrain = f"v{i % 3}", f"t{i % 4}"
+        squares = rng.gamma(2.0, 0.1, len(causes))
+        budget = pl.DataFrame({"name": causes, "mean_square": squares}).with_columns(
+            pl.when(pl.col("name").is_in(causes[-2:])).then("name").otherwise(pl.lit("effect")).alias("kind"),
+            *((pl.col("mean_square") / squares.sum()).alias(column) for column in ("share", "low", "high")),
+        )
+        estimates = [(effect, name, float(rng.normal(1.0, 0.1)), 0.05) for effect, name in numbers]
+        run = Run(
+            name=f"r{i:03d}", dataset=f"{vehicle}_{terrain}", vehicle=vehicle, terrain=terrain,
+            seconds=6.0, start_ns=(1_700_000_000 + 86_400 * i) * 10**9, budget=budget, estimates=estimates,
+        )  # fmt: skip
+        write_run(store, run, seed=i)
 
 
 def _cut_windows(slip: pl.DataFrame) -> pl.DataFrame:
