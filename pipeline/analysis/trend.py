@@ -147,7 +147,8 @@ def update_trend(store: Store) -> None:
     path = store.root / TREND
     if not path.is_file():
         return
-    with contextlib.suppress(SlipError, OSError, ValueError, KeyError, TypeError, AttributeError):
+    unreadable = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError)
+    with contextlib.suppress(SlipError, *unreadable):
         asked = json.loads(path.read_text(encoding="utf-8"))["asked"]
         limits = {str(name): float(value) for name, value in asked["limits"].items()}
         by = [str(name) for name in asked["by"]]

@@ -138,9 +138,9 @@ def is_of_one_run(effect: Effect) -> bool:
 
 
 def take_numbers(estimates: pl.DataFrame) -> pl.DataFrame:
-    """Rows of `estimates` that count: not at a bound, of two inputs the command."""
+    """Rows of `estimates` that count: not at a bound, with an error, of two inputs the command."""
     return (
-        estimates.filter(~pl.col("at_bound"))
+        estimates.filter(~pl.col("at_bound"), pl.col("standard_error") > 0.0)
         .with_columns(pl.col("input").cast(pl.String))
         .sort("run", "effect", "parameter", "input")
         .unique(["run", "effect", "parameter"], keep="first", maintain_order=True)

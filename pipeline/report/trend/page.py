@@ -62,8 +62,8 @@ def render_trend(
         [picture for _, _, pictures in groups for picture in pictures],
         title="Trends",
         facts=[
-            f"{len(parameters)} parameters of {len(vehicles)} vehicles",
-            f"{len(series)} series of {len(names)} groups",
+            f"{len(parameters)} parameters of {len(vehicles)} vehicle{'s' * (len(vehicles) != 1)}",
+            f"{len(series)} series of {len(names)} group{'s' * (len(names) != 1)}",
             f"{len(keys)} runs",
             f"{len(alerts)} alert{'s' * (len(alerts) != 1)}",
         ],
