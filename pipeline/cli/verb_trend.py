@@ -80,7 +80,8 @@ def _describe(found: Trend, page: Path) -> str:
 
     quiet = describe_quiet(found.series, found.parameters)
     lines = [f"!! {alert.text}" for alert in found.alerts] or [quiet]
-    for one in found.parameters:
+    # What could not be tested is in the notes.
+    for one in (one for one in found.parameters if not one.need):
         unit = "" if one.unit == "1" else f" {one.unit}"
         label = f"{one.vehicle} {one.label}"
         runs = one.points.height

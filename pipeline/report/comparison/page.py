@@ -87,7 +87,7 @@ def render_comparison(
         difficulty=tabulate_difficulty(shown),
         swaps=list_contradictions(shown),
         measures=list(MEASURES.values()),
-        orders=[one.text for one in compare_orders(shown)],
+        orders=list(dict.fromkeys(one.text for one in compare_orders(shown))),
         notes=notes,
         counted=shown.select("dataset", "keys").to_dicts(),
     )
