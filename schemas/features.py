@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 import dataframely as dy
+import polars as pl
 
 from schemas.contract import Table
 
@@ -69,3 +70,7 @@ class Features(Table):
     unpredictability = _feature("m/s", "rms slip that a fitted slip model leaves, held out", 0.0, 1e3)
     relative_unpredictability = _feature("1", "unpredictability over rms ideal speed", 0.0, 1e6)
     transitory_slip = _feature("m", "slip path a change of command adds to the steady one", -1e6, 1e6)
+
+    @dy.rule()
+    def run_is_the_beginning_of_the_hash(cls) -> pl.Expr:  # noqa: N805 - rules receive the class
+        return pl.col("sha256").str.slice(0, 16) == pl.col("run")

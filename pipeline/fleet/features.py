@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 MAGIC = b"PAR1"
 LARGEST_BYTES = 64 * 2**20
 MOST_ROWS = 100_000
+_LARGEST_PART = 10**9
 _PARTS = ("sha256", "input")
 
 
@@ -154,7 +155,7 @@ def merge_features(frames: Sequence[pl.DataFrame], where: str) -> tuple[pl.DataF
 
 
 def _order_version(text: str) -> list[int]:
-    return [int(part) if part.isdigit() else -1 for part in text.split(".")][:8]
+    return [min(int(part), _LARGEST_PART) if part.isdigit() else -1 for part in text.split(".")][:8]
 
 
 def _refuse(where: str, why: str) -> ComparisonError:

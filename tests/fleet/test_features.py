@@ -86,6 +86,8 @@ def test_the_verbs_share_merge_and_draw(
 def test_a_log_counts_once_and_the_later_version_counts(features: pl.DataFrame) -> None:
     newer = features.with_columns(pl.lit("99.0.10").alias("made_by"), pl.col("median_modulus") * 2.0)
     older = features.with_columns(pl.lit("99.0.9").alias("made_by"))
+    hostile = features.with_columns(pl.lit("9" * 40).alias("made_by"))
+    assert merge_features([hostile, features], "")[0].equals(hostile)
     for order in ([newer, older], [older, newer]):
         merged, twice = merge_features(order, "")
         assert merged.equals(newer.sort("sha256", "input"))
@@ -124,6 +126,7 @@ def with_unit(table: pa.Table) -> pa.Table:
         (with_column("terrain", "ice\x1b[2J"), "rows break the contract"),
         (with_column("sha256", "0" * 63), "rows break the contract"),
         (with_column("samples", 10**15), "rows break the contract"),
+        (with_column("run", "0" * 15 + "f"), "run_is_the_beginning_of_the_hash"),
         (with_unit, "units are others than the contract's: of mass"),
         (lambda table: table.drop_columns(["mass"]), "its columns are not those of the contract"),
         (lambda table: table.append_column("raw", table.column("mass")), "its columns are not those"),
