@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: ablate hidden-effect hidden-table inject mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs few-shot fleets format fuzz inspect lock map pictures plan-game platforms samples \
+.PHONY: ablate hidden-effect hidden-table inject mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs few-shot fleets format fuzz inspect lock map pictures plan-game platforms samples \
 	serve test test-long trend wheel
 
 help: ## print this list
@@ -115,6 +115,9 @@ bench-batch: $(VENV)/.ready-dev ## batches of 10, 100 and 1,000 logs, on one and
 
 damage-results: $(VENV)/.ready-dev ## every byte of small results changed, files and runs deleted and swapped: noticed or not
 	$(BIN)/python benchmarks/damage_results.py $$ARGS
+
+bench-fleet: $(VENV)/.ready-dev ## levels, causes and trends of 300 runs: time and memory [ARGS="--runs 300"]
+	$(BIN)/python benchmarks/fleet_speed.py $$ARGS
 
 bench-export: $(VENV)/.ready-dev ## exporting runs of 1, 3 and 10 hours as MCAP
 	$(BIN)/python benchmarks/export.py

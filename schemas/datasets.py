@@ -19,7 +19,7 @@ class Datasets(Table):
     """
 
     NAME: ClassVar[str] = "datasets"
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     by = fields.text("columns that make a dataset, for example `dataset` or `vehicle,terrain`")
     input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})
@@ -50,9 +50,13 @@ class Datasets(Table):
     largest_kinetic_energy = fields.number("J", "largest 1/2 m v^2 of any run", nullable=True)
     relative_slip = fields.number("1", "median modulus over ideal speed, while it moves", nullable=True)
     slip_energy = fields.number("J", "median of 1/2 m |g_xy|^2 + 1/2 I g_w^2", nullable=True)
+    lost_energy = fields.number(
+        "1", "slip path over path driven: energy lost per metre and mass, over mu g", nullable=True
+    )
     unpredictability = fields.number(
         "m/s", "rms slip that a fitted slip model leaves, held out", nullable=True
     )
+    relative_unpredictability = fields.number("1", "unpredictability over rms ideal speed", nullable=True)
     transitory_slip = fields.number(
         "m", "slip path a change of command adds to the steady one", nullable=True
     )

@@ -92,8 +92,7 @@ def compare_results(store: Store, question: Question) -> Answer:
         ComparisonError: ``no_such_column``.
     """
     compared = find_material(store, question.by, trusted_only=True)
-    runs = _gather(compared)
-    compared, runs, notes = _agree_on_scale(compared, runs)
+    compared, runs, notes = measure_runs(compared)
     if runs.is_empty():
         raise JobError(
             "nothing_to_compare",
@@ -101,8 +100,7 @@ def compare_results(store: Store, question: Question) -> Answer:
             where=str(store.root),
             hint="Analyze logs first: slip analyze LOG... --out RESULTS --terrain NAME.",
         )
-    chosen = question.input or _choose_input(runs)
-    runs = add_measures(runs, measure_difficulty(_scan_slip(compared), _describe_vehicles(compared, runs)))
+    chosen = question.input or choose_input(runs)
     quantity = "median_modulus"
     if question.as_published:
         chosen, quantity = "command", "published_norm"
@@ -134,6 +132,17 @@ def compare_results(store: Store, question: Question) -> Answer:
     return Answer(datasets, comparisons, runs, chosen, quantity, intervals, boxes, all_notes)
 
 
+def measure_runs(compared: ComparedRuns) -> tuple[ComparedRuns, pl.DataFrame, list[str]]:
+    """Runs that can be compared, one row a run and input with all measures, and what must be known."""
+    compared, runs, notes = _agree_on_scale(compared, _gather(compared))
+    if runs.is_empty():
+        return compared, runs, notes
+    scales = runs.unique("run").select("run", "length_scale")
+    vehicles = compared.labels.select("run", "mass", "inertia").join(scales, on="run")
+    slip = compared.scan("slip").filter(pl.col("run").is_in(list(compared.manifests)))
+    return compared, add_measures(runs, measure_difficulty(slip, vehicles)), notes
+
+
 def _gather(compared: ComparedRuns) -> pl.DataFrame:
     if not compared.manifests:
         return pl.DataFrame()
@@ -158,7 +167,8 @@ def _agree_on_scale(
     return compared, runs.filter(pl.col("run").is_in(kept)), [NOT_VALID]
 
 
-def _choose_input(runs: pl.DataFrame) -> str:
+def choose_input(runs: pl.DataFrame) -> str:
+    """What u is where nobody says: the command where every run has one, else the measured wheels."""
     on_command = runs.filter(pl.col("input") == "command")["run"].n_unique()
     return "command" if on_command == runs["run"].n_unique() else "measured"
 
@@ -174,15 +184,6 @@ def _doubt_commands(compared: ComparedRuns) -> list[str]:
     return [
         f"read with care, the recorded command is scaled wrongly (use --input measured): {', '.join(runs)}"
     ]
-
-
-def _scan_slip(compared: ComparedRuns) -> pl.LazyFrame:
-    return compared.scan("slip").filter(pl.col("run").is_in(list(compared.manifests)))
-
-
-def _describe_vehicles(compared: ComparedRuns, runs: pl.DataFrame) -> pl.DataFrame:
-    scales = runs.unique("run").select("run", "length_scale")
-    return compared.labels.select("run", "mass", "inertia").join(scales, on="run")
 
 
 def _group(compared: ComparedRuns, samples: Mapping[str, Samples]) -> list[Group]:

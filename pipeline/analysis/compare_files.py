@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
+from pipeline.fleet.measures import compare_orders
 from pipeline.fleet.tables import write_csv, write_latex
 
 if TYPE_CHECKING:
@@ -69,6 +70,9 @@ def describe_answer(answer: Answer) -> dict[str, object]:
         "quantity": answer.quantity,
         "datasets": _list_rows(answer.datasets.filter(pl.col("input") == answer.input)),
         "pairs": _list_rows(answer.comparisons.drop("run", "dataset", "vehicle", "terrain")),
+        "orders": [
+            vars(one) for one in compare_orders(answer.datasets.filter(pl.col("input") == answer.input))
+        ],
         "notes": list(answer.notes),
     }
 

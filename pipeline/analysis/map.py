@@ -7,12 +7,16 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.analysis.compared_runs import find_material
-from pipeline.fleet import add_measures, gather_runs, measure_difficulty, pool_runs
+from pipeline.analysis.compare import choose_input, measure_runs
+from pipeline.analysis.compared_runs import find_material, read_digest
+from pipeline.fleet import pool_runs
 from pipeline.fleet.deployments import find_own_table, read_deployments
+from pipeline.fleet.features import read_features
+from pipeline.fleet.measures import MEASURES, Measure
 from pipeline.fleet.place import place_datasets, place_deployments
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from pipeline.analysis.options import FigureFormat
@@ -29,6 +33,8 @@ class DeploymentMap:
         own: own datasets that can be placed.
         keys: run/generation of the runs of every own dataset.
         notes: what is not on the map, and why.
+        input: what u is of the own datasets.
+        measure: what colours them.
     """
 
     deployments: pl.DataFrame
@@ -36,39 +42,64 @@ class DeploymentMap:
     own: pl.DataFrame
     keys: tuple[str, ...]
     notes: tuple[str, ...]
+    input: str
+    measure: Measure
 
 
-def draw_up_map(store: Store, table: Path | None = None) -> DeploymentMap:
-    """Place the literature and the results' datasets (slip on the measured wheels where there are any).
+def draw_up_map(
+    store: Store,
+    table: Path | None = None,
+    *,
+    fed: str | None = None,
+    show: str = "slip",
+    shared: Path | None = None,
+) -> DeploymentMap:
+    """Place the literature and the results' datasets.
 
     Args:
         store: the results; may be empty.
         table: a table of deployments; by default the project's own.
+        fed: what u is; None: as `compare_results` chooses it.
+        show: key of `MEASURES` that colours the datasets.
+        shared: features of others, as of `slip share`; what is of the results' own logs does not count twice.
 
     Raises:
-        ComparisonError: the table is not there or breaks its schema.
+        ComparisonError: the table is not there or breaks its schema; ``bad_features``.
     """
     deployments = read_deployments(table or find_own_table())
-    compared = find_material(store, ("dataset",), trusted_only=True)
-    datasets = pl.DataFrame()
-    if compared.manifests:
-        names = list(compared.manifests)
-        runs = gather_runs(
-            compared.scan("aggregates").filter(pl.col("run").is_in(names)).collect(), compared.labels
-        )
-        scales = runs.unique("run").select("run", "length_scale")
-        vehicles = compared.labels.select("run", "mass", "inertia").join(scales, on="run")
-        slip = compared.scan("slip").filter(pl.col("run").is_in(names))
-        datasets = pool_runs(add_measures(runs, measure_difficulty(slip, vehicles)), ("dataset",))
+    compared, runs, _ = measure_runs(find_material(store, ("dataset",), trusted_only=True))
+    chosen = fed or ("command" if runs.is_empty() else choose_input(runs))
     own, notes = _empty_own(), list(compared.notes)
     keys: tuple[str, ...] = ()
-    if not datasets.is_empty():
-        # On measured wheels, slip is what the ground did; the drivetrain's share would move with the command.
-        chosen = datasets.sort("input", descending=True).unique("dataset", keep="first").sort("dataset")
-        own, told = place_datasets(chosen)
+    parts = [] if runs.is_empty() else [pool_runs(runs, ("dataset",))]
+    if shared is not None:
+        parts.append(
+            _pool_shared(read_features(shared), [read_digest(m) for m in compared.manifests.values()])
+        )
+    if parts:
+        pooled = pl.concat(
+            [part.with_columns(pl.col("input").cast(pl.String)) for part in parts], how="diagonal"
+        )
+        datasets = pooled.filter(pl.col("input") == chosen).sort("dataset")
+        missing = sorted(set(pooled["dataset"]) - set(datasets["dataset"]))
+        notes += (
+            [f"not on the map, because there is no {chosen} input: {', '.join(missing)}"] if missing else []
+        )
+        own, told = place_datasets(datasets, MEASURES[show].column)
         notes += told
-        keys = tuple(f"{row['dataset']}: {row['keys']}" for row in chosen.iter_rows(named=True))
-    return DeploymentMap(deployments, place_deployments(deployments), own, keys, tuple(notes))
+        keys = tuple(f"{row['dataset']}: {row['keys']}" for row in datasets.iter_rows(named=True))
+    return DeploymentMap(
+        deployments, place_deployments(deployments), own, keys, tuple(notes), chosen, MEASURES[show]
+    )
+
+
+def _pool_shared(features: pl.DataFrame, own: Sequence[str]) -> pl.DataFrame:
+    others = features.filter(~pl.col("sha256").is_in(list(own))).with_columns(
+        pl.format("{} (shared)", "dataset").alias("group"),
+        pl.col("from_results").alias("key"),
+        pl.lit(None, pl.Float64).alias("published_norm"),
+    )
+    return pool_runs(others, ("dataset",))
 
 
 def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None = None) -> Path:
@@ -76,16 +107,23 @@ def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None =
     from pipeline.report.deployments import picture_map, render_map  # noqa: PLC0415 - heavy
     from pipeline.report.pages import write_page  # noqa: PLC0415 - heavy
 
-    page = render_map(drawn.deployments, drawn.points, drawn.own, notes=drawn.notes, keys=drawn.keys)
+    page = render_map(
+        drawn.deployments, drawn.points, drawn.own, drawn.measure, input_name=drawn.input, notes=drawn.notes,
+        keys=drawn.keys,
+    )  # fmt: skip
     path = write_page(store, "map.html", page)
     if figures:
         from pipeline.report.export import write_pictures  # noqa: PLC0415 - heavy
 
-        write_pictures([picture_map(drawn.points, drawn.own)], store.root / "figures", figures)
+        write_pictures(
+            [picture_map(drawn.points, drawn.own, drawn.measure, drawn.input)],
+            store.root / "figures",
+            figures,
+        )
     return path
 
 
 def _empty_own() -> pl.DataFrame:
-    texts, numbers = ("dataset", "vehicle", "terrain", "zone"), ("energy", "complexity", "slip")
+    texts, numbers = ("dataset", "vehicle", "terrain", "zone"), ("energy", "complexity", "value")
     schema = dict.fromkeys(texts, pl.String()) | dict.fromkeys(numbers, pl.Float64()) | {"runs": pl.Int64()}
     return pl.DataFrame(schema=pl.Schema(schema))

@@ -45,6 +45,8 @@ _BLOCK_S = 10.0
 _ENDS = (0.025, 0.5, 0.975)
 # Residuals of one run are half or twice those of another where they differ much.
 _USUAL_LOG_RATIO = math.log(2.0)
+# How fast a run was driven is known to a part in a hundred.
+_SMALL = 0.01
 
 
 @dataclass(frozen=True)
@@ -97,14 +99,20 @@ class _Driven:
     left: Floats
     scale: Floats
 
+    @property
+    def pace(self) -> float:
+        """Root mean square ideal speed [m/s], how fast the run was driven."""
+        return float(np.sqrt(np.mean(np.sum((self.ideal * self.scale) ** 2, axis=1))))
+
 
 def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Prediction:
     """Drive the commands of the vehicle's runs with draws of the model expected on a terrain.
 
     A draw is a run that may come: its numbers are drawn, its commands are those of a run (`weigh_runs`), and
     what the model leaves is what that run's own model left, sized as drawn from all runs (`draw_run` on its
-    logarithm). The error of the forecast is that of its expected numbers against the draw, with what
-    is left added in squares; the slip is that of the draw.
+    logarithm, over how fast they were driven). How fast it is driven is drawn in the same way, and scales
+    what comes out. The error of the forecast is that of its expected numbers against the draw, with
+    what is left added in squares; the slip is that of the draw.
 
     Args:
         store: the results.
@@ -113,7 +121,8 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
     """
     runs = _load_runs(store, forecast)
     rng = np.random.default_rng(seed)
-    logs = np.log([max(run.error_m, 1e-6) for run in runs])
+    paces = np.log([max(run.pace, 1e-6) for run in runs])
+    logs = np.log([max(run.error_m, 1e-6) for run in runs]) - paces
     length = [max(run.comparison.run.duration_s / _BLOCK_S, 1.0) for run in runs]
     terrains = [str(run.manifest.details.get("terrain")) for run in runs]
     sizes = draw_run(
@@ -121,6 +130,10 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
         size=_USUAL_LOG_RATIO, count=DRAWS, rng=rng,
     ).run  # fmt: skip
     there = np.array([name == forecast.terrain for name in terrains])
+    comes = draw_run(
+        paces, np.full(len(runs), _SMALL), terrains, forecast.terrain,
+        size=_USUAL_LOG_RATIO, count=DRAWS, rng=rng,
+    ).run  # fmt: skip
     choices = rng.choice(len(runs), DRAWS, p=weigh_runs(there)).tolist()
     numbers: Floats = np.empty((DRAWS, 3))
     known = [_predict(run, forecast.effects) for run in runs]
@@ -134,7 +147,9 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
         grown = math.exp(size - float(logs[choice]))
         slip = run.ideal - predict_at_from(run.comparison, effects, Timing(), run.times) - grown * run.left
         modulus = np.linalg.norm(slip * run.scale, axis=1)
-        numbers[which] = (*(math.hypot(error, math.exp(size)) for error in errors), np.nanmedian(modulus))
+        left = math.exp(size + float(paces[choice]))
+        told = (*(math.hypot(error, left) for error in errors), np.nanmedian(modulus))
+        numbers[which] = math.exp(float(comes[which] - paces[choice])) * np.array(told)
     error, without, modulus_median = (_bound(column) for column in numbers.T)
     used = tuple(run.manifest.run for run in runs)
     vehicle = runs[0].comparison.context.vehicle

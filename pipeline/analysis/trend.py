@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -9,9 +11,12 @@ import polars as pl
 
 from pipeline.analysis.compared_runs import ComparedRuns, find_material
 from pipeline.analysis.errors import JobError
+from pipeline.core.errors import SlipError
 from pipeline.fleet import gather_runs
+from pipeline.fleet.parameter_trend import PLACES, describe_parameter, follow_parameters, say_power
 from pipeline.fleet.trend import (
     FEWEST_RUNS,
+    LEVEL,
     Alert,
     Series,
     describe_step,
@@ -23,8 +28,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from pipeline.fleet.parameter_trend import ParameterTrend
     from pipeline.store import Store
 
+TREND = "trend.json"
 _SLIP = {
     "median_modulus": "m/s",
     "median_window_norm": "m/s",
@@ -35,25 +42,27 @@ _SLIP = {
 
 @dataclass(frozen=True)
 class Trend:
-    """Series of every group, what to look at, and what must be known."""
+    """Series of groups, parameters of vehicles, what to look at, what must be known, what was asked."""
 
     series: tuple[Series, ...]
+    parameters: tuple[ParameterTrend, ...]
     alerts: tuple[Alert, ...]
     keys: tuple[str, ...]
     notes: tuple[str, ...]
+    asked: Mapping[str, object]
 
 
 def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: Mapping[str, float]) -> Trend:
-    """Follow every quantity of every group of the results over the dates of its runs.
+    """Follow every quantity of every group of the results, and every parameter of every vehicle, over dates.
 
-    Slip comes from the tables `aggregates`, parameters from the diagnoses' tables `parameters`, the health of
+    Slip comes from the tables `aggregates`, parameters from the diagnoses' tables `estimates`, the health of
     the data from findings (their values, and how many warnings a run has) and from the share of suspect
     samples.
 
     Args:
         store: the results.
-        by: columns that make a group, for example `vehicle`.
-        threshold: relative change of level that raises an alert.
+        by: columns that make a group, for example `vehicle`; parameters are followed by vehicle.
+        threshold: relative change of level of slip or health that raises an alert.
         limits: highest value allowed of the last run, by quantity.
 
     Raises:
@@ -73,48 +82,78 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
             where=str(store.root),
             hint="Analyze logs whose clock was set, or put the date into their names (2026-05-03).",
         )
-    parameters = _read_parameters(compared)
-    parts = [_read_slip(compared), _read_health(compared), parameters]
+    dated = dated.with_row_index("order").with_columns(pl.col("order").cast(pl.Int64))
     values = (
-        dated.select("run", "group", "day")
-        .with_row_index("order")
-        .join(pl.concat(parts), on="run")
+        dated.select("run", "group", "day", "order")
+        .join(pl.concat([_read_slip(compared), _read_health(compared)]), on="run")
         .filter(pl.col("value").is_finite())
         .sort("order")
     )
     series = follow_quantities(values)
-    longest = {one.group: 0 for one in series}
-    for one in series:
-        longest[one.group] = max(longest[one.group], one.points.height)
-    short = sorted(group for group, runs in longest.items() if runs < FEWEST_RUNS)
-    if short:
-        notes.append(f"too few runs to find a change, {FEWEST_RUNS} are needed: {', '.join(short)}")
-    notes += _note_gaps(series, parameters, longest)
-    alerts = raise_alerts(series, threshold=threshold, limits=limits)
-    known = {quantity for one in series for quantity in (one.quantity, one.quantity.split(" (")[0])}
+    estimates = compared.scan("estimates").filter(pl.col("run").is_in(dated["run"].to_list())).collect()
+    parameters = follow_parameters(estimates, dated.select("order", "run", "day"), level=LEVEL / 2)
+    notes += _note_what_lacks(series, parameters)
+    alerts = raise_alerts(
+        series, parameters, vehicles=_find_vehicles(dated), threshold=threshold, limits=limits
+    )
+    names = [one.quantity for one in series] + [one.label for one in parameters]
+    known = {*names, *(name.split(" (")[0] for name in names)}
     notes += [f"no run has the quantity {name!r} that a limit is for" for name in limits if name not in known]
     keys = tuple(f"{run}/{compared.manifests[run].key}" for run in dated["run"])
-    return Trend(tuple(series), tuple(alerts), keys, tuple(notes))
+    asked = {"by": list(by), "threshold": threshold, "limits": dict(limits)}
+    return Trend(tuple(series), parameters, tuple(alerts), keys, tuple(notes), asked)
 
 
-def _note_gaps(series: Sequence[Series], parameters: pl.DataFrame, runs: Mapping[str, int]) -> list[str]:
-    """Parameters that the diagnoses of only some runs of a group name."""
-    named = set(parameters["quantity"])
-    gaps = [
-        f"{one.quantity} in {one.points.height} of {runs[one.group]} runs of {one.group}"
-        for one in series
-        if one.quantity in named and one.points.height < runs[one.group]
-    ]
-    return [f"named in some runs only: {'; '.join(gaps)}"] if gaps else []
+def _find_vehicles(dated: pl.DataFrame) -> dict[str, str]:
+    """The vehicle of each group that has one only."""
+    groups = dated.group_by("group").agg(pl.col("vehicle").unique())
+    return {group: vehicles[0] for group, vehicles in groups.iter_rows() if len(vehicles) == 1}
+
+
+def _note_what_lacks(series: Sequence[Series], parameters: Sequence[ParameterTrend]) -> list[str]:
+    """Groups and vehicles with too few runs to find a change, and runs that stand apart."""
+    longest: dict[str, int] = {}
+    for one in series:
+        longest[one.group] = max(longest.get(one.group, 0), one.points.height)
+    short = sorted(group for group, runs in longest.items() if runs < FEWEST_RUNS)
+    notes = []
+    if short:
+        notes.append(f"too few runs to find a change of slip, {FEWEST_RUNS} are needed: {', '.join(short)}")
+    needs: dict[str, list[str]] = {}
+    for number in parameters:
+        if number.need:
+            needs.setdefault(f"{number.vehicle}, {say_power(number)}", []).append(number.label)
+        if number.odd:
+            notes.append(f"{number.label} of {number.vehicle} stands apart in {', '.join(number.odd)}")
+    return [*notes, *(f"{', '.join(labels)} of {need}" for need, labels in needs.items())]
 
 
 def write_trend(store: Store, trend: Trend) -> Path:
-    """Write `trend.html`; its path."""
+    """Write `trend.html` and `trend.json`; the path of the first."""
+    content = {**describe_trend(trend), "asked": trend.asked}
+    store.write_results_text(TREND, json.dumps(content, indent=1, allow_nan=False) + "\n")
     from pipeline.report.pages import write_page  # noqa: PLC0415 - heavy
     from pipeline.report.trend import render_trend  # noqa: PLC0415 - heavy
 
-    page = render_trend(trend.series, trend.alerts, notes=trend.notes, keys=trend.keys)
+    page = render_trend(trend.series, trend.parameters, trend.alerts, notes=trend.notes, keys=trend.keys)
     return write_page(store, "trend.html", page)
+
+
+def update_trend(store: Store) -> None:
+    """Follow the trend anew, as it was asked for before, where it was; nothing else is done.
+
+    Results without any run with a date keep the trend they have, and so do those whose question cannot be
+    read.
+    """
+    path = store.root / TREND
+    if not path.is_file():
+        return
+    unreadable = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError)
+    with contextlib.suppress(SlipError, *unreadable):
+        asked = json.loads(path.read_text(encoding="utf-8"))["asked"]
+        limits = {str(name): float(value) for name, value in asked["limits"].items()}
+        by = [str(name) for name in asked["by"]]
+        write_trend(store, follow_trend(store, by, threshold=float(asked["threshold"]), limits=limits))
 
 
 def describe_trend(trend: Trend) -> dict[str, object]:
@@ -126,11 +165,18 @@ def describe_trend(trend: Trend) -> dict[str, object]:
                 "group": one.group,
                 "quantity": one.quantity,
                 "unit": one.unit,
-                "points": one.points.to_dicts(),
-                "changes": [{**vars(step), "text": describe_step(one, step)} for step in one.steps],
+                "points": one.points.drop("order").to_dicts(),
+                "changes": [
+                    {
+                        **{key: value for key, value in vars(step).items() if key not in PLACES},
+                        "text": describe_step(one, step),
+                    }
+                    for step in one.steps
+                ],
             }
             for one in trend.series
         ],
+        "parameters": [describe_parameter(one) for one in trend.parameters],
         "notes": list(trend.notes),
     }
 
@@ -189,17 +235,3 @@ def _read_health(compared: ComparedRuns) -> pl.DataFrame:
         .collect()
     )
     return pl.concat([told, counted, suspect])
-
-
-def _read_parameters(compared: ComparedRuns) -> pl.DataFrame:
-    return (
-        compared.scan("parameters")
-        .filter(pl.col("run").is_in(list(compared.manifests)))
-        .select(
-            "run",
-            pl.format("{}.{} ({})", "effect", "parameter", pl.col("input").cast(pl.String)).alias("quantity"),
-            "unit",
-            "value",
-        )
-        .collect()
-    )

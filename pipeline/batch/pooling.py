@@ -19,7 +19,7 @@ _VERSION = 2
 
 
 def refresh_pools(store: Store) -> bool:
-    """Bring `datasets.parquet`, the catalogue, and a fleet model that was fitted once up to date.
+    """Bring `datasets.parquet`, the catalogue, and a fleet model and a trend that were asked for up to date.
 
     Other batches may add runs meanwhile: it is done again until the runs are those that were pooled, so that
     the last one to finish leaves the right tables, whoever wrote last.
@@ -76,6 +76,8 @@ def _write_pools(store: Store) -> None:
     # A batch with nothing to do needs none of these.
     from pipeline.analysis.analyze import update_datasets  # noqa: PLC0415
     from pipeline.analysis.fleet import update_fleet  # noqa: PLC0415
+    from pipeline.analysis.trend import update_trend  # noqa: PLC0415
 
     update_datasets(store)
     update_fleet(store)
+    update_trend(store)

@@ -114,6 +114,8 @@ def _compare_causes(
 
 
 def _describe(answer: Answer, written: Mapping[str, Path]) -> str:
+    from pipeline.fleet.measures import MEASURES, compare_orders  # noqa: PLC0415 - heavy
+
     datasets = answer.datasets.filter(answer.datasets["input"] == answer.input).select(
         "dataset", "runs", "median_window_norm"
     )
@@ -126,6 +128,9 @@ def _describe(answer: Answer, written: Mapping[str, Path]) -> str:
     ]
     lines += [_describe_dataset(row) for row in rated.iter_rows(named=True)]
     lines += ["", *_describe_pairs(list(answer.comparisons.sort("p_adjusted", "p").iter_rows(named=True)))]
+    orders = compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
+    told = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
+    lines += [*([""] if told else []), *dict.fromkeys(told)]
     lines += ["", *(f"! {note}" for note in answer.notes), f"page    {written['comparison.html']}"]
     return "\n".join(lines)
 

@@ -14,6 +14,11 @@ if TYPE_CHECKING:
 
 _LABEL = 26
 _LEVEL = 9
+_SPREADS = (
+    ("spread_terrain", "between terrains"),
+    ("spread_run", "between runs"),
+    ("chi_square", "reduced chi-square"),
+)
 
 Results = Annotated[Path, Parameter(help="results folder")]
 Out = Annotated[Path | None, Parameter(help="the same as RESULTS")]
@@ -90,11 +95,7 @@ def _describe(content: Mapping[str, object]) -> list[str]:
 def _describe_number(row: Mapping[str, object]) -> list[str]:
     label = f"{row['effect']}.{row['parameter']}"
     unit = "" if row["unit"] == "1" else f" {row['unit']}"
-    spreads = [
-        f"{words} {_number(row[key])}"
-        for key, words in (("spread_terrain", "between terrains"), ("spread_run", "between runs"))
-        if row[key] is not None
-    ]
+    spreads = [f"{words} {_number(row[key])}" for key, words in _SPREADS if row[key] is not None]
     value = f"{_number(row['value'])}{unit}"
     if row["low"] is not None:
         value += f" [{_number(row['low'])}, {_number(row['high'])}]"

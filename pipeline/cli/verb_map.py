@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
@@ -34,6 +34,17 @@ def draw(  # noqa: D417 - arguments document themselves
     deployments: Annotated[
         Path | None, Parameter(help="table of deployments in place of the project's own")
     ] = None,
+    fed: Annotated[
+        Literal["command", "measured"] | None,
+        Parameter(name="--input", help="what the ideal model was fed with (default: as slip compare)"),
+    ] = None,
+    show: Annotated[
+        Literal["slip", "relative", "energy", "unpredictable", "transitory"],
+        Parameter(help="the measure of difficulty that colours own datasets"),
+    ] = "slip",
+    shared: Annotated[
+        Path | None, Parameter(help="features of others, as slip share writes them, to draw as well")
+    ] = None,
     figures: FigureFormat | None = None,
     out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
     json: bool = False,
@@ -50,13 +61,15 @@ def draw(  # noqa: D417 - arguments document themselves
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     store = Store(out or results)
-    drawn = draw_up_map(store, deployments)
+    drawn = draw_up_map(store, deployments, fed=fed, show=show, shared=shared)
     page = write_map(store, drawn, figures)
     if json:
         print_json(
             {
                 "deployments": drawn.points.to_dicts(),
                 "datasets": drawn.own.to_dicts(),
+                "input": drawn.input,
+                "measure": vars(drawn.measure),
                 "notes": list(drawn.notes),
                 "page": str(page),
             }
@@ -64,13 +77,18 @@ def draw(  # noqa: D417 - arguments document themselves
     elif not quiet:
         print_lines(
             f"{row['dataset']:<34}{row['energy']:>10.3g} J   complexity {row['complexity']:.1f}   "
-            f"slip {row['slip']:.3g} m/s   {row['zone']} risk"
+            f"{drawn.measure.name} {_say(row['value'], drawn.measure.unit)}   {row['zone']} risk"
             for row in drawn.own.sort("energy", descending=True).iter_rows(named=True)
         )
         print_lines(f"! {note}" for note in drawn.notes)
         placed = f"{drawn.points.height} of {drawn.deployments.height} deployments placed"
-        print_lines([f"page    {page}    ({placed})"])
+        fed_words = drawn.input.replace("measured", "measured wheels")
+        print_lines([f"page    {page}    ({placed}; {drawn.measure.name} on {fed_words})"])
     return CLEAN
+
+
+def _say(value: float | None, unit: str) -> str:
+    return "-" if value is None else f"{value:.3g}{'' if unit == '1' else f' {unit}'}"
 
 
 def add(  # noqa: D417 - arguments document themselves
@@ -96,7 +114,7 @@ def add(  # noqa: D417 - arguments document themselves
 
 
 def merge(  # noqa: D417 - arguments document themselves
-    first: Annotated[Path, Parameter(help="a table of deployments")],
+    first: Annotated[Path, Parameter(help="a table of deployments (CSV), or features (Parquet)")],
     second: Annotated[Path, Parameter(help="another")],
     /,
     *,
@@ -104,18 +122,47 @@ def merge(  # noqa: D417 - arguments document themselves
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Merge two tables of deployments; the same deployment counts once, contradictions are refused.
+    """Merge two tables of deployments, or two files of `slip share`; what stands in both counts once.
+
+    Contradictions are refused, and so is a file that is not what it should be.
 
     Args:
         json: print one JSON object.
         quiet: print nothing.
     """
+    if _are_features(first, second):
+        _merge_features(first, second, to, json=json, quiet=quiet)
+        return CLEAN
     from pipeline.fleet.deployments import merge_deployments, write_deployments  # noqa: PLC0415 - heavy
 
     table = merge_deployments(first, second)
     write_deployments(table, to)
     _tell(table, to, json=json, quiet=quiet)
     return CLEAN
+
+
+def _are_features(*paths: Path) -> bool:
+    from pipeline.fleet.features import MAGIC  # noqa: PLC0415 - heavy
+
+    for path in paths:
+        if path.is_file():
+            with path.open("rb") as file:
+                if file.read(len(MAGIC)) == MAGIC:
+                    return True
+    return False
+
+
+def _merge_features(first: Path, second: Path, to: Path, *, json: bool, quiet: bool) -> None:
+    from pipeline.fleet.features import merge_features, read_features, write_features  # noqa: PLC0415 - heavy
+
+    to = to if to != _OWN else Path("features.parquet")
+    merged, twice = merge_features([read_features(path) for path in (first, second)], f"{first} and {second}")
+    write_features(merged, to)
+    runs = merged["sha256"].n_unique()
+    if json:
+        print_json({"file": str(to), "runs": runs, "rows": merged.height, "twice": twice})
+    elif not quiet:
+        print_lines([f"{to}: {runs} runs, {merged.height} rows, {twice} stood twice"])
 
 
 def _tell(table: pl.DataFrame, path: Path, *, json: bool, quiet: bool) -> None:

@@ -27,10 +27,10 @@ def trend(  # noqa: D417 - arguments document themselves
     /,
     *,
     by: Annotated[
-        str, Parameter(help="whose trends: dataset, vehicle, terrain, or several of them")
+        str, Parameter(help="whose slip and health: dataset, vehicle, terrain, or several of them")
     ] = "dataset",
     threshold: Annotated[
-        NonNegativeFloat, Parameter(help="relative change of level that raises an alert")
+        NonNegativeFloat, Parameter(help="relative change of slip that raises an alert")
     ] = 0.1,
     limit: Annotated[
         tuple[str, ...], Parameter(help="QUANTITY=VALUE, an alert where the last run is above", negative="")
@@ -41,8 +41,10 @@ def trend(  # noqa: D417 - arguments document themselves
 ) -> int:
     """Follow slip, fitted parameters and data health over dates; exit code 4 when something moved.
 
-    Writes trend.html. A level has moved where the runs' means step more than chance allows, and by more than
-    the threshold; at least eight runs are needed.
+    Writes trend.html and trend.json, which a batch keeps up to date. Parameters are followed by vehicle,
+    whatever ground its runs were on, from four runs on; a change counts where it is more than chance allows
+    and worth a name. Slip and health take eight runs and the threshold. What moved with a parameter is told
+    with it.
 
     Args:
         json: print one JSON object.
@@ -73,16 +75,25 @@ def _read_limit(text: str) -> tuple[str, float]:
 
 
 def _describe(found: Trend, page: Path) -> str:
+    from pipeline.fleet.parameter_trend import say_power  # noqa: PLC0415 - heavy
     from pipeline.fleet.trend import describe_quiet  # noqa: PLC0415 - heavy
 
-    lines = [f"!! {alert.text}" for alert in found.alerts] or [describe_quiet(found.series)]
-    groups = list(dict.fromkeys(one.group for one in found.series))
-    for group in groups:
+    quiet = describe_quiet(found.series, found.parameters)
+    lines = [f"!! {alert.text}" for alert in found.alerts] or [quiet]
+    # What could not be tested is in the notes.
+    for one in (one for one in found.parameters if not one.need):
+        unit = "" if one.unit == "1" else f" {one.unit}"
+        label = f"{one.vehicle} {one.label}"
+        runs = one.points.height
+        lines.append(
+            f"{label:<44}{runs:>4} run{'s' * (runs != 1):<2} {one.latest:.3g}{unit}, {say_power(one)}"
+        )
+    for group in dict.fromkeys(one.group for one in found.series):
         own = [one for one in found.series if one.group == group]
         slip = next((one for one in own if one.quantity.startswith("median_modulus")), own[0])
         runs = slip.points.height
         lines.append(
-            f"{group:<34}{runs:>4} run{'s' * (runs != 1):<2} {slip.quantity} {slip.latest:.3g} {slip.unit}"
+            f"{group:<44}{runs:>4} run{'s' * (runs != 1):<2} {slip.quantity} {slip.latest:.3g} {slip.unit}"
         )
     lines += [*(f"! {note}" for note in found.notes), f"page    {page}"]
     return "\n".join(lines)

@@ -20,7 +20,8 @@ THIS_RUN = "this run only"
 _MEDIANS = (
     "median_modulus", "median_window_norm", "published_norm", "transitory_median_modulus",
     "steady_median_modulus", "drivetrain_mean_square", "ground_mean_square", "cross_mean_square",
-    "height_rate", "relative_slip", "slip_energy", "unpredictability", "transitory_slip",
+    "height_rate", "relative_slip", "slip_energy", "lost_energy", "unpredictability",
+    "relative_unpredictability", "transitory_slip",
 )  # fmt: skip
 _SUMS = ("samples", "windows", "distance", "duration")
 _NO_INTERVALS: Mapping[tuple[str, str], Interval] = {}

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.fleet.errors import ComparisonError
-from pipeline.fleet.hierarchy import leave_out_odd, take_numbers
+from pipeline.fleet.hierarchy import is_of_one_run, leave_out_odd, take_numbers
 from pipeline.fleet.runs import UNKNOWN
 from pipeline.fleet.statistics import draw_run
 from pipeline.models.catalogue import find_effect
@@ -27,8 +27,6 @@ DRAWS = 400
 _ENDS = (0.025, 0.975)
 # Between these ends a normal distribution has so many standard deviations.
 _WIDTH = 2 * 1.959964
-# Moments and places of one recording say nothing of another.
-_OF_ONE_RUN = ("duration", "place")
 
 
 @dataclass(frozen=True)
@@ -140,13 +138,13 @@ def forecast_vehicle(
     Raises:
         ComparisonError: ``no_such_vehicle``: no run of the vehicle on a known terrain has estimates.
     """
-    rows = take_numbers(estimates).filter(pl.col("vehicle") == vehicle)
+    known = estimates.filter(pl.col("terrain") != UNKNOWN)
+    rows = take_numbers(known).filter(pl.col("vehicle") == vehicle)
     if rows.is_empty():
-        known = sorted(set(estimates.filter(pl.col("terrain") != UNKNOWN)["vehicle"]))
         raise ComparisonError(
             "no_such_vehicle",
             f"no run of {vehicle} on a known terrain has estimates",
-            hint=f"There are runs of: {', '.join(known) or 'no vehicle'}.",
+            hint=f"There are runs of: {', '.join(sorted(set(known['vehicle']))) or 'no vehicle'}.",
         )
     here = rows.filter(pl.col("terrain") == terrain)
     numbers = []
@@ -183,7 +181,6 @@ def _choose_effects(rows: pl.DataFrame, source: str) -> list[Effect]:
     chosen = [
         effect
         for effect in effects
-        if (source == "command" or effect.place > Place.DRIVE)
-        and not any(parameter.relative_to in _OF_ONE_RUN for parameter in effect.parameters)
+        if (source == "command" or effect.place > Place.DRIVE) and not is_of_one_run(effect)
     ]
     return [effect for effect in chosen if not any(effect.id in other.contains for other in chosen)]

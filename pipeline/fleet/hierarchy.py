@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.fleet.statistics import LevelFit
+    from pipeline.models.effect import Effect
 
+_OF_ONE_RUN = ("duration", "place")
 SURE = 0.01
 """A difference is taken for one below this chance: of ten numbers of a vehicle, nine fleets in ten show none
 that are not there."""
@@ -106,14 +108,7 @@ def fit_fleet(estimates: pl.DataFrame) -> FleetModel:
     bound = known.filter(pl.col("at_bound")).select("effect").to_series().unique().sort().to_list()
     if bound:
         notes.append(f"numbers at a bound of the search are left out: of {', '.join(bound)} in some runs")
-    numbers = []
-    for (vehicle, effect, parameter), rows in (
-        take_numbers(known)
-        .partition_by("vehicle", "effect", "parameter", as_dict=True, maintain_order=True)
-        .items()
-    ):
-        if rows["named"].any():
-            numbers.append(_fit_number(str(vehicle), str(effect), str(parameter), rows))
+    numbers = [_fit_number(*number) for number in list_numbers(known)]
     numbers.sort(key=lambda one: (one.vehicle, -one.named, one.effect, one.parameter))
     runs = {
         str(vehicle): tuple(rows["run"].unique().sort().to_list())
@@ -122,10 +117,30 @@ def fit_fleet(estimates: pl.DataFrame) -> FleetModel:
     return FleetModel(tuple(numbers), dict(sorted(runs.items())), tuple(notes))
 
 
+def list_numbers(estimates: pl.DataFrame) -> list[tuple[str, str, str, pl.DataFrame]]:
+    """Vehicle, effect, parameter and rows of every number whose effect at least one run names.
+
+    Not those of effects that act at a moment or a place of one recording, which say nothing of another.
+    """
+    parts = take_numbers(estimates).partition_by(
+        "vehicle", "effect", "parameter", as_dict=True, maintain_order=True
+    )
+    return [
+        (str(vehicle), str(effect), str(parameter), rows)
+        for (vehicle, effect, parameter), rows in parts.items()
+        if rows["named"].any() and not is_of_one_run(find_effect(str(effect))())
+    ]
+
+
+def is_of_one_run(effect: Effect) -> bool:
+    """Whether an effect acts at a moment or a place of one recording."""
+    return any(parameter.relative_to in _OF_ONE_RUN for parameter in effect.parameters)
+
+
 def take_numbers(estimates: pl.DataFrame) -> pl.DataFrame:
-    """Rows of `estimates` that count: known terrain, not at a bound, of two inputs the command."""
+    """Rows of `estimates` that count: not at a bound, with an error, of two inputs the command."""
     return (
-        estimates.filter(pl.col("terrain") != UNKNOWN, ~pl.col("at_bound"))
+        estimates.filter(~pl.col("at_bound"), pl.col("standard_error") > 0.0)
         .with_columns(pl.col("input").cast(pl.String))
         .sort("run", "effect", "parameter", "input")
         .unique(["run", "effect", "parameter"], keep="first", maintain_order=True)

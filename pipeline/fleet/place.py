@@ -48,11 +48,12 @@ def place_deployments(deployments: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def place_datasets(datasets: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
+def place_datasets(datasets: pl.DataFrame, column: str) -> tuple[pl.DataFrame, list[str]]:
     """Own datasets as points of the map, and why some are not on it.
 
     Args:
         datasets: table `datasets` of one input.
+        column: of it, which is put into ``value``.
     """
     placed = datasets.with_columns(
         pl.col("terrain").map_elements(rate_name, return_dtype=pl.Float64).alias("complexity")
@@ -73,7 +74,7 @@ def place_datasets(datasets: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
             "runs",
             pl.col("largest_kinetic_energy").alias("energy"),
             "complexity",
-            pl.col("median_modulus").alias("slip"),
+            pl.col(column).alias("value"),
         ).with_columns(_name_zone()),
         notes,
     )

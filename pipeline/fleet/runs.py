@@ -22,7 +22,9 @@ _FASTEST = 0.99
 _MEASURES = {
     "relative_slip": pl.Float64,
     "slip_energy": pl.Float64,
+    "lost_energy": pl.Float64,
     "unpredictability": pl.Float64,
+    "relative_unpredictability": pl.Float64,
     "transitory_slip": pl.Float64,
     "published_norm": pl.Float64,
 }
@@ -87,11 +89,15 @@ def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFra
       0.1 m/s: what share of what was asked did not become motion.
     - ``slip_energy`` [J]: median of 1/2 m |g_xy|^2 + 1/2 I g_w^2, the kinetic energy of the slip velocity.
       I is that of a plate as wide as the track and as long as the wheelbase, m (b^2 + l^2) / 12.
+    - ``lost_energy`` [1]: slip path over path driven, of the vehicle's plate: root mean square over its mass
+      of the velocities at its points, both integrated. Ground that slips at Coulomb's friction mu takes
+      mu g times as much energy per metre and mass; mu is not known, and drops out of comparisons.
     - ``transitory_slip`` [m]: median over command steps of the integral of modulus minus the step's steady
       median over its transitory span: the slip path that a change of command costs on top of steady driving.
     - ``largest_kinetic_energy`` [J]: 1/2 m v^2 of the 99th percentile of the speed's running median over one
       second: the jitter of held poses and single jumps are no motion.
-    - ``unpredictability`` [m/s]: see `measure_unpredictability`.
+    - ``unpredictability`` [m/s]: see `measure_unpredictability`; ``relative_unpredictability`` [1]: over the
+      root mean square ideal speed ||(f_x, f_y, L f_w)||.
 
     Args:
         slip: table `slip` of all runs; only the columns needed are read, suspect rows are left out.
@@ -99,7 +105,7 @@ def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFra
             ``length_scale`` [m].
 
     Returns:
-        ``run``, ``input`` and the five measures.
+        ``run``, ``input`` and the measures.
     """
     sound = slip.filter(~pl.col("suspect")).join(vehicles.lazy(), on="run")
     squared_yaw = (pl.col("length_scale") * pl.col("f_w")) ** 2
@@ -111,6 +117,8 @@ def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFra
     simple = sound.group_by("run", "input").agg(
         (pl.col("modulus") / ideal).filter(ideal > _MOVING_MPS).median().alias("relative_slip"),
         energy.median().alias("slip_energy"),
+        (_plate("g").sum() / _plate("v").sum()).alias("lost_energy"),
+        (ideal**2).mean().sqrt().alias("ideal"),
         (0.5 * pl.col("mass").first() * calm.quantile(_FASTEST) ** 2).alias("largest_kinetic_energy"),
     )
     fresh, late = pl.col("transitory"), ~pl.col("transitory")
@@ -129,7 +137,16 @@ def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFra
     joined, left = pl.collect_all(
         [simple.join(steps, on=["run", "input"], how="left"), measure_unpredictability(sound)]
     )
-    return joined.join(left, on=["run", "input"], how="left").sort("run", "input")
+    whole = joined.join(left, on=["run", "input"], how="left").sort("run", "input")
+    return whole.with_columns(
+        (pl.col("unpredictability") / pl.col("ideal")).alias("relative_unpredictability")
+    ).drop("ideal")
+
+
+def _plate(of: str) -> pl.Expr:
+    """Root mean square velocity of the points of a plate with the vehicle's mass and inertia."""
+    turning = pl.col("inertia") / pl.col("mass") * pl.col(f"{of}_w") ** 2
+    return (pl.col(f"{of}_x") ** 2 + pl.col(f"{of}_y") ** 2 + turning).sqrt()
 
 
 def add_measures(runs: pl.DataFrame, measures: pl.DataFrame) -> pl.DataFrame:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from pipeline.fleet.parameter_trend import describe_change, say_change
 from pipeline.fleet.statistics import find_changes
 
 if TYPE_CHECKING:
@@ -12,8 +13,12 @@ if TYPE_CHECKING:
 
     import polars as pl
 
+    from pipeline.fleet.parameter_trend import ParameterTrend
+
 FEWEST_RUNS = 8
 LEVEL = 0.05
+"""Chance of an alert where nothing moved: half of it for the parameters of a vehicle, half for all else."""
+_SLIP_FIRST = ("median_modulus (command)", "median_modulus (measured)")
 
 
 @dataclass(frozen=True)
@@ -23,6 +28,8 @@ class Step:
     Attributes:
         since: day of the first run of the new level.
         run: that run.
+        earliest, latest: between which places among all dated runs the change is, a run of the series off
+            on either side.
         before: level before, the mean over runs.
         after: level after.
         runs_before: runs of the level before.
@@ -32,6 +39,8 @@ class Step:
 
     since: str
     run: str
+    earliest: int
+    latest: int
     before: float
     after: float
     runs_before: int
@@ -50,9 +59,9 @@ class Series:
 
     Attributes:
         group: whose.
-        quantity: for example `median_modulus (command)` or `effective_track.k (measured)`.
+        quantity: for example `median_modulus (command)`.
         unit: of the values.
-        points: ``day``, ``run``, ``value``, in the order of time.
+        points: ``order``, ``day``, ``run``, ``value``, in the order of time.
         steps: changes of level, in the order of time.
     """
 
@@ -80,71 +89,128 @@ class Alert:
 def follow_quantities(values: pl.DataFrame) -> list[Series]:
     """Every quantity of every group as a series, with its steps.
 
-    Steps are looked for by `find_changes`, at 5 % for each series, where there are at least eight runs: with
-    fewer, no order of the runs is rare enough.
+    Steps are looked for by `find_changes`, where there are at least eight runs: with fewer, no order of the
+    runs is rare enough. All series share the chance of a step that is none.
 
     Args:
-        values: ``group``, ``quantity``, ``unit``, ``day``, ``run``, ``value`` in the order of time.
+        values: ``order`` (of all dated runs), ``group``, ``quantity``, ``unit``, ``day``, ``run``, ``value``
+            in the order of time.
     """
+    parts = values.partition_by("group", "quantity", as_dict=True, maintain_order=True)
+    tested = sum(_can_step(rows) for rows in parts.values())
     series = []
-    for (group, quantity), rows in values.partition_by(
-        "group", "quantity", as_dict=True, maintain_order=True
-    ).items():
-        points = rows.select("day", "run", "value")
-        series.append(Series(str(group), str(quantity), str(rows["unit"][0]), points, _find_steps(points)))
+    for (group, quantity), rows in parts.items():
+        points = rows.select("order", "day", "run", "value")
+        steps = _find_steps(points, LEVEL / 2 / tested) if _can_step(rows) else ()
+        series.append(Series(str(group), str(quantity), str(rows["unit"][0]), points, steps))
     return sorted(series, key=lambda one: (one.group, one.quantity))
 
 
-def raise_alerts(series: list[Series], *, threshold: float, limits: Mapping[str, float]) -> list[Alert]:
-    """Steps of the last level beyond ``threshold``, and last values beyond their limit.
+@dataclass(frozen=True)
+class _Event:
+    """A change that may be told: alone, or with the one that it follows from."""
+
+    group: str
+    quantity: str
+    text: str
+    short: str
+    earliest: int
+    latest: int
+
+
+def raise_alerts(
+    series: Sequence[Series],
+    parameters: Sequence[ParameterTrend],
+    *,
+    vehicles: Mapping[str, str],
+    threshold: float,
+    limits: Mapping[str, float],
+) -> list[Alert]:
+    """One alert for each cause: the last change of a parameter, or of anything else, and what moved with it.
+
+    Changes of one vehicle that may be of the same day are one: that of the surest parameter, with the
+    others, slip and all, in its words. Last values beyond their limit are alerts of their own.
 
     Args:
         series: as of `follow_quantities`.
-        threshold: relative change of level that matters, for example 0.1.
+        parameters: as of `follow_parameters`; they count where they move by what is worth a name.
+        vehicles: vehicle of each group that has one only.
+        threshold: relative change of a series that matters, for example 0.1.
         limits: highest value allowed, by quantity (with or without the input in brackets).
     """
+    moved = [(one, one.changes[-1]) for one in parameters if one.changes]
+    moved = [(one, last) for one, last in moved if abs(last.after - last.before) >= one.worth]
+    events = [
+        _Event(one.vehicle, one.label, describe_change(one, last), say_change(one, last), last.earliest,
+               last.latest)
+        for one, last in sorted(moved, key=lambda pair: (pair[1].p, -pair[0].named))
+    ]  # fmt: skip
+    stepped = [(one, one.steps[-1]) for one in series if one.steps and one.steps[-1].size >= threshold]
+    events += [
+        _Event(vehicles.get(one.group, one.group), one.quantity, describe_step(one, step),
+               say_step(one, step), step.earliest, step.latest)
+        for one, step in sorted(stepped, key=lambda pair: pair[0].quantity not in _SLIP_FIRST)
+    ]  # fmt: skip
     alerts = []
-    for one in series:
-        if one.steps and one.steps[-1].size >= threshold:
-            alerts.append(Alert(one.group, one.quantity, describe_step(one, one.steps[-1])))
-        limit = limits.get(one.quantity, limits.get(one.quantity.split(" (")[0]))
-        if limit is not None and one.latest > limit:
-            text = (
-                f"{one.quantity} of {one.group} is {one.latest:.3g} {one.unit} in {one.points['run'][-1]}, "
-                f"above the limit of {limit:g}"
-            )
-            alerts.append(Alert(one.group, one.quantity, text))
+    while events:
+        head = events.pop(0)
+        same = [one for one in events if one.group == head.group and _overlap(one, head)]
+        events = [one for one in events if one not in same]
+        told = "; ".join(one.short for one in same)
+        alerts.append(Alert(head.group, head.quantity, head.text + (f"; with it: {told}" if told else "")))
+    lasts = [(one.group, one.quantity, one.unit, one.latest, one.points["run"][-1]) for one in series]
+    lasts += [(one.vehicle, one.label, one.unit, one.latest, one.points["run"][-1]) for one in parameters]
+    for group, quantity, unit, value, run in lasts:
+        limit = limits.get(quantity, limits.get(quantity.split(" (")[0]))
+        if limit is not None and value > limit:
+            text = f"{quantity} of {group} is {value:.3g} {unit} in {run}, above the limit of {limit:g}"
+            alerts.append(Alert(group, quantity, text))
     return alerts
 
 
-def describe_quiet(series: Sequence[Series]) -> str:
+def _overlap(one: _Event, other: _Event) -> bool:
+    return one.earliest <= other.latest and other.earliest <= one.latest
+
+
+def describe_quiet(series: Sequence[Series], parameters: Sequence[ParameterTrend]) -> str:
     """What is to be said where there is no alert: that nothing moved, or that nothing could be tested."""
     most = max((one.points.height for one in series), default=0)
-    if most >= FEWEST_RUNS:
+    if most >= FEWEST_RUNS or any(not one.need for one in parameters):
         return "nothing moved beyond the threshold"
     return (
-        f"nothing could be tested: a change of level takes {FEWEST_RUNS} runs, the most of a group is {most}"
+        f"nothing could be tested: a change of slip takes {FEWEST_RUNS} runs, the most of a group is {most}; "
+        "one of a parameter four runs on one ground"
     )
+
+
+def say_step(series: Series, step: Step) -> str:
+    """What moved from what to what."""
+    unit = f" {series.unit}" if series.unit not in ("", "1") else ""
+    return f"{series.quantity} of {series.group} {step.before:.3g} -> {step.after:.3g}{unit}"
 
 
 def describe_step(series: Series, step: Step) -> str:
     """A step in a sentence: whose quantity moved from what to what, since when, how sure."""
-    unit = f" {series.unit}" if series.unit not in ("", "1") else ""
     return (
-        f"{series.quantity} of {series.group} moved from {step.before:.3g} to {step.after:.3g}{unit} since "
-        f"{step.since} ({step.runs_before} runs before, {step.runs_after} since, p = {step.p:.2g})"
+        f"{say_step(series, step)} since {step.since} ({step.runs_before} runs before, {step.runs_after} "
+        f"since, p = {step.p:.2g})"
     )
 
 
-def _find_steps(points: pl.DataFrame) -> tuple[Step, ...]:
-    if points.height < FEWEST_RUNS:
-        return ()
-    changes = find_changes(points["value"].to_numpy(), level=LEVEL)
+def _can_step(rows: pl.DataFrame) -> bool:
+    return rows.height >= FEWEST_RUNS and rows["value"].n_unique() > 1
+
+
+def _find_steps(points: pl.DataFrame, level: float) -> tuple[Step, ...]:
+    changes = find_changes(points["value"].to_numpy(), level=level)
     edges = [0, *(change.index for change in changes), points.height]
+    orders = points["order"].to_list()
     return tuple(
         Step(
             since=points["day"][change.index],
             run=points["run"][change.index],
+            earliest=orders[max(change.index - 2, 0)] + 1,
+            latest=orders[min(change.index + 1, len(orders) - 1)],
             before=change.before,
             after=change.after,
             runs_before=edges[i + 1] - edges[i],

@@ -20,13 +20,12 @@ if TYPE_CHECKING:
     from pipeline.identification.problem import Problem
     from pipeline.models.model import Model
 
-_ROUNDS = 2
-
 
 def tie_to_prior(problem: Problem, model: Model, numbers: Mapping[str, tuple[float, float]]) -> Problem:
     """The problem with a prior on the model's numbers.
 
-    How often residuals repeat each other is read from those of the fit itself, which is repeated with it.
+    How much less residuals know than they say is read from the fit without the prior: a prior that the runs
+    contradict leaves more of them, and would weigh itself up by it.
 
     Args:
         problem: the runs.
@@ -36,12 +35,9 @@ def tie_to_prior(problem: Problem, model: Model, numbers: Mapping[str, tuple[flo
     Returns:
         The runs made ready once, shared with `problem`, with the prior in every part.
     """
-    tied = _tie(problem, [Prior(numbers)] * len(problem.parts))
-    for _ in range(_ROUNDS):
-        fitted = fit_model(tied, model)
-        repeats = [measure_excess(part, fit) for part, fit in zip(tied.parts, fitted.fits, strict=True)]
-        tied = _tie(problem, [Prior(numbers, count) for count in repeats])
-    return tied
+    alone = fit_model(problem, model)
+    excess = [measure_excess(part, fit) for part, fit in zip(problem.parts, alone.fits, strict=True)]
+    return _tie(problem, [Prior(numbers, one) for one in excess])
 
 
 def fit_with_prior(problem: Problem, model: Model, numbers: Mapping[str, tuple[float, float]]) -> Fitted:
@@ -62,7 +58,9 @@ def measure_excess(part: Part, fit: PartFit) -> float:
     squares = np.mean((live / scale)[:, list(part.channels)] ** 2)
     distance = float(np.median(np.diff(part.times.mean(axis=1))))
     repeats = max(count_repeats(part, fit), SHORTEST_TIME_S / max(distance, 1e-3))
-    return repeats * max(float(squares), 1.0)
+    count = live.shape[0] * len(part.channels) / repeats
+    freedom = max(count - len(fit.free), 1.0)
+    return float(repeats * max(float(squares) * count / freedom, 1.0))
 
 
 def _tie(problem: Problem, priors: list[Prior]) -> Problem:

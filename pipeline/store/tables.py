@@ -145,7 +145,7 @@ def name_broken_rules(failure: FailureInfo) -> pl.DataFrame:
     return rows.with_columns(broken.to_series())
 
 
-def encode_parquet(contract: Contract, frame: pl.DataFrame) -> bytes:
+def encode_parquet(contract: Contract, frame: pl.DataFrame, *, compression: str = "zstd") -> bytes:
     """A frame as Parquet bytes; the same frame gives the same bytes.
 
     Fields carry unit, frame and description, the schema carries ``contract`` and ``contract_version``.
@@ -156,8 +156,8 @@ def encode_parquet(contract: Contract, frame: pl.DataFrame) -> bytes:
     pq.write_table(
         pa.Table.from_arrays(table.columns, schema=schema),
         sink,
-        compression="zstd",
-        compression_level=_ZSTD_LEVEL,
+        compression=compression,
+        compression_level=_ZSTD_LEVEL if compression == "zstd" else None,
         row_group_size=_ROWS_PER_GROUP,
         # Numbers of a sensor hardly repeat: their dictionaries would be larger than they are.
         use_dictionary=[field.name for field in schema if not pa.types.is_floating(field.type)],

@@ -129,6 +129,15 @@ def test_an_offset_between_the_steering_sensor_and_the_tyres_is_named(tmp_path: 
     assert found.effects[0].equivalent_to == ("steering_offset",)
 
 
+def test_wheels_that_spin_by_almost_half_are_small_or_slip_on_this_ground(
+    tmp_path: Path,
+) -> None:
+    spinning = replace(_SCENE, effects={"wheel_radius": 0.6}, duration_s=60.0)
+    found = _diagnose(spinning, tmp_path, inputs=("measured",)).runs[0]
+    assert [effect.id for effect in found.effects] == ["wheel_radius"]
+    assert {one.name for one in found.effects[0].readings} == {"wheel_radius", "longitudinal_slip"}
+
+
 def test_the_ladder_falls_on_data_that_no_rung_has_seen(skidding: Diagnosis) -> None:
     errors = [rung["t_mrmse_m"] for rung in skidding.runs[0].ladder]
     assert len(errors) == 3

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
+from pipeline.models import list_effects
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -38,7 +40,6 @@ class Run:
     sha256: str = ""
     start_ns: int = 1_700_000_000_000_000_000
     findings: Sequence[tuple[str, str, float | None]] = field(default=())
-    parameters: Sequence[tuple[str, str, float, str]] = field(default=())
     estimates: Sequence[tuple[str, str, float, float]] = field(default=())
     budget: pl.DataFrame | None = None
     still: bool = False
@@ -91,7 +92,6 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
         "aggregates": _aggregate(slip, run),
         "findings": _list_findings(run),
         "poses": _integrate(t, speed, turn, run.start_ns),
-        "parameters": _list_parameters(run),
     }
     if run.budget is not None:
         tables["budget"] = _complete_budget(run.budget)
@@ -118,6 +118,31 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
                 "dataset": run.dataset,
             }
         )
+
+
+def write_budgets(store: Store, runs: int) -> None:
+    """Runs of three vehicles on four terrains, a day each, with estimates of all numbers and budgets."""
+    rng = np.random.default_rng(0)
+    numbers = [
+        (effect.id, parameter.name)
+        for effect in list_effects()
+        for parameter in effect.parameters
+        if math.isfinite(parameter.neutral)
+    ]
+    causes = [*dict.fromkeys(effect for effect, _ in numbers[:7]), "disturbance", "localization_noise"]
+    for i in range(runs):
+        vehicle, terrain = f"v{i % 3}", f"t{i % 4}"
+        squares = rng.gamma(2.0, 0.1, len(causes))
+        budget = pl.DataFrame({"name": causes, "mean_square": squares}).with_columns(
+            pl.when(pl.col("name").is_in(causes[-2:])).then("name").otherwise(pl.lit("effect")).alias("kind"),
+            *((pl.col("mean_square") / squares.sum()).alias(column) for column in ("share", "low", "high")),
+        )
+        estimates = [(effect, name, float(rng.normal(1.0, 0.1)), 0.05) for effect, name in numbers]
+        run = Run(
+            name=f"r{i:03d}", dataset=f"{vehicle}_{terrain}", vehicle=vehicle, terrain=terrain,
+            seconds=6.0, start_ns=(1_700_000_000 + 86_400 * i) * 10**9, budget=budget, estimates=estimates,
+        )  # fmt: skip
+        write_run(store, run, seed=i)
 
 
 def _cut_windows(slip: pl.DataFrame) -> pl.DataFrame:
@@ -187,19 +212,6 @@ def _list_findings(run: Run) -> pl.DataFrame:
         "stage": pl.String, "id": pl.String, "severity": pl.Enum(["info", "warning", "error"]),
         "text": pl.String, "where": pl.String, "t_start": pl.Float64, "t_end": pl.Float64,
         "value": pl.Float64, "count": pl.Int64,
-    }  # fmt: skip
-    return pl.DataFrame(rows, schema=schema, orient="row")
-
-
-def _list_parameters(run: Run) -> pl.DataFrame:
-    rows = [
-        {"input": "measured", "effect": effect, "parameter": name, "value": value, "low": None, "high": None,
-         "unit": unit, "at_bound": False}
-        for effect, name, value, unit in run.parameters
-    ]  # fmt: skip
-    schema = {
-        "input": _INPUTS, "effect": pl.String, "parameter": pl.String, "value": pl.Float64, "low": pl.Float64,
-        "high": pl.Float64, "unit": pl.String, "at_bound": pl.Boolean,
     }  # fmt: skip
     return pl.DataFrame(rows, schema=schema, orient="row")
 

@@ -43,17 +43,18 @@ def results(tmp_path: Path) -> Path:
                     terrain=terrain,
                     mass_kg=mass,
                     sha256=f"{dataset}{number}",
+                    estimates=[("effective_track", "k", 1.7 + 0.02 * number, 0.01)],
                 )
                 write_run(Store(folder), made, seed=number)
     return folder
 
 
-@pytest.mark.parametrize("verb", ["compare", "map"])
+@pytest.mark.parametrize("verb", ["compare", "map", "trend"])
 def test_nothing_is_cut_or_overlaps(verb: str, chrome: Chrome, results: Path, pictures: Path) -> None:
     with pytest.raises(SystemExit) as ended:
         main([verb, str(results), "--quiet"])
     assert ended.value.code == 0
-    page = results / ("comparison.html" if verb == "compare" else "map.html")
+    page = results / {"compare": "comparison.html"}.get(verb, f"{verb}.html")
     for width in (390, 1280):
         chrome.size(width, 900, dark=width < 600)
         chrome.open(page.as_uri())

@@ -145,6 +145,12 @@ def test_own_datasets_stand_on_the_map_by_their_slip(tmp_path: Path) -> None:
     assert drawn.own["complexity"].to_list() == pytest.approx([6.0])
     assert any("scale does not know" in note and "warthog_moon" in note for note in drawn.notes)
     assert any("cart_ice" in note for note in drawn.notes)
+    # On the command, as `slip compare` chooses it, unless something else is asked for.
+    assert (drawn.input, drawn.own["value"].to_list()) == ("command", pytest.approx([2.0], rel=0.2))
+    lost, wheels = draw_up_map(store, show="energy"), draw_up_map(store, fed="measured")
+    assert lost.own["value"].item() > 0.0
+    assert wheels.own["value"].item() == pytest.approx(0.5 * drawn.own["value"].item())
+    assert "own runs: lost energy on command [1]" in write_map(store, lost).read_text(encoding="utf-8")
     page = write_map(store, drawn, "svg").read_text(encoding="utf-8")
     assert "warthog_ice: a/k0" in page
     assert (tmp_path / "figures" / "deployment_map.svg").stat().st_size > 1000

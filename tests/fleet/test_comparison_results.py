@@ -15,6 +15,7 @@ from pipeline.analysis.compare_files import describe_answer, write_answer
 from pipeline.analysis.errors import JobError
 from pipeline.cli.app import main
 from pipeline.fleet import ComparisonError, Group, Samples, compare_groups
+from pipeline.fleet.measures import compare_orders
 from pipeline.store import Store
 from schemas.contract import list_contracts
 from schemas.slip import Slip
@@ -171,6 +172,31 @@ def test_measures_of_difficulty_have_their_definition(store: Store) -> None:
     assert row["unpredictability"] < 1.0
     assert 1.0 / 2.3 < row["relative_slip"] < 1.0 / 0.5
     assert row["height_rate"] is None
+    # Slip goes 1 m/s sideways and ahead while the vehicle drives at |v|: a path over a path.
+    slip = store.read("one", "slip").filter(pl.col("input") == "command")
+    turning = (1.08**2 + 0.914**2) / 12.0 * slip["v_w"] ** 2
+    driven = (slip["v_x"] ** 2 + slip["v_y"] ** 2 + turning).sqrt()
+    assert row["lost_energy"] == pytest.approx(slip.height / driven.sum())
+    ideal = (slip["f_x"] ** 2 + slip["f_w"] ** 2).mean() ** 0.5  # type: ignore[operator]
+    assert row["relative_unpredictability"] == pytest.approx(row["unpredictability"] / ideal)
+
+
+def test_vehicles_agree_on_the_order_of_grounds_or_there_are_too_few(store: Store) -> None:
+    for vehicle, scale in (("warthog", 1.0), ("husky_a200", 0.2)):
+        for place, terrain in enumerate(("asphalt", "gravel", "grass", "sand", "ice")):
+            name = f"{vehicle}_{terrain}"
+            made = Run(name=name, dataset=name, vehicle=vehicle, terrain=terrain, median=scale * 2.0**place)
+            write_run(store, made, seed=place)
+    orders = {
+        one.measure: one for one in compare_orders(ask(store).datasets.filter(pl.col("input") == "command"))
+    }
+    assert orders["slip"].tau == pytest.approx(1.0)
+    assert orders["slip"].p == pytest.approx(2 / 120)
+    assert orders["slip"].terrains[0] == "asphalt"
+    few = ask(store).datasets.filter(pl.col("terrain").is_in(["asphalt", "ice"]))
+    assert "too few grounds to be sure" in compare_orders(few.filter(pl.col("input") == "command"))[0].text
+    one = few.filter(pl.col("dataset").is_in(["warthog_ice", "husky_a200_asphalt"]))
+    assert compare_orders(one)[0].text == "husky_a200 and warthog share no ground: no order to compare"
 
 
 def test_files_and_json_keep_their_promises(store: Store, capsys: pytest.CaptureFixture[str]) -> None:

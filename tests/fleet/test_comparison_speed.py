@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import resource
 import subprocess
 import sys
 import time
 from typing import TYPE_CHECKING
 
-import numpy as np
-import polars as pl
 import pytest
-from comparison_store import Run, write_run
+from comparison_store import Run, write_budgets, write_run
 
-from pipeline.models import list_effects
 from pipeline.store import Store
 
 if TYPE_CHECKING:
@@ -49,34 +45,17 @@ def test_a_hundred_runs_take_ten_seconds_and_a_gigabyte(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("verb", [("fleet", "fit"), ("compare", "--causes")], ids=lambda verb: verb[0])
+@pytest.mark.parametrize(
+    "verb", [("fleet", "fit"), ("compare", "--causes"), ("trend",)], ids=lambda verb: verb[0]
+)
 def test_three_hundred_runs_by_cause_take_ten_seconds_and_a_gigabyte(
     tmp_path: Path, verb: tuple[str, ...]
 ) -> None:
-    store, rng = Store(tmp_path), np.random.default_rng(0)
-    numbers = [
-        (effect.id, parameter.name)
-        for effect in list_effects()
-        for parameter in effect.parameters
-        if math.isfinite(parameter.neutral)
-    ]
-    causes = [*dict.fromkeys(effect for effect, _ in numbers[:7]), "disturbance", "localization_noise"]
-    for i in range(300):
-        vehicle, terrain = f"v{i % 3}", f"t{i % 4}"
-        squares = rng.gamma(2.0, 0.1, len(causes))
-        budget = pl.DataFrame({"name": causes, "mean_square": squares}).with_columns(
-            pl.when(pl.col("name").is_in(causes[-2:])).then("name").otherwise(pl.lit("effect")).alias("kind"),
-            *((pl.col("mean_square") / squares.sum()).alias(column) for column in ("share", "low", "high")),
-        )
-        estimates = [(effect, name, float(rng.normal(1.0, 0.1)), 0.05) for effect, name in numbers]
-        run = Run(
-            name=f"r{i:03d}", dataset=f"{vehicle}_{terrain}", vehicle=vehicle, terrain=terrain,
-            seconds=6.0, budget=budget, estimates=estimates,
-        )  # fmt: skip
-        write_run(store, run, seed=i)
+    write_budgets(Store(tmp_path), 300)
     program = "import sys; from pipeline.cli.app import main; main(sys.argv[1:])"
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([sys.executable, "-c", program, *verb, str(tmp_path), "--quiet"], check=True)
+    ended = subprocess.run([sys.executable, "-c", program, *verb, str(tmp_path), "--quiet"], check=False)
+    assert ended.returncode in (0, 4)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     # It runs on one core: what it takes of it is what it takes where nothing else runs.
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 10.0

@@ -40,7 +40,7 @@ def drive_a_season(store: Store, tracks: list[float], *, median: float = 1.0) ->
                 seconds=30.0,
                 start_ns=stamp_of(day),
                 findings=[("heading_skew", "warning", 0.1)],
-                parameters=[("effective_track", "k", track, "1")],
+                estimates=[("effective_track", "k", track, 0.004)],
             ),
         )
 
@@ -55,43 +55,76 @@ def store(tmp_path: Path) -> Store:
     return Store(tmp_path)
 
 
-def test_a_track_that_moved_is_said_with_its_day(store: Store) -> None:
+def test_a_track_that_moved_is_said_with_its_day_and_what_is_likely(store: Store) -> None:
     wobble = [0.01, -0.02, 0.015, -0.01, 0.02, -0.015, 0.0]
     tracks = [1.8 + wobble[i % 7] for i in range(13)] + [2.1 + wobble[i % 7] for i in range(6)]
     drive_a_season(store, tracks)
     found = follow(store)
-    (alert,) = [alert for alert in found.alerts if alert.quantity.startswith("effective_track")]
-    assert alert.text.startswith(
-        "effective_track.k (measured) of warthog-2 moved from 1.8 to 2.1 since 2026-05-03 "
-        "(13 runs before, 6 since"
+    (alert,) = found.alerts
+    assert alert.text == (
+        "effective_track.k of warthog-2 1.8 -> 2.1 since 2026-05-03 (13 runs before, 6 since, p < 0.001): "
+        "likely another tyre pressure or load, or other ground"
     )
     quantities = {one.quantity for one in found.series}
     assert {"median_modulus (command)", "finding heading_skew", "warnings", "suspect share"} <= quantities
     page = write_trend(store, found).read_text(encoding="utf-8")
-    assert "moved from 1.8 to 2.1" in page
+    assert "1.8 -&gt; 2.1 since 2026-05-03" in page
 
 
-def test_small_steps_raise_no_alert_and_few_runs_are_said(store: Store) -> None:
-    drive_a_season(store, [1.8] * 6 + [1.85] * 6)
+def test_what_moves_with_a_parameter_is_told_with_it(store: Store) -> None:
+    drive_a_season(store, [1.8, 1.81] * 5, median=1.0)
+    for i in range(10, 20):
+        write_run(
+            store,
+            Run(
+                name=f"later_{i}", dataset="warthog-2_gravel", vehicle="warthog-2", median=3.0, seconds=30.0,
+                start_ns=stamp_of(FIRST + timedelta(days=i)), findings=[("heading_skew", "warning", 0.3)],
+                estimates=[("effective_track", "k", 2.0 + 0.01 * (i % 2), 0.004)],
+            ),
+        )  # fmt: skip
+    (alert,) = follow(store).alerts
+    assert alert.quantity == "effective_track.k"
+    with_it = alert.text.split("; with it: ")[1]
+    assert with_it.startswith("median_modulus (command) of warthog-2 ")
+    assert "finding heading_skew of warthog-2 0.1 -> 0.3" in with_it
+
+
+def test_changes_not_worth_a_name_raise_no_alert(store: Store) -> None:
+    drive_a_season(store, [1.8, 1.801] * 4 + [1.808, 1.807] * 4)
     found = follow(store)
-    steady = next(one for one in found.series if one.quantity.startswith("effective_track"))
-    assert [step.after for step in steady.steps] == pytest.approx([1.85])
-    assert not [alert for alert in found.alerts if alert.quantity == steady.quantity]
+    (track,) = found.parameters
+    assert [change.after for change in track.changes] == pytest.approx([1.8075])
+    assert not found.alerts
 
 
 def test_where_all_stands_still_nothing_moved(store: Store) -> None:
     drive_a_season(store, [1.8] * 8)
     found = follow(store)
     assert not found.alerts
-    assert describe_quiet(found.series) == "nothing moved beyond the threshold"
+    assert describe_quiet(found.series, found.parameters) == "nothing moved beyond the threshold"
     assert "Nothing moved beyond the threshold" in write_trend(store, found).read_text(encoding="utf-8")
 
 
-def test_too_few_runs_are_said(store: Store) -> None:
-    drive_a_season(store, [1.8, 1.8, 1.8, 2.4, 2.4, 2.4])
+def test_four_runs_tell_a_large_change_and_three_say_what_they_lack(store: Store) -> None:
+    drive_a_season(store, [1.8, 1.802, 1.801])
     found = follow(store)
     assert not found.alerts
-    assert any("too few runs to find a change, 8 are needed: warthog-2" in note for note in found.notes)
+    assert any(
+        "too few runs to find a change of slip, 8 are needed: warthog-2" in note for note in found.notes
+    )
+    lack = "a change takes 1 more run on ground that was driven before"
+    assert any(lack in note and "effective_track.k" in note for note in found.notes)
+    write_run(
+        store,
+        Run(
+            name="fourth", dataset="warthog-2_gravel", vehicle="warthog-2", seconds=30.0,
+            start_ns=stamp_of(FIRST + timedelta(days=9)), estimates=[("effective_track", "k", 2.3, 0.004)],
+        ),
+    )  # fmt: skip
+    (alert,) = follow(store).alerts
+    assert alert.text.startswith(
+        "effective_track.k of warthog-2 1.8 -> 2.3 since 2026-04-29 (3 runs before, 1 since"
+    )
 
 
 def test_where_no_group_has_enough_runs_nothing_is_said_to_stand_still(
@@ -101,7 +134,7 @@ def test_where_no_group_has_enough_runs_nothing_is_said_to_stand_still(
     with pytest.raises(SystemExit) as ended:
         main(["trend", str(store.root), "--by", "vehicle"])
     assert ended.value.code == 0
-    said = "nothing could be tested: a change of level takes 8 runs, the most of a group is 1"
+    said = "nothing could be tested: a change of slip takes 8 runs, the most of a group is 1"
     spoken = capsys.readouterr().out
     assert spoken.startswith(said)
     assert "nothing moved" not in spoken

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -213,6 +214,25 @@ def test_a_batch_keeps_a_fleet_that_was_fitted_up_to_date(
     shown = json.loads(run_slip(capsys, "fleet", "show", str(results.root), "--json")[1])
     assert "mud" in shown["parameters"][0]["terrains"]
     assert not any("have changed since" in note for note in shown["notes"])
+
+
+def test_a_batch_keeps_a_trend_that_was_asked_for_up_to_date(
+    results: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    refresh_pools(results)
+    assert not (results.root / "trend.json").exists()
+    asked = ("--by", "vehicle", "--limit", "wheel_radius.k=1.5")
+    assert run_slip(capsys, "trend", str(results.root), *asked, "--quiet")[0] == 0
+    new = Run(name="new", terrain="ice", seconds=6.0, estimates=[("wheel_radius", "k", 1.6, ERROR)])
+    write_run(results, replace(new, start_ns=new.start_ns + 10**15))
+    refresh_pools(results)
+    told = json.loads((results.root / "trend.json").read_text(encoding="utf-8"))
+    assert told["asked"]["by"] == ["vehicle"]
+    assert any("in new, above the limit of 1.5" in alert["text"] for alert in told["alerts"])
+    assert "above the limit of 1.5" in (results.root / "trend.html").read_text(encoding="utf-8")
+    (results.root / "trend.json").write_text('{"asked": 3}', encoding="utf-8")
+    write_run(results, Run(name="newer", terrain="ice", seconds=6.0))
+    assert refresh_pools(results)
 
 
 def test_without_a_fleet_or_estimates_one_line_says_what_to_do(

@@ -197,3 +197,12 @@ def test_words_for_delta() -> None:
         "medium",
         "large",
     ]
+
+
+@pytest.mark.parametrize("count", [2, 4, 6])
+def test_kendall_p_counts_all_orders(count: int) -> None:
+    taus = [ps.kendall_tau(np.arange(count), order) for order in itertools.permutations(range(count))]
+    for tau in set(taus):
+        p, smallest = ps.kendall_p(tau, count)
+        assert p == pytest.approx(np.mean(np.abs(taus) >= abs(tau) - 1e-9))
+        assert smallest == pytest.approx(2 / len(taus))

@@ -29,7 +29,7 @@ from pipeline.fleet.statistics.intervals import (
     bound_typical,
 )
 from pipeline.fleet.statistics.levels import GroupMean, LevelFit, find_outlier, split_levels
-from pipeline.fleet.statistics.orders import kendall_tau, list_swaps
+from pipeline.fleet.statistics.orders import kendall_p, kendall_tau, list_swaps
 from pipeline.fleet.statistics.pairs import Blocks, Comparison, compare_blocks, compare_runs, cut_blocks
 from pipeline.fleet.statistics.permutation import (
     DRAWS,
@@ -40,9 +40,11 @@ from pipeline.fleet.statistics.permutation import (
 )
 from pipeline.fleet.statistics.posterior import Draws, draw_run
 from pipeline.fleet.statistics.ranks import mann_whitney
+from pipeline.fleet.statistics.shifts import FEWEST_FREE, Shift, ShiftSearch, find_shifts, guess_shift
 
 __all__ = [
     "DRAWS",
+    "FEWEST_FREE",
     "MOST_GROUPS",
     "TIMES_PER_BLOCK",
     "Blocks",
@@ -53,6 +55,8 @@ __all__ = [
     "Interval",
     "LevelFit",
     "PermutationTest",
+    "Shift",
+    "ShiftSearch",
     "StatisticsError",
     "adjust_holm",
     "adjust_max_t",
@@ -69,7 +73,10 @@ __all__ = [
     "draw_run",
     "find_changes",
     "find_outlier",
+    "find_shifts",
+    "guess_shift",
     "integrated_time",
+    "kendall_p",
     "kendall_tau",
     "list_swaps",
     "mann_whitney",

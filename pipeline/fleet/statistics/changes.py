@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 FEWEST_RUNS = 3
 _DRAWS = 1_999
+# Orders beyond what the level takes, so that p can be below it.
+_PER_LEVEL = 4.0
 _TIE = 1e-9
 
 
@@ -74,10 +76,11 @@ def _split(
     if piece.size < 2 * fewest or float(np.ptp(piece)) == 0.0:
         return []
     observed = _weigh_splits(piece[None, :], fewest)[0]
-    orders = generator.permuted(np.tile(piece, (_DRAWS, 1)), axis=1)
+    draws = max(_DRAWS, round(_PER_LEVEL / level))
+    orders = generator.permuted(np.tile(piece, (draws, 1)), axis=1)
     largest = _weigh_splits(orders, fewest).max(axis=1)
     as_large = int(np.count_nonzero(largest >= observed.max() - _TIE * float(largest.max())))
-    p = (1 + as_large) / (_DRAWS + 1)
+    p = (1 + as_large) / (draws + 1)
     if p > level:
         return []
     middle = start + fewest + int(observed.argmax())

@@ -89,10 +89,10 @@ def split_levels(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) ->
     """
     from scipy.special import chdtrc, fdtrc  # noqa: PLC0415 - heavy
 
-    sample, names = _make_sample(values, errors, groups)
+    sample, names = make_sample(values, errors, groups)
     freedom = sample.y.size - len(names)
-    within = _maximize(sample, common=False)[1]
-    between, run = _maximize(sample, common=True)
+    within = maximize_likelihood(sample, common=False)[1]
+    between, run = maximize_likelihood(sample, common=True)
     p_groups = p_runs = chi_square = math.nan
     if freedom:
         scatter = sample.add_within(0.0)
@@ -129,7 +129,7 @@ def find_outlier(values: ArrayLike, errors: ArrayLike, groups: Sequence[str], *,
     """
     from scipy.special import stdtr  # noqa: PLC0415 - heavy, and only this function of it
 
-    sample, _ = _make_sample(values, errors, groups)
+    sample, _ = make_sample(values, errors, groups)
     runs = np.bincount(sample.group, minlength=sample.count)[sample.group]
     asked = runs > 2  # noqa: PLR2004 - of two runs nobody knows which is odd
     if not asked.any():
@@ -140,11 +140,11 @@ def find_outlier(values: ArrayLike, errors: ArrayLike, groups: Sequence[str], *,
     )
     worst = int(np.argmax(np.where(asked, size, -1.0)))
     kept = np.arange(sample.y.size) != worst
-    others = _Sample(sample.y[kept], sample.known[kept], sample.group[kept], sample.count)
+    others = Sample(sample.y[kept], sample.known[kept], sample.group[kept], sample.count)
     freedom = others.y.size - others.count
     if freedom < _FEWEST_OTHERS:
         return None
-    run = _maximize(others, common=False)[1]
+    run = maximize_likelihood(others, common=False)[1]
     _, means, total = others.weigh(run)
     group = sample.group[worst]
     deviation = math.sqrt(sample.known[worst] + run + 1.0 / float(total[group]))
@@ -152,7 +152,8 @@ def find_outlier(values: ArrayLike, errors: ArrayLike, groups: Sequence[str], *,
     return worst if farther * int(asked.sum()) < chance else None
 
 
-def _make_sample(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) -> tuple[_Sample, list[str]]:
+def make_sample(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) -> tuple[Sample, list[str]]:
+    """Checked values with the numbers of their groups, and the groups' names; errors as of `split_levels`."""
     y, s = check_values(values, what="values"), check_values(errors, what="errors")
     if not y.size == s.size == len(groups) or np.any(s <= 0.0):
         raise StatisticsError(
@@ -162,11 +163,11 @@ def _make_sample(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) ->
         )
     names = sorted(set(groups))
     number = np.array([names.index(name) for name in groups], dtype=np.int64)
-    return _Sample(y, s**2, number, len(names)), names
+    return Sample(y, s**2, number, len(names)), names
 
 
 @dataclass(frozen=True)
-class _Sample:
+class Sample:
     """Values, their known variances, the number of each one's group, and how many groups there are."""
 
     y: Floats
@@ -219,7 +220,7 @@ class _Sample:
         return float(value), np.array([0.0, trace - np.sum(pulled**2)])
 
 
-def _maximize(sample: _Sample, *, common: bool) -> tuple[float, float]:
+def maximize_likelihood(sample: Sample, *, common: bool) -> tuple[float, float]:
     """Likeliest variances between groups and between runs, neither below zero.
 
     Spreads are searched, of which the likelihood is an even function: zero is no edge to get stuck at.
@@ -247,7 +248,7 @@ def _maximize(sample: _Sample, *, common: bool) -> tuple[float, float]:
     return between, run
 
 
-def _bound_mean(sample: _Sample, between: float, run: float) -> Interval | None:
+def _bound_mean(sample: Sample, between: float, run: float) -> Interval | None:
     """Interval of the common mean; its degrees of freedom are those of the variances that are not zero."""
     if sample.y.size < 2:  # noqa: PLR2004 - one value has no scatter
         return None
@@ -266,7 +267,7 @@ def _bound_mean(sample: _Sample, between: float, run: float) -> Interval | None:
     return Interval(mean - half, mean + half, _LEVEL)
 
 
-def _inform(sample: _Sample, between: float, run: float) -> Floats:
+def _inform(sample: Sample, between: float, run: float) -> Floats:
     """Expected information of the restricted likelihood on both variances, shape (2, 2)."""
     weight, _, total = sample.weigh(run)
     kept = 1.0 / (1.0 + between * total)
@@ -282,7 +283,7 @@ def _inform(sample: _Sample, between: float, run: float) -> Floats:
     return 0.5 * np.array([[both, mixed], [mixed, single]])
 
 
-def _describe_groups(sample: _Sample, names: Sequence[str], run: float, freedom: int) -> dict[str, GroupMean]:
+def _describe_groups(sample: Sample, names: Sequence[str], run: float, freedom: int) -> dict[str, GroupMean]:
     """Means of the groups; their intervals count the runs within all groups."""
     runs = np.bincount(sample.group, minlength=sample.count)
     _, means, total = sample.weigh(run)

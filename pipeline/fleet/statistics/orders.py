@@ -32,6 +32,23 @@ def kendall_tau(a: ArrayLike, b: ArrayLike) -> float:
     return float(np.sum(left * right)) / scale if scale else 0.0
 
 
+def kendall_p(tau: float, count: int) -> tuple[float, float]:
+    """Chance of an order as like or unlike as this if there were none, and the least that `count` allow.
+
+    Exact for orders without ties: the number of orders with each count of contradictions grows by one thing
+    at a time (Kendall, Biometrika 30, 1938).
+
+    Args:
+        tau: as of `kendall_tau`.
+        count: how many things were ordered, at least two.
+    """
+    chances = np.ones(1)
+    for size in range(2, count + 1):
+        chances = np.convolve(chances, np.full(size, 1.0 / size))
+    levels = np.abs(1.0 - 2.0 * np.arange(chances.size) / (chances.size - 1))
+    return float(chances[levels >= abs(tau) - 1e-9].sum()), float(chances[levels >= 1.0 - 1e-9].sum())
+
+
 def list_swaps(a: ArrayLike, b: ArrayLike) -> list[tuple[int, int]]:
     """Pairs (i, j) with ``a[i] > a[j]`` but ``b[i] < b[j]``, the strongest contradiction in ranks first.
 

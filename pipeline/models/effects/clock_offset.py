@@ -52,7 +52,7 @@ class ClockOffset(ReportEffect):
     readings = (
         Reading(Level.VEHICLE, "clock_offset", "a localization that is always as late"),
         Reading(Level.TERRAIN, "body_inertia", "a body that follows its wheels late on this ground"),
-        Reading(Level.RUN, "clock_offset", "clocks that are set anew in each run"),
+        Reading(Level.RUN, "clock_offset", "clocks set anew"),
     )
 
     def describe_motion(self, vehicle: Vehicle) -> str:

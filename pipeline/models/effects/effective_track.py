@@ -57,7 +57,7 @@ class EffectiveTrack(KinematicEffect):
     readings = (
         Reading(Level.VEHICLE, "geometry", "wheels and wheelbase as they are, or a wrong track width"),
         Reading(Level.TERRAIN, "effective_track", "skidding in turns as this ground makes it"),
-        Reading(Level.RUN, "effective_track", "another tyre pressure or load in some runs"),
+        Reading(Level.RUN, "effective_track", "another tyre pressure or load"),
     )
 
     def describe_motion(self, vehicle: Vehicle) -> str:

@@ -52,7 +52,7 @@ class HeadingSkew(ReportEffect):
     readings = (
         Reading(Level.VEHICLE, "heading_skew", "a recorder that dates headings late"),
         Reading(Level.TERRAIN, "lateral_skid", "sliding outward in turns on this ground"),
-        Reading(Level.RUN, "heading_skew", "clocks that are set anew in each run"),
+        Reading(Level.RUN, "heading_skew", "clocks set anew"),
     )
 
     def describe_motion(self, vehicle: Vehicle) -> str:

@@ -35,7 +35,7 @@ class WheelRadius(KinematicEffect):
             "true over nominal radius",
             0.92,
             least=Least(0.004, DATA_SHEET),
-            plausible=Plausible(0.7, 1.3, "wider than the 2 to 25 % that were seen"),
+            plausible=Plausible(0.4, 1.3, "radii are off by 2 to 25 %, wheels slip by half on loose ground"),
             quantities=(Quantity.RADIUS,),
         ),
     )
@@ -46,7 +46,7 @@ class WheelRadius(KinematicEffect):
     readings = (
         Reading(Level.VEHICLE, "wheel_radius", "wheels smaller or larger than configured"),
         Reading(Level.TERRAIN, "longitudinal_slip", "wheels that turn on without grip on this ground"),
-        Reading(Level.RUN, "wheel_radius", "another tyre pressure or load in some runs"),
+        Reading(Level.RUN, "wheel_radius", "another tyre pressure or load"),
     )
 
     def describe_motion(self, vehicle: Vehicle) -> str:

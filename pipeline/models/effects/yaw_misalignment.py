@@ -45,7 +45,7 @@ class YawMisalignment(ReportEffect):
     readings = (
         Reading(Level.VEHICLE, "yaw_misalignment", "a sensor mounted askew, or an axle that is bent"),
         Reading(Level.TERRAIN, "crabbing", "a ground that pushes the vehicle aside"),
-        Reading(Level.RUN, "yaw_misalignment", "a sensor mounted anew in some runs"),
+        Reading(Level.RUN, "yaw_misalignment", "a sensor mounted anew"),
     )
 
     def describe_motion(self, vehicle: Vehicle) -> str:

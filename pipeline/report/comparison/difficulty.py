@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pipeline.fleet.measures import MEASURES
 from pipeline.fleet.statistics import kendall_tau, list_swaps
 from pipeline.report.elements import Cell, Column, Table
 from pipeline.report.words import MISSING, say_number
@@ -11,21 +12,6 @@ from pipeline.report.words import MISSING, say_number
 if TYPE_CHECKING:
     import polars as pl
 
-MEASURES: dict[str, tuple[str, str, str]] = {
-    "median_modulus": ("slip modulus", "m/s", "the published idea: fast vehicles look worse"),
-    "relative_slip": ("relative slip", "1", "modulus over ideal speed, while the vehicle should move"),
-    "slip_energy": (
-        "slip energy",
-        "J",
-        "1/2 m |g_xy|\u00b2 + 1/2 I g_w\u00b2: what the ground would have to absorb",
-    ),
-    "unpredictability": (
-        "unpredictability",
-        "m/s",
-        "rms slip that a fitted slip model leaves on unseen data",
-    ),
-    "transitory_slip": ("transitory slip", "m", "slip path that a change of command adds to the steady one"),
-}
 _MOST_SWAPS = 4
 _FEWEST = 2
 
@@ -37,7 +23,8 @@ def tabulate_difficulty(shown: pl.DataFrame) -> Table:
         shown: table `datasets` of one input.
     """
     rated = _rate(shown)
-    ranks = {column: rated[column].rank("min") for column in MEASURES}
+    columns = [measure.column for measure in MEASURES.values()]
+    ranks = {column: rated[column].rank("min") for column in columns}
     rows: list[list[str | Cell]] = [
         [
             str(row["dataset"]),
@@ -46,12 +33,12 @@ def tabulate_difficulty(shown: pl.DataFrame) -> Table:
                     say_number(row[column]),
                     small=f"({int(ranks[column][i])})" if row[column] is not None else "",
                 )
-                for column in MEASURES
+                for column in columns
             ),
         ]
         for i, row in enumerate(rated.iter_rows(named=True))
     ]
-    both = {column: rated.drop_nulls(column) for column in MEASURES}
+    both = {column: rated.drop_nulls(column) for column in columns}
     agreement = (
         MISSING
         if pair.height < _FEWEST
@@ -59,19 +46,20 @@ def tabulate_difficulty(shown: pl.DataFrame) -> Table:
         for column, pair in both.items()
     )
     rows.append([Cell("agreement with the modulus (Kendall)", tag="i"), *agreement])
-    head = [Column("dataset"), *(Column(name, unit, number=True) for name, unit, _ in MEASURES.values())]
+    head = [Column("dataset"), *(Column(one.name, one.unit, number=True) for one in MEASURES.values())]
     return Table("Median over runs and, in brackets, the rank from easy to hard", head, rows)
 
 
 def list_contradictions(shown: pl.DataFrame) -> list[str]:
     """Pairs of datasets that a measure orders otherwise than the modulus does, in words."""
     told = []
-    for column, (name, _, _) in MEASURES.items():
-        both = _rate(shown).drop_nulls(column)
+    for measure in MEASURES.values():
+        both = _rate(shown).drop_nulls(measure.column)
         if both.height >= _FEWEST:
-            swaps = list_swaps(both["median_modulus"].to_numpy(), both[column].to_numpy())
+            swaps = list_swaps(both["median_modulus"].to_numpy(), both[measure.column].to_numpy())
             told += [
-                f"{both['dataset'][i]} slips more than {both['dataset'][j]} by modulus, but less by {name}"
+                f"{both['dataset'][i]} slips more than {both['dataset'][j]} by modulus, "
+                f"but less by {measure.name}"
                 for i, j in swaps[:_MOST_SWAPS]
             ]
     return told

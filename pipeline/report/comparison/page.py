@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.report.comparison.difficulty import MEASURES, list_contradictions, tabulate_difficulty
+from pipeline.fleet.measures import MEASURES, compare_orders
+from pipeline.report.comparison.difficulty import list_contradictions, tabulate_difficulty
 from pipeline.report.comparison.figures import draw_boxes, draw_runs
 from pipeline.report.elements import Cell, Column, Picture, Table
 from pipeline.report.page import render_figures
@@ -86,6 +87,7 @@ def render_comparison(
         difficulty=tabulate_difficulty(shown),
         swaps=list_contradictions(shown),
         measures=list(MEASURES.values()),
+        orders=list(dict.fromkeys(one.text for one in compare_orders(shown))),
         notes=notes,
         counted=shown.select("dataset", "keys").to_dicts(),
     )

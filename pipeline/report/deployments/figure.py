@@ -29,12 +29,13 @@ _SHAPES = {
 _ZONE_OPACITY = {"low": 0.0, "medium": 0.45, "high": 0.85}
 
 
-def draw_map(points: pl.DataFrame, own: pl.DataFrame) -> Drawing:
+def draw_map(points: pl.DataFrame, own: pl.DataFrame, about: str) -> Drawing:
     """Deployments at kinetic energy [J, log] against terrain complexity, with the user's datasets on top.
 
     Args:
         points: as of `place_deployments`.
         own: as of `place_datasets`; may be empty.
+        about: what colours them, with its unit.
     """
     own = number_datasets(own)
     arrows = points.filter(pl.col("bound").is_in(["upper", "lower"])).with_columns(
@@ -52,7 +53,7 @@ def draw_map(points: pl.DataFrame, own: pl.DataFrame) -> Drawing:
     }
     layers = [_shade_zones(), _name_zones(), *_draw_bounds(), *_draw_literature(points)]
     if not own.is_empty():
-        layers.append(_draw_own())
+        layers.append(_draw_own(about))
     layers += _draw_names()
     chart = alt.layer(*layers).resolve_scale(color="independent", shape="independent")
     note = (
@@ -168,13 +169,11 @@ def _draw_literature(points: pl.DataFrame) -> list[alt.Chart]:
     return [marks]
 
 
-def _draw_own() -> alt.Chart:
+def _draw_own(about: str) -> alt.Chart:
     colour = alt.Color(
-        "slip:Q",
+        "value:Q",
         scale=alt.Scale(range=list(theme.SLIP_RAMP), interpolate="rgb"),
-        legend=alt.Legend(
-            title="own runs: median slip [m/s]", gradientLength=150, gradientThickness=8, tickCount=3
-        ),
+        legend=alt.Legend(title=f"own runs: {about}", gradientLength=150, gradientThickness=8, tickCount=3),
     )
     marks: alt.Chart = (
         alt.Chart(alt.NamedData("own"))
@@ -187,7 +186,7 @@ def _draw_own() -> alt.Chart:
                 alt.Tooltip("dataset:N"),
                 alt.Tooltip("runs:Q"),
                 alt.Tooltip("energy:Q", format=",.3~r", title="J"),
-                alt.Tooltip("slip:Q", format=".3"),
+                alt.Tooltip("value:Q", format=".3", title=about),
             ],
         )
     )

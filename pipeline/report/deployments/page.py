@@ -9,15 +9,14 @@ import polars as pl
 from pipeline.report.deployments.figure import draw_map, number_datasets
 from pipeline.report.elements import Cell, Column, Picture, Table
 from pipeline.report.page import render_figures
+from pipeline.report.run import INPUT_WORDS
 from pipeline.report.words import say_number
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_OWN = (
-    Column("dataset"), Column("runs", number=True), Column("kinetic energy", "J", number=True),
-    Column("complexity", number=True), Column("median slip", "m/s", number=True), Column("risk"),
-)  # fmt: skip
+    from pipeline.fleet.measures import Measure
+
 _LITERATURE = (
     Column("deployment"), Column("mass", "kg", number=True), Column("known"),
     Column("speed", "m/s", number=True), Column("known"), Column("kinetic energy", "J", number=True),
@@ -25,26 +24,31 @@ _LITERATURE = (
 )  # fmt: skip
 
 
-def picture_map(points: pl.DataFrame, own: pl.DataFrame) -> Picture:
+def picture_map(points: pl.DataFrame, own: pl.DataFrame, measure: Measure, input_name: str) -> Picture:
     """The map as a figure.
 
     Args:
         points: as of `place_deployments`.
         own: as of `place_datasets`; may be empty.
+        measure: what colours them.
+        input_name: what u was.
     """
     high = points.filter(pl.col("zone") == "high")["key"].to_list()
     words = (
         f"{points.height} deployments of the literature and {own.height} own datasets, by kinetic energy and "
         f"terrain complexity. At high risk: {', '.join(high) or 'none'}."
     )
-    return Picture("deployment_map", "The map", draw_map(points, own), words)
+    about = f"{measure.name} {INPUT_WORDS[input_name]} [{measure.unit}]"
+    return Picture("deployment_map", "The map", draw_map(points, own, about), words)
 
 
 def render_map(
     deployments: pl.DataFrame,
     points: pl.DataFrame,
     own: pl.DataFrame,
+    measure: Measure,
     *,
+    input_name: str,
     notes: Sequence[str],
     keys: Sequence[str],
 ) -> str:
@@ -54,36 +58,43 @@ def render_map(
         deployments: the table of deployments.
         points: as of `place_deployments`.
         own: as of `place_datasets`.
+        measure: what colours them.
+        input_name: what u was.
         notes: what must be known.
         keys: run/generation of the runs counted, one text a dataset.
     """
     facts = [f"{deployments.height} deployments", f"{points.height} on the map", f"{own.height} own datasets"]
     return render_figures(
         "report/templates/map.html",
-        [picture_map(points, own)],
+        [picture_map(points, own, measure, input_name)],
         title="Deployment map",
         facts=facts,
         notes=notes,
-        own=_tabulate_own(own),
+        own=_tabulate_own(own, measure, input_name),
         literature=_tabulate_literature(deployments, points),
         left=deployments.filter(~pl.col("key").is_in(points["key"].to_list())).to_dicts(),
         runs=keys,
     )
 
 
-def _tabulate_own(own: pl.DataFrame) -> Table:
+def _tabulate_own(own: pl.DataFrame, measure: Measure, input_name: str) -> Table:
     rows = [
         [
             Cell(row["dataset"], before=str(number)),
             str(row["runs"]),
             say_number(row["energy"]),
             say_number(row["complexity"], digits=2),
-            say_number(row["slip"]),
+            say_number(row["value"]),
             row["zone"],
         ]
         for number, row in enumerate(number_datasets(own).iter_rows(named=True), start=1)
     ]
-    return Table("Largest kinetic energy of any run, slip over runs", _OWN, rows)
+    head = (
+        Column("dataset"), Column("runs", number=True), Column("kinetic energy", "J", number=True),
+        Column("complexity", number=True), Column(measure.name, measure.unit, number=True), Column("risk"),
+    )  # fmt: skip
+    caption = f"Largest kinetic energy of any run; {measure.name} {INPUT_WORDS[input_name]}, median over runs"
+    return Table(caption, head, rows)
 
 
 def _tabulate_literature(deployments: pl.DataFrame, points: pl.DataFrame) -> Table:

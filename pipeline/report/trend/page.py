@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import altair as alt
 import polars as pl
 
+from pipeline.fleet.parameter_trend import describe_change, say_power
 from pipeline.fleet.trend import describe_quiet, describe_step
 from pipeline.report import theme
 from pipeline.report.elements import Picture
@@ -19,6 +20,7 @@ from pipeline.report.words import begin_large
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.fleet.parameter_trend import ParameterTrend
     from pipeline.fleet.trend import Alert, Series
 
 _FEWEST_POINTS = 3
@@ -26,31 +28,106 @@ _LATER = ("finding ", "suspect share", "warnings")
 
 
 def render_trend(
-    series: Sequence[Series], alerts: Sequence[Alert], *, notes: Sequence[str], keys: Sequence[str]
+    series: Sequence[Series],
+    parameters: Sequence[ParameterTrend],
+    alerts: Sequence[Alert],
+    *,
+    notes: Sequence[str],
+    keys: Sequence[str],
 ) -> str:
     """The whole page as HTML.
 
     Args:
         series: as of `follow_quantities`; those with fewer than three runs are left out.
+        parameters: as of `follow_parameters`; the same.
         alerts: as of `raise_alerts`.
         notes: what must be known.
         keys: run/generation of every run.
     """
+    vehicles = list(dict.fromkeys(one.vehicle for one in parameters))
     names = list(dict.fromkeys(one.group for one in series))
     groups = [
-        (number, name, _draw_group([one for one in series if one.group == name], number))
+        (f"vehicle-{number}", f"Parameters of {name}", _draw_vehicle(parameters, name, number))
+        for number, name in enumerate(vehicles)
+    ] + [
+        (
+            f"group-{number}",
+            f"Slip and data of {name}",
+            _draw_group([one for one in series if one.group == name], number),
+        )
         for number, name in enumerate(names)
     ]
     return render_figures(
         "report/templates/trend.html",
         [picture for _, _, pictures in groups for picture in pictures],
         title="Trends",
-        facts=[f"{len(names)} groups", f"{len(series)} series", f"{len(keys)} runs", f"{len(alerts)} alerts"],
+        facts=[
+            f"{len(parameters)} parameters of {len(vehicles)} vehicle{'s' * (len(vehicles) != 1)}",
+            f"{len(series)} series of {len(names)} group{'s' * (len(names) != 1)}",
+            f"{len(keys)} runs",
+            f"{len(alerts)} alert{'s' * (len(alerts) != 1)}",
+        ],
         alerts=[alert.text for alert in alerts],
-        quiet=begin_large(describe_quiet(series)),
+        quiet=begin_large(describe_quiet(series, parameters)),
         notes=notes,
         groups=[group for group in groups if group[2]],
         runs=keys,
+    )
+
+
+def _draw_vehicle(parameters: Sequence[ParameterTrend], vehicle: str, number: int) -> list[Picture]:
+    own = [one for one in parameters if one.vehicle == vehicle and one.points.height >= _FEWEST_POINTS]
+    own.sort(key=lambda one: (not one.changes, -one.named, one.label))
+    pictures = []
+    for place, one in enumerate(own):
+        unit = f" [{one.unit}]" if one.unit not in ("", "1") else ""
+        name = f"parameter_{number}_{place}"
+        told = "; ".join(describe_change(one, change) for change in one.changes) or "no change"
+        odd = f". Left out, apart from the others: {', '.join(one.odd)}" if one.odd else ""
+        words = (
+            f"{one.points.height} runs, last {one.latest:.3g}. {begin_large(told)}; {say_power(one)}{odd}."
+        )
+        pictures.append(Picture(name, f"{one.label}{unit}", _draw_parameter(one, name), words))
+    return pictures
+
+
+def _draw_parameter(trend: ParameterTrend, name: str) -> Drawing:
+    """Runs with the intervals of their estimates, on the limits that all lie within, by ground."""
+    rows = trend.points.drop("order").with_row_index("order").with_columns(pl.col("order").cast(pl.Float64))
+    base = alt.Chart(alt.NamedData(f"{name}_points")).encode(x=_along(rows))
+    axis = alt.Axis(title=None, format=",.3~r", tickCount=4, minExtent=44)
+    value = alt.Y("value:Q", axis=axis, scale=alt.Scale(zero=False))
+    limits = base.mark_rule(strokeWidth=9, color=theme.SHADE).encode(
+        y=alt.Y("limit_low:Q"), y2="limit_high:Q"
+    )
+    levels = base.mark_tick(thickness=2.5, width=14, color=theme.ON_COMMAND, orient="horizontal").encode(
+        y=alt.Y("level:Q")
+    )
+    errors = base.mark_rule(color=theme.SLIP).encode(y=alt.Y("low:Q"), y2="high:Q")
+    grounds = sorted(set(rows["terrain"]))
+    legend = alt.Legend(title="ground") if len(grounds) > 1 else None
+    dots = base.mark_point(size=46, filled=True, color=theme.SLIP, opacity=1).encode(
+        y=value,
+        shape=alt.Shape("terrain:N", legend=legend, scale=alt.Scale(domain=grounds)),
+        tooltip=[
+            *(alt.Tooltip(f"{column}:N") for column in ("run", "day", "terrain")),
+            *(alt.Tooltip(f"{column}:Q", format=".4") for column in ("value", "level")),
+        ],
+    )
+    chart = alt.layer(limits, levels, errors, dots)
+    chart = chart.properties(width=640, height=140, usermeta={"gutter": 60})
+    note = (
+        f"{begin_large(say_power(trend))}. Bars: where all runs lie at 95 %; strokes: level on that ground."
+    )
+    return Drawing(chart, {f"{name}_points": rows}, note)
+
+
+def _along(points: pl.DataFrame) -> alt.X:
+    about = f"runs in the order of their dates, {points['day'][0]} to {points['day'][-1]}"
+    return alt.X(
+        "order:Q",
+        axis=alt.Axis(title=about, labels=False, grid=False),
+        scale=alt.Scale(domain=[-0.5, points.height - 0.5], nice=False, zero=False),
     )
 
 
@@ -69,20 +146,16 @@ def _picture(series: Series, name: str) -> Picture:
 
 
 def _draw_series(series: Series, name: str) -> Drawing:
-    points = series.points.with_row_index("order").with_columns(pl.col("order").cast(pl.Float64))
+    points = (
+        series.points.drop("order").with_row_index("order").with_columns(pl.col("order").cast(pl.Float64))
+    )
     levels = _tabulate_levels(series)
     axis = alt.Axis(title=None, format=",~r", tickCount=4, minExtent=44)
-    about = f"runs in the order of their dates, {points['day'][0]} to {points['day'][-1]}"
-    along = alt.X(
-        "order:Q",
-        axis=alt.Axis(title=about, labels=False, grid=False),
-        scale=alt.Scale(domain=[-0.5, points.height - 0.5], nice=False, zero=False),
-    )
     dots = (
         alt.Chart(alt.NamedData(f"{name}_points"))
         .mark_point(size=46, filled=True, color=theme.SLIP, opacity=0.9)
         .encode(
-            x=along,
+            x=_along(points),
             y=alt.Y("value:Q", axis=axis, scale=alt.Scale(zero=False)),
             tooltip=[alt.Tooltip("run:N"), alt.Tooltip("day:N"), alt.Tooltip("value:Q", format=".4")],
         )

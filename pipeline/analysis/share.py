@@ -1,0 +1,51 @@
+"""What the results share with others: features of every run, without data, names of files or places."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import polars as pl
+
+from pipeline.analysis.compare import measure_runs
+from pipeline.analysis.compared_runs import find_material, read_digest
+from pipeline.analysis.errors import JobError
+from pipeline.core.version import read_version
+from pipeline.fleet.features import check_features
+from schemas.features import Features
+
+if TYPE_CHECKING:
+    from pipeline.store import Store
+
+_HASH = 64
+
+
+def gather_features(store: Store) -> tuple[pl.DataFrame, tuple[str, ...]]:
+    """The table `features` of the results, and notes on what is left out.
+
+    Raises:
+        JobError: ``nothing_to_share``.
+        ComparisonError: ``bad_features``: a number is out of range.
+    """
+    compared, runs, told = measure_runs(find_material(store, ("dataset",), trusted_only=True))
+    digests = {run: read_digest(manifest) for run, manifest in compared.manifests.items()}
+    nameless = sorted(run for run, digest in digests.items() if len(digest) != _HASH)
+    notes = [*compared.notes, *told[1:]]
+    if nameless:
+        notes.append(f"left out, the hash of the log is not known: {', '.join(nameless)}")
+    known = runs.filter(~pl.col("run").is_in(nameless)) if not runs.is_empty() else runs
+    if known.is_empty():
+        raise JobError(
+            "nothing_to_share",
+            "there is no run to share" + "".join(f"; {note}" for note in notes),
+            where=str(store.root),
+            hint="Analyze logs first: slip analyze LOG... --out RESULTS --terrain NAME.",
+        )
+    schema = Features.create_empty().schema
+    shared = known.with_columns(
+        pl.col("run").replace_strict(digests, return_dtype=pl.String).alias("sha256"),
+        pl.col("input").cast(pl.String),
+        pl.lit(read_version()).alias("made_by"),
+        pl.col("key").alias("from_results"),
+    ).with_columns(pl.col("sha256").str.slice(0, 16).alias("run"))
+    typed = shared.select(pl.col(name).cast(kind) for name, kind in schema.items())
+    return check_features(typed.sort("sha256", "input"), str(store.root)), tuple(notes)

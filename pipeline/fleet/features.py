@@ -1,0 +1,165 @@
+"""Features of deployments as one file to share: written, read as from a stranger, merged.
+
+A file that others send is not trusted: it is read whole and only if it is small, none of it is compressed, so
+that nothing in it can inflate, and it has exactly the columns, types and ranges of its contract.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from typing import TYPE_CHECKING
+
+import polars as pl
+
+from pipeline.fleet.errors import ComparisonError
+from schemas.contract import contract_of
+from schemas.features import Features
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    import pyarrow as pa
+
+MAGIC = b"PAR1"
+LARGEST_BYTES = 64 * 2**20
+MOST_ROWS = 100_000
+_LARGEST_PART = 10**9
+_PARTS = ("sha256", "input")
+
+
+def write_features(frame: pl.DataFrame, path: Path) -> None:
+    """Write features in the place of the file before.
+
+    Raises:
+        ComparisonError: ``not_written``.
+    """
+    from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
+    from pipeline.store.tables import encode_parquet  # noqa: PLC0415
+
+    try:
+        replace_file(path, encode_parquet(contract_of("features"), frame, compression="none"))
+    except OSError as error:
+        raise ComparisonError(
+            "not_written", f"the file cannot be written: {error.strerror}", where=str(path),
+            hint="Choose another file.",
+        ) from error  # fmt: skip
+
+
+def check_features(frame: pl.DataFrame, where: str) -> pl.DataFrame:
+    """The rows, if all of them keep the contract.
+
+    Raises:
+        ComparisonError: ``bad_features``.
+    """
+    valid, failure = Features.filter(frame)
+    if len(failure):
+        rules = ", ".join(sorted(failure.counts()))
+        raise _refuse(where, f"{len(failure)} of {frame.height} rows break the contract ({rules})")
+    return valid
+
+
+def read_features(path: Path) -> pl.DataFrame:
+    """Features out of a file that anybody may have made.
+
+    Raises:
+        ComparisonError: ``bad_features``: why it is not taken.
+    """
+    import pyarrow as pa  # noqa: PLC0415 - heavy
+
+    data = _read_small(path)
+    try:
+        table = _open_table(data, str(path))
+        # Texts that are no UTF-8, in rows or in the schema, would end the program further on.
+        table.validate(full=True)
+        frame = pl.from_arrow(pa.Table.from_arrays(table.columns, names=table.column_names))
+    except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, pl.exceptions.PolarsError) as error:
+        told = str(error).splitlines()[:1] or [type(error).__name__]
+        raise _refuse(str(path), f"it cannot be read: {told[0][:200]}") from error
+    wanted = Features.create_empty().schema
+    if not isinstance(frame, pl.DataFrame) or dict(frame.schema) != dict(wanted):
+        raise _refuse(str(path), "its columns are of other types than the contract's")
+    return check_features(frame.select(wanted.names()), str(path))
+
+
+def _read_small(path: Path) -> bytes:
+    """The bytes of a plain file that is not large; nothing else is waited for."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    except OSError as error:
+        raise _refuse(str(path), f"it cannot be opened: {error.strerror}") from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise _refuse(str(path), "it is no plain file")
+    with os.fdopen(descriptor, "rb") as file:
+        data = file.read(LARGEST_BYTES + 1)
+    if len(data) > LARGEST_BYTES:
+        raise _refuse(str(path), f"it is larger than {LARGEST_BYTES >> 20} MB")
+    if data[:4] != MAGIC:
+        raise _refuse(str(path), "it is no Parquet file")
+    return data
+
+
+def _open_table(data: bytes, where: str) -> pa.Table:
+    import pyarrow as pa  # noqa: PLC0415 - heavy
+    import pyarrow.parquet as pq  # noqa: PLC0415 - heavy
+
+    file = pq.ParquetFile(
+        pa.BufferReader(data), thrift_string_size_limit=2**20, thrift_container_size_limit=2**16
+    )
+    about, contract = file.metadata, contract_of("features")
+    told = {key: value for key, value in (about.metadata or {}).items() if key != b"ARROW:schema"}
+    version = told.get(b"contract_version", b"").decode("utf-8", "replace")[:20]
+    if told.get(b"contract") != b"features" or version != str(contract.version):
+        raise _refuse(where, f"it is not of version {contract.version} of the contract `features`")
+    if about.num_rows > MOST_ROWS:
+        raise _refuse(where, f"it has more than {MOST_ROWS} rows")
+    if sorted(file.schema_arrow.names) != sorted(Features.column_names()):
+        raise _refuse(where, "its columns are not those of the contract")
+    ours = contract.metadata_of
+    theirs = {
+        name: (file.schema_arrow.field(name).metadata or {}).get(b"unit", b"")
+        for name in file.schema_arrow.names
+    }
+    if wrong := sorted(name for name, unit in theirs.items() if unit != ours(name).get("unit", "").encode()):
+        raise _refuse(where, f"units are others than the contract's: of {', '.join(wrong)}")
+    chunks = [
+        about.row_group(group).column(column)
+        for group in range(about.num_row_groups)
+        for column in range(about.num_columns)
+    ]
+    if any(chunk.compression != "UNCOMPRESSED" for chunk in chunks):
+        raise _refuse(where, "a part of it is compressed, and might be anything")
+    return file.read()
+
+
+def merge_features(frames: Sequence[pl.DataFrame], where: str) -> tuple[pl.DataFrame, int]:
+    """Features of several files as one, sorted, and how many rows of them stood twice.
+
+    A log is told by the hash of its content. What two versions of slip made of it is not the same: the row of
+    the later one stays.
+
+    Raises:
+        ComparisonError: ``bad_features``: one version says two things of the same log.
+    """
+    joined = pl.concat(frames).unique(maintain_order=True)
+    newest = pl.col("made_by").map_elements(_order_version, return_dtype=pl.List(pl.Int64))
+    ranked = joined.with_columns(newest.alias("order")).sort(*_PARTS, "order")
+    last = ranked.filter(pl.col("order") == pl.col("order").last().over(_PARTS)).drop("order")
+    twice = last.filter(last.select(_PARTS).is_duplicated())
+    if twice.height:
+        logs = ", ".join(twice["run"].unique().sort().head(5))
+        raise _refuse(where, f"they contradict each other on the logs {logs}")
+    return last, sum(frame.height for frame in frames) - last.height
+
+
+def _order_version(text: str) -> list[int]:
+    return [min(int(part), _LARGEST_PART) if part.isdigit() else -1 for part in text.split(".")][:8]
+
+
+def _refuse(where: str, why: str) -> ComparisonError:
+    return ComparisonError(
+        "bad_features", f"these features are not taken: {why}", where=where,
+        hint="Have them made again: slip share RESULTS --to features.parquet.",
+    )  # fmt: skip

@@ -1,0 +1,196 @@
+"""Features of deployments: what is shared, and what of a stranger's file is taken."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from comparison_store import Run, write_run
+
+from pipeline.analysis.map import draw_up_map
+from pipeline.analysis.share import gather_features
+from pipeline.cli.app import main
+from pipeline.fleet import ComparisonError
+from pipeline.fleet.features import LARGEST_BYTES, merge_features, read_features, write_features
+from pipeline.store import Store
+
+PLACE = "/home/somebody/secret_farm"
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    made = Store(tmp_path_factory.mktemp("results"))
+    for number, terrain in enumerate(("gravel", "ice")):
+        write_run(
+            made,
+            Run(
+                name=f"secret_farm/run_{number}", dataset=f"warthog_{terrain}", terrain=terrain,
+                sha256=f"{number}" * 64, seconds=60.0,
+            ),
+            seed=number,
+        )  # fmt: skip
+    return made
+
+
+@pytest.fixture
+def features(store: Store) -> pl.DataFrame:
+    return gather_features(store)[0]
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(ComparisonError) as told:
+        read_features(path)
+    assert told.value.code == "bad_features"
+    assert "\n" not in str(told.value)
+    return str(told.value)
+
+
+def test_features_come_back_as_they_were_shared(features: pl.DataFrame, store: Store, tmp_path: Path) -> None:
+    path = tmp_path / "features.parquet"
+    write_features(features, path)
+    assert read_features(path).equals(features)
+    assert features.height == 4
+    compared = store.read("secret_farm/run_0", "aggregates").filter(
+        pl.col("input") == "command", pl.col("subset") == "all"
+    )
+    own = features.filter(pl.col("sha256") == "0" * 64, pl.col("input") == "command")
+    assert own["median_modulus"].item() == compared["median_modulus"].item()
+    assert b"secret_farm" not in path.read_bytes()
+
+
+def test_the_verbs_share_merge_and_draw(
+    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, merged = tmp_path / "a.parquet", tmp_path / "b.parquet"
+    for arguments in (
+        ["share", str(store.root), "--to", str(first), "--quiet"],
+        ["map", "merge", str(first), str(first), "--to", str(merged), "--json"],
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert ended.value.code == 0
+    assert json.loads(capsys.readouterr().out) == {"file": str(merged), "runs": 2, "rows": 4, "twice": 4}
+    alone = draw_up_map(Store(tmp_path / "none"), shared=merged)
+    assert alone.own["dataset"].to_list() == ["warthog_gravel (shared)", "warthog_ice (shared)"]
+    # Own logs do not stand on the map twice.
+    assert draw_up_map(store, shared=merged).own["dataset"].to_list() == ["warthog_gravel", "warthog_ice"]
+
+
+def test_a_log_counts_once_and_the_later_version_counts(features: pl.DataFrame) -> None:
+    newer = features.with_columns(pl.lit("99.0.10").alias("made_by"), pl.col("median_modulus") * 2.0)
+    older = features.with_columns(pl.lit("99.0.9").alias("made_by"))
+    hostile = features.with_columns(pl.lit("9" * 40).alias("made_by"))
+    assert merge_features([hostile, features], "")[0].equals(hostile)
+    for order in ([newer, older], [older, newer]):
+        merged, twice = merge_features(order, "")
+        assert merged.equals(newer.sort("sha256", "input"))
+        assert twice == 4
+    with pytest.raises(ComparisonError, match="contradict each other on the logs 0000"):
+        merge_features([features, features.with_columns(pl.col("median_modulus") * 2.0)], "a and b")
+
+
+def table_of(path: Path) -> pa.Table:
+    return pq.read_table(path)
+
+
+def with_column(name: str, values: object) -> Callable[[pa.Table], pa.Table]:
+    def change(table: pa.Table) -> pa.Table:
+        place = table.schema.get_field_index(name)
+        field = table.schema.field(name)
+        return table.set_column(place, field, pa.array([values] * table.num_rows, field.type))
+
+    return change
+
+
+def with_unit(table: pa.Table) -> pa.Table:
+    place = table.schema.get_field_index("mass")
+    field = table.schema.field(place).with_metadata({"unit": "lb"})
+    return table.set_column(place, field, table.column(place))
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (with_column("mass", -1.0), "rows break the contract (mass|min)"),
+        (with_column("median_modulus", float("nan")), "rows break the contract"),
+        (with_column("median_modulus", float("inf")), "rows break the contract"),
+        (with_column("vehicle", PLACE), "rows break the contract (vehicle|regex)"),
+        (with_column("vehicle", "x" * 10_000), "rows break the contract"),
+        (with_column("terrain", "ice\x1b[2J"), "rows break the contract"),
+        (with_column("sha256", "0" * 63), "rows break the contract"),
+        (with_column("samples", 10**15), "rows break the contract"),
+        (with_column("run", "0" * 15 + "f"), "run_is_the_beginning_of_the_hash"),
+        (with_unit, "units are others than the contract's: of mass"),
+        (lambda table: table.drop_columns(["mass"]), "its columns are not those of the contract"),
+        (lambda table: table.append_column("raw", table.column("mass")), "its columns are not those"),
+        (lambda table: table.replace_schema_metadata({"contract": "features", "contract_version": "99"}),
+         "it is not of version 1"),
+        (lambda table: table.replace_schema_metadata({}), "it is not of version 1"),
+        (lambda table: pa.concat_tables([table] * 30_000), "more than 100000 rows"),
+    ],
+)  # fmt: skip
+def test_what_breaks_the_contract_is_refused(
+    change: Callable[[pa.Table], pa.Table], why: str, features: pl.DataFrame, tmp_path: Path
+) -> None:
+    path = tmp_path / "f.parquet"
+    write_features(features, path)
+    pq.write_table(change(table_of(path)), path, compression="none")
+    assert why in refused(path)
+
+
+def test_other_types_and_compressed_parts_are_refused(features: pl.DataFrame, tmp_path: Path) -> None:
+    path = tmp_path / "f.parquet"
+    write_features(features, path)
+    table = table_of(path)
+    pq.write_table(table, path, compression="zstd")
+    assert "compressed" in refused(path)
+    place = table.schema.get_field_index("mass")
+    field = table.schema.field(place).with_type(pa.string())
+    pq.write_table(table.set_column(place, field, pa.array(["1"] * 4)), path, compression="none")
+    assert "of other types" in refused(path)
+
+
+def test_what_is_no_small_plain_file_is_refused_at_once(tmp_path: Path) -> None:
+    pipe, large, text = tmp_path / "pipe", tmp_path / "large", tmp_path / "text"
+    os.mkfifo(pipe)
+    with large.open("wb") as file:
+        file.write(b"PAR1")
+        file.truncate(LARGEST_BYTES + 1)
+    text.write_text("key,year\n")
+    assert "no plain file" in refused(pipe)
+    assert "no plain file" in refused(tmp_path)
+    assert "larger than 64 MB" in refused(large)
+    assert "no Parquet file" in refused(text)
+    assert "cannot be opened" in refused(tmp_path / "none")
+
+
+def test_damage_anywhere_is_refused_or_changes_nothing_but_values_in_range(
+    features: pl.DataFrame, tmp_path: Path
+) -> None:
+    path = tmp_path / "f.parquet"
+    write_features(features, path)
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    refusals = 0
+    for trial in range(400):
+        data = bytearray(whole)
+        if trial % 4 == 0:
+            data = data[: int(rng.integers(4, len(data)))]
+        else:
+            for place in rng.integers(4, len(data), 1 + trial % 3):
+                data[place] ^= int(rng.integers(1, 256))
+        path.write_bytes(data)
+        try:
+            read = read_features(path)
+        except ComparisonError as error:
+            refusals += error.code == "bad_features"
+        else:
+            assert read.schema == features.schema
+    assert refusals > 150
