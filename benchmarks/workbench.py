@@ -47,7 +47,7 @@ class Desk:
         self._values = cycle((1.5, 1.6, 1.7))
 
     def ask(self, action: str, **more: object) -> dict[str, object]:
-        return self._server.desk(self._run, action, **more)
+        return self._server.session(self._run, action, **more)
 
     def draw(self) -> None:
         self._server.post("/api/figures", run=self._run)

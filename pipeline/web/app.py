@@ -43,7 +43,9 @@ _PAGES = {
     "/page.css": ("pipeline.web", "page.css", "text/css"),
     "/page.js": ("pipeline.web", "page.js", "text/javascript"),
     "/pane.js": ("pipeline.web", "pane.js", "text/javascript"),
+    "/model.js": ("pipeline.web", "model.js", "text/javascript"),
     "/parts.js": ("pipeline.web", "parts.js", "text/javascript"),
+    "/difference.js": ("pipeline.web", "difference.js", "text/javascript"),
     "/marks.js": ("pipeline.report", "marks.js", "text/javascript"),
     "/plots.js": ("pipeline.report", "plots.js", "text/javascript"),
 }
@@ -79,6 +81,7 @@ class Web:
             Route("/api/save", self.save, methods=["POST"]),
             Route("/api/upload", self.upload, methods=["POST"]),
             Route("/api/diagnose", self.diagnose, methods=["POST"]),
+            Route("/api/sample", self.sample, methods=["POST"]),
             Route("/api/retry", self.retry, methods=["POST"]),
             Route("/api/dismiss", self.dismiss, methods=["POST"]),
         ]
@@ -152,6 +155,11 @@ class Web:
         ask = await read_ask(request)
         manifest = await run_in_threadpool(find_run, self._sessions.store, ask.run)
         return answer({"job": self._sessions.jobs.diagnose(manifest).show()})
+
+    async def sample(self, _: Request) -> Response:
+        """Begin to make a sample log and to analyze it."""
+        job = await run_in_threadpool(self._sessions.jobs.make_sample)
+        return answer({"job": job.show()})
 
     async def retry(self, request: Request) -> Response:
         """Analyze a log again, now that its vehicle is known."""
