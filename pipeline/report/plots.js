@@ -98,6 +98,8 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false
       tooltip: { theme: dark.matches ? "dark" : "light", disableDefaultStyle: strict },
       defaultStyle: !strict,
     });
+    // The place around it has a label that says what is drawn.
+    place.querySelector("svg")?.setAttribute("aria-hidden", "true");
     views.set(id, { view: result.view, names, meta: spec.usermeta ?? {}, finalize: () => result.finalize() });
     return result.view;
   };

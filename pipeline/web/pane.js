@@ -278,26 +278,29 @@ export class Pane {
     if (await this.ask("try")) this.follow();
   }
 
+  // How far the trial is, as long as it goes on; what comes while something else was asked is not shown.
   async follow() {
-    const turn = this.turn;
-    const run = this.run;
-    while (this.run === run && turn === this.turn && this.state?.trial && this.state.trial.tried < this.state.trial.total) {
-      await new Promise((done) => setTimeout(done, 700));
-      if (this.run !== run || turn !== this.turn || this.root.classList.contains("busy")) continue;
-      try {
-        const state = await post("/api/session", { run, slot: this.slot, input: this.state.session.input, action: "open" });
-        if (this.run !== run || turn !== this.turn) return;
-        this.state.trial = state.trial;
-        if (!state.trial) {
-          this.tryAll();
-          return;
-        }
+    if (this.following) return;
+    this.following = true;
+    let ended = false;
+    try {
+      while (this.state?.trial && this.state.trial.tried < this.state.trial.total) {
+        await new Promise((done) => setTimeout(done, 700));
+        const asked = this.state;
+        if (!asked || this.root.classList.contains("busy")) continue;
+        const { trial } = await post("/api/session", { ...this.request, action: "open" });
+        if (this.state !== asked) continue;
+        asked.trial = trial;
+        ended = !trial;
         buildModel(this);
-      } catch (error) {
-        toast(error.message);
-        return;
       }
+    } catch (error) {
+      toast(error.message);
+    } finally {
+      this.following = false;
     }
+    // It was ended for another one, which is over.
+    if (ended) this.tryAll();
   }
 
   // Figures ------------------------------------------------------------------------------------------------
@@ -366,7 +369,7 @@ export class Pane {
       const ladder = this.figures.querySelector("[data-figure=ladder]");
       if (ladder) await this.plots.draw(ladder);
       this.root.dataset.drawn = String(turn);
-      if (this.state.trial && this.state.trial.tried < this.state.trial.total) this.follow();
+      if (this.state.trial) this.follow();
     } catch (error) {
       toast(error.message);
     }
