@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 _WORTH = 0.99
 _MOST_KEPT = 40
 _TWIN = 0.95
-"""Cosine between what two effects take off the residuals, from which on they are called twins: nine tenths of the
-square of what one does the other does too."""
+"""Cosine between what two effects take off the residuals, from which on they are called twins: nine tenths
+of the square of what one does the other does too."""
 
 
 @dataclass

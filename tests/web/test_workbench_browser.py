@@ -226,6 +226,10 @@ def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, tmp_path: Path)
             " entry.textContent.includes('named')).map((entry) => entry.dataset.effect)"
         )
         assert set(chrome.run(named)) == {"effective_track", "drive_lag"}
+        manifest = Store(tmp_path / "out").manifest("field/late")
+        assert manifest is not None
+        told = json.loads(manifest.path("diagnosis.json").read_text())["where"][0]["text"]
+        assert told in str(chrome.run("document.querySelector('.where').textContent"))
         chrome.click(".add-all")
         chrome.wait("document.querySelectorAll('.card').length === 2")
         chrome.wait("document.querySelectorAll('[data-figure=ladder] .mark-rect path').length === 3")
@@ -307,7 +311,8 @@ def test_nothing_is_cut_or_overlaps(
     })"""
     assert chrome.run(cut) == []
     overlapping = """(() => {
-      const parts = [...document.querySelectorAll('.hero > *, .glance > *, .model > *, .figures > *, #side > :not(.model)')]
+      const rooms = ['.hero > *', '.glance > *', '.model > *', '.figures > *', '#side > :not(.model)'];
+      const parts = [...document.querySelectorAll(rooms.join())]
         .map((node) => [node.className || node.id, node.getBoundingClientRect()])
         .filter(([, box]) => box.width && box.height);
       const found = [];
