@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from contextlib import asynccontextmanager
+from importlib import import_module
 from importlib.resources import files
 from typing import TYPE_CHECKING
 from urllib.parse import quote
@@ -197,6 +199,7 @@ def build_app(
 
     @asynccontextmanager
     async def live(_: Starlette) -> AsyncIterator[None]:
+        threading.Thread(target=_load_heavy, name="load", daemon=True).start()
         try:
             yield
         finally:
@@ -204,6 +207,11 @@ def build_app(
 
     app = Starlette(routes=Web(sessions).routes(), exception_handlers=make_handlers(places), lifespan=live)
     return Guard(app, token, hosts)
+
+
+def _load_heavy() -> None:
+    """Load what the first fit needs while somebody still looks for a run."""
+    import_module("scipy.stats")
 
 
 def _serve_own(package: str, name: str, kind: str) -> Answer:

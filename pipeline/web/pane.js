@@ -341,10 +341,12 @@ export class Pane {
   }
 
   // What another model moves: rows of the figures, where it fails, what the figures say to those who hear them.
-  take({ rows, where, words }) {
-    this.plots?.feed(rows);
+  async take({ rows, where, words }) {
     this.tellWhere(where);
     for (const [id, text] of Object.entries(words)) this.figures.querySelector(`[data-figure=${id}]`)?.setAttribute("aria-label", text);
+    // Words are seen before the figures are drawn.
+    await new Promise((done) => setTimeout(done));
+    await this.plots?.feed(rows);
   }
 
   async paint(turn = this.turn) {
@@ -365,9 +367,11 @@ export class Pane {
     try {
       const answer = await post("/api/rows", this.request);
       if (turn !== this.turn) return;
-      this.take(answer);
+      const fed = this.take(answer);
       const ladder = this.figures.querySelector("[data-figure=ladder]");
       if (ladder) await this.plots.draw(ladder);
+      await fed;
+      if (turn !== this.turn) return;
       this.root.dataset.drawn = String(turn);
       if (this.state.trial) this.follow();
     } catch (error) {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import closing
 from typing import TYPE_CHECKING, cast
 
@@ -46,9 +47,7 @@ def look(chrome: Chrome, picture: Path) -> None:
 
 @pytest.mark.long
 @WIDTHS
-def test_add_slide_undo_and_save(
-    chrome: Chrome, workbench: Workbench, pictures: Path, tmp_path: Path, width: int
-) -> None:
+def test_add_slide_undo_and_save(chrome: Chrome, workbench: Workbench, pictures: Path, width: int) -> None:
     open_page(chrome, workbench, width)
     before = cast("float", chrome.run(ERROR))
     assert "error" in str(chrome.run("document.querySelector('.glance').innerText"))
@@ -58,17 +57,18 @@ def test_add_slide_undo_and_save(
     look(chrome, pictures / f"flow_added_{width}.png")
 
     # The error stays in sight, however far one scrolls, and undo moves nothing else.
-    chrome.run("document.querySelector('[data-figure=trajectory]').scrollIntoView({ block: 'center' })")
-    place = chrome.run("scrollY")
-    map_before = chrome.run("document.querySelector('[data-figure=trajectory]').innerHTML")
-    box = cast("dict[str, float]", chrome.run("document.querySelector('.glance').getBoundingClientRect()"))
-    assert box["top"] >= 0.0
-    assert box["bottom"] < 300.0
+    drawn = "document.querySelector('[data-figure=trajectory]')"
+    chrome.run(f"{drawn}.scrollIntoView({{ block: 'center' }})")
+    place = f"{drawn}.getBoundingClientRect().top"
+    before_undo = cast("list[object]", chrome.run(f"[{place}, {drawn}.innerHTML]"))
+    glance = "(({ top, bottom }) => [top, bottom])(document.querySelector('.glance').getBoundingClientRect())"
+    top, bottom = cast("list[float]", chrome.run(glance))
+    assert 0.0 <= top < bottom < 300.0
     chrome.run("document.querySelector('.formula').open = true")
     chrome.run("document.querySelector('.undo').click()")
     chrome.wait(f"!document.querySelector('.card') && Math.abs({ERROR} - {before}) < 1e-6")
-    chrome.wait(f"document.querySelector('[data-figure=trajectory]').innerHTML !== {map_before!r}")
-    assert abs(cast("float", chrome.run("scrollY")) - cast("float", place)) < 400.0
+    chrome.wait(f"{drawn}.innerHTML !== {json.dumps(before_undo[1])}")
+    assert chrome.run(place) == pytest.approx(before_undo[0], abs=60.0)
     assert chrome.run("document.querySelector('.formula').open")
     chrome.run("document.querySelector('.redo').click()")
     chrome.wait("document.querySelector('.card')")
@@ -83,6 +83,13 @@ def test_add_slide_undo_and_save(
     chrome.click(".hero .save")
     chrome.wait("document.getElementById('toast').textContent.includes('saved')")
     look(chrome, pictures / f"flow_saved_{width}.png")
+    workbench.session(RUN, "set", effect="effective_track", parameter="k", value=10.0)
+    chrome.run("location.reload()")
+    chrome.wait("document.querySelector('.bound')?.innerText.includes('at its bound')")
+    colours = (
+        "['.at-bound output', '.bound'].map((part) => getComputedStyle(document.querySelector(part)).color)"
+    )
+    assert chrome.run(colours) == ["rgb(179, 38, 30)"] * 2
     assert (workbench.results / "workbench/models/field/hidden.toml").is_file()
 
 
