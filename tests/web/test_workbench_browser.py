@@ -137,21 +137,7 @@ def test_what_the_loader_of_models_warns_of_is_shown(
     look_for_trouble(chrome)
 
 
-def test_two_models_of_a_run_stand_side_by_side(chrome: Chrome, workbench: Workbench, pictures: Path) -> None:
-    workbench.session(RUN, "add", effect="effective_track")
-    chrome.size(LAPTOP, 900)
-    chrome.open(workbench.address)
-    chrome.wait(SHOWN)
-    chrome.click("#compare")
-    chrome.wait("document.querySelector('[data-slot=b]')?.dataset.drawn")
-    numbers = "[...document.querySelectorAll('.number.r .value')].map((node) => Number(node.textContent))"
-    first, second = cast("list[float]", chrome.run(numbers))
-    assert first < 0.2 * second
-    assert cast("int", chrome.run("document.documentElement.scrollWidth - innerWidth")) <= 0
-    chrome.picture(pictures / "workbench_compare.png", whole=True)
-    look_for_trouble(chrome)
-
-
+@pytest.mark.long
 def test_an_address_that_changes_in_an_open_tab_is_followed(chrome: Chrome, workbench: Workbench) -> None:
     chrome.size(LAPTOP, 900)
     chrome.open(workbench.address)
@@ -172,6 +158,7 @@ def count_marks(figure: str, pane: str = "a") -> str:
     return f"document.querySelector('{plot}').querySelectorAll(\"{kinds}\").length"
 
 
+@pytest.mark.long
 def test_a_stretch_that_is_brushed_shows_on_the_map_and_in_command_space(
     chrome: Chrome, workbench: Workbench, pictures: Path
 ) -> None:
@@ -212,6 +199,7 @@ def test_a_stretch_that_is_brushed_shows_on_the_map_and_in_command_space(
     look_for_trouble(chrome)
 
 
+@pytest.mark.long
 def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, tmp_path: Path) -> None:
     log = tmp_path / "field" / "late.mcap"
     simulate_case(None, {"effective_track": TRACK, "drive_lag": 0.3}, out=log, seed=4, duration_s=90.0)
@@ -257,6 +245,7 @@ def test_what_raises_an_error_is_not_taken_unless_it_is_said_again(
     assert errors == []
 
 
+@pytest.mark.long
 def test_a_run_stands_beside_those_that_its_report_does(chrome: Chrome, workbench: Workbench) -> None:
     store = Store(workbench.results)
     manifest = store.manifest(RUN)
