@@ -196,7 +196,7 @@ def _find_twins(
         trial: with what was found of them.
     """
     change = (new.residuals - base.residuals) / np.nanstd(base.residuals, axis=0)
-    change = np.nan_to_num(change).ravel()
+    change = np.nan_to_num(change, posinf=0.0, neginf=0.0).ravel()
     taken[name] = change / max(float(np.linalg.norm(change)), 1e-12)
     twins = [other for other in taken if other != name and abs(taken[other] @ taken[name]) > _TWIN]
     for entry in trial.found:
