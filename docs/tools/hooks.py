@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from mkdocs.structure.files import Files
 
 
+_NAMED = 'class="md-search" data-md-component="search" role="dialog" aria-label="Search"'
+
+
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Every effect has its place in the contents, in the order of a command's way."""
     (effects,) = (section["Effects"] for section in config.nav or [] if "Effects" in section)
@@ -31,3 +34,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for path, text in write_reference().items():
         files.append(File.generated(config, path, content=text))
     return files
+
+
+def on_post_page(output: str, **_: object) -> str:
+    """The theme's search is a dialog without a name, which readers of screens need."""
+    return output.replace('class="md-search" data-md-component="search" role="dialog"', _NAMED)

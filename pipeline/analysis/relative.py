@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
     from pipeline.vehicles import Vehicle
 
 COLUMNS = ("model_x", "model_y", "model_w", "residual_modulus")
@@ -91,8 +93,7 @@ def add_model(
             found.append(Finding("model_not_followed", "warning", f"{name}: {error}", where="model"))
             parts.append(part)
             continue
-        left = (predicted - part.select("v_x", "v_y", "v_w").to_numpy()) * np.array([1.0, 1.0, length])
-        columns = [*predicted.T, np.sqrt(np.sum(left**2, axis=1))]
+        columns = [*predicted.T, find_residual_modulus(predicted, part, length=length)]
         parts.append(
             part.with_columns(
                 pl.Series(column, values).fill_nan(None)
@@ -100,3 +101,17 @@ def add_model(
             )
         )
     return pl.concat(parts), tuple(found)
+
+
+def find_residual_modulus(
+    predicted: NDArray[np.float64], slip: pl.DataFrame, *, length: float
+) -> NDArray[np.float64]:
+    """Modulus of what a model leaves of the motion [m/s], shape (n,).
+
+    Args:
+        predicted: body velocities of the model at the rows of ``slip`` [m/s, m/s, rad/s], shape (n, 3).
+        slip: rows of table `slip` of one input.
+        length: length scale L [m] of the modulus.
+    """
+    left = (predicted - slip.select("v_x", "v_y", "v_w").to_numpy()) * np.array([1.0, 1.0, length])
+    return np.asarray(np.sqrt(np.sum(left**2, axis=1)), dtype=np.float64)

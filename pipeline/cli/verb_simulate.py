@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import textwrap
 from pathlib import Path
 from typing import Annotated
 
@@ -114,5 +116,14 @@ def _print_catalogue(
     for title, rows in (("cases", cases), ("effects", effects), ("platforms", platforms)):
         print(title)
         width = max(len(name) for name, _ in rows)
+        room = max(shutil.get_terminal_size().columns, width + 44)
         for name, text in rows:
-            print(f"  {name:<{width}}  {text}")
+            begin = f"  {name:<{width}}  "
+            aside = textwrap.TextWrapper(
+                room,
+                initial_indent=begin,
+                subsequent_indent=" " * len(begin),
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+            print(aside.fill(text))

@@ -6,10 +6,21 @@ const slipMarks = (parts, { marked = () => {} } = {}) => {
   let spans = [];
   let points = [];
   let zoom = null;
+  let shown = null;
+  let seen = null;
   let track = [];
   let plots = null;
   let redraw = () => {};
   let waiting = false;
+
+  // The points of the map, as they are drawn now: another model slips otherwise.
+  const trackOf = () => {
+    if (shown && shown.rows.track !== seen) {
+      seen = shown.rows.track;
+      track = seen ? plots.unpack(seen) : [];
+    }
+    return track;
+  };
 
   const fillsView = (span) => zoom !== null && span.t_start <= zoom[0] && span.t_end >= zoom[1];
 
@@ -64,14 +75,14 @@ const slipMarks = (parts, { marked = () => {} } = {}) => {
 
   const markTime = (start, end) => {
     const [low, high] = start < end ? [start, end] : [end, start];
-    const within = track.filter((row) => row.t >= low && row.t <= high);
+    const within = trackOf().filter((row) => row.t >= low && row.t <= high);
     set([{ t_start: low, t_end: high }], within, { ends: [low.toFixed(1), high.toFixed(1)] });
   };
 
   const markPoints = (inside) => {
     const found = [];
     let open = null;
-    track.forEach((row) => {
+    trackOf().forEach((row) => {
       if (!inside(row)) open = null;
       else if (open && open.piece === row.piece) open.span.t_end = row.t;
       else {
@@ -79,13 +90,13 @@ const slipMarks = (parts, { marked = () => {} } = {}) => {
         found.push(open.span);
       }
     });
-    set(found, track.filter(inside));
+    set(found, trackOf().filter(inside));
   };
 
   // Spans that were marked beside this one: shown here, not told again.
   const follow = (others) => {
     const inside = (row) => others.some((span) => row.t >= span.t_start && row.t <= span.t_end);
-    set(others.map((span) => ({ ...span })), others.length ? track.filter(inside) : [], { told: false });
+    set(others.map((span) => ({ ...span })), others.length ? trackOf().filter(inside) : [], { told: false });
   };
 
   const setZoom = (domain) => {
@@ -182,8 +193,7 @@ const slipMarks = (parts, { marked = () => {} } = {}) => {
 
   // Figures that are there now: their rows, how they are drawn, and how those over time are drawn again.
   const join = (page, newPlots, drawAgain, places) => {
-    [plots, redraw] = [newPlots, drawAgain];
-    track = page.rows.track ? plots.unpack(page.rows.track) : [];
+    [plots, redraw, shown, seen, track] = [newPlots, drawAgain, page, undefined, []];
     for (const place of places) {
       const brush = page.figures[place.dataset.figure].usermeta?.brush;
       if (!brush) continue;

@@ -98,7 +98,9 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false
       tooltip: { theme: dark.matches ? "dark" : "light", disableDefaultStyle: strict },
       defaultStyle: !strict,
     });
-    views.set(id, { view: result.view, names, meta: spec.usermeta ?? {}, finalize: () => result.finalize() });
+    // The place around it has a label that says what is drawn.
+    place.querySelector("svg")?.setAttribute("aria-hidden", "true");
+    views.set(id, { place, view: result.view, names, meta: spec.usermeta ?? {}, finalize: () => result.finalize() });
     return result.view;
   };
 
@@ -114,13 +116,24 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false
     place.classList.add("drawn");
   };
 
-  // Puts new rows into what is drawn; axes whose ends are fixed stay where they are.
-  const feed = (rows) => {
+  // Puts new rows into what is drawn, into what is in sight first; axes whose ends are fixed stay where they are.
+  // What comes while the rest is drawn takes its place.
+  let fed = 0;
+  const feed = async (rows) => {
     Object.assign(page.rows, rows);
-    for (const { view, names } of views.values()) {
+    const turn = (fed += 1);
+    const away = ({ place }) => {
+      const { top, bottom } = place.getBoundingClientRect();
+      return Math.max(top - innerHeight, -bottom, 0);
+    };
+    const order = [...views.values()].map((drawn) => [away(drawn), drawn]).sort(([one], [other]) => one - other);
+    for (const [far, { view, names }] of order) {
       const changed = Object.keys(rows).filter((name) => names.has(name));
-      for (const name of changed) view.data(name, unpack(rows[name]));
-      if (changed.length) view.runAsync();
+      if (!changed.length) continue;
+      if (far) await new Promise((done) => setTimeout(done));
+      if (turn !== fed) return;
+      for (const name of changed) view.data(name, unpack(page.rows[name]));
+      await view.runAsync();
     }
   };
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from contextlib import asynccontextmanager
+from importlib import import_module
 from importlib.resources import files
 from typing import TYPE_CHECKING
 from urllib.parse import quote
@@ -44,7 +46,9 @@ _PAGES = {
     "/page.css": ("pipeline.web", "page.css", "text/css"),
     "/page.js": ("pipeline.web", "page.js", "text/javascript"),
     "/pane.js": ("pipeline.web", "pane.js", "text/javascript"),
+    "/model.js": ("pipeline.web", "model.js", "text/javascript"),
     "/parts.js": ("pipeline.web", "parts.js", "text/javascript"),
+    "/difference.js": ("pipeline.web", "difference.js", "text/javascript"),
     "/marks.js": ("pipeline.report", "marks.js", "text/javascript"),
     "/plots.js": ("pipeline.report", "plots.js", "text/javascript"),
 }
@@ -82,6 +86,7 @@ class Web:
             Route("/api/save", self.save, methods=["POST"]),
             Route("/api/upload", self.upload, methods=["POST"]),
             Route("/api/diagnose", self.diagnose, methods=["POST"]),
+            Route("/api/sample", self.sample, methods=["POST"]),
             Route("/api/retry", self.retry, methods=["POST"]),
             Route("/api/dismiss", self.dismiss, methods=["POST"]),
         ]
@@ -167,6 +172,11 @@ class Web:
         manifest = await run_in_threadpool(find_run, self._sessions.store, ask.run)
         return answer({"job": self._sessions.jobs.diagnose(manifest).show()})
 
+    async def sample(self, _: Request) -> Response:
+        """Begin to make a sample log and to analyze it."""
+        job = await run_in_threadpool(self._sessions.jobs.make_sample)
+        return answer({"job": job.show()})
+
     async def retry(self, request: Request) -> Response:
         """Analyze a log again, now that its vehicle is known."""
         query = request.query_params
@@ -203,6 +213,7 @@ def build_app(
 
     @asynccontextmanager
     async def live(_: Starlette) -> AsyncIterator[None]:
+        threading.Thread(target=_load_heavy, name="load", daemon=True).start()
         try:
             yield
         finally:
@@ -210,6 +221,11 @@ def build_app(
 
     app = Starlette(routes=Web(sessions).routes(), exception_handlers=make_handlers(places), lifespan=live)
     return Guard(app, token, hosts)
+
+
+def _load_heavy() -> None:
+    """Load what the first fit needs while somebody still looks for a run."""
+    import_module("scipy.stats")
 
 
 def _serve_own(package: str, name: str, kind: str) -> Answer:

@@ -7,6 +7,7 @@ import math
 from typing import TYPE_CHECKING
 
 from pipeline.models import list_effects
+from pipeline.models.bounds import stands_at_bound
 from pipeline.models.formula import FormulaEffect
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ def _show_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> di
         "from": low,
         "to": high,
         "step": (high - low) / _STEPS,
+        "at_bound": value != parameter.neutral and stands_at_bound(value, parameter.bounds),
         "locked": parameter.name in effect.fixed,
     }
 

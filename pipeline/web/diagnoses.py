@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.analysis.diagnosis import DIAGNOSIS, read_recording
 from pipeline.analysis.options import INPUTS
+from pipeline.report.run import mapping_in
 from pipeline.store.files import make_folder, replace_file
 from pipeline.web.runs import read_json
 from pipeline.web.session import place_of_run
@@ -25,6 +26,13 @@ def read_diagnosis(results: Path, manifest: Manifest) -> Mapping[str, object] | 
     kept = read_json(_path_of(results, manifest))
     found = kept.get("diagnosis") if kept.get("key") == manifest.key else None
     return found if isinstance(found, dict) else None
+
+
+def find_formula(diagnosis: Mapping[str, object] | None) -> str | None:
+    """The formula that was found for what no effect explains, as text of a model file; None without one."""
+    unexplained = mapping_in(diagnosis or {}, "unexplained")
+    formula = unexplained.get("formula")
+    return formula if isinstance(formula, str) and formula else None
 
 
 def write_diagnosis(results: Path, manifest: Manifest) -> None:

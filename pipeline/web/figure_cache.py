@@ -1,13 +1,19 @@
-"""The figures of the report, for one session: whole, or only the rows that a change of a value moves."""
+"""The figures of the report, for one session: whole, or only the rows that a change of the model moves."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
+import polars as pl
+
 from pipeline.analysis.diagnosis import DIAGNOSIS
+from pipeline.analysis.relative import find_residual_modulus
 from pipeline.report import RunReport, theme
 from pipeline.report.figures import list_figures
 from pipeline.report.figures.autocorrelation import list_autocorrelations
+from pipeline.report.figures.command_space import list_cells
 from pipeline.report.figures.ladder import list_rungs
 from pipeline.report.figures.reach import list_reach
 from pipeline.report.figures.residuals import list_residuals
@@ -15,14 +21,14 @@ from pipeline.report.figures.signature import list_signatures
 from pipeline.report.figures.step_response import list_responses
 from pipeline.report.figures.trajectory import list_arcs
 from pipeline.report.figures.velocities import model_rows
+from pipeline.report.run import number_in
 from pipeline.report.scene import Scene
-from pipeline.report.sections.where import VERBS, find_regions
 from pipeline.report.specs import build_spec, pack_rows, share_rows
 from pipeline.web.runs import read_summary
 
 if TYPE_CHECKING:
-    from pipeline.report.motion_view import MotionView
     from pipeline.store import Manifest
+    from pipeline.web.run_cache import Shown
 
 FIGURES = (
     "ladder",
@@ -39,6 +45,7 @@ FIGURES = (
 _LIVE = (
     list_rungs,
     list_arcs,
+    list_cells,
     list_reach,
     list_residuals,
     list_autocorrelations,
@@ -46,6 +53,23 @@ _LIVE = (
     model_rows,
     list_signatures,
 )
+_COLOURED = ("trajectory", "command_space")
+_LEFT = "Colours: what the model leaves of the slip."
+
+
+@dataclass(frozen=True)
+class _ModelScene(Scene):
+    """A run's tables with the slip that a model leaves, on the scale of the ideal model's.
+
+    Attributes:
+        ideal_cap: where the colour ramp ends [m/s], the same for every model.
+    """
+
+    ideal_cap: float
+
+    @cached_property
+    def modulus_cap(self) -> float:
+        return self.ideal_cap
 
 
 class FigureCache:
@@ -61,10 +85,12 @@ class FigureCache:
         self._summary = read_summary(manifest)
         told = manifest.read_json(DIAGNOSIS) if DIAGNOSIS in manifest.files else {}
         self._diagnosis: dict[str, object] = {key: told[key] for key in ("input", "budget") if key in told}
+        self._length = number_in(self._summary, "length_scale_m") or 1.0
+        self._caps: dict[str, float] = {}
 
-    def draw(self, view: MotionView) -> dict[str, object]:
+    def draw(self, shown: Shown) -> dict[str, object]:
         """Specifications, rows, titles and words of all figures."""
-        scene = self._scene(view)
+        scene = self._scene(shown)
         drawn = [(figure, figure.draw(scene)) for figure in list_figures() if figure.id in FIGURES]
         there = {figure.id: (figure, drawing) for figure, drawing in drawn if drawing is not None}
         ordered = [there[name] for name in FIGURES if name in there]
@@ -72,33 +98,47 @@ class FigureCache:
             "figures": {figure.id: build_spec(drawing) for figure, drawing in ordered},
             "rows": share_rows(drawing for _, drawing in ordered),
             "dark": dict(theme.DARK_TWINS),
-            "where": self._where(scene),
+            "where": shown.where,
             "shown": [
                 {
                     "id": figure.id,
                     "title": figure.title,
                     "width": figure.width.value,
                     "words": figure.describe(scene),
-                    "note": drawing.note,
+                    "note": f"{_LEFT} {drawing.note}" if figure.id in _COLOURED else drawing.note,
                 }
                 for figure, drawing in ordered
             ],
         }
 
-    def redraw(self, view: MotionView) -> dict[str, object]:
-        """The rows that differ from model to model."""
-        scene = self._scene(view)
-        rows = {}
+    def redraw(self, shown: Shown) -> dict[str, object]:
+        """The rows and words that differ from model to model."""
+        scene = self._scene(shown)
+        rows: dict[str, pl.DataFrame] = {}
         for gather in _LIVE:
             rows.update(gather(scene))
-        return {"rows": pack_rows(rows)}
+        if scene.track is not None:
+            rows["track"] = scene.track.frame
+        words = {figure.id: figure.describe(scene) for figure in list_figures() if figure.id in _COLOURED}
+        return {"rows": pack_rows(rows), "where": shown.where, "words": words}
 
-    @staticmethod
-    def _where(scene: Scene) -> list[dict[str, object]]:
-        """The regions of driving that carry more slip than their share of the time."""
-        name = scene.report.main_input
-        found = find_regions(scene.sound_slip.get(name), VERBS[name])
-        return [{"words": words, "slip": slip, "time": time} for words, slip, time in found]
+    def _scene(self, shown: Shown) -> Scene:
+        """The run as figures need it, fed with what the model is fed with."""
+        source = shown.view.input
+        summary = {**self._summary, "input": source}
+        if source not in self._caps:
+            self._caps[source] = Scene(RunReport(summary, self._tables)).modulus_cap
+        tables = {**self._tables, "slip": self._leave(shown)} if "slip" in self._tables else self._tables
+        report = RunReport(summary, tables, self._diagnosis, motion=shown.view)
+        return _ModelScene(report, self._caps[source])
 
-    def _scene(self, view: MotionView) -> Scene:
-        return Scene(RunReport(self._summary, self._tables, self._diagnosis, motion=view))
+    def _leave(self, shown: Shown) -> pl.DataFrame:
+        """The table `slip` with the modulus of what a model leaves of it."""
+        slip = self._tables["slip"]
+        if not shown.view.effects:
+            return slip
+        followed = pl.col("input").cast(pl.String) == shown.view.input
+        part, rest = slip.filter(followed), slip.filter(~followed)
+        left = find_residual_modulus(shown.predict(part["t"].to_numpy()), part, length=self._length)
+        kept = pl.Series("modulus", left).fill_nan(None)
+        return pl.concat([part.with_columns(kept).filter(pl.col("modulus").is_not_null()), rest])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import secrets
 import threading
 import time
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from pipeline.web.places import Places
 
 WORDS = {
+    "sample": "driving a simulated Husky over tile",
     "upload": "taking the log in",
     "read": "reading the log",
     "extract": "extracting commands and poses",
@@ -41,6 +43,8 @@ WORDS = {
 _STEPS = ("upload", "read", *STAGES, "diagnosis", "report")
 _MOST_JOBS = 50
 _LONGEST_NAME = 200
+_SAMPLE = "husky_tile"
+_SAMPLE_BYTES = 20_000_000
 _FOLDER = Path("/dropped")
 """A run is called after its log's folder and name; this one need not exist."""
 
@@ -167,6 +171,27 @@ class Jobs:
             raise
         self._start(job, job.upload, None)
         return job
+
+    def make_sample(self) -> Job:
+        """Simulate a log with two hidden effects and analyze it, for who has none at hand.
+
+        Raises:
+            WorkbenchError: too many logs wait, or there is no room on the disk.
+        """
+        job = Job(secrets.token_hex(4), f"{_SAMPLE}.mcap")
+        job.upload = self._uploads.make_room(job.name, _SAMPLE_BYTES)
+        job.tell("sample")
+        self._add(job)
+        self._begin(job, partial(self._simulate, job, job.upload))
+        return job
+
+    def _simulate(self, job: Job, upload: Upload) -> Errand:
+        from pipeline.simulate import simulate_case  # noqa: PLC0415 - only for who has no log
+
+        simulate_case(_SAMPLE, out=upload.path)
+        job.sha256 = hashlib.sha256(upload.path.read_bytes()).hexdigest()
+        job.tell("read")
+        return self._make_analysis(upload, job.sha256, None)
 
     def retry(self, name: str, vehicle: str) -> Job:
         """Analyze again, now that the vehicle is known.

@@ -1,4 +1,5 @@
 // Runs, dropped logs, one pane or two; what is open stands in the address, so that a reload brings it back.
+import { showDifference } from "./difference.js";
 import { Pane } from "./pane.js";
 import { get, h, post, say, sayDuration, toast, upload } from "./parts.js";
 
@@ -6,6 +7,7 @@ const find = (id) => document.getElementById(id);
 const panes = { a: null, b: null };
 let listed = { runs: [], jobs: [], vehicles: [] };
 let aimed = "a";
+const narrow = matchMedia("(max-width: 860px)");
 
 const address = () => new URLSearchParams(location.hash.slice(1));
 
@@ -25,25 +27,38 @@ const ORDERS = {
   length: (a, b) => (b.duration_s ?? 0) - (a.duration_s ?? 0),
 };
 
+// How far a run can be trusted: 0 nothing was said against it, 1 something was, 2 it allows no conclusions.
+const doubt = (run) => {
+  const worst = run.findings.map((finding) => ({ error: 2, warning: 1 })[finding.severity] ?? 0);
+  return Math.max(run.losses.length ? 1 : 0, Number.isFinite(run.median_modulus) ? 0 : 2, ...worst);
+};
+
+const sayHealth = (run) => {
+  const told = [run.losses.length && "losses", run.findings.some((finding) => finding.severity === "error") && "no conclusions"].filter(Boolean).join(", ");
+  return told && h("i", { class: "lossy" }, told);
+};
+
 const showRuns = () => {
   const words = find("search").value.toLowerCase().split(/\s+/).filter(Boolean);
   const text = (run) => [run.run, run.vehicle, run.terrain, run.dataset].join(" ").toLowerCase();
   const shown = listed.runs.filter((run) => words.every((word) => text(run).includes(word)));
   shown.sort(ORDERS[find("sort").value]);
+  const most = Math.max(...shown.map((run) => run.median_modulus ?? 0), 0);
   const open = new Set([panes.a?.run, panes.b?.run]);
   find("count").textContent = listed.runs.length ? `${shown.length} of ${listed.runs.length}` : "none yet";
   find("runs").replaceChildren(...shown.map((run) => h("li", {},
-    h("button", { type: "button", class: "run", "aria-current": open.has(run.run) ? "true" : null, onclick: () => open_(run.run) },
+    h("button", { type: "button", class: "run", "aria-current": open.has(run.run) ? "true" : null, title: run.run, bar: most > 0 ? (run.median_modulus ?? 0) / most : 0, onclick: () => open_(run.run) },
       h("b", {}, run.run),
-      h("span", {}, [run.terrain, sayDuration(run.duration_s), run.median_modulus === null || run.median_modulus === undefined ? "" : `${say(run.median_modulus)} m/s`].filter(Boolean).join(" · ")),
-      run.losses.length > 0 && h("i", { class: "lossy", title: "the log had losses" }, "losses")))));
+      h("span", { class: "slip-of" }, Number.isFinite(run.median_modulus) ? `slip ${say(run.median_modulus)} m/s` : ""),
+      h("span", { class: "facts" }, [run.vehicle, run.terrain, sayDuration(run.duration_s)].filter(Boolean).join(" · "), " ", sayHealth(run))))));
   find("bench").classList.toggle("empty", !listed.runs.length);
-  if (!listed.runs.length) find("panes").replaceChildren(h("div", { class: "blank" }, h("h2", {}, "No runs yet"), h("p", {}, "Drop an MCAP anywhere on this page: it is analyzed here, and nothing leaves this machine.")));
+  if (!listed.runs.length) find("panes").replaceChildren(h("div", { class: "blank" }, h("h2", {}, "No runs yet"), h("p", {}, "Drop an MCAP anywhere on this page: it is analyzed here, and nothing leaves this machine."),
+    h("p", {}, "No log at hand?"), h("button", { type: "button", class: "sample", onclick: () => order(() => post("/api/sample", {})) }, "Try it with a sample log")));
 };
 
 const open_ = async (run) => {
   const slot = panes.b && aimed === "b" ? "b" : "a";
-  if (matchMedia("(max-width: 860px)").matches) find("shelf").open = false;
+  if (narrow.matches) find("shelf").open = false;
   await panes[slot].open(run);
 };
 
@@ -75,14 +90,21 @@ const arrange = (two) => {
   panes.a ??= new Pane("a", remember, () => watch());
   panes.b = two ? (panes.b ?? new Pane("b", remember, () => watch())) : null;
   find("bench").classList.toggle("single", !two);
-  for (const pane of Object.values(panes)) if (pane) pane.findPeers = findPeers;
+  for (const pane of Object.values(panes)) {
+    if (!pane) continue;
+    pane.findPeers = findPeers;
+    pane.shown = () => showDifference(find("difference"), panes.a, panes.b);
+    pane.place(two || narrow.matches ? null : find("side"));
+  }
+  showDifference(find("difference"), panes.a, panes.b);
   // What is marked in one is marked in the other, as long as both show the same run.
   const other = { a: "b", b: "a" };
   for (const pane of Object.values(panes))
     if (pane) pane.marked = (spans) => panes[other[pane.slot]]?.run === pane.run && panes[other[pane.slot]].marks.follow(spans);
   if (!listed.runs.length) return;
   find("panes").replaceChildren(...Object.values(panes).filter(Boolean).map((pane) => pane.root));
-  for (const pane of Object.values(panes)) pane?.root.addEventListener("pointerdown", () => (aimed = pane.slot));
+  for (const pane of Object.values(panes))
+    for (const kind of ["pointerdown", "focusin"]) pane?.root.addEventListener(kind, () => (aimed = pane.slot));
 };
 
 find("compare").addEventListener("change", async (event) => {
@@ -100,26 +122,42 @@ find("compare").addEventListener("change", async (event) => {
 
 // Dropped logs -----------------------------------------------------------------------------------------------
 
+// Logs that were refused before the server kept anything of them.
+let refused = [];
+
 const showJobs = (jobs) => {
-  find("jobs").replaceChildren(...jobs.map((job) => h("li", { class: `job${job.error ? " failed" : ""}`, data: { job: job.id } },
+  const focus = document.activeElement?.dataset?.keep;
+  find("jobs").replaceChildren(...[...refused, ...jobs].map((job) => h("li", { class: `job${job.error ? " failed" : ""}`, data: { job: job.id } },
     h("b", {}, job.name),
     !job.done && h("span", {}, `${job.words}, ${Math.round(job.seconds)} s`),
     !job.done && h("i", { class: "progress", bar: job.total && job.stage === "upload" ? (job.received / job.total) / job.steps : job.step / job.steps }),
     job.error && h("p", {}, job.error.message),
     job.error && askVehicle(job),
     job.run && h("button", { type: "button", onclick: () => open_(job.run) }, job.lossy ? "Open (log had losses)" : "Open"),
-    job.done && h("button", { type: "button", class: "drop", "aria-label": "dismiss", onclick: async () => showJobs((await post(`/api/dismiss?id=${encodeURIComponent(job.id)}`, {})).jobs) }, "×"))));
+    job.done && h("button", { type: "button", class: "drop", "aria-label": `dismiss ${job.name}`, data: { keep: `dismiss ${job.id}` }, onclick: () => dismiss(job) }, "×"))));
+  if (focus) find("jobs").querySelector(`[data-keep="${CSS.escape(focus)}"]`)?.focus({ preventScroll: true });
+};
+
+const dismiss = async (job) => {
+  refused = refused.filter((other) => other !== job);
+  showJobs((await post(`/api/dismiss?id=${encodeURIComponent(job.id)}`, {})).jobs);
 };
 
 const askVehicle = (job) => {
   if (!job.error.code.includes("vehicle")) return null;
-  const chosen = h("select", { "aria-label": "vehicle of this log" }, h("option", { value: "" }, "choose the vehicle …"),
+  const chosen = h("select", { "aria-label": "vehicle of this log", data: { keep: `vehicle ${job.id}` } }, h("option", { value: "" }, "choose the vehicle …"),
     listed.vehicles.map((vehicle) => h("option", { value: vehicle.id }, vehicle.name)));
-  chosen.addEventListener("change", async () => {
-    await post(`/api/retry?id=${encodeURIComponent(job.id)}&vehicle=${encodeURIComponent(chosen.value)}`, {});
+  const again = () => chosen.value && order(() => post(`/api/retry?id=${encodeURIComponent(job.id)}&vehicle=${encodeURIComponent(chosen.value)}`, {}));
+  return h("div", { class: "any" }, chosen, h("button", { type: "button", class: "analyze", onclick: again }, "Analyze"));
+};
+
+const order = async (ask) => {
+  try {
+    await ask();
     watch();
-  });
-  return chosen;
+  } catch (error) {
+    toast(error.message);
+  }
 };
 
 let watching = false;
@@ -155,8 +193,8 @@ const take = async (files) => {
     try {
       await upload(file, (share) => line.querySelector(".progress").style.setProperty("--share", share / 7));
     } catch (error) {
-      toast(error.message);
-      line.remove();
+      refused.unshift({ id: `refused-${refused.length}`, name: file.name, done: true, error: { code: error.code ?? "", message: error.message } });
+      showJobs(listed.jobs);
       continue;
     }
     await watch();
@@ -195,19 +233,23 @@ addEventListener("resize", () => {
   again();
 });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", again);
+narrow.addEventListener("change", () => arrange(find("compare").checked));
 
 const openAddress = async () => {
   const kept = address();
   arrange(kept.has("b"));
   const known = (run) => run && listed.runs.some((entry) => entry.run === run);
-  const first = known(kept.get("a")) ? kept.get("a") : [...listed.runs].sort(ORDERS.slip)[0]?.run;
+  // Unless one was asked for, the soundest run opens, and of these the one with the most slip.
+  const soundest = [...listed.runs].sort((a, b) => doubt(a) - doubt(b) || ORDERS.slip(a, b));
+  let first = known(kept.get("a")) ? kept.get("a") : null;
   if (first) await panes.a.open(first);
+  else for (const { run } of soundest.slice(0, 3)) if (await panes.a.open((first = run))) break;
   if (panes.b && first) await panes.b.open(known(kept.get("b")) ? kept.get("b") : first);
 };
 
 const begin = async () => {
   try {
-    if (matchMedia("(max-width: 860px)").matches) find("shelf").open = false;
+    if (narrow.matches) find("shelf").open = false;
     await load();
     for (const job of listed.jobs) if (job.done) opened.add(job.id);
     if (listed.jobs.some((job) => !job.done)) watch();

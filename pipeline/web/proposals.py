@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import threading
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from pipeline.core.errors import SlipError
 from pipeline.diagnosis.verdict import compare
@@ -17,13 +20,19 @@ from pipeline.web.cards import describe_shortly
 from pipeline.web.errors import evaluating
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
     from pipeline.identification import HeldOut, Problem
     from pipeline.models import Model
     from pipeline.web.run_cache import PreparedRun
 
 _WORTH = 0.99
-_EACH_NUMBER = 1.02
 _MOST_KEPT = 40
+_TWIN = 0.95
+"""Cosine between what two effects take off the residuals, from which on they are called twins: nine tenths
+of the square of what one does the other does too."""
 
 
 @dataclass
@@ -50,8 +59,8 @@ class Trial:
         return self.stopped and self.tried < self.total
 
     def show(self) -> dict[str, object]:
-        """As JSON: those that help first."""
-        ranked = sorted(self.found, key=lambda entry: (not entry["helps"], entry["rank"]))
+        """As JSON: those that help first, by how far both errors over 2 s fall."""
+        ranked = sorted(self.found, key=lambda entry: (not entry["helps"], entry["left"]))
         return {"total": self.total, "tried": self.tried, "found": ranked}
 
 
@@ -61,6 +70,23 @@ class Trials:
     def __init__(self) -> None:
         self._known: dict[tuple[object, ...], Trial] = {}
         self._lock = threading.Lock()
+        self._in_front = 0
+        self._idle = threading.Event()
+        self._idle.set()
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        """As long as somebody waits for an answer no further effect is tried."""
+        with self._lock:
+            self._in_front += 1
+            self._idle.clear()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._in_front -= 1
+                if not self._in_front:
+                    self._idle.set()
 
     def find(self, prepared: PreparedRun, model: Model) -> Trial | None:
         """The trial of a model, if there is one that was not stopped before its end."""
@@ -93,7 +119,8 @@ class Trials:
             trial = Trial(owner, len(kinds))
             self._known[key] = trial
         names = [effect.id for effect in kinds]
-        threading.Thread(target=_try_all, args=(prepared, model, names, trial), daemon=True).start()
+        work = (prepared, model, names, trial, self._idle)
+        threading.Thread(target=_try_all, args=work, daemon=True).start()
         return trial
 
 
@@ -102,20 +129,26 @@ def _key(prepared: PreparedRun, model: Model) -> tuple[object, ...]:
     return (manifest.run, manifest.key, prepared.problem.source.value, model.effects)
 
 
-def _try_all(prepared: PreparedRun, model: Model, names: list[str], trial: Trial) -> None:
+def _try_all(
+    prepared: PreparedRun, model: Model, names: list[str], trial: Trial, idle: threading.Event
+) -> None:
     try:
         with evaluating(prepared.manifest.run):
-            _try_each(prepared, model, names, trial)
+            _try_each(prepared, model, names, trial, idle)
     except SlipError:
         # On top of a model that cannot be fitted nothing can be tried.
         trial.tried = trial.total
 
 
-def _try_each(prepared: PreparedRun, model: Model, names: list[str], trial: Trial) -> None:
+def _try_each(
+    prepared: PreparedRun, model: Model, names: list[str], trial: Trial, idle: threading.Event
+) -> None:
     problem = prepared.second_problem()
     base: HeldOut = hold_out(problem, fit_model(problem, model))
     kinds = {effect.id: effect for effect in list_effects()}
+    taken: dict[str, NDArray[np.float64]] = {}
     for name in names:
+        idle.wait()
         if trial.stopped:
             return
         added = model + kinds[name]()
@@ -126,21 +159,50 @@ def _try_each(prepared: PreparedRun, model: Model, names: list[str], trial: Tria
                 # What cannot be fitted to this run is no proposal.
                 held_out = base
             ratio = compare_losses(held_out, base)
+            helps = ratio < _WORTH and _reaches_further(base, held_out) and _is_sure(problem, base, held_out)
+            twins = _find_twins(name, held_out, base, taken, trial) if helps else []
             trial.found.append(
                 {
                     "id": name,
                     "about": describe_shortly(kinds[name]),
                     "ratio": ratio,
-                    # Of two that do the same, the one with fewer numbers.
-                    "rank": ratio * _EACH_NUMBER ** len(kinds[name].parameters),
-                    "helps": ratio < _WORTH
-                    and _reaches_further(base, held_out)
-                    and _is_sure(problem, base, held_out),
+                    "left": _share_left(base, held_out),
+                    "helps": helps,
+                    "twins": twins,
                     "from": {"t": base.pooled.t_mrmse_m, "r": base.pooled.r_mrmse_rad},
                     "to": {"t": held_out.pooled.t_mrmse_m, "r": held_out.pooled.r_mrmse_rad},
                 }
             )
         trial.tried += 1
+
+
+def _share_left(base: HeldOut, new: HeldOut) -> float:
+    """What stays of the errors over 2 s that the page shows: of position times of heading."""
+    before, after = base.pooled, new.pooled
+    position = after.t_mrmse_m / max(before.t_mrmse_m, 1e-12)
+    return position * after.r_mrmse_rad / max(before.r_mrmse_rad, 1e-12)
+
+
+def _find_twins(
+    name: str, new: HeldOut, base: HeldOut, taken: dict[str, NDArray[np.float64]], trial: Trial
+) -> list[str]:
+    """Effects tried before that take the same off the residuals, which are told so too.
+
+    Args:
+        name: id of the effect.
+        new: with it.
+        base: without it.
+        taken: what those before took, of unit length, shape (3 n,); this one is added.
+        trial: with what was found of them.
+    """
+    change = (new.residuals - base.residuals) / np.nanstd(base.residuals, axis=0)
+    change = np.nan_to_num(change, posinf=0.0, neginf=0.0).ravel()
+    taken[name] = change / max(float(np.linalg.norm(change)), 1e-12)
+    twins = [other for other in taken if other != name and abs(taken[other] @ taken[name]) > _TWIN]
+    for entry in trial.found:
+        if entry["id"] in twins:
+            entry["twins"] = [*entry["twins"], name]  # type: ignore[misc]
+    return twins
 
 
 def _reaches_further(base: HeldOut, new: HeldOut) -> bool:

@@ -24,7 +24,8 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         run: name of the run.
         slot: `a`, or `b` for the session beside it.
         input: what the model is fed with; None for the usual one.
-        action: what to do; `add_named` puts in the model that the diagnosis wrote, fitted as one.
+        action: what to do; `add_named` puts in the model that the diagnosis wrote, fitted as one,
+            `add_found` the formula that it found.
         anyway: take an effect though it raises an error.
         effect: id of the effect it concerns.
         parameter: name of the parameter it concerns.
@@ -39,6 +40,7 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         "open",
         "add",
         "add_named",
+        "add_found",
         "drop",
         "switch",
         "set",

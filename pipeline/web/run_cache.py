@@ -5,21 +5,28 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING
 
 import polars as pl
 
+from pipeline.diagnosis.error_regions import map_errors, pick_regions
+from pipeline.diagnosis.unexplained import find_places
 from pipeline.identification import Input, Problem, State, choose_input, fit_model, hold_out
 from pipeline.identification.describe import errors_as_json
 from pipeline.identification.floor import estimate_floor
 from pipeline.identification.intervals import estimate_intervals
+from pipeline.identification.predict import predict_at_from
 from pipeline.identification.scoring import score
 from pipeline.models import Timing
 from pipeline.report.motion_run import load_motion_run, load_vehicle
 from pipeline.report.motion_view import MotionStage
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
 
     from pipeline.identification import Errors, Fitted
     from pipeline.models import Model
@@ -40,6 +47,21 @@ class Judged:
     errors: Errors
     floor: Errors
     intervals: Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A model on a run, as it is shown.
+
+    Attributes:
+        view: rows to draw.
+        where: the regions that carry most of its error, in the words of `slip diagnose`.
+        predict: its body velocities at times of aligned poses [s], shape (n, 3).
+    """
+
+    view: MotionView
+    where: list[str]
+    predict: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 @dataclass
@@ -98,16 +120,24 @@ class PreparedRun:
         _, wheel = timing
         return State(model.effects, (Timing(wheel),))
 
-    def view(
+    def show(
         self,
         model: Model,
         timing: Sequence[float],
         ladder: Sequence[Mapping[str, object]],
         floor: Mapping[str, object] | None,
-    ) -> MotionView:
-        """Rows to draw of a model as it stands."""
+    ) -> Shown:
+        """A model as it stands, to be drawn."""
         with self.lock:
-            return self.stage.view(self.state(model, timing), ladder, floor)
+            state = self.state(model, timing)
+            whole, comparison = self.problem.whole, self.problem.comparisons[0]
+            residual = whole.find_residuals(state)
+            regions = map_errors(whole, residual, find_places(comparison))
+            return Shown(
+                view=self.stage.view(state, ladder, floor),
+                where=[region.sentence for region in pick_regions(regions, residual, whole.noise)],
+                predict=partial(predict_at_from, comparison, state.effects_of(0), state.timing[0]),
+            )
 
     def second_problem(self) -> Problem:
         """The run made ready once more, for trying many effects beside the work in front."""

@@ -7,13 +7,14 @@ from collections import OrderedDict
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from pipeline.models import Model
 from pipeline.models.model_text import write_model
 from pipeline.report.diagnosed import read_model_text
 from pipeline.store import Store
 from pipeline.store.files import make_folder
 from pipeline.web import actions
 from pipeline.web.cards import list_catalogue, show_session
-from pipeline.web.diagnoses import read_diagnosis
+from pipeline.web.diagnoses import find_formula, read_diagnosis
 from pipeline.web.errors import WorkbenchError, evaluating
 from pipeline.web.figure_cache import FigureCache
 from pipeline.web.formulas import make_formula
@@ -21,7 +22,7 @@ from pipeline.web.jobs import Jobs
 from pipeline.web.proposals import Trials
 from pipeline.web.run_cache import RunCache
 from pipeline.web.runs import describe_run, find_run
-from pipeline.web.session import SessionFile, switch_off
+from pipeline.web.session import SessionFile, format_step, switch_off
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,12 +31,11 @@ if TYPE_CHECKING:
     from pipeline.batch.work import Report, Task
     from pipeline.models.formula import FormulaEffect
     from pipeline.models.model_file import ModelFile
-    from pipeline.report.motion_view import MotionView
     from pipeline.store import Manifest
     from pipeline.web.limits import Limits
     from pipeline.web.places import Places
     from pipeline.web.requests import Ask
-    from pipeline.web.run_cache import PreparedRun
+    from pipeline.web.run_cache import PreparedRun, Shown
     from pipeline.web.session import Session
 
 _MOST_ALBUMS = 6
@@ -78,7 +78,7 @@ class Sessions:
         manifest = find_run(self.store, ask.run)
         file = SessionFile(self.results, ask.run, ask.slot)
         prepared = self._cache.prepared(manifest, self._input_of(ask, file, manifest))
-        with prepared.lock, evaluating(ask.run):
+        with self._trials.waiting(), prepared.lock, evaluating(ask.run):
             session = actions.open_session(file, prepared)
             if ask.action == "preview":
                 return self._preview(file, prepared, session, ask)
@@ -93,15 +93,15 @@ class Sessions:
 
     def draw(self, ask: Ask) -> dict[str, object]:
         """All figures of a session."""
-        figures, view = self._look(ask)
-        with evaluating(ask.run):
-            return figures.draw(view)
+        with self._trials.waiting(), evaluating(ask.run):
+            figures, shown = self._look(ask)
+            return figures.draw(shown)
 
     def redraw(self, ask: Ask) -> dict[str, object]:
         """The rows of a session's figures that a change moves."""
-        figures, view = self._look(ask)
-        with evaluating(ask.run):
-            return figures.redraw(view)
+        with self._trials.waiting(), evaluating(ask.run):
+            figures, shown = self._look(ask)
+            return figures.redraw(shown)
 
     def format_model(self, run: str, slot: str) -> str:
         """The model file of a session as text."""
@@ -126,7 +126,7 @@ class Sessions:
         manifest = find_run(self.store, ask.run)
         file = SessionFile(self.results, ask.run, ask.slot)
         prepared = self._cache.prepared(manifest, self._input_of(ask, file, manifest))
-        with prepared.lock, evaluating(ask.run):
+        with prepared.lock:
             session = actions.open_session(file, prepared)
         return prepared, session, file.parse(session.step.model)
 
@@ -145,6 +145,7 @@ class Sessions:
             "open": lambda: session,
             "add": lambda: actions.add_effect(file, prepared, session, ask.effect, anyway=ask.anyway),
             "add_named": lambda: self._add_named(file, prepared, session, ask),
+            "add_found": lambda: self._add_found(file, prepared, session, ask),
             "formula": lambda: actions.add_effect(
                 file, prepared, session, _read_formula(ask), anyway=ask.anyway
             ),
@@ -170,6 +171,16 @@ class Sessions:
         said = f"+ all {len(missing)} that were named"
         return actions.add_effects(file, prepared, session, missing, said, anyway=ask.anyway)
 
+    def _add_found(self, file: SessionFile, prepared: PreparedRun, session: Session, ask: Ask) -> Session:
+        found = read_diagnosis(self.results, prepared.manifest)
+        text = find_formula(found)
+        if text is None:
+            raise WorkbenchError(
+                "no_formula", "no formula was found on this run", where=ask.run, hint="Diagnose it first."
+            )
+        (formula,) = file.parse(format_step(Model(prepared.vehicle), {}) + text).model.effects
+        return actions.add_effect(file, prepared, session, formula, anyway=ask.anyway)
+
     def _begin_trial(self, file: SessionFile, prepared: PreparedRun, session: Session) -> Session:
         model = switch_off(file.parse(session.step.model).model, session.step.off)
         self._trials.begin(prepared, model, f"{file.slot} {file.run}")
@@ -182,8 +193,8 @@ class Sessions:
         trial = actions.set_value(file, prepared, session, ask.effect, {ask.parameter: ask.value})
         parsed = file.parse(trial.step.model)
         model = switch_off(parsed.model, trial.step.off)
-        view = prepared.view(model, trial.step.timing, trial.step.ladder, session.floor or None)
-        return {"session": show_session(trial, parsed), **self._figures_of(prepared.manifest).redraw(view)}
+        shown = prepared.show(model, trial.step.timing, trial.step.ladder, session.floor or None)
+        return {"session": show_session(trial, parsed), **self._figures_of(prepared.manifest).redraw(shown)}
 
     def _show(self, file: SessionFile, prepared: PreparedRun, session: Session) -> dict[str, object]:
         parsed = file.parse(session.step.model)
@@ -198,12 +209,11 @@ class Sessions:
             "slot": file.slot,
         }
 
-    def _look(self, ask: Ask) -> tuple[FigureCache, MotionView]:
+    def _look(self, ask: Ask) -> tuple[FigureCache, Shown]:
         prepared, session, parsed = self._open(ask)
         model = switch_off(parsed.model, session.step.off)
-        with evaluating(ask.run):
-            view = prepared.view(model, session.step.timing, session.step.ladder, session.floor or None)
-        return self._figures_of(prepared.manifest), view
+        shown = prepared.show(model, session.step.timing, session.step.ladder, session.floor or None)
+        return self._figures_of(prepared.manifest), shown
 
     def _figures_of(self, manifest: Manifest) -> FigureCache:
         key = (manifest.run, manifest.key)

@@ -102,13 +102,9 @@ class Uploads:
             WorkbenchError: too large or too many, no room on the disk, or the connection broke; nothing of
                 it is left then.
         """
-        self._check_quota(name, total)
         upload = None
         try:
-            self._check_room(name, total)
-            upload = Upload(self._open() / secrets.token_hex(_NAME_BYTES), name, total)
-            self._known[upload.folder.name] = upload
-            upload.folder.mkdir()
+            upload = self.make_room(name, total)
             begin()
             return upload, await self._fill(upload, chunks, tell)
         except BaseException as error:
@@ -122,6 +118,28 @@ class Uploads:
                     hint="Free some space.",
                 ) from error
             raise
+
+    def make_room(self, name: str, total: int) -> Upload:
+        """A folder for a log.
+
+        Args:
+            name: of the log, for people.
+            total: bytes that it needs.
+
+        Raises:
+            WorkbenchError: too large or too many, or no room on the disk.
+            OSError: the folder cannot be made.
+        """
+        self._check_quota(name, total)
+        self._check_room(name, total)
+        upload = Upload(self._open() / secrets.token_hex(_NAME_BYTES), name, total)
+        self._known[upload.folder.name] = upload
+        try:
+            upload.folder.mkdir()
+        except OSError:
+            self.remove(upload)
+            raise
+        return upload
 
     def remove(self, upload: Upload) -> None:
         """Delete a log."""

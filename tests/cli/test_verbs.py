@@ -288,17 +288,26 @@ def test_simulate_writes_a_log_with_the_effect_asked_for(tmp_path: Path) -> None
         assert not (tmp_path / "x.mcap").exists()
 
 
-def test_the_list_of_cases_keeps_names_and_texts_apart(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_of_cases_keeps_names_and_texts_apart_within_the_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit) as ended:
         main(["simulate", "--cases", "--json"])
     assert ended.value.code == 0
     listed = json.loads(capsys.readouterr().out)
     with pytest.raises(SystemExit):
         main(["simulate", "--cases"])
-    rows = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines() if line.startswith(" ")]
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith(" ")]
+    assert all(len(line) <= 80 or len(line.split()) == 1 for line in lines if line[2] == " ")
+    rows: list[list[str]] = []
+    for line in lines:
+        if line[2] == " ":
+            rows[-1] += line.split()
+        else:
+            rows.append(line.split())
     told = {**listed["cases"], **listed["effects"], **listed["platforms"]}
-    assert [name for name, _ in rows] == list(told)
-    assert [text for _, text in rows] == list(told.values())
+    assert rows == [[name, *text.split()] for name, text in told.items()]
 
 
 def test_help_loads_no_heavy_library() -> None:

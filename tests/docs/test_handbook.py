@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 import pytest
+from barriers import find_barriers
 from blocks import find_difference, list_pages, read_commands
 from effects_pages import list_settings
 from reference import list_verbs, write_reference
@@ -78,6 +79,7 @@ def test_the_search_works_from_the_disk_and_nothing_is_asked_of_a_network(
     chrome.size(1280, 900)
     chrome.open((handbook / "index.html").as_uri())
     chrome.wait("document.readyState === 'complete' && document.querySelector('.md-search__input')")
+    assert find_barriers(chrome) == []
     chrome.click(".md-search__input")
     chrome.run("document.querySelector('.md-search__input').value = 'understeer'")
     typed = "new KeyboardEvent('keyup', { bubbles: true })"

@@ -242,6 +242,7 @@ def test_a_diagnosis_that_is_asked_for_is_kept_beside_the_results(workbench: Wor
 
 def test_what_cannot_be_done_is_said_and_changes_nothing(workbench: Workbench) -> None:
     assert workbench.refuse("/api/session", run="nobody")["code"] == "no_such_run"
+    assert workbench.refuse("/api/session", run=RUN, action="add_found")["code"] == "no_formula"
     assert workbench.refuse("/api/session", run=RUN, action="add", effect="magic")["code"] == "unknown_effect"
     assert workbench.refuse("/api/session", run=RUN, action="drop", effect="lag")["code"] == "no_such_effect"
     assert workbench.refuse("/api/session", run=RUN, action="burn")["code"] == "bad_request"

@@ -26,7 +26,6 @@ def draw_command_space(scene: Scene) -> Drawing | None:
     slip = scene.sound_slip.get(scene.report.main_input)
     if slip is None:
         return None
-    cells = _count_cells(slip)
     bounds = {name: _bound(slip, name) for name in ("f_x", "f_w")}
     words = INPUT_WORDS[scene.report.main_input]
     x = alt.X(
@@ -60,7 +59,13 @@ def draw_command_space(scene: Scene) -> Drawing | None:
     meta = parts.brush_over_plane("f_w", "f_x")
     chart = alt.layer(heat, marked).properties(width=480, height=340, usermeta=meta)
     note = f"Cells with fewer than {_FEWEST_SAMPLES} samples are left empty."
-    return Drawing(chart, {"command_cells": cells} | parts.marked_rows(), note)
+    return Drawing(chart, list_cells(scene) | parts.marked_rows(), note)
+
+
+def list_cells(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Cells of the plane of commands: edges, median modulus, samples; empty without slip."""
+    slip = scene.sound_slip.get(scene.report.main_input)
+    return {} if slip is None else {"command_cells": _count_cells(slip)}
 
 
 def _bound(slip: pl.DataFrame, name: str) -> list[float]:

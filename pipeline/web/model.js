@@ -1,0 +1,168 @@
+// The model of a session: its effects as cards, and what to add next, one row an effect.
+import { h, say, sayShare } from "./parts.js";
+
+const REST_MS = 350;
+const FIRST_ROWS = 7;
+
+// All anew, but what is open stays open, what has the focus keeps it, and nothing scrolls.
+export const buildModel = (pane) => {
+  const { model, state } = pane;
+  const { session } = state;
+  const focus = document.activeElement?.closest("[data-keep]")?.dataset.keep;
+  const fields = [...model.querySelectorAll("[data-field]")].map((field) => [field.dataset.field, field.value]);
+  const open = new Set([...model.querySelectorAll("details[open]")].map((part) => part.className));
+  const cards = session.effects.map((effect) => buildCard(pane, effect));
+  model.replaceChildren(
+    h("h3", {}, "Model"),
+    ...session.warnings.map((told) => h("p", { class: "doubts warning", role: "status" }, told)),
+    cards.length ? h("ul", { class: "cards" }, cards) : h("p", { class: "quiet" }, "The ideal model: no effect yet."),
+    h("h3", {}, "Add an effect"),
+    buildNext(pane),
+    buildFormula(pane));
+  for (const part of model.querySelectorAll("details")) part.open = open.has(part.className);
+  for (const [name, value] of fields) if (value) model.querySelector(`[data-field="${name}"]`).value = value;
+  if (focus) model.querySelector(`[data-keep="${CSS.escape(focus)}"]`)?.focus({ preventScroll: true });
+};
+
+// Cards -----------------------------------------------------------------------------------------------------
+
+const buildCard = (pane, effect) => {
+  const carries = effect.without_m !== null && !effect.off ? effect.without_m - pane.state.session.errors.t : null;
+  return h("li", { class: `card${effect.off ? " off" : ""}`, tabindex: "-1", data: { effect: effect.id } },
+    h("div", { class: "head" },
+      h("b", {}, effect.id),
+      h("button", { type: "button", class: "switch", "aria-pressed": String(!effect.off), "aria-label": `${effect.id} on`, title: "on or off, without a fit", data: { keep: `switch ${effect.id}` }, onclick: () => pane.act("switch", { effect: effect.id }) }, effect.off ? "off" : "on"),
+      h("button", { type: "button", class: "drop", title: "drop it and fit the rest", "aria-label": `drop ${effect.id}`, onclick: () => pane.act("drop", { effect: effect.id }) }, "×")),
+    h("p", { class: "quiet" }, effect.formula.length ? effect.formula.join("; ") : effect.sentence || effect.about),
+    effect.parameters.map((parameter) => buildSlider(pane, effect, parameter)),
+    carries !== null && carries > 0 && h("p", { class: "carries" }, `without it ${say(effect.without_m)} m`));
+};
+
+const buildSlider = (pane, effect, parameter) => {
+  const { name, unit, value, low, high, at_bound: atBound } = parameter;
+  const label = `${effect.id}.${name}`;
+  const words = (number) => `${say(number, 4)} ${unit === "1" ? "" : unit}`.trim();
+  const shown = h("output", {}, words(value));
+  const input = h("input", {
+    type: "range", min: String(parameter.from), max: String(parameter.to), step: String(parameter.step),
+    value: String(value), "aria-label": `${label} [${unit}], ${parameter.about}`, "aria-valuetext": words(value), data: { keep: label },
+  });
+  input.value = String(value);
+  input.disabled = effect.off;
+  input.addEventListener("input", () => {
+    shown.textContent = words(Number(input.value));
+    input.setAttribute("aria-valuetext", shown.textContent);
+    pane.preview(effect.id, name, Number(input.value));
+  });
+  // Keys change the value many times in a row: only where it comes to rest is a step.
+  input.addEventListener("change", () => {
+    clearTimeout(pane.rest);
+    pane.resting = { effect: effect.id, parameter: name, value: Number(input.value) };
+    pane.rest = setTimeout(() => pane.settle().then(() => pane.redraw()), REST_MS);
+  });
+  const span = low === null ? "" : `95 %: ${say(low, 4)} to ${say(high, 4)}`;
+  return h("div", { class: `slider${atBound ? " at-bound" : ""}` },
+    h("div", { class: "named-value" }, h("span", {}, name), shown),
+    input,
+    h("p", { class: "quiet" }, atBound ? h("b", { class: "bound" }, "at its bound: it may go no further") : span,
+      h("button", { type: "button", class: "lock", "aria-pressed": String(parameter.locked), "aria-label": `lock ${label}`, title: "a locked value stays as it is in a fit", data: { keep: `lock ${label}` }, onclick: () => pane.act("lock", { effect: effect.id, parameter: name }) }, parameter.locked ? "locked" : "lock")));
+};
+
+// What to add -----------------------------------------------------------------------------------------------
+
+// One row an effect: what the trial of every effect and the diagnosis say of it, by how far the errors fall.
+const listRows = ({ session, trial, diagnosis }) => {
+  const there = new Set(session.effects.map((effect) => effect.id));
+  const rows = new Map();
+  for (const entry of trial?.found ?? []) rows.set(entry.id, { ...entry, tried: true, twins: entry.twins ?? [] });
+  for (const entry of diagnosis?.effects ?? []) {
+    if (entry.corrected) continue;
+    const row = rows.get(entry.id) ?? { id: entry.id, about: "", twins: [] };
+    const twins = [...new Set([...row.twins, ...(entry.equivalent_to ?? [])])];
+    rows.set(entry.id, { ...row, named: true, sentence: entry.sentence, gain: entry.gain ?? 0, twins });
+  }
+  const shown = [...rows.values()].filter((row) => (row.named || row.helps) && !there.has(row.id));
+  const fall = (row) => (row.tried ? row.left : 1) - (row.tried ? 0 : 1e-9 * row.gain);
+  return shown.sort((one, other) => fall(one) - fall(other));
+};
+
+// While a hand is over the list, no row moves away from under it.
+const holdStill = (pane, rows) => {
+  const list = pane.model.querySelector(".proposals");
+  if (list?.matches(":hover, :focus-within") && pane.held) {
+    const at = new Map(pane.held.map((id, number) => [id, number]));
+    rows.sort((one, other) => (at.get(one.id) ?? Infinity) - (at.get(other.id) ?? Infinity));
+  }
+  pane.held = rows.map((row) => row.id);
+  return rows;
+};
+
+const buildNext = (pane) => {
+  const { session, trial, catalogue, diagnosis } = pane.state;
+  const there = new Set(session.effects.map((effect) => effect.id));
+  const rows = holdStill(pane, listRows(pane.state));
+  const running = trial && trial.tried < trial.total;
+  const named = rows.filter((row) => row.named).length;
+  const found = diagnosis?.unexplained?.formula ? buildFound(pane, diagnosis.unexplained, there) : null;
+  const undecided = (diagnosis?.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. ${entry.separate_by ?? ""}`));
+  const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Not explained yet: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}`) : null;
+  const build = (row, number) => buildRow(pane, row, number === 0 && !running);
+  return h("div", { class: "next" },
+    running && h("p", { class: "quiet trying" }, `trying every effect: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.tried / trial.total })),
+    !trial && h("button", { type: "button", class: "try", onclick: () => pane.tryAll() }, "Try every effect"),
+    h("ul", { class: "proposals" }, rows.slice(0, FIRST_ROWS).map(build), found),
+    rows.length > FIRST_ROWS && h("details", { class: "further" }, h("summary", {}, `${rows.length - FIRST_ROWS} more that help`), h("ul", { class: "proposals" }, rows.slice(FIRST_ROWS).map((row) => build(row)))),
+    named > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, onclick: () => pane.addAll() }, `Add all ${named} that are named`),
+    trial && !running && !rows.length && !found && h("p", { class: "nothing" }, tellNothing(session)),
+    !diagnosis && h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", data: { keep: "diagnose" }, onclick: () => pane.diagnose() }, "Diagnose")),
+    undecided, rest,
+    buildCatalogue(pane, catalogue.filter((entry) => !there.has(entry.id))));
+};
+
+const buildRow = (pane, row, first) => {
+  const share = (key) => sayShare(row.to[key] / row.from[key] - 1);
+  const marks = [row.named && h("i", { class: "mark" }, "named by the diagnosis"),
+    row.twins.length > 0 && h("i", { class: "mark twin", title: "they take the same off the error of this run: take one of them" }, `twin: ${row.twins.join(", ")}`)].filter(Boolean);
+  return h("li", { class: first ? "first" : "", data: { effect: row.id }, bar: row.tried ? Math.min(Math.max(1 - row.to.t / row.from.t, 0), 1) : 0 },
+    h("div", {},
+      h("b", {}, row.id), h("span", {}, row.sentence || row.about),
+      h("span", { class: "quiet falls" }, row.tried ? `position ${say(row.from.t)} → ${say(row.to.t)} m, ${share("t")}; heading ${share("r")}` : "not tried yet"),
+      marks.length > 0 && h("span", { class: "marks" }, marks)),
+    h("button", { type: "button", class: "add", "aria-label": `add ${row.id}`, title: row.about, data: { keep: `add ${row.id}` }, onclick: () => pane.add(row.id) }, "Add"));
+};
+
+const buildFound = (pane, unexplained, there) => {
+  const id = /^id = "(\w+)"/m.exec(unexplained.formula)?.[1] ?? "formula";
+  if (there.has(id)) return null;
+  const lines = unexplained.formula.split("\n").filter((line) => /^v_[xyw] = /.test(line)).map((line) => line.replaceAll('"', "").replace("=", "+="));
+  return h("li", { data: { effect: id } },
+    h("div", {}, h("b", {}, "a formula"), h("code", {}, lines.join("; ")), h("span", { class: "quiet" }, unexplained.where ?? ""), h("span", { class: "marks" }, h("i", { class: "mark" }, "found by the diagnosis"))),
+    h("button", { type: "button", class: "add found", "aria-label": "add the formula that was found", data: { keep: "add found" }, onclick: () => pane.addFound() }, "Add"));
+};
+
+const tellNothing = (session) => {
+  const room = session.floor ? session.errors.t / session.floor.t : Infinity;
+  if (room < 1.3) return "Nothing is missing: the model is as good as the localization lets us see.";
+  return "No single effect of the catalogue helps further. What is left may be a formula of your own, or noise.";
+};
+
+// Chosen and said apart: with keys one passes every entry of a list.
+const buildCatalogue = (pane, entries) => {
+  const chosen = h("select", { "aria-label": "Any effect of the catalogue", class: "catalogue", data: { keep: "catalogue", field: "catalogue" } }, h("option", { value: "" }, "any other effect …"),
+    entries.map((entry) => h("option", { value: entry.id, title: entry.about }, entry.id)));
+  const add = h("button", { type: "button", class: "add-chosen", "aria-label": "add the chosen effect", onclick: () => chosen.value && pane.add(chosen.value) }, "Add");
+  return h("div", { class: "any" }, chosen, add);
+};
+
+const buildFormula = (pane) => {
+  const field = (name, hint, wide) => h("input", { name, placeholder: hint, "aria-label": hint, class: wide ? "wide" : "", autocomplete: "off", spellcheck: "false", data: { keep: `field ${name}`, field: name } });
+  const channel = h("select", { name: "channel", "aria-label": "velocity it adds to", data: { keep: "field channel", field: "channel" } }, ["v_x", "v_y", "v_w"].map((name) => h("option", { value: name }, `${name} +=`)));
+  const parts = { effect: field("effect", "name, for example my_skid"), formula: field("formula", "formula: c * v0 * w0", true), parameters: field("parameters", "parameters: c [s] -0.5 .. 0.5", true) };
+  const form = h("form", { onsubmit: async (event) => {
+    event.preventDefault();
+    await pane.act("formula", { effect: parts.effect.value.trim(), channel: channel.value, formula: parts.formula.value, parameters: parts.parameters.value });
+    pane.tryAll();
+  } }, parts.effect, channel, parts.formula, parts.parameters, h("button", { type: "submit" }, "Add formula"),
+  h("p", { class: "quiet" }, "Signals: v0, s0 (sideways), w0, f_x, f_w, left, right, roll, pitch, yaw, x, y, t, and each with _rate. Units are checked."));
+  return h("details", { class: "formula" }, h("summary", {}, "Write a formula"), form);
+};

@@ -1,0 +1,132 @@
+"""Everything that is shown is of the model that stands there: map, commands, where it fails, what to add."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from workbench_server import RUN, Workbench
+
+from pipeline.analysis.relative import find_residual_modulus
+from pipeline.identification import Input
+from pipeline.identification.predict import predict_at
+from pipeline.models import read_model
+from pipeline.report.motion_run import load_motion_run, load_vehicle
+from pipeline.store import Store
+from pipeline.web.proposals import Trials
+
+Rows = dict[str, dict[str, list[float | None]]]
+
+
+def rows_of(answer: dict[str, object]) -> Rows:
+    return cast("Rows", answer["rows"])
+
+
+def finite(values: list[float | None]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.array([value for value in values if value is not None])
+
+
+def write_diagnosis(workbench: Workbench, told: dict[str, object]) -> None:
+    home = workbench.results / "runs/field/hidden"
+    manifest = json.loads((home / "manifest.json").read_text())
+    del manifest["checksum"]
+    (home / manifest["folder"] / "diagnosis.json").write_text(json.dumps(told))
+    manifest["files"]["diagnosis.json"] = manifest["files"]["summary.json"]
+    (home / "manifest.json").write_text(json.dumps(manifest))
+
+
+def test_map_and_commands_show_what_the_model_leaves_of_the_slip(workbench: Workbench) -> None:
+    workbench.session(RUN)
+    drawn = workbench.post("/api/figures", run=RUN)
+    manifest = Store(workbench.results).manifest(RUN)
+    assert manifest is not None
+    slip = manifest.read("slip").filter(input="command")
+    assert finite(rows_of(drawn)["track"]["modulus"]).max() == pytest.approx(slip["modulus"].max(), abs=1e-4)
+
+    workbench.session(RUN, "add", effect="effective_track")
+    moved = workbench.post("/api/rows", run=RUN)
+    path = workbench.post("/api/save", run=RUN)["path"]
+    vehicle = load_vehicle(manifest)
+    predicted = predict_at(
+        read_model(Path(str(path))).model,
+        load_motion_run(manifest, vehicle),
+        Input.COMMAND,
+        slip["t"].to_numpy(),
+    )
+    # As `slip analyze --model` has it, on the scale of the ideal model.
+    left = find_residual_modulus(predicted, slip, length=1.0)
+    shown = finite(rows_of(moved)["track"]["modulus"])
+    assert shown.max() == pytest.approx(np.nanmax(left), rel=0.02)
+    assert np.median(shown) < 0.3 * slip["modulus"].median()
+    before = rows_of(drawn)["command_cells"]["modulus"]
+    assert np.median(finite(rows_of(moved)["command_cells"]["modulus"])) < 0.3 * np.median(finite(before))
+    workbench.session(RUN, "undo")
+    assert rows_of(workbench.post("/api/rows", run=RUN))["track"] == rows_of(drawn)["track"]
+
+
+def test_where_is_told_of_the_model_that_stands_there(workbench: Workbench) -> None:
+    workbench.session(RUN)
+    ideal = cast("list[str]", workbench.post("/api/figures", run=RUN)["where"])
+    assert ideal[0].startswith("turning faster than")
+    workbench.session(RUN, "add", effect="effective_track")
+    after = cast("list[str]", workbench.post("/api/rows", run=RUN)["where"])
+    assert not any(sentence.startswith("turning") for sentence in after)
+
+
+def test_effects_that_do_the_same_are_told_to_be_twins(workbench: Workbench) -> None:
+    workbench.session(RUN, "try")
+    end = time.monotonic() + 60.0
+    while True:
+        trial = cast("dict[str, Any]", workbench.session(RUN)["trial"])
+        if trial["tried"] == trial["total"]:
+            break
+        assert time.monotonic() < end
+        time.sleep(0.2)
+    helping = [entry for entry in trial["found"] if entry["helps"]]
+    assert [entry["left"] for entry in helping] == sorted(entry["left"] for entry in helping)
+    names = {entry["id"] for entry in helping}
+    for entry in helping:
+        assert set(entry["twins"]) <= names - {entry["id"]}
+        for twin in entry["twins"]:
+            (other,) = (found for found in helping if found["id"] == twin)
+            assert entry["id"] in other["twins"]
+            assert entry["to"]["r"] / entry["from"]["r"] == pytest.approx(
+                other["to"]["r"] / other["from"]["r"], abs=0.25
+            )
+
+
+def test_a_trial_waits_while_somebody_waits_for_an_answer() -> None:
+    trials = Trials()
+    with trials.waiting():
+        with trials.waiting():
+            assert not trials._idle.is_set()
+        assert not trials._idle.is_set()
+    assert trials._idle.is_set()
+
+
+def test_a_formula_that_the_diagnosis_found_is_added(workbench: Workbench) -> None:
+    formula = (
+        '[[effect]]\nid = "found_w"\nv_w = "k * w0"\nk = {value = -0.3, unit = "1", bounds = [-0.9, 0.9]}\n'
+    )
+    write_diagnosis(workbench, {"input": "command", "effects": [], "unexplained": {"formula": formula}})
+    added = cast("dict[str, Any]", workbench.session(RUN, "add_found")["session"])
+    assert [effect["id"] for effect in added["effects"]] == ["found_w"]
+    # The log turns as if its wheels stood 1.6 times as far apart.
+    assert added["effects"][0]["parameters"][0]["value"] == pytest.approx(1 / 1.6 - 1.0, rel=0.02)
+    assert added["errors"]["r"] < 0.1 * added["ideal"]["r"]
+
+
+def test_a_value_at_its_bound_is_told(workbench: Workbench) -> None:
+    added = cast("dict[str, Any]", workbench.session(RUN, "add", effect="effective_track")["session"])
+    assert added["effects"][0]["parameters"][0]["at_bound"] is False
+    highest = added["effects"][0]["parameters"][0]["to"]
+    far = cast(
+        "dict[str, Any]",
+        workbench.session(RUN, "set", effect="effective_track", parameter="k", value=10.0)["session"],
+    )
+    assert highest < 10.0
+    assert far["effects"][0]["parameters"][0]["at_bound"] is True
