@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -11,9 +9,11 @@ import numpy as np
 
 from pipeline.core.toml import TomlError, parse_toml
 from pipeline.logs import LogWriter
+from pipeline.models.model_text import format_value
 from pipeline.plan.errors import PlanError
 from pipeline.plan.manoeuvres import RATE_HZ
 from pipeline.plan.plan import SAFETY, Impossible, Plan, Promise
+from pipeline.store.files import replace_file
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -79,15 +79,13 @@ def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
         _write_mcap(plan, mcap)
         pages = [(folder / PAGE, page)] if page else []
         for path, text in ((csv, _format_csv(plan)), (toml, _format_toml(plan)), *pages):
-            draft = path.with_name(f".{path.name}.part")
-            draft.write_text(text, encoding="utf-8")
-            draft.replace(path)
+            replace_file(path, text.encode())
     except OSError as error:
         raise PlanError(
             "cannot_write",
             f"the plan cannot be written ({error.strerror})",
             where=str(folder),
-            hint="Choose another --to.",
+            hint="Choose another --out.",
         ) from None
     return (toml, csv, mcap, *(path for path, _ in pages))
 
@@ -170,11 +168,4 @@ def _format_toml(plan: Plan) -> str:
 
 
 def _format_table(table: Mapping[str, object]) -> list[str]:
-    """Lines of TOML: its strings and lists of strings are those of JSON."""
-    return [f"{key} = {_format_value(value)}" for key, value in table.items()]
-
-
-def _format_value(value: object) -> str:
-    if isinstance(value, float) and math.isfinite(value):
-        return repr(round(value, 6))
-    return json.dumps(value, ensure_ascii=False)
+    return [f"{key} = {format_value(value)}" for key, value in table.items()]
