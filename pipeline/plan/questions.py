@@ -34,7 +34,6 @@ DECIDED_T = 5.0
 STRETCHES = 3.0
 """Stretches of driving that must speak for a decision: of two nobody knows the spread."""
 STRETCH_S = 10.0
-INTERVAL_SHARE = 0.05
 # Of the jackknife of intervals: command steps are joined to at least six seconds.
 _BLOCK_S = 7.0
 _CLOCK_S = 0.05
