@@ -4,8 +4,8 @@
 
 Each draw hides one to three effects in a simulated vehicle and drives it poorly. The plan is driven by
 the simulator, which shares no code with the plan's models; then both logs are diagnosed together. One promise
-of each plan, drawn at random, is tested at its own second too: the drive is ended there and diagnosed again. One
-line a draw, then the rates. A file of scores that exists is continued: its seeds are not played again.
+of each plan, drawn at random, is tested at its own second too: the drive is ended there and diagnosed again.
+One line a draw, then the rates. A file of scores that exists is continued: its seeds are not played again.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pipeline.analysis.diagnosis import read_recording
 from pipeline.analysis.options import Options
 from pipeline.analysis.plan import ALL, ask, study
 from pipeline.core.errors import SlipError
-from pipeline.diagnosis import Named, Recording  # noqa: TC001
+from pipeline.diagnosis import Named, Recording, diagnose_runs
 from pipeline.plan import (
     Plan,
     Request,
@@ -164,7 +164,7 @@ def _drive(
         or (np.abs(way[:, 1]) > 0.5 * plan.area.width_m).any()
     )
     _, after = _record(driven, folder / "after.mcap")
-    diagnosis = study([before, after], vehicle).diagnosis
+    diagnosis = diagnose_runs([before, after], vehicle).runs[0]
     check = check_plan(promised, diagnosis)
     score.promised, score.kept = len(check.kept), sum(one.kept for one in check.kept)
     widths = [
@@ -185,7 +185,7 @@ def _drive(
         drawn = np.random.default_rng([score.seed, 23]).integers(len(promised.promises))
         one = promised.promises[int(drawn)]
         _, cut = _record(replace(driven, duration_s=one.decided_after_s), folder / "cut.mcap")
-        joint = study([before, cut], vehicle).diagnosis
+        joint = diagnose_runs([before, cut], vehicle).runs[0]
         tested = check_plan(msgspec.structs.replace(promised, promises=[one]), joint).kept[0]
         score.seconds, score.seconds_kept = 1, int(tested.kept)
         if not tested.kept:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 _POINTS = 60
 # By less than this share the rest of a drive makes no interval narrower.
 _NO_NARROWER = 0.1
+# Where driving is all alike, a fifth of it is as little.
+_WORTH_SAYING = 0.25
 _DIGITS = 4
 
 
@@ -78,12 +80,13 @@ def describe_enough(effects: Sequence[Named]) -> str:
     if known:
         since, label = max(known)
         who = label if len(known) == 1 else f"{len(known)} numbers"
-        told.append(f"of {driven:.0f} s of driving, {who} within {INTERVAL_SHARE:.0%} after {since:.0f} s")
+        told.append(f"{who} within {INTERVAL_SHARE:.0%} after {since:.0f} of {driven:.0f} s of driving")
     if vague:
         share, label = max(vague)
         # Intervals narrow with the square root of the time.
-        times = (share / INTERVAL_SHARE) ** 2
-        told.append(f"{label} within {share:.0%} only: as much driving {times:.0f} times over for 5 %")
+        more = driven * (share / INTERVAL_SHARE) ** 2
+        told.append(f"{label} within {share:.0%} only, {more / 60.0:.0f} min of such driving are needed")
     idle = 1.0 - needed / driven
-    told.append(f"the last {idle:.0%} made no interval narrower by a tenth")
+    if idle >= _WORTH_SAYING:
+        told.append(f"the last {idle:.0%} of this drive made no interval narrower by a tenth")
     return "; ".join(told)

@@ -72,7 +72,7 @@ def compare(part: Part, weights: Weights, before: Floats, after: Floats) -> Verd
 
 
 def grow_t(part: Part, weights: Weights, before: Floats, after: Floats) -> tuple[Floats, Floats]:
-    """How the t of `compare` grows with the stretches of driving that are judged.
+    """How the t of `compare` grows, every three seconds of driving.
 
     Returns:
         Seconds of windows until the end of each stretch, and t by then; both of shape (k,).
@@ -80,7 +80,7 @@ def grow_t(part: Part, weights: Weights, before: Floats, after: Floats) -> tuple
     old, new = weights.cost(before), weights.cost(after)
     moved = (((before - after) / weights.scale) ** 2).sum(axis=1)
     stretch = number_units(part.run, part.times, SHORT_S)
-    ends = np.flatnonzero(np.diff(part.unit, append=-1)) + 1
+    ends = np.flatnonzero(np.diff(stretch, append=-1)) + 1
     seconds = np.cumsum(count_seconds(part))[ends - 1]
     t = [_find_t(part.unit[:n], stretch[:n], old[:n], new[:n], moved[:n]) for n in ends.tolist()]
     return seconds, np.array(t)

@@ -34,7 +34,7 @@ def narrow_intervals(fitted: Fitted) -> dict[str, Curve]:
 
     See `narrow_part`; numbers of one run alone are left out.
     """
-    found = {}
+    found: dict[str, Curve] = {}
     for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
         if not fit.free:
             continue

@@ -12,6 +12,8 @@ from pipeline.identification.parts import count_seconds
 from pipeline.models.bounds import stands_at_bound
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from pipeline.identification.fit import Fitted, PartFit
     from pipeline.identification.parts import Part
     from pipeline.identification.problem import Problem
@@ -116,7 +118,7 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
 def estimate_part(part: Part, fit: PartFit) -> Estimates:
     """Intervals of the free numbers of one part, the others as they are."""
     count = len(fit.free)
-    blocks = _sum_blocks(part, fit)
+    blocks = sum_blocks(part, fit)
     total, rows, size = _find_observable(part, fit, blocks)
     freedom = _count_freedom(part, blocks.count)
     correlation = np.full((count, count), np.nan)
@@ -147,23 +149,29 @@ def estimate_part(part: Part, fit: PartFit) -> Estimates:
     return Estimates(tuple(items), correlation, blocks.count)
 
 
-def narrow_part(part: Part, fit: PartFit) -> tuple[Floats, Floats]:
+def narrow_part(part: Part, fit: PartFit, order: Sequence[int] | None = None) -> tuple[Floats, Floats]:
     """How wide intervals were when only the first blocks had been driven, under the whole run's model.
 
     The numbers are moved to what fits those blocks best, in one step, and the same jackknife is made of them:
     the last of all widths is that of `estimate_part`.
+
+    Args:
+        part: of the way.
+        fit: a converged fit of it.
+        order: numbers of blocks in the order in which they are used; as they were driven by default.
 
     Returns:
         Seconds of windows until the end of each block, shape (k,), and half-widths of the 95 % interval of
         each free number, infinite where it could not be told and of numbers that derivatives do not find,
         shape (k, p).
     """
-    blocks = _sum_blocks(part, fit)
-    seconds = np.cumsum(np.bincount(blocks.label, count_seconds(part), minlength=blocks.count))
+    blocks = sum_blocks(part, fit)
+    used = np.arange(blocks.count) if order is None else np.asarray(order, dtype=np.int64)
+    seconds = np.cumsum(np.bincount(blocks.label, count_seconds(part), minlength=blocks.count)[used])
     halves = np.full((blocks.count, len(fit.free)), np.inf)
     smooth = np.array([number.is_smooth for number in fit.free])
     for count in range(1, blocks.count + 1):
-        first = blocks.take(count)
+        first = blocks.take(used[:count])
         total, rows, size = _find_observable(part, fit, first)
         if count < blocks.count and rows.size:
             first = first.move(_solve(total, first.gradients.sum(axis=0), rows, size))
@@ -175,7 +183,7 @@ def narrow_part(part: Part, fit: PartFit) -> tuple[Floats, Floats]:
     return np.asarray(seconds, dtype=np.float64), halves
 
 
-def _find_observable(part: Part, fit: PartFit, blocks: _Blocks) -> tuple[Floats, Integers, Floats]:
+def _find_observable(part: Part, fit: PartFit, blocks: Blocks) -> tuple[Floats, Integers, Floats]:
     """Normal matrix with the prior, which numbers move it at all, and the size of each."""
     total = blocks.normals.sum(axis=0) + np.diag(part.prior.weigh(fit.state, fit.free))
     size = np.sqrt(np.maximum(np.diag(total), 0.0))
@@ -192,7 +200,7 @@ def _find_quantile(freedom: float) -> float:
     return float(stdtrit(min(freedom, _NORMAL), 0.975))
 
 
-def _find_spread(part: Part, blocks: _Blocks, total: Floats, rows: Integers, size: Floats) -> Floats | None:
+def _find_spread(part: Part, blocks: Blocks, total: Floats, rows: Integers, size: Floats) -> Floats | None:
     """Covariance of the observable numbers; None where nothing tells it."""
     if rows.size and part.prior.numbers:
         scale = np.outer(size[rows], size[rows])
@@ -212,7 +220,7 @@ def _solve(total: Floats, pull: Floats, rows: Integers, size: Floats) -> Floats:
     return moved
 
 
-def _carry_clocks(blocks: _Blocks, total: Floats, rows: Integers, size: Floats) -> Floats:
+def _carry_clocks(blocks: Blocks, total: Floats, rows: Integers, size: Floats) -> Floats:
     """Standard errors that come from not knowing the clocks exactly, shape (rows,)."""
     carried = np.zeros(rows.size)
     for pull in blocks.clocks.sum(axis=1) if rows.size else ():
@@ -313,7 +321,7 @@ def integrate_correlation(part: Part, fit: PartFit) -> float:
 
 
 @dataclass(frozen=True)
-class _Blocks:
+class Blocks:
     """What every block says.
 
     Attributes:
@@ -330,18 +338,19 @@ class _Blocks:
 
     @property
     def count(self) -> int:
+        """How many."""
         return int(self.normals.shape[0])
 
-    def take(self, count: int) -> _Blocks:
-        """The first so many."""
-        return _Blocks(self.label, self.normals[:count], self.gradients[:count], self.clocks[:, :count])
+    def take(self, numbers: Integers) -> Blocks:
+        """Those of these numbers."""
+        return Blocks(self.label, self.normals[numbers], self.gradients[numbers], self.clocks[:, numbers])
 
-    def move(self, step: Floats) -> _Blocks:
+    def move(self, step: Floats) -> Blocks:
         """The same about numbers that are moved by a step."""
         return replace(self, gradients=self.gradients - self.normals @ step)
 
 
-def _sum_blocks(part: Part, fit: PartFit) -> _Blocks:
+def sum_blocks(part: Part, fit: PartFit) -> Blocks:
     """Normal matrix and gradient of every block."""
     label = join_blocks(part, fit)
     pieces = int(label.max()) + 1
@@ -351,7 +360,7 @@ def _sum_blocks(part: Part, fit: PartFit) -> _Blocks:
     gradients = np.zeros((pieces, columns.shape[2]))
     np.add.at(normals, label, np.einsum("ncp,ncq->npq", columns, columns))
     np.add.at(gradients, label, np.einsum("ncp,nc->np", columns, fit.residual * factor))
-    return _Blocks(label, normals, gradients, _pull_clocks(part, fit, label, pieces))
+    return Blocks(label, normals, gradients, _pull_clocks(part, fit, label, pieces))
 
 
 def _jackknife(normals: Floats, gradients: Floats, rows: Integers, size: Floats) -> Floats:

@@ -345,7 +345,9 @@ def _promise(
             promises.append(_keep_promise(one, edges, measured))
         else:
             impossible.append(
-                Impossible(one.question.text, one.question.effects, _explain(one, reached, measured))
+                Impossible(
+                    one.question.text, one.question.effects, _explain(one, reached, measured, one.bound(full))
+                )
             )
     promises.sort(key=lambda promise: promise.decided_after_s)
     return tuple(promises), tuple(impossible), answered
@@ -368,20 +370,19 @@ def _keep_promise(one: Answerable, edges: Floats, measured: float) -> Promise:
     return Promise(question.text, question.effects, "interval", after, measured, question.goal, number.unit)
 
 
-def _explain(one: Answerable, reached: float, measured: float) -> str:
+def _explain(one: Answerable, reached: float, measured: float, bound: float) -> str:
     """Why a question stays open."""
     question = one.question
-    if reached >= _HOPELESS:
-        enough = measured >= DECIDED_T if isinstance(question, Separation) else measured <= question.goal
-        if enough:
-            return f"fewer than {STRETCHES:g} stretches of the plan show it: more time or room is needed"
-        what = (
-            f"t = {measured:.1f} of {DECIDED_T:g}"
-            if isinstance(question, Separation)
-            else f"+- {measured:.2g} where {question.goal:.2g} is asked"
-        )
-        return f"the plan reaches {what}: more time or room is needed"
-    return _advise(question)
+    if reached < _HOPELESS:
+        return _advise(question)
+    if isinstance(question, Separation):
+        enough, what = measured >= DECIDED_T, f"t = {measured:.1f} of {DECIDED_T:g}"
+    else:
+        enough = bound <= question.goal
+        what = f"+- {measured:.2g}, or up to {bound:.2g}, where {question.goal:.2g} is asked"
+    if enough:
+        return f"fewer than {STRETCHES:g} stretches of the plan show it: more time or room is needed"
+    return f"the plan reaches {what}: more time or room is needed"
 
 
 def _advise(question: Question) -> str:
