@@ -122,7 +122,7 @@ def play(seed: int, folder: Path) -> Score:
     name, scenario = draw_scenario(seed)
     score = Score(seed, name, scenario.program.name, sorted(scenario.effects), [], [])
     try:
-        vehicle, before = _record(scenario, folder / "before.mcap")
+        vehicle, before = record(scenario, folder / "before.mcap")
         studied = study([before], vehicle)
         score.first = [effect.id for effect in studied.diagnosis.effects]
         score.undecided = [list(group.candidates) for group in studied.diagnosis.undecided]
@@ -163,7 +163,7 @@ def _drive(
         (np.abs(way[:, 0]) > 0.5 * plan.area.length_m).any()
         or (np.abs(way[:, 1]) > 0.5 * plan.area.width_m).any()
     )
-    _, after = _record(driven, folder / "after.mcap")
+    _, after = record(driven, folder / "after.mcap")
     diagnosis = diagnose_runs([before, after], vehicle).runs[0]
     check = check_plan(promised, diagnosis)
     score.promised, score.kept = len(check.kept), sum(one.kept for one in check.kept)
@@ -184,7 +184,7 @@ def _drive(
     if promised.promises:
         drawn = np.random.default_rng([score.seed, 23]).integers(len(promised.promises))
         one = promised.promises[int(drawn)]
-        _, cut = _record(replace(driven, duration_s=one.decided_after_s), folder / "cut.mcap")
+        _, cut = record(replace(driven, duration_s=one.decided_after_s), folder / "cut.mcap")
         joint = diagnose_runs([before, cut], vehicle).runs[0]
         tested = check_plan(msgspec.structs.replace(promised, promises=[one]), joint).kept[0]
         score.seconds, score.seconds_kept = 1, int(tested.kept)
@@ -196,7 +196,8 @@ def _is_true(effect: Named, truth: set[str]) -> bool:
     return bool({effect.id, *effect.equivalent_to} & truth)
 
 
-def _record(scenario: Scenario, path: Path) -> tuple[Vehicle, Recording]:
+def record(scenario: Scenario, path: Path) -> tuple[Vehicle, Recording]:
+    """Simulate a run, analyze it, and give it as it is diagnosed."""
     write_log(simulate_run(scenario), path)
     options = Options(out=path.parent / "results", report=False, diagnosis=False)
     return read_recording(analyze_log(path, options).manifest)
