@@ -353,17 +353,20 @@ def _promise(
     return tuple(promises), tuple(impossible), answered
 
 
-def _keep_promise(one: Answerable, edges: Floats, measured: float) -> Promise:
-    count = edges.size - 1
-    low, high = 0, count
+def since_when(one: Answerable, edges: Floats) -> float:
+    """Seconds [s] after which a question is answered, of groups between edges; infinite where it is not."""
+    low, high = 0, edges.size
     while low < high:
         middle = (low + high) // 2
-        if one.answer((np.arange(count) < middle).astype(np.float64)) >= 1.0:
+        if one.answer((np.arange(edges.size - 1) < middle).astype(np.float64)) >= 1.0:
             high = middle
         else:
             low = middle + 1
-    question = one.question
-    after = float(edges[high])
+    return float(edges[high]) if high < edges.size else math.inf
+
+
+def _keep_promise(one: Answerable, edges: Floats, measured: float) -> Promise:
+    question, after = one.question, since_when(one, edges)
     if isinstance(question, Separation):
         return Promise(question.text, question.effects, "separation", after, measured, DECIDED_T)
     number = question.model.free[question.number]
