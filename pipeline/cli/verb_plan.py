@@ -177,7 +177,8 @@ def _gather(
     names: Sequence[str], options: Options, *, quiet: bool
 ) -> tuple[Vehicle, list[Recording], dict[str, object], bool]:
     """Recordings of one vehicle, and what was chosen in the first of them."""
-    from pipeline.analysis.diagnosis import read_choices, read_recording  # noqa: PLC0415 - heavy
+    from pipeline.analysis.diagnosis import read_recording  # noqa: PLC0415 - heavy
+    from pipeline.analysis.plan import read_command  # noqa: PLC0415 - heavy
     from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
 
     vehicles: list[Vehicle] = []
@@ -190,7 +191,7 @@ def _gather(
             open_run(name, options, progress) as opened,
         ):
             vehicle, recording = read_recording(opened.manifest)
-            chosen = chosen or read_choices(opened.manifest)
+            chosen = chosen or read_command(opened.manifest)
         if opened.note and not quiet:
             say(f"slip: {opened.note}")
         lossy |= opened.lossy

@@ -6,6 +6,7 @@ import math
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +17,7 @@ from pipeline.plan.errors import PlanError
 from pipeline.plan.limits import is_steered
 from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, Commands, join, list_manoeuvres, wait
 from pipeline.plan.questions import DECIDED_T, STRETCHES, Judge, Separation
-from pipeline.plan.rehearsal import Rehearsal, start_state
+from pipeline.plan.rehearsal import Rehearsal, drive, start_state
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -95,6 +96,8 @@ class Plan:
         topic, type_name: on which the commands are played.
         steered: whether a turn is a steering angle.
         home_m: largest distance of any model's end from the start.
+        wheels: speeds of the left and the right wheels [rad/s] as commands, shape (n,) each; None where these
+            are not all that is commanded.
         ways: of the models, base first, positions x + iy [m] 20 times a second, shape (models, n).
     """
 
@@ -110,6 +113,7 @@ class Plan:
     type_name: str
     steered: bool
     home_m: float
+    wheels: tuple[Floats, Floats] | None = field(repr=False)
     ways: Complex = field(repr=False)
 
     def to_json(self) -> dict[str, object]:
@@ -203,8 +207,19 @@ def make_plan(knowledge: Knowledge, questions: Sequence[Question], request: Requ
         type_name=request.type_name,
         steered=is_steered(knowledge.vehicle),
         home_m=float(np.abs(ways[:, -1]).max()),
+        wheels=_turn_wheels(commands, knowledge),
         ways=ways,
     )
+
+
+def _turn_wheels(commands: Commands, knowledge: Knowledge) -> tuple[Floats, Floats] | None:
+    """Wheel commands as a log would record them."""
+    kinematics = knowledge.vehicle.kinematics
+    if is_steered(knowledge.vehicle) or kinematics.has_inputs("sideways"):
+        return None
+    vehicle = msgspec.structs.replace(knowledge.vehicle, controller_track_multiplier=1.0)
+    driven, scale = drive(commands, vehicle), knowledge.senses.command_scale
+    return driven.left / scale, driven.right / scale
 
 
 @dataclass(frozen=True)
