@@ -329,7 +329,12 @@ export class Pane {
     const all = effects.length > 1 && h("button", { type: "button", class: "add-all", onclick: () => this.addAll() }, `Add all ${effects.length}`);
     const undecided = (diagnosis.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. ${entry.separate_by ?? ""}`));
     const rest = diagnosis.unexplained ? [h("p", { class: "quiet" }, `Not explained yet: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}`)] : [];
-    return h("div", { class: "named" }, told.length ? h("ul", { class: "proposals" }, told) : null, all, undecided, rest);
+    const unseen = (diagnosis.unobservable ?? []).length;
+    const command = `slip plan ${this.run} --for ${undecided.length ? "undecided" : "all"} --out plan`;
+    const plan = undecided.length || unseen
+      ? h("p", { class: "quiet plan" }, "What to drive next: ", h("code", {}, command), ", then play plan/plan.mcap (look at plan/plan.html before).")
+      : effects.length || there.size ? h("p", { class: "quiet plan" }, "Nothing is open that a drive could decide.") : null;
+    return h("div", { class: "named" }, told.length ? h("ul", { class: "proposals" }, told) : null, all, undecided, plan, rest);
   }
 
   async diagnose() {
