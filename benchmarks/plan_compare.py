@@ -72,7 +72,7 @@ PAIRS = (
 PROTOCOLS = ("plan", "gentle", "DRIVE", "eights", "human")
 _DURATION_S = 150.0
 _PLAN_S = 60.0
-_AREA = "30x20m"
+_AREA = "100x100m"
 
 
 def draw_scenario(name: str, hidden: tuple[str, ...], seed: int) -> Scenario:
@@ -126,7 +126,10 @@ def _plan(
     )
     if not gentle:
         limits = replace(
-            limits, acceleration_mps2=RATE_HZ * limits.speed_mps, turn_rate=RATE_HZ * limits.turn
+            limits,
+            acceleration_mps2=RATE_HZ * limits.speed_mps,
+            turn_rate=RATE_HZ * limits.turn,
+            lateral_mps2=math.inf,
         )
     largest = find_largest(knowledge, limits, _PLAN_S)
     usual = [find_effect(name)().make_usual(largest) for name in asked]

@@ -126,7 +126,8 @@ def choose_topic(vehicle: Vehicle, choices: Mapping[str, object], log: str) -> t
         sides = [str(one).removesuffix(".data") for one in str(command["topic"]).split(", ")]
         if len(sides) == 2:  # noqa: PLR2004 - left and right
             return ", ".join(sides), WHEELS
-    usual = [topic for topic in vehicle.topics.command if "cmd" in topic]
+    # A topic of one motor takes no body command.
+    usual = [topic for topic in vehicle.topics.command if "cmd" in topic and "motor" not in topic]
     return (usual or ["/cmd_vel"])[0], types[-1] if is_steered(vehicle) else types[0]
 
 
