@@ -41,16 +41,18 @@ def draw_enough(scene: Scene) -> Drawing | None:
     )
     end = float(pl.concat(list(rows.values()))["seconds"].max() or 1.0)  # type: ignore[arg-type]
     panels = [
-        _draw_panel("enough_width", "half of the 95 % interval, of the number", INTERVAL_SHARE, colour, end),
-        _draw_panel("enough_evidence", "evidence for the name [t]", LEAST_T, colour, end),
+        _draw_panel("enough_width", "half of the 95 % interval, of the number", colour, end),
+        _draw_panel("enough_evidence", "evidence for the name [t]", colour, end),
     ]
-    note = "Dashed: 5 %, and the t from which a name is given."
-    return Drawing(alt.vconcat(*panels).properties(usermeta={"gutter": parts.GUTTER}), rows, note)
+    bounds = {"enough_width_bound": INTERVAL_SHARE, "enough_evidence_bound": LEAST_T}
+    shown = rows | {name: pl.DataFrame({"value": [value]}) for name, value in bounds.items()}
+    told = str(scene.report.diagnosis.get("enough") or "")
+    note = f"{told[:1].upper()}{told[1:]}. " if told else ""
+    note += "Dashed: 5 %, and the t from which a name is given."
+    return Drawing(alt.vconcat(*panels).properties(usermeta={"gutter": parts.GUTTER}), shown, note)
 
 
-def _draw_panel(
-    name: str, title: str, goal: float, colour: alt.Color, end: float
-) -> alt.LayerChart | alt.FacetChart:
+def _draw_panel(name: str, title: str, colour: alt.Color, end: float) -> alt.LayerChart | alt.FacetChart:
     wide = name == "enough_width"
     scale = alt.Scale(type="log", domain=[0.002, _WIDEST]) if wide else alt.Scale(zero=True)
     look = alt.Axis(title=None, tickCount=4, format=",~r", minExtent=parts.GUTTER - 10)
@@ -73,7 +75,8 @@ def _draw_panel(
             tooltip=["number:N", alt.Tooltip("seconds:Q", format=".0f"), alt.Tooltip("value:Q", format=".3")],
         )
     )
-    bound = alt.Chart().mark_rule(color=theme.INK, strokeDash=[4, 3]).encode(y=alt.datum(goal))
+    bound = alt.Chart(alt.NamedData(f"{name}_bound")).mark_rule(color=theme.INK, strokeDash=[4, 3])
+    bound = bound.encode(y="value:Q")
     return alt.layer(line, bound).properties(width=parts.WIDTH, height=120, title=title)
 
 
