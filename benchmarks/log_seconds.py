@@ -5,13 +5,15 @@
 Every recording under ../shared/logs whose name holds one of the words is diagnosed. For each number that was
 named: the seconds of driving after which its interval stays within 5 %, or within 1.25 times its last width
 where the recording never gets there. Then the same stretches in the order that a plan's criterion prefers: by
-their derivatives alone, next comes what lowers the summed squares of half-widths over goals most in a second.
+their derivatives alone, next comes what lowers the summed squares of half-widths over goals most in a second;
+once for all numbers together, once for the number alone.
 """
 
 from __future__ import annotations
 
 import sys
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -59,33 +61,46 @@ def order_blocks(part: Part, fit: PartFit, goals: np.ndarray) -> list[int]:
     return order
 
 
-def compare(part: Part, fit: PartFit) -> list[tuple[str, float, float, float]]:
-    """Label, target half-width, and seconds as driven and in the best order, of every named number."""
+@dataclass(frozen=True)
+class Row:
+    """A number's goal, whether that is 5 %, and the seconds until it stays within by order of stretches."""
+
+    label: str
+    goal: float
+    narrow: bool
+    driven_s: float
+    together_s: float
+    alone_s: float
+
+
+def compare(part: Part, fit: PartFit) -> list[Row]:
+    """Every named number of a part."""
     known = {effect.id for effect in list_effects()}
-    seconds, halves = narrow_part(part, fit)
-    goals = np.full(len(fit.free), np.inf)
+    driven = narrow_part(part, fit)
+    last = driven[1][-1]
+    goals, narrow = np.full(len(fit.free), np.inf), np.zeros(len(fit.free), dtype=bool)
     for place, number in enumerate(fit.free):
-        if number.effect in known and number.run is None and np.isfinite(halves[-1, place]):
+        if number.effect in known and number.run is None and np.isfinite(last[place]):
             goal = find_goal(number.effect, number.name, fit.state.get(number))
-            goals[place] = goal if halves[-1, place] <= goal else _NEVER * halves[-1, place]
+            narrow[place] = last[place] <= goal
+            goals[place] = goal if narrow[place] else _NEVER * last[place]
     if not np.isfinite(goals).any():
         return []
-    chosen = narrow_part(part, fit, order_blocks(part, fit, goals))
-    return [
-        (
-            fit.free[place].label,
-            float(goals[place]),
-            last_until(Curve(seconds, halves[:, place]), float(goals[place])),
-            last_until(Curve(chosen[0], chosen[1][:, place]), float(goals[place])),
-        )
-        for place in np.flatnonzero(np.isfinite(goals)).tolist()
-    ]
+    together = narrow_part(part, fit, order_blocks(part, fit, goals))
+    rows = []
+    for place in np.flatnonzero(np.isfinite(goals)).tolist():
+        only = np.full(goals.size, np.inf)
+        only[place] = goals[place]
+        orders = (driven, together, narrow_part(part, fit, order_blocks(part, fit, only)))
+        times = [last_until(Curve(one, half[:, place]), float(goals[place])) for one, half in orders]
+        rows.append(Row(fit.free[place].label, float(goals[place]), bool(narrow[place]), *times))
+    return rows
 
 
 def main() -> None:
     """Diagnose, order, print."""
     words = sys.argv[1:]
-    ratios, needed = [], []
+    every: list[Row] = []
     for log in sorted(LOGS.glob("*.mcap")):
         if words and not any(word in log.name for word in words):
             continue
@@ -109,16 +124,19 @@ def main() -> None:
             if fit.free
             for row in compare(part, fit)
         ]
-        for label, goal, driven, chosen in rows:
-            print(f"    {label:<36}+- {goal:<9.3g}{driven:6.0f} s as driven{chosen:6.0f} s in the best order")
-        if rows:
-            driven, chosen = max(row[2] for row in rows), max(row[3] for row in rows)
-            ratios.append(driven / chosen)
-            needed.append(chosen / float(count_seconds(problem.whole).sum()))
-    if ratios:
-        ends = f"median of {len(ratios)} runs, {min(ratios):.1f} to {max(ratios):.1f}"
-        print(f"all numbers of a run: {np.median(ratios):.1f} times fewer seconds ({ends})")
-        print(f"stretches that were needed: {np.median(needed):.0%} of what was driven")
+        for row in rows:
+            times = (
+                f"{row.driven_s:6.0f} s as driven{row.together_s:6.0f} s best first{row.alone_s:6.0f} s alone"
+            )
+            print(
+                f"    {row.label:<28}{'5 %' if row.narrow else '':<4}+- {row.goal:<9.3g}{times}", flush=True
+            )
+        every += rows
+    for title, some in (("within 5 %", [r for r in every if r.narrow]), ("all numbers", every)):
+        if some:
+            together = np.median([row.driven_s / row.together_s for row in some])
+            alone = np.median([row.driven_s / row.alone_s for row in some])
+            print(f"{title}: {together:.2f} times fewer seconds, {alone:.2f} alone (medians of {len(some)})")
 
 
 if __name__ == "__main__":
