@@ -300,7 +300,7 @@ def test_a_missing_or_empty_table_costs_only_its_figures(
 def test_without_a_diagnosis_the_page_proposes_one_and_draws_no_model(report: RunReport) -> None:
     page = render_report(RunReport(report.summary, report.tables))
     drawn = {str(found["data-figure"]) for _, found in outline_of(page).tags if "data-figure" in found}
-    of_models = {"ladder", "budget", "residuals", "autocorrelation", "reach"}
+    of_models = {"enough", "ladder", "budget", "residuals", "autocorrelation", "reach"}
     assert {figure.id for figure in list_figures()} - drawn == of_models
     assert "slip diagnose" in page
     assert "slip serve" not in page

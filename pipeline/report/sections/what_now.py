@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 def view_what_now(page: Page) -> dict[str, object]:
     """Commands that go on from this run, and whether anything is open that a drive could decide."""
     if not page.report.text("run"):
-        return {"steps": []}
+        return {"steps": [], "settled": False}
     diagnosis = page.report.diagnosis
     settled = bool(diagnosis.get("effects")) and not any(
         diagnosis.get(key) for key in ("undecided", "unobservable", "unexplained")
