@@ -3,8 +3,9 @@
     python benchmarks/plan_game.py --draws 12 [--seed 1] [--out scores.jsonl]
 
 Each draw hides one to three effects in a simulated vehicle and drives it poorly. The plan is driven by
-the simulator, which shares no code with the plan's models; then both logs are diagnosed together. One line a
-draw, then the rates.
+the simulator, which shares no code with the plan's models; then both logs are diagnosed together. One promise
+of each plan, drawn at random, is tested at its own second too: the drive is ended there and diagnosed again.
+One line a draw, then the rates. A file of scores that exists is continued: its seeds are not played again.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ import argparse
 import json
 import tempfile
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from pipeline.analysis.analyze import analyze_log
@@ -23,7 +25,7 @@ from pipeline.analysis.diagnosis import read_recording
 from pipeline.analysis.options import Options
 from pipeline.analysis.plan import ALL, ask, study
 from pipeline.core.errors import SlipError
-from pipeline.diagnosis import Named, Recording  # noqa: TC001
+from pipeline.diagnosis import Named, Recording, diagnose_runs
 from pipeline.plan import (
     Plan,
     Request,
@@ -72,6 +74,11 @@ class Score:
     undecided: list[list[str]]
     promised: int = 0
     kept: int = 0
+    intervals: int = 0
+    intervals_kept: int = 0
+    seconds: int = 0
+    seconds_kept: int = 0
+    broken: list[str] = field(default_factory=list)
     pairs: int = 0
     decided: int = 0
     joint: list[str] | None = None
@@ -79,6 +86,7 @@ class Score:
     left_area: bool = False
     duration_s: float = 0.0
     plan_s: float = 0.0
+    cpu_s: float = 0.0
     error: str = ""
 
 
@@ -114,7 +122,7 @@ def play(seed: int, folder: Path) -> Score:
     name, scenario = draw_scenario(seed)
     score = Score(seed, name, scenario.program.name, sorted(scenario.effects), [], [])
     try:
-        vehicle, before = _record(scenario, folder / "before.mcap")
+        vehicle, before = record(scenario, folder / "before.mcap")
         studied = study([before], vehicle)
         score.first = [effect.id for effect in studied.diagnosis.effects]
         score.undecided = [list(group.candidates) for group in studied.diagnosis.undecided]
@@ -145,6 +153,7 @@ def _drive(
     plan: Plan, scenario: Scenario, vehicle: Vehicle, before: Recording, folder: Path, score: Score
 ) -> None:
     path = write_plan(plan, folder / "plan")[-1]
+    promised = read_promises(folder / "plan")
     played = read_played(path, scenario.vehicle)
     driven = replace(
         scenario, played=played, duration_s=float(played.time_s[-1]) + 0.5, seed=scenario.seed + 500_000
@@ -154,10 +163,17 @@ def _drive(
         (np.abs(way[:, 0]) > 0.5 * plan.area.length_m).any()
         or (np.abs(way[:, 1]) > 0.5 * plan.area.width_m).any()
     )
-    _, after = _record(driven, folder / "after.mcap")
-    diagnosis = study([before, after], vehicle).diagnosis
-    check = check_plan(read_promises(folder / "plan"), diagnosis)
+    _, after = record(driven, folder / "after.mcap")
+    diagnosis = diagnose_runs([before, after], vehicle).runs[0]
+    check = check_plan(promised, diagnosis)
     score.promised, score.kept = len(check.kept), sum(one.kept for one in check.kept)
+    widths = [
+        one.kept
+        for promise, one in zip(promised.promises, check.kept, strict=True)
+        if promise.kind == "interval"
+    ]
+    score.intervals, score.intervals_kept = len(widths), sum(widths)
+    score.broken = [f"{one.question}: {one.measured}" for one in check.kept if not one.kept]
     score.joint = [effect.id for effect in diagnosis.effects]
     truth = set(score.truth)
     score.wrong = [effect.id for effect in diagnosis.effects if not _is_true(effect, truth)]
@@ -165,13 +181,23 @@ def _drive(
         if truth & set(group):
             score.pairs += 1
             score.decided += any(_is_true(e, truth & set(group)) for e in diagnosis.effects)
+    if promised.promises:
+        drawn = np.random.default_rng([score.seed, 23]).integers(len(promised.promises))
+        one = promised.promises[int(drawn)]
+        _, cut = record(replace(driven, duration_s=one.decided_after_s), folder / "cut.mcap")
+        joint = diagnose_runs([before, cut], vehicle).runs[0]
+        tested = check_plan(msgspec.structs.replace(promised, promises=[one]), joint).kept[0]
+        score.seconds, score.seconds_kept = 1, int(tested.kept)
+        if not tested.kept:
+            score.broken.append(f"after {one.decided_after_s:g} s, {tested.question}: {tested.measured}")
 
 
 def _is_true(effect: Named, truth: set[str]) -> bool:
     return bool({effect.id, *effect.equivalent_to} & truth)
 
 
-def _record(scenario: Scenario, path: Path) -> tuple[Vehicle, Recording]:
+def record(scenario: Scenario, path: Path) -> tuple[Vehicle, Recording]:
+    """Simulate a run, analyze it, and give it as it is diagnosed."""
     write_log(simulate_run(scenario), path)
     options = Options(out=path.parent / "results", report=False, diagnosis=False)
     return read_recording(analyze_log(path, options).manifest)
@@ -186,26 +212,45 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
-    scores = []
+    scores = _read_scores(asked.out)
+    known = {score.seed for score in scores}
     for seed in range(asked.seed, asked.seed + asked.draws):
+        if seed in known:
+            continue
+        begun = time.process_time()
         with tempfile.TemporaryDirectory(prefix="slip-") as folder:
             score = play(seed, Path(folder))
+        score.cpu_s = round(time.process_time() - begun, 1)
         scores.append(score)
         print(json.dumps(asdict(score)), flush=True)
         if asked.out is not None:
             with asked.out.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(asdict(score)) + "\n")
+    _report(scores)
+
+
+def _read_scores(path: Path | None) -> list[Score]:
+    if path is None or not path.exists():
+        return []
+    return [Score(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def _report(scores: list[Score]) -> None:
     driven = [score for score in scores if score.joint is not None]
     print(f"draws {len(scores)}, errors {sum(bool(s.error) for s in scores)}, plans driven {len(driven)}")
     print(f"undecided groups that hold a hidden effect, decided for it: {_rate(driven, 'decided', 'pairs')}")
-    print(f"promises kept: {_rate(driven, 'kept', 'promised')}")
+    print(f"promises kept at the end of the plan: {_rate(driven, 'kept', 'promised')}")
+    print(f"of these, intervals: {_rate(driven, 'intervals_kept', 'intervals')}")
+    print(f"promises kept at their own second, one a plan: {_rate(driven, 'seconds_kept', 'seconds')}")
     print(f"drives with a wrong name: {sum(bool(s.wrong) for s in driven)} of {len(driven)}")
     print(f"drives that left the area: {sum(s.left_area for s in driven)} of {len(driven)}")
     print(f"slowest plan: {max((s.plan_s for s in scores), default=0.0)} s")
+    print(f"CPU a draw: {sum(s.cpu_s for s in scores) / max(len(scores), 1):.1f} s")
 
 
 def _rate(scores: list[Score], part: str, whole: str) -> str:
-    return f"{sum(getattr(s, part) for s in scores)} of {sum(getattr(s, whole) for s in scores)}"
+    kept, asked = (sum(getattr(score, name) for score in scores) for name in (part, whole))
+    return f"{kept} of {asked} ({kept / max(asked, 1):.1%})"
 
 
 if __name__ == "__main__":

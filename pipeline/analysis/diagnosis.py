@@ -22,7 +22,7 @@ STAGE = "diagnosis"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 7
+VERSION = 8
 _WRITTEN = ("ladder", "parameters", "budget", "estimates")
 
 

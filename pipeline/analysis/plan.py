@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.core.errors import SlipError
-from pipeline.plan.files import list_types
+from pipeline.plan.files import WHEELS, list_types
 from pipeline.plan.limits import is_steered
 
 if TYPE_CHECKING:
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis import Recording, RunDiagnosis
     from pipeline.plan import Knowledge, Limits
     from pipeline.plan.questions import Question
+    from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
 
 UNDECIDED = "undecided"
@@ -93,8 +94,20 @@ def ask(
     return questions
 
 
+def read_command(manifest: Manifest) -> dict[str, object]:
+    """How a stored run's command was chosen: its ``choices``, and ``command_source`` as it was configured."""
+    from pipeline.analysis.diagnosis import read_choices  # noqa: PLC0415 - heavy
+
+    configuration = manifest.details.get("configuration")
+    source = configuration.get("command") if isinstance(configuration, dict) else None
+    return {**read_choices(manifest), "command_source": source}
+
+
 def choose_topic(vehicle: Vehicle, choices: Mapping[str, object], log: str) -> tuple[str, str]:
-    """Topic and type of the body command that a log recorded; the vehicle's usual one where it has none."""
+    """Topics and type of the command that a log recorded; the vehicle's usual one where it has none.
+
+    A body command where there is one, else a pair of wheel speeds [rad/s], else what is usual.
+    """
     from pipeline.logs import open_log  # noqa: PLC0415 - heavy
 
     types = list_types(steered=is_steered(vehicle))
@@ -109,5 +122,18 @@ def choose_topic(vehicle: Vehicle, choices: Mapping[str, object], log: str) -> t
     for topic in asked:
         if found.get(topic) in types:
             return topic, found[topic]
-    usual = [topic for topic in vehicle.topics.command if "cmd" in topic]
+    if isinstance(command, dict) and command.get("type") == WHEELS and _is_plain(choices, vehicle):
+        sides = [str(one).removesuffix(".data") for one in str(command["topic"]).split(", ")]
+        if len(sides) == 2:  # noqa: PLR2004 - left and right
+            return ", ".join(sides), WHEELS
+    # A topic of one motor takes no body command.
+    usual = [topic for topic in vehicle.topics.command if "cmd" in topic and "motor" not in topic]
     return (usual or ["/cmd_vel"])[0], types[-1] if is_steered(vehicle) else types[0]
+
+
+def _is_plain(choices: Mapping[str, object], vehicle: Vehicle) -> bool:
+    """Whether recorded wheel commands are rad/s, forward above zero."""
+    asked = choices.get("command_source")
+    source = asked if isinstance(asked, dict) else {}
+    unit, sign = source.get("unit"), source.get("sign")
+    return not vehicle.units and unit in {None, "rad/s"} and sign in {None, 1} and not source.get("per_turn")

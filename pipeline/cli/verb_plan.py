@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
     from pipeline.analysis.options import Options
     from pipeline.diagnosis import Recording, RunDiagnosis
-    from pipeline.plan import Knowledge, Plan
+    from pipeline.plan import Knowledge, Needed, Plan
     from pipeline.vehicles import Vehicle
 
 
@@ -54,6 +55,7 @@ def plan(  # noqa: D417 - the runs document themselves
     topic: str | None = None,
     type_name: Annotated[str | None, Parameter(name="--type")] = None,
     check: Path | None = None,
+    compare: str | None = None,
     seed: int = 0,
     config: Path | None = None,
     results: Path = Path("results"),
@@ -74,6 +76,8 @@ def plan(  # noqa: D417 - the runs document themselves
         topic: on which the commands will be played (default: as the run recorded them).
         type_name: message type of that topic.
         check: plan.toml, or the plan's folder, to compare with the log that came of it.
+        compare: other ways to drive whose seconds are told beside the plan's, for example
+            drive,human,straight_and_circle,eights.
         seed: of the draws from what is known.
         config: configuration file of the logs.
         results: results folder of the runs.
@@ -124,6 +128,12 @@ def plan(  # noqa: D417 - the runs document themselves
             seed,
         )
         made = make_plan(knowledge, questions, request)
+        others: list[Needed] = []
+        if compare is not None:
+            from pipeline.plan import compare_protocols  # noqa: PLC0415 - heavy
+
+            others = compare_protocols(knowledge, questions, limits, compare.split(","), seed)
+        asked = [question.text for question in questions]
         files: tuple[Path, ...] = ()
         if made.manoeuvres:
             from pipeline.report.pages import lead_to  # noqa: PLC0415 - heavy
@@ -136,17 +146,40 @@ def plan(  # noqa: D417 - the runs document themselves
             print_json({"errors": [describe_error(at_work, error)]})
         return FAILED
     if json:
-        print_json({**made.to_json(), "files": [str(file) for file in files], "errors": []})
+        told = {
+            one.protocol: {text: _finite(second) for text, second in zip(asked, one.seconds, strict=True)}
+            for one in others
+        }
+        written = {"files": [str(file) for file in files], "errors": []}
+        print_json({**made.to_json(), **({"compare": told} if others else {}), **written})
     elif not quiet:
-        print_lines(_describe(made, diagnosis, files))
+        print_lines([*_describe(made, diagnosis, files), *_list_others(made, asked, others)])
     return LOSSY if lossy else CLEAN
+
+
+def _finite(seconds: float) -> float | None:
+    return seconds if math.isfinite(seconds) else None
+
+
+def _list_others(made: Plan, asked: Sequence[str], others: Sequence[Needed]) -> list[str]:
+    """Seconds of the plan and of other protocols, a line a question."""
+    if not others or not asked:
+        return []
+    mine = {one.question: one.decided_after_s for one in made.promises}
+    rows = [f"{'seconds to decide':<44}{'plan':>8}" + "".join(f"{one.protocol:>21}" for one in others)]
+    for number, text in enumerate(asked):
+        seconds = [one.seconds[number] for one in others]
+        told = "".join(f"{'-' if math.isinf(s) else f'{s:.0f}':>21}" for s in seconds)
+        rows.append(f"{text:<44}{f'{mine[text]:.0f}' if text in mine else '-':>8}{told}")
+    return rows
 
 
 def _gather(
     names: Sequence[str], options: Options, *, quiet: bool
 ) -> tuple[Vehicle, list[Recording], dict[str, object], bool]:
     """Recordings of one vehicle, and what was chosen in the first of them."""
-    from pipeline.analysis.diagnosis import read_choices, read_recording  # noqa: PLC0415 - heavy
+    from pipeline.analysis.diagnosis import read_recording  # noqa: PLC0415 - heavy
+    from pipeline.analysis.plan import read_command  # noqa: PLC0415 - heavy
     from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
 
     vehicles: list[Vehicle] = []
@@ -159,7 +192,7 @@ def _gather(
             open_run(name, options, progress) as opened,
         ):
             vehicle, recording = read_recording(opened.manifest)
-            chosen = chosen or read_choices(opened.manifest)
+            chosen = chosen or read_command(opened.manifest)
         if opened.note and not quiet:
             say(f"slip: {opened.note}")
         lossy |= opened.lossy

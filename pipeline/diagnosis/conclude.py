@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pipeline.diagnosis import residual_structure
 from pipeline.diagnosis.context import measure_exceeded
 from pipeline.diagnosis.diagnosis import Named, RunDiagnosis
+from pipeline.diagnosis.enough import Growth
 from pipeline.diagnosis.error_regions import map_errors, pick_regions
 from pipeline.diagnosis.estimates import list_estimates
 from pipeline.diagnosis.library import is_term
@@ -22,16 +23,17 @@ from pipeline.diagnosis.naming_rules import join_classes, list_equivalents
 from pipeline.diagnosis.plausibility import find_exceeded, find_implausible
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.values import list_values, read_clock
+from pipeline.diagnosis.verdict import grow_t
 from pipeline.identification import Input
 from pipeline.identification.apportion import apportion
 from pipeline.identification.describe import errors_as_json, ladder_as_json
+from pipeline.identification.growth import Curve, narrow_intervals
 from pipeline.identification.judgement import judge_model, note_fit
 from pipeline.identification.ladder import compare_losses
-from pipeline.identification.parts import BodyPart
+from pipeline.identification.parts import BodyPart, count_seconds
 from pipeline.models import Model, ModelFile, find_effect
 from pipeline.models.effect import Late, find_late
 from pipeline.runs import MotionError
-from pipeline.runs.windows import WINDOW_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -87,14 +89,14 @@ def summarize(
         judgements |= _judge_ways(context, [source], [*found, *terms], open_ids)
     judgement = judgements.get(source.value)
     told = [e for e in found if not e.searched_as & open_ids and e.id not in known]
-    described = tuple(_describe(effect, context, ways, judgement) for effect in _order(told, judgement))
+    described = _describe_all(told, context, ways, judgement)
     immaterial = tuple(effect for effect in described if effect.moves and not effect.moves.is_material)
     if immaterial:
         small = {effect.id for effect in immaterial}
         found, told = ([effect for effect in some if effect.id not in small] for some in (found, told))
         judgements = _judge_ways(context, inputs, [*found, *terms], open_ids)
         judgement = judgements.get(source.value)
-        described = tuple(_describe(effect, context, ways, judgement) for effect in _order(told, judgement))
+        described = _describe_all(told, context, ways, judgement)
     unexplained = residual_structure.describe(ways)
     exceeded = measure_exceeded(context)
     doubts = {effect.id: _doubt(effect, exceeded) for effect in described}
@@ -173,10 +175,7 @@ def _note_doubts(doubts: Mapping[str, str | None]) -> list[Mapping[str, Json]]:
 def _note_brevity(context: Context, common: RunDiagnosis) -> list[Mapping[str, Json]]:
     """A word where there was less driving than names can be trusted on."""
     least, words = _LEAST_DRIVING_S[common.input]
-    driven = sum(
-        float(np.minimum(np.diff(comparison.windows.times[:, 0], append=np.inf), WINDOW_S).sum())
-        for comparison in context.problem.comparisons
-    )
+    driven = float(count_seconds(context.problem.whole).sum())
     if driven >= least:
         return []
     text = (
@@ -242,14 +241,22 @@ def _was_aligned(effect: Effect, context: Context) -> bool:
     return effect.late is Late.POSES and context.has_gyro
 
 
+def _describe_all(
+    told: Sequence[Effect], context: Context, ways: Sequence[Explored], judgement: Judgement | None
+) -> tuple[Named, ...]:
+    widths = {} if judgement is None else narrow_intervals(judgement.fitted)
+    return tuple(_describe(effect, context, ways, judgement, widths) for effect in _order(told, judgement))
+
+
 def _describe(
     effect: Effect,
     context: Context,
     ways: Sequence[Explored],
     judgement: Judgement | None,
+    widths: Mapping[str, Curve],
 ) -> Named:
     way = _way_of(effect, ways)
-    gain, selected = _measure_gain(effect, way)
+    gain, selected, evidence = _measure_gain(effect, way)
     if _was_aligned(effect, context):
         values = read_clock(effect, context.runs)
     elif judgement is not None and effect.id in judgement.fitted.model:
@@ -267,6 +274,10 @@ def _describe(
         selected=selected,
         motion=_restore(effect.id, values).describe_motion(context.vehicle),
         moves=None if judgement is None else measure_moves(judgement, effect),
+        growth=Growth(
+            evidence,
+            {name: widths[label] for name in values if (label := f"{effect.id}.{name}") in widths},
+        ),
     )
 
 
@@ -327,8 +338,8 @@ def _way_of(effect: Effect, ways: Sequence[Explored]) -> Explored:
     return ways[0]
 
 
-def _measure_gain(effect: Effect, way: Explored) -> tuple[float, float]:
-    """Relative rise of the held-out loss without an effect, and how often that is worth a name."""
+def _measure_gain(effect: Effect, way: Explored) -> tuple[float, float, Curve]:
+    """Relative rise of the held-out loss without an effect, how often that is worth a name, and its t."""
     selection, final = way.search.selection, way.search.final
     names = effect.searched_as & set(final.ids)
     clock = find_late(final.state.effects, Late.POSES)
@@ -340,7 +351,8 @@ def _measure_gain(effect: Effect, way: Explored) -> tuple[float, float]:
     gain = float(before.sum()) / max(float(after.sum()), 1e-12) - 1.0
     draws = np.random.default_rng(0).integers(0, before.size, (_DRAWS, before.size))
     falls = 1.0 - after[draws].sum(axis=1) / np.maximum(before[draws].sum(axis=1), 1e-12)
-    return gain, float(np.mean(falls >= _WORTH))
+    growing = Curve(*grow_t(selection.part, selection.weights, held, final.held))
+    return gain, float(np.mean(falls >= _WORTH)), growing
 
 
 def _delay_poses(part: Part, state: State) -> Floats:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
+from pipeline.diagnosis.enough import describe_enough
 from pipeline.diagnosis.error_regions import tabulate_regions
 from pipeline.diagnosis.materiality import LEAST_TURN_RAD, LEAST_WAY_SHARE
 from pipeline.models.catalogue import find_effect
@@ -16,6 +17,7 @@ from pipeline.runs.windows import HORIZON_S
 if TYPE_CHECKING:
     import polars as pl
 
+    from pipeline.diagnosis.enough import Growth
     from pipeline.diagnosis.error_regions import Region
     from pipeline.diagnosis.excitation import Unobservable
     from pipeline.diagnosis.materiality import Moves
@@ -57,6 +59,7 @@ class Named:
         tentative: far more structure stays in its channel than it explains; or it lowers no error on its own
             way; or its interval holds doing nothing.
         moves: how far it moves predictions over 2 s; None where the model does not hold it.
+        growth: what was known of it by when; None where the model does not hold it.
     """
 
     id: str
@@ -70,6 +73,7 @@ class Named:
     motion: str
     tentative: bool = False
     moves: Moves | None = None
+    growth: Growth | None = None
 
     @property
     def readings(self) -> tuple[Reading, ...]:
@@ -117,6 +121,7 @@ class Named:
                 "heading_rad": _clean(self.moves.heading_rad),
                 "way_share": _clean(self.moves.way_share),
             },
+            "growth": None if self.growth is None else self.growth.to_json(),
         }
 
 
@@ -274,6 +279,7 @@ class RunDiagnosis:
             "disturbance": dict(self.disturbance),
             "model": None if self.proposal is None else format_model(self.proposal),
             "budget": [_budget_as_json(budget) for budget in self.budgets],
+            "enough": describe_enough(self.effects) or None,
         }
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.identification.parts import number_units
+from pipeline.identification.parts import count_seconds, number_units
 
 if TYPE_CHECKING:
     from pipeline.identification.parts import Part
@@ -64,25 +64,42 @@ class Verdict:
 def compare(part: Part, weights: Weights, before: Floats, after: Floats) -> Verdict:
     """Judge held-out residuals of two models under one weights."""
     old, new = weights.cost(before), weights.cost(after)
-
-    def add_up(label: Integers, values: Floats) -> Floats:
-        return np.asarray(np.bincount(label, values), dtype=np.float64)
-
-    count = np.bincount(part.unit)
-    kept = count >= min(_FEWEST_WINDOWS, int(count.max()))
-    sums_old = add_up(part.unit, old)[kept]
-    sums_new = add_up(part.unit, new)[kept]
     gain = 1.0 - float(new.sum()) / max(float(old.sum()), 1e-12)
+    moved = (((before - after) / weights.scale) ** 2).sum(axis=1)
+    stretch = number_units(part.run, part.times, SHORT_S)
+    z = _normal_t(part, after / weights.scale, _add_up(stretch, old - new), _add_up(stretch, moved))
+    return Verdict(gain, _find_t(part.unit, stretch, old, new, moved), z)
+
+
+def grow_t(part: Part, weights: Weights, before: Floats, after: Floats) -> tuple[Floats, Floats]:
+    """How the t of `compare` grows, every three seconds of driving.
+
+    Returns:
+        Seconds of windows until the end of each stretch, and t by then; both of shape (k,).
+    """
+    old, new = weights.cost(before), weights.cost(after)
+    moved = (((before - after) / weights.scale) ** 2).sum(axis=1)
+    stretch = number_units(part.run, part.times, SHORT_S)
+    ends = np.flatnonzero(np.diff(stretch, append=-1)) + 1
+    seconds = np.cumsum(count_seconds(part))[ends - 1]
+    t = [_find_t(part.unit[:n], stretch[:n], old[:n], new[:n], moved[:n]) for n in ends.tolist()]
+    return seconds, np.array(t)
+
+
+def _add_up(label: Integers, values: Floats) -> Floats:
+    return np.asarray(np.bincount(label, values), dtype=np.float64)
+
+
+def _find_t(unit: Integers, stretch: Integers, old: Floats, new: Floats, moved: Floats) -> float:
+    """See `Verdict`; of costs by window."""
+    count = np.bincount(unit)
+    kept = count >= min(_FEWEST_WINDOWS, int(count.max()))
+    sums_old, sums_new = _add_up(unit, old)[kept], _add_up(unit, new)[kept]
     difference = sums_old - sums_new
     ratio = np.log(np.maximum(sums_old, 1e-9) / np.maximum(sums_new, 1e-9))
-    moved = (((before - after) / weights.scale) ** 2).sum(axis=1)
-    action = add_up(part.unit, moved)[kept]
-    stretch = number_units(part.run, part.times, SHORT_S)
-    short = _ratio_t(add_up(stretch, old - new), add_up(stretch, moved)) * LEAST_T / _SHORT_T
-    rare = _normal_t(part, after / weights.scale, add_up(stretch, old - new), add_up(stretch, moved))
-    return Verdict(
-        gain, max(_block_t(difference), _block_t(ratio), _ratio_t(difference, action), short), rare
-    )
+    action = _add_up(unit, moved)[kept]
+    short = _ratio_t(_add_up(stretch, old - new), _add_up(stretch, moved)) * LEAST_T / _SHORT_T
+    return max(_block_t(difference), _block_t(ratio), _ratio_t(difference, action), short)
 
 
 def _ratio_t(difference: Floats, action: Floats) -> float:

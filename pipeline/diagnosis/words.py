@@ -6,6 +6,7 @@ import math
 from textwrap import wrap
 from typing import TYPE_CHECKING, cast
 
+from pipeline.diagnosis.enough import describe_enough
 from pipeline.diagnosis.materiality import describe_threshold
 from pipeline.runs.windows import HORIZON_S
 
@@ -74,6 +75,8 @@ def _list_shared(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
         now, floor = _number(last, "t_mrmse_m"), _number(diagnosis.noise_floor, "t_mrmse_m")
         lines.append(("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m"))
     lines += _label("budget", _describe_budget(diagnosis))
+    enough = describe_enough(diagnosis.effects)
+    lines += _label("enough", [enough] if enough else [])
     return [*lines, *_label("below", _describe_immaterial(diagnosis)), *_describe_unobservable(diagnosis)]
 
 

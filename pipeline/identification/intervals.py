@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.identification.parts import count_seconds
 from pipeline.models.bounds import stands_at_bound
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from pipeline.identification.fit import Fitted, PartFit
     from pipeline.identification.parts import Part
     from pipeline.identification.problem import Problem
@@ -58,10 +61,7 @@ class Estimate:
     @property
     def deviation(self) -> float:
         """Standard deviation of the estimate, few blocks allowed for: Student's t of it is the interval."""
-        from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
-
-        half = 0.5 * (self.high - self.low)
-        return half / float(stdtrit(min(self.freedom, _NORMAL), 0.975))
+        return 0.5 * (self.high - self.low) / _find_quantile(self.freedom)
 
 
 @dataclass(frozen=True)
@@ -117,32 +117,19 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
 
 def estimate_part(part: Part, fit: PartFit) -> Estimates:
     """Intervals of the free numbers of one part, the others as they are."""
-    from scipy.stats import t as student  # noqa: PLC0415 - heavy
-
     count = len(fit.free)
-    block = join_blocks(part, fit)
-    pieces = int(block.max()) + 1
-    normals, gradients = _sum_blocks(fit, block, pieces)
-    total = normals.sum(axis=0) + np.diag(part.prior.weigh(fit.state, fit.free))
-    size = np.sqrt(np.maximum(np.diag(total), 0.0))
-    observable = size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)
-    rows = np.flatnonzero(observable)
-    errors = np.full(count, np.nan)
+    blocks = sum_blocks(part, fit)
+    total, rows, size = _find_observable(part, fit, blocks)
+    freedom = _count_freedom(part, blocks.count)
     correlation = np.full((count, count), np.nan)
-    freedom: float = max(pieces - 1, 1)
-    spread: Floats | None = None
-    if rows.size and part.prior.numbers:
-        freedom = np.inf
-        scale = np.outer(size[rows], size[rows])
-        spread = part.prior.excess * np.linalg.inv(total[np.ix_(rows, rows)] / scale) / scale
-    elif rows.size and pieces > 1:
-        spread = _jackknife(normals, gradients, rows, size)
+    errors = np.full(count, np.nan)
+    spread = _find_spread(part, blocks, total, rows, size)
     if spread is not None:
         errors[rows] = np.sqrt(np.diag(spread))
         deviation = np.maximum(np.outer(errors[rows], errors[rows]), 1e-300)
         correlation[np.ix_(rows, rows)] = spread / deviation
-    wide = float(student.ppf(0.975, freedom))
-    errors[rows] = np.hypot(errors[rows], _carry_clocks(part, fit, total, rows, size))
+    wide = _find_quantile(freedom)
+    errors[rows] = np.hypot(errors[rows], _carry_clocks(blocks, total, rows, size))
     items = []
     for index, number in enumerate(fit.free):
         value = fit.state.get(number)
@@ -155,29 +142,106 @@ def estimate_part(part: Part, fit: PartFit) -> Estimates:
                 value + half,
                 float(errors[index]),
                 at_bound=stands_at_bound(value, number.bounds),
-                observable=bool(observable[index]),
-                freedom=float(freedom) if number.is_smooth else np.inf,
+                observable=index in rows,
+                freedom=freedom if number.is_smooth else np.inf,
             )
         )
-    return Estimates(tuple(items), correlation, pieces)
+    return Estimates(tuple(items), correlation, blocks.count)
 
 
-def _carry_clocks(part: Part, fit: PartFit, total: Floats, rows: Integers, size: Floats) -> Floats:
+def narrow_part(part: Part, fit: PartFit, order: Sequence[int] | None = None) -> tuple[Floats, Floats]:
+    """How wide intervals were when only the first blocks had been driven, under the whole run's model.
+
+    The numbers are moved to what fits those blocks best, in one step, and the same jackknife is made of them:
+    the last of all widths is that of `estimate_part`.
+
+    Args:
+        part: of the way.
+        fit: a converged fit of it.
+        order: numbers of blocks in the order in which they are used; as they were driven by default.
+
+    Returns:
+        Seconds of windows until the end of each block, shape (k,), and half-widths of the 95 % interval of
+        each free number, infinite where it could not be told and of numbers that derivatives do not find,
+        shape (k, p).
+    """
+    blocks = sum_blocks(part, fit)
+    used = np.arange(blocks.count) if order is None else np.asarray(order, dtype=np.int64)
+    seconds = np.cumsum(np.bincount(blocks.label, count_seconds(part), minlength=blocks.count)[used])
+    halves = np.full((blocks.count, len(fit.free)), np.inf)
+    smooth = np.array([number.is_smooth for number in fit.free])
+    for count in range(1, blocks.count + 1):
+        first = blocks.take(used[:count])
+        total, rows, size = _find_observable(part, fit, first)
+        if count < blocks.count and rows.size:
+            first = first.move(_solve(total, first.gradients.sum(axis=0), rows, size))
+        spread = _find_spread(part, first, total, rows, size)
+        if spread is not None:
+            errors = np.hypot(np.sqrt(np.diag(spread)), _carry_clocks(first, total, rows, size))
+            halves[count - 1, rows] = _find_quantile(_count_freedom(part, count)) * errors
+    halves[:, ~smooth] = np.inf
+    return np.asarray(seconds, dtype=np.float64), halves
+
+
+def _find_observable(part: Part, fit: PartFit, blocks: Blocks) -> tuple[Floats, Integers, Floats]:
+    """Normal matrix with the prior, which numbers move it at all, and the size of each."""
+    total = blocks.normals.sum(axis=0) + np.diag(part.prior.weigh(fit.state, fit.free))
+    size = np.sqrt(np.maximum(np.diag(total), 0.0))
+    return total, np.flatnonzero(size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)), size
+
+
+def _count_freedom(part: Part, blocks: int) -> float:
+    return np.inf if part.prior.numbers else float(max(blocks - 1, 1))
+
+
+def _find_quantile(freedom: float) -> float:
+    from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
+
+    return float(stdtrit(min(freedom, _NORMAL), 0.975))
+
+
+def _find_spread(part: Part, blocks: Blocks, total: Floats, rows: Integers, size: Floats) -> Floats | None:
+    """Covariance of the observable numbers; None where nothing tells it."""
+    if rows.size and part.prior.numbers:
+        scale = np.outer(size[rows], size[rows])
+        spread: Floats = part.prior.excess * np.linalg.inv(total[np.ix_(rows, rows)] / scale) / scale
+        return spread
+    if rows.size and blocks.count > 1:
+        return _jackknife(blocks.normals, blocks.gradients, rows, size)
+    return None
+
+
+def _solve(total: Floats, pull: Floats, rows: Integers, size: Floats) -> Floats:
+    """How far numbers move under a pull, zero where they are not observable, shape (p,)."""
+    scale = size[rows]
+    scaled = total[np.ix_(rows, rows)] / np.outer(scale, scale) + 1e-9 * np.eye(rows.size)
+    moved = np.zeros(size.size)
+    moved[rows] = np.linalg.solve(scaled, pull[rows] / scale) / scale
+    return moved
+
+
+def _carry_clocks(blocks: Blocks, total: Floats, rows: Integers, size: Floats) -> Floats:
     """Standard errors that come from not knowing the clocks exactly, shape (rows,)."""
     carried = np.zeros(rows.size)
-    if rows.size == 0:
-        return carried
-    scaled = total[np.ix_(rows, rows)] / np.outer(size[rows], size[rows]) + 1e-9 * np.eye(rows.size)
+    for pull in blocks.clocks.sum(axis=1) if rows.size else ():
+        carried = np.hypot(carried, np.abs(_solve(total, pull, rows, size)[rows]))
+    return carried
+
+
+def _pull_clocks(part: Part, fit: PartFit, label: Integers, pieces: int) -> Floats:
+    """How one standard error of each run's clock pulls the numbers in every block, shape (runs, k, p)."""
     factor = fit.weights.factors(fit.residual)
+    found = []
     for run, error in enumerate(part.list_clock_errors().tolist()):
         if error == 0.0:
             continue
         mine = part.run == run
         late = (part.shift_clock(fit.state, run, _DELAY_STEP) - fit.residual[mine]) / _DELAY_STEP
-        pull = np.einsum("ncp,nc->p", fit.jacobian[mine] * factor[mine][:, :, None], late * factor[mine])
-        shift = np.linalg.solve(scaled, pull[rows] / size[rows]) / size[rows]
-        carried = np.hypot(carried, np.abs(shift) * error)
-    return carried
+        pull = np.zeros((pieces, len(fit.free)))
+        rows = fit.jacobian[mine] * factor[mine][:, :, None]
+        np.add.at(pull, label[mine], error * np.einsum("ncp,nc->np", rows, late * factor[mine]))
+        found.append(pull)
+    return np.array(found).reshape(len(found), pieces, len(fit.free))
 
 
 def _widen(part: Part, fit: PartFit, number: Free) -> float:
@@ -256,15 +320,47 @@ def integrate_correlation(part: Part, fit: PartFit) -> float:
     return longest
 
 
-def _sum_blocks(fit: PartFit, block: Integers, pieces: int) -> tuple[Floats, Floats]:
+@dataclass(frozen=True)
+class Blocks:
+    """What every block says.
+
+    Attributes:
+        label: number of the block of every window, shape (n,).
+        normals: their normal matrices, shape (k, p, p).
+        gradients: and gradients, shape (k, p).
+        clocks: what their clocks may pull, shape (runs, k, p).
+    """
+
+    label: Integers
+    normals: Floats
+    gradients: Floats
+    clocks: Floats
+
+    @property
+    def count(self) -> int:
+        """How many."""
+        return int(self.normals.shape[0])
+
+    def take(self, numbers: Integers) -> Blocks:
+        """Those of these numbers."""
+        return Blocks(self.label, self.normals[numbers], self.gradients[numbers], self.clocks[:, numbers])
+
+    def move(self, step: Floats) -> Blocks:
+        """The same about numbers that are moved by a step."""
+        return replace(self, gradients=self.gradients - self.normals @ step)
+
+
+def sum_blocks(part: Part, fit: PartFit) -> Blocks:
     """Normal matrix and gradient of every block."""
+    label = join_blocks(part, fit)
+    pieces = int(label.max()) + 1
     factor = fit.weights.factors(fit.residual)
     columns = fit.jacobian * factor[:, :, None]
     normals = np.zeros((pieces, columns.shape[2], columns.shape[2]))
     gradients = np.zeros((pieces, columns.shape[2]))
-    np.add.at(normals, block, np.einsum("ncp,ncq->npq", columns, columns))
-    np.add.at(gradients, block, np.einsum("ncp,nc->np", columns, fit.residual * factor))
-    return normals, gradients
+    np.add.at(normals, label, np.einsum("ncp,ncq->npq", columns, columns))
+    np.add.at(gradients, label, np.einsum("ncp,nc->np", columns, fit.residual * factor))
+    return Blocks(label, normals, gradients, _pull_clocks(part, fit, label, pieces))
 
 
 def _jackknife(normals: Floats, gradients: Floats, rows: Integers, size: Floats) -> Floats:

@@ -18,6 +18,7 @@ from pipeline.identification.state import State
 from pipeline.identification.weights import measure_noise
 from pipeline.models.effect import Place
 from pipeline.models.forward import Timing
+from pipeline.runs.windows import WINDOW_S
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -230,6 +231,14 @@ def number_units(run: Integers, times: Floats, length: float = UNIT_S) -> Intege
     """Stretches of ten seconds, or of another length, numbered through all runs."""
     label = run * 1_000_000 + (times.mean(axis=1) // length).astype(np.int64)
     return np.unique(label, return_inverse=True)[1].astype(np.int64)
+
+
+def count_seconds(part: Part) -> Floats:
+    """Seconds that each window adds to those before it, so that overlaps count once, shape (n,)."""
+    starts = part.times[:, 0]
+    further = np.append(np.diff(starts), np.inf)
+    further[np.flatnonzero(np.diff(part.run))] = np.inf
+    return np.asarray(np.minimum(further, WINDOW_S), dtype=np.float64)
 
 
 def find_live(ideal: Floats) -> Flags:

@@ -81,14 +81,14 @@ def format_model(file: ModelFile) -> str:
         f"format = {FORMAT}",
     ]
     if file.note:
-        lines.append(f"note = {_value(file.note)}")
+        lines.append(f"note = {format_value(file.note)}")
     if file.effect_files:
-        lines.append(f"effects = [{', '.join(_value(name) for name in file.effect_files)}]")
+        lines.append(f"effects = [{', '.join(format_value(name) for name in file.effect_files)}]")
     lines += ["", *_format_vehicle(file.model.vehicle)]
     for effect in file.model:
-        lines += ["", "[[effect]]", f"id = {_value(effect.id)}"]
+        lines += ["", "[[effect]]", f"id = {format_value(effect.id)}"]
         if isinstance(effect, FormulaEffect):
-            lines += [f"{channel} = {_value(text)}" for channel, text in effect.formulas.items()]
+            lines += [f"{channel} = {format_value(text)}" for channel, text in effect.formulas.items()]
         lines += [_format_parameter(file, effect, parameter) for parameter in effect.parameters]
     if file.fit:
         lines += ["", "# What the values were fitted on.", *_format_table("fit", file.fit)]
@@ -100,10 +100,10 @@ def _format_vehicle(vehicle: Vehicle) -> list[str]:
     lines = ["[vehicle]"]
     values = msgspec.structs.asdict(vehicle)
     if preset is not None:
-        lines.append(f"preset = {_value(preset.id)}")
+        lines.append(f"preset = {format_value(preset.id)}")
         known = msgspec.structs.asdict(preset)
         return lines + [f"{key} = {_exactly(values[key])}" for key in _GEOMETRY if values[key] != known[key]]
-    lines += [f"name = {_value(vehicle.name)}", f"kind = {_value(vehicle.kind)}"]
+    lines += [f"name = {format_value(vehicle.name)}", f"kind = {format_value(vehicle.kind)}"]
     return lines + [f"{key} = {_exactly(values[key])}" for key in _GEOMETRY if values[key] is not None]
 
 
@@ -112,8 +112,8 @@ def _format_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> 
     parts = [] if math.isnan(value) else [f"value = {_round_within(value, parameter)}"]
     if label in file.intervals:
         low, high = file.intervals[label]
-        parts += [f"low = {_value(low)}", f"high = {_value(high)}"]
-    parts.append(f"unit = {_value(parameter.unit)}")
+        parts += [f"low = {format_value(low)}", f"high = {format_value(high)}"]
+    parts.append(f"unit = {format_value(parameter.unit)}")
     if isinstance(effect, FormulaEffect):
         parts.append(f"bounds = [{', '.join(map(_exactly, parameter.bounds))}]")
         if parameter.neutral != 0.0:
@@ -130,14 +130,14 @@ def _format_table(name: str, table: Mapping[str, object]) -> list[str]:
     lines = [f"[{name}]"]
     for key, value in table.items():
         if not _is_tables(value):
-            lines.append(f"{_key(key)} = {_value(value)}")
+            lines.append(f"{_key(key)} = {format_value(value)}")
     for key, value in table.items():
         if _is_tables(value) and isinstance(value, Sequence):
             for row in value:
                 lines += [
                     "",
                     f"[[{name}.{_key(key)}]]",
-                    *(f"{_key(k)} = {_value(v)}" for k, v in row.items()),
+                    *(f"{_key(k)} = {format_value(v)}" for k, v in row.items()),
                 ]
     return lines
 
@@ -151,12 +151,12 @@ def _is_tables(value: object) -> bool:
     )
 
 
-def _value(value: object) -> str:
+def format_value(value: object) -> str:
     """A value in TOML; lists and tables stand in one line."""
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + " }"
+        return "{ " + ", ".join(f"{_key(k)} = {format_value(v)}" for k, v in value.items()) + " }"
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return "[" + ", ".join(_value(item) for item in value) + "]"
+        return "[" + ", ".join(format_value(item) for item in value) + "]"
     if isinstance(value, float):
         value = _round(value)
     return str(tomlkit.item(value).as_string())

@@ -13,12 +13,15 @@ from pipeline.plan.files import read_promises, write_plan
 from pipeline.plan.knowledge import Knowledge, assume, learn
 from pipeline.plan.limits import Area, Limits, choose_limits, parse_area
 from pipeline.plan.plan import SAFETY, Plan, Request, find_largest, make_plan
+from pipeline.plan.protocols import PROTOCOLS, Needed, compare_protocols
 
 __all__ = [
+    "PROTOCOLS",
     "SAFETY",
     "Area",
     "Knowledge",
     "Limits",
+    "Needed",
     "Plan",
     "PlanError",
     "Request",
@@ -28,6 +31,7 @@ __all__ = [
     "assume",
     "check_plan",
     "choose_limits",
+    "compare_protocols",
     "find_largest",
     "learn",
     "list_names",

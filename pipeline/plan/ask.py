@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.identification.growth import find_goal
 from pipeline.models import find_effect, list_effects
 from pipeline.plan.errors import PlanError
-from pipeline.plan.questions import INTERVAL_SHARE, Precision, Separation
+from pipeline.plan.questions import Precision, Separation
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -38,19 +38,12 @@ def ask_numbers(model: Hypothesis) -> list[Precision]:
     spread = np.sqrt(np.diag(np.linalg.inv(model.information))) if model.free else np.zeros(0)
     found = []
     for place, number in enumerate(model.free):
-        parameter = find_effect(number.effect)().parameter(number.name)
-        size = max(abs(float(model.values[place])), _size_of_name(parameter.typical, parameter.neutral))
-        goal = INTERVAL_SHARE * size
+        goal = find_goal(number.effect, number.name, float(model.values[place]))
         if _NORMAL_95 * float(spread[place]) > goal:
             unit = "" if number.unit == "1" else f" {number.unit}"
             text = f"{number.label} within {goal:.2g}{unit}"
             found.append(Precision(text, (number.effect,), model, place, goal))
     return found
-
-
-def _size_of_name(typical: float, neutral: float) -> float:
-    """A usual size: numbers near nothing need no better share of themselves."""
-    return abs(typical - (neutral if math.isfinite(neutral) else 0.0))
 
 
 def ask_presence(knowledge: Knowledge, names: Iterable[str], largest: Largest) -> list[Separation]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -11,9 +9,11 @@ import numpy as np
 
 from pipeline.core.toml import TomlError, parse_toml
 from pipeline.logs import LogWriter
+from pipeline.models.model_text import format_value
 from pipeline.plan.errors import PlanError
 from pipeline.plan.manoeuvres import RATE_HZ
 from pipeline.plan.plan import SAFETY, Impossible, Plan, Promise
+from pipeline.store.files import replace_file
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -30,13 +30,16 @@ _FIELDS: Mapping[str, tuple[str, str]] = {
     "ackermann_msgs/msg/AckermannDrive": ("speed", "steering_angle"),
     "ackermann_msgs/msg/AckermannDriveStamped": ("drive.speed", "drive.steering_angle"),
 }
+WHEELS = "std_msgs/msg/Float64"
+"""Of wheel speeds [rad/s], a topic a side."""
+_PAIR = 2
 # A player shifts log times to now; stamps begin at a round moment so that the same plan has the same bytes.
 _START_NS = 1_700_000_000_000_000_000
 _SECOND = 1_000_000_000
 
 
 def list_types(*, steered: bool) -> tuple[str, ...]:
-    """Message types of commands: of a steering angle, or of a yaw rate."""
+    """Message types of body commands: of a steering angle, or of a yaw rate."""
     return tuple(name for name in _FIELDS if ("Ackermann" in name) == steered)
 
 
@@ -66,12 +69,14 @@ def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
     Raises:
         PlanError: ``cannot_write``, or ``wrong_type`` for a message type that cannot carry the commands.
     """
-    if plan.type_name not in list_types(steered=plan.steered):
+    types = [*list_types(steered=plan.steered), *([WHEELS] if plan.wheels is not None else [])]
+    topics = plan.topic.split(", ")
+    if plan.type_name not in types or len(topics) != (_PAIR if plan.type_name == WHEELS else 1):
         raise PlanError(
             "wrong_type",
             f"commands of this vehicle cannot be written as {plan.type_name}",
             where=plan.topic,
-            hint=f"Give --type as one of {', '.join(list_types(steered=plan.steered))}.",
+            hint=f"Give --type as one of {', '.join(types)}; {WHEELS} on --topic '/LEFT, /RIGHT'.",
         )
     toml, csv, mcap = (folder / name for name in _NAMES)
     try:
@@ -79,15 +84,13 @@ def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
         _write_mcap(plan, mcap)
         pages = [(folder / PAGE, page)] if page else []
         for path, text in ((csv, _format_csv(plan)), (toml, _format_toml(plan)), *pages):
-            draft = path.with_name(f".{path.name}.part")
-            draft.write_text(text, encoding="utf-8")
-            draft.replace(path)
+            replace_file(path, text.encode())
     except OSError as error:
         raise PlanError(
             "cannot_write",
             f"the plan cannot be written ({error.strerror})",
             where=str(folder),
-            hint="Choose another --to.",
+            hint="Choose another --out.",
         ) from None
     return (toml, csv, mcap, *(path for path, _ in pages))
 
@@ -109,14 +112,17 @@ def read_promises(path: Path) -> Promised:
 
 
 def _write_mcap(plan: Plan, path: Path) -> None:
-    speed, turn = _FIELDS[plan.type_name]
     stamps = _START_NS + np.round(plan.commands.times * _SECOND).astype(np.int64)
-    fields: dict[str, NDArray[np.float64]] = {speed: plan.commands.speed, turn: plan.commands.turn}
-    stamped = plan.type_name.endswith("Stamped")
+    fields: list[dict[str, NDArray[np.float64]]]
+    if plan.type_name == WHEELS and plan.wheels is not None:
+        fields = [{"data": side} for side in plan.wheels]
+    else:
+        speed, turn = _FIELDS[plan.type_name]
+        fields = [{speed: plan.commands.speed, turn: plan.commands.turn}]
+    header = stamps if plan.type_name.endswith("Stamped") else None
     with LogWriter(path) as writer:
-        writer.write_columns(
-            plan.topic, plan.type_name, stamps, fields, header_time=stamps if stamped else None
-        )
+        for topic, values in zip(plan.topic.split(", "), fields, strict=True):
+            writer.write_columns(topic, plan.type_name, stamps, values, header_time=header)
         writer.metadata("safety", {"text": " ".join(SAFETY)})
 
 
@@ -170,11 +176,4 @@ def _format_toml(plan: Plan) -> str:
 
 
 def _format_table(table: Mapping[str, object]) -> list[str]:
-    """Lines of TOML: its strings and lists of strings are those of JSON."""
-    return [f"{key} = {_format_value(value)}" for key, value in table.items()]
-
-
-def _format_value(value: object) -> str:
-    if isinstance(value, float) and math.isfinite(value):
-        return repr(round(value, 6))
-    return json.dumps(value, ensure_ascii=False)
+    return [f"{key} = {format_value(value)}" for key, value in table.items()]

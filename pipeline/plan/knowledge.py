@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.identification import Input, Problem, fit_model
-from pipeline.identification.intervals import integrate_correlation
+from pipeline.identification.intervals import count_repeats
 from pipeline.models import Model
 from pipeline.plan.errors import PlanError
 from pipeline.plan.limits import is_steered
@@ -192,9 +192,7 @@ def _expect(effects: Sequence[Effect], free: Sequence[Free]) -> Floats:
 def _inflate(part: Part, fit: PartFit) -> float:
     """Variance of weighted residuals times the number of neighbours that repeat each of them."""
     rest = fit.weights.weigh(fit.residual)[part.live][:, list(part.channels)]
-    stride = float(np.median(np.diff(part.times.mean(axis=1))))
-    repeats = max(integrate_correlation(part, fit) / max(stride, 1e-3), 1.0)
-    return max(float(np.mean(rest**2)), 1e-12) * repeats
+    return max(float(np.mean(rest**2)), 1e-12) * count_repeats(part, fit)
 
 
 def _measure_noise(part: Part, fit: PartFit) -> Floats:

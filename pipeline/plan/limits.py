@@ -93,10 +93,10 @@ def choose_limits(
         return Limits(
             speed, turn, acceleration, turn / _TURN_RISE_S, yaw_rate_radps=yaw_rate_radps or math.inf
         )
-    turn = vehicle.max_yaw_rate_radps or min(
-        _USUAL_YAW_RATE_RADPS, 2.0 * speed / (vehicle.track_width_m or 1.0)
-    )
-    turn = min(yaw_rate_radps or math.inf, turn)
+    # Beyond what is usual only where somebody says so: the preset, or who asks.
+    fastest = 2.0 * speed / (vehicle.track_width_m or 1.0)
+    most = vehicle.max_yaw_rate_radps or min(yaw_rate_radps or _USUAL_YAW_RATE_RADPS, fastest)
+    turn = min(yaw_rate_radps or math.inf, most)
     return Limits(speed, turn, acceleration, turn / _TURN_RISE_S)
 
 

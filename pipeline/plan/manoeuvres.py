@@ -83,7 +83,7 @@ def list_manoeuvres(vehicle: Vehicle, limits: Limits) -> tuple[Manoeuvre, ...]:
     found: list[Manoeuvre] = []
 
     def add(name: str, *stages: tuple[float, float, float]) -> None:
-        found.append(Manoeuvre(name, _go_and_return(_hold(stages, vehicle, limits), steered=steered)))
+        found.append(Manoeuvre(name, _go_and_return(hold_within(stages, vehicle, limits), steered=steered)))
 
     speed, turn = limits.speed_mps, limits.turn
     for share in (_SMALL, *_SHARES):
@@ -116,7 +116,7 @@ def list_manoeuvres(vehicle: Vehicle, limits: Limits) -> tuple[Manoeuvre, ...]:
     return tuple(found)
 
 
-def _hold(stages: Sequence[tuple[float, float, float]], vehicle: Vehicle, limits: Limits) -> Commands:
+def hold_within(stages: Sequence[tuple[float, float, float]], vehicle: Vehicle, limits: Limits) -> Commands:
     """Targets of (speed, turn, seconds) held one after the other."""
     counts = [round(seconds * RATE_HZ) for _, _, seconds in stages]
     return _limit(

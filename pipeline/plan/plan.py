@@ -6,6 +6,7 @@ import math
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +17,7 @@ from pipeline.plan.errors import PlanError
 from pipeline.plan.limits import is_steered
 from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, Commands, join, list_manoeuvres, wait
 from pipeline.plan.questions import DECIDED_T, STRETCHES, Judge, Separation
-from pipeline.plan.rehearsal import Rehearsal, start_state
+from pipeline.plan.rehearsal import Rehearsal, drive, start_state
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -95,6 +96,8 @@ class Plan:
         topic, type_name: on which the commands are played.
         steered: whether a turn is a steering angle.
         home_m: largest distance of any model's end from the start.
+        wheels: speeds of the left and the right wheels [rad/s] as commands, shape (n,) each; None where these
+            are not all that is commanded.
         ways: of the models, base first, positions x + iy [m] 20 times a second, shape (models, n).
     """
 
@@ -110,6 +113,7 @@ class Plan:
     type_name: str
     steered: bool
     home_m: float
+    wheels: tuple[Floats, Floats] | None = field(repr=False)
     ways: Complex = field(repr=False)
 
     def to_json(self) -> dict[str, object]:
@@ -203,8 +207,19 @@ def make_plan(knowledge: Knowledge, questions: Sequence[Question], request: Requ
         type_name=request.type_name,
         steered=is_steered(knowledge.vehicle),
         home_m=float(np.abs(ways[:, -1]).max()),
+        wheels=_turn_wheels(commands, knowledge),
         ways=ways,
     )
+
+
+def _turn_wheels(commands: Commands, knowledge: Knowledge) -> tuple[Floats, Floats] | None:
+    """Wheel commands as a log would record them."""
+    kinematics = knowledge.vehicle.kinematics
+    if is_steered(knowledge.vehicle) or kinematics.has_inputs("sideways"):
+        return None
+    vehicle = msgspec.structs.replace(knowledge.vehicle, controller_track_multiplier=1.0)
+    driven, scale = drive(commands, vehicle), knowledge.senses.command_scale
+    return driven.left / scale, driven.right / scale
 
 
 @dataclass(frozen=True)
@@ -345,43 +360,47 @@ def _promise(
             promises.append(_keep_promise(one, edges, measured))
         else:
             impossible.append(
-                Impossible(one.question.text, one.question.effects, _explain(one, reached, measured))
+                Impossible(
+                    one.question.text, one.question.effects, _explain(one, reached, measured, one.bound(full))
+                )
             )
     promises.sort(key=lambda promise: promise.decided_after_s)
     return tuple(promises), tuple(impossible), answered
 
 
-def _keep_promise(one: Answerable, edges: Floats, measured: float) -> Promise:
-    count = edges.size - 1
-    low, high = 0, count
+def since_when(one: Answerable, edges: Floats) -> float:
+    """Seconds [s] after which a question is answered, of groups between edges; infinite where it is not."""
+    low, high = 0, edges.size
     while low < high:
         middle = (low + high) // 2
-        if one.answer((np.arange(count) < middle).astype(np.float64)) >= 1.0:
+        if one.answer((np.arange(edges.size - 1) < middle).astype(np.float64)) >= 1.0:
             high = middle
         else:
             low = middle + 1
-    question = one.question
-    after = float(edges[high])
+    return float(edges[high]) if high < edges.size else math.inf
+
+
+def _keep_promise(one: Answerable, edges: Floats, measured: float) -> Promise:
+    question, after = one.question, since_when(one, edges)
     if isinstance(question, Separation):
         return Promise(question.text, question.effects, "separation", after, measured, DECIDED_T)
     number = question.model.free[question.number]
     return Promise(question.text, question.effects, "interval", after, measured, question.goal, number.unit)
 
 
-def _explain(one: Answerable, reached: float, measured: float) -> str:
+def _explain(one: Answerable, reached: float, measured: float, bound: float) -> str:
     """Why a question stays open."""
     question = one.question
-    if reached >= _HOPELESS:
-        enough = measured >= DECIDED_T if isinstance(question, Separation) else measured <= question.goal
-        if enough:
-            return f"fewer than {STRETCHES:g} stretches of the plan show it: more time or room is needed"
-        what = (
-            f"t = {measured:.1f} of {DECIDED_T:g}"
-            if isinstance(question, Separation)
-            else f"+- {measured:.2g} where {question.goal:.2g} is asked"
-        )
-        return f"the plan reaches {what}: more time or room is needed"
-    return _advise(question)
+    if reached < _HOPELESS:
+        return _advise(question)
+    if isinstance(question, Separation):
+        enough, what = measured >= DECIDED_T, f"t = {measured:.1f} of {DECIDED_T:g}"
+    else:
+        enough = bound <= question.goal
+        what = f"+- {measured:.2g}, or up to {bound:.2g}, where {question.goal:.2g} is asked"
+    if enough:
+        return f"fewer than {STRETCHES:g} stretches of the plan show it: more time or room is needed"
+    return f"the plan reaches {what}: more time or room is needed"
 
 
 def _advise(question: Question) -> str:

@@ -44,11 +44,13 @@ class Senses:
         gyro: how the gyro fits the poses; None without a good one.
         encoders: whether wheels are measured.
         track_multiplier: of the controller.
+        command_scale: by which recorded commands are multiplied.
     """
 
     gyro: GyroFit | None = None
     encoders: bool = False
     track_multiplier: float = 1.0
+    command_scale: float = 1.0
 
 
 def read_senses(runs: Sequence[MotionRun]) -> Senses:
@@ -56,7 +58,8 @@ def read_senses(runs: Sequence[MotionRun]) -> Senses:
     fits = [run.gyro_fit for run in runs]
     gyro = None if any(fit is None for fit in fits) else fits[0]
     encoders = all(run.wheels is not None for run in runs)
-    return Senses(gyro, encoders, runs[0].alignment.track_multiplier)
+    known = runs[0].alignment
+    return Senses(gyro, encoders, known.track_multiplier, known.command_scale)
 
 
 class Rehearsal:

@@ -23,6 +23,8 @@ _TURNED = {
     "geometry_msgs/msg/Twist": ("linear.x", "angular.z"),
     "geometry_msgs/msg/TwistStamped": ("twist.linear.x", "twist.angular.z"),
 }
+# Wheel speeds [rad/s], a topic a side.
+_SIDE = "std_msgs/msg/Float64"
 
 
 def read_played(path: Path, vehicle: Vehicle) -> Commands:
@@ -37,12 +39,21 @@ def read_played(path: Path, vehicle: Vehicle) -> Commands:
     types = _STEERED if vehicle.kind == "ackermann" else _TURNED
     index = open_log(path)
     topic = next((channel.topic for channel in index.channels if channel.type_name in types), None)
+    sides = sorted(channel.topic for channel in index.channels if channel.type_name == _SIDE)
+    if topic is None and len(sides) == 2 and vehicle.kind == "differential":  # noqa: PLR2004 - left and right
+        found = read_topics(index, [Wanted(side) for side in sides])
+        left, right = (found.of(side)[0] for side in sides)
+        rates = [np.asarray(one.fields["data"], dtype=np.float64) for one in (left, right)]
+        half = vehicle.lever_m * vehicle.controller_track_multiplier
+        speed = 0.5 * vehicle.wheel_radius_m * (rates[0] + rates[1])
+        turn = 0.5 * vehicle.wheel_radius_m * (rates[1] - rates[0]) / half
+        return Commands((left.log_time - left.log_time[0]) * 1e-9, speed, turn, None)
     if topic is None:
         raise SimulateError(
             "nothing_to_play",
             f"no topic has commands that a vehicle of kind {vehicle.kind} is driven with",
             where=str(path),
-            hint=f"Give a recording with {' or '.join(types)}.",
+            hint=f"Give a recording with {' or '.join(types)}, or {_SIDE} for the left and the right wheels.",
         )
     columns = read_topics(index, [Wanted(topic)]).of(topic)[0]
     speed, turn = (np.asarray(columns.fields[name], dtype=np.float64) for name in types[columns.type_name])

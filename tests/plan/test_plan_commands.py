@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -12,6 +12,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from pipeline.analysis.plan import choose_topic
 from pipeline.models import find_effect
 from pipeline.plan import (
     PlanError,
@@ -19,19 +20,26 @@ from pipeline.plan import (
     ask_presence,
     assume,
     choose_limits,
+    compare_protocols,
     make_plan,
     parse_area,
     write_plan,
 )
-from pipeline.plan.files import list_types, read_promises
+from pipeline.plan.files import WHEELS, list_types, read_promises
 from pipeline.plan.limits import is_steered, parse_time
-from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, limit_yaw_rate, list_manoeuvres
+from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, join, limit_yaw_rate, list_manoeuvres, wait
 from pipeline.plan.plan import Plan, find_largest
 from pipeline.plan.rehearsal import Rehearsal
+from pipeline.simulate import find_vehicle
+from pipeline.simulate.played import read_played
 from pipeline.vehicles import Vehicle, find_preset, list_presets
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
 
 PRESETS = [preset for preset in list_presets() if preset.max_speed_mps]
 TURNING = ("effective_track", "wheel_asymmetry")
@@ -101,6 +109,7 @@ def test_a_plan_stays_inside_whatever_limit_of_acceleration_no_log_has_shown(
     assert np.abs(path.imag).max() < 0.5 * plan.area.width_m
 
 
+@pytest.mark.long
 def test_the_same_request_gives_the_same_plan(plan: Plan) -> None:
     vehicle = _find("husky_a200")
     knowledge = assume(vehicle)
@@ -110,27 +119,116 @@ def test_the_same_request_gives_the_same_plan(plan: Plan) -> None:
     assert again.promises == plan.promises
 
 
-def test_the_official_reader_reads_the_commands_with_right_stamps(plan: Plan, tmp_path: Path) -> None:
-    toml, csv, mcap = write_plan(plan, tmp_path / "plan")
-    with mcap.open("rb") as file:
-        messages = [
-            (message.log_time, decoded)
-            for _, _, message, decoded in make_reader(
-                file, decoder_factories=[DecoderFactory()]
-            ).iter_decoded_messages()
-        ]
-    assert len(messages) == plan.commands.speed.size
-    times = np.array([time for time, _ in messages])
-    assert np.diff(times).tolist() == [round(1e9 / RATE_HZ)] * (len(messages) - 1)
-    stamps = [one.header.stamp.sec * 1_000_000_000 + one.header.stamp.nanosec for _, one in messages]
-    assert stamps == times.tolist()
-    speed = np.array([one.twist.linear.x for _, one in messages])
-    assert np.abs(speed).max() <= 0.8
-    assert np.abs(np.diff(speed)).max() * RATE_HZ <= plan.limits.acceleration_mps2 * (1 + 1e-6)
-    assert np.abs([one.twist.angular.z for _, one in messages]).max() <= plan.limits.turn
+def _read(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Log times and messages by topic, of the official reader."""
+    found: dict[str, list[tuple[int, Any]]] = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, message, decoded in reader.iter_decoded_messages():
+            found.setdefault(channel.topic, []).append((message.log_time, decoded))
+    return found
+
+
+def _check_stamps(messages: list[tuple[int, Any]], plan: Plan) -> None:
+    times = [time for time, _ in messages]
+    assert len(times) == plan.commands.speed.size
+    assert np.diff(times).tolist() == [round(1e9 / RATE_HZ)] * (len(times) - 1)
+    if plan.type_name.endswith("Stamped"):
+        stamps = [one.header.stamp.sec * 1_000_000_000 + one.header.stamp.nanosec for _, one in messages]
+        assert stamps == times
+
+
+def _check_limits(speed: Floats, turn: Floats, vehicle: Vehicle, plan: Plan, rounding: float = 1e-9) -> None:
+    limits = plan.limits
+    assert np.abs(speed).max() <= limits.speed_mps + rounding
+    assert (np.abs(turn) <= limit_yaw_rate(speed, vehicle, limits) + rounding).all()
+    assert np.abs(np.diff(speed, prepend=0.0)).max() <= limits.acceleration_mps2 / RATE_HZ + rounding
+    lead = round(LEAD_S * RATE_HZ)
+    assert not speed[:lead].any()
+    assert not turn[:lead].any()
+    assert np.abs(speed).max() > 0.1 * limits.speed_mps
+
+
+@pytest.mark.parametrize("type_name", list_types(steered=False))
+def test_the_official_reader_reads_body_commands_within_the_limits(
+    plan: Plan, tmp_path: Path, type_name: str
+) -> None:
+    toml, csv, mcap = write_plan(replace(plan, type_name=type_name), tmp_path / "plan")
+    (messages,) = _read(mcap).values()
+    _check_stamps(messages, replace(plan, type_name=type_name))
+    twists = [getattr(one, "twist", one) for _, one in messages]
+    speed, turn = np.array([t.linear.x for t in twists]), np.array([t.angular.z for t in twists])
+    _check_limits(speed, turn, _find("husky_a200"), plan)
     assert np.allclose(speed, np.loadtxt(csv, delimiter=",", skiprows=1)[:, 1], atol=1e-6)
     promised = read_promises(toml)
     assert [one.question for one in promised.promises] == [one.question for one in plan.promises]
+
+
+@pytest.mark.parametrize("type_name", list_types(steered=True))
+def test_the_official_reader_reads_steering_within_the_limits(
+    plan: Plan, tmp_path: Path, type_name: str
+) -> None:
+    car = _find("car")
+    limits = choose_limits(car)
+    commands = join([wait(LEAD_S), *(one.commands for one in list_manoeuvres(car, limits)[::7])])
+    driven = replace(plan, steered=True, type_name=type_name, wheels=None, commands=commands, limits=limits)
+    (messages,) = _read(write_plan(driven, tmp_path / "plan")[2]).values()
+    _check_stamps(messages, driven)
+    asked = [getattr(one, "drive", one) for _, one in messages]
+    # The fields are float32.
+    speed, turn = np.array([one.speed for one in asked]), np.array([one.steering_angle for one in asked])
+    assert np.allclose(speed, commands.speed, atol=1e-6)
+    _check_limits(speed, turn, car, driven, rounding=1e-6)
+
+
+def test_wheel_commands_on_two_topics_are_the_same_drive(plan: Plan, tmp_path: Path) -> None:
+    wheels = replace(plan, type_name=WHEELS, topic="/left_drive/velocity, /right_drive/velocity")
+    mcap = write_plan(wheels, tmp_path / "plan")[2]
+    found = _read(mcap)
+    assert set(found) == {"/left_drive/velocity", "/right_drive/velocity"}
+    for messages in found.values():
+        _check_stamps(messages, wheels)
+    left, right = (np.array([one.data for _, one in found[topic]]) for topic in sorted(found))
+    vehicle = _find("husky_a200")
+    assert vehicle.wheel_radius_m is not None
+    assert vehicle.track_width_m is not None
+    speed = 0.5 * vehicle.wheel_radius_m * (left + right)
+    turn = vehicle.wheel_radius_m * (right - left) / vehicle.track_width_m
+    _check_limits(speed, turn, vehicle, plan)
+    assert np.allclose(turn, plan.commands.turn, atol=1e-9)
+    played = read_played(mcap, find_vehicle("husky"))
+    assert np.allclose(played.speed_mps, plan.commands.speed, atol=1e-9)
+    assert np.allclose(played.time_s, plan.commands.times, atol=1e-9)
+    with pytest.raises(PlanError, match="cannot be written as"):
+        write_plan(replace(wheels, topic="/one"), tmp_path / "other")
+
+
+def test_a_plan_goes_where_the_log_was_commanded() -> None:
+    """Wheel topics are taken where they are known to be rad/s; else the vehicle's usual body command."""
+    warthog = _find("warthog")
+    pair = "/left_drive/velocity.data, /right_drive/velocity.data"
+    choices = {"choices": {"command": {"topic": pair, "type": WHEELS, "others": []}}}
+    assert choose_topic(warthog, choices, "gone.mcap") == (
+        "/left_drive/velocity, /right_drive/velocity",
+        WHEELS,
+    )
+    for source in ({"unit": "m/s"}, {"sign": -1}, {"per_turn": 400.0}):
+        topic, type_name = choose_topic(warthog, {**choices, "command_source": source}, "gone.mcap")
+        assert (topic, type_name) == ("/controller/cmd_vel", "geometry_msgs/msg/Twist")
+
+
+def test_other_protocols_are_timed_for_the_same_questions_within_the_same_limits() -> None:
+    vehicle = _find("husky_a200")
+    knowledge, limits = assume(vehicle), choose_limits(vehicle)
+    questions = ask_presence(knowledge, TURNING, find_largest(knowledge, limits, 60.0))
+    names = ("drive", "straight_and_circle")
+    drive, laps = compare_protocols(knowledge, questions, limits, names)
+    assert (drive.protocol, laps.protocol) == names
+    assert all(10.0 < second < 300.0 for second in drive.seconds)
+    # Once round takes longer than two random steps, and nothing turns before it.
+    assert drive.seconds[0] < laps.seconds[0]
+    with pytest.raises(PlanError, match="straight_and_circle"):
+        compare_protocols(knowledge, questions, limits, ["dance"])
 
 
 def test_a_plan_is_written_only_in_a_type_that_carries_its_commands(plan: Plan, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import stdtrit
 
 from pipeline.diagnosis import Named, RunDiagnosis, Value
 from pipeline.diagnosis.undecided import Undecided
@@ -17,7 +18,7 @@ from pipeline.plan import assume, check_plan
 from pipeline.plan.files import Promised
 from pipeline.plan.knowledge import Hypothesis
 from pipeline.plan.plan import Promise
-from pipeline.plan.questions import DECIDED_T, Answerable, Evidence, Groups, Separation
+from pipeline.plan.questions import DECIDED_T, Answerable, Evidence, Groups, Precision, Separation
 from pipeline.vehicles import find_preset
 
 
@@ -48,6 +49,20 @@ def test_a_decision_needs_several_stretches_however_large_one_is() -> None:
     even = Evidence(np.zeros((4, 0, 0)), np.zeros((4, 0)), np.full(4, 1e3), np.zeros((0, 0)))
     assert Answerable(question, (even,), groups).answer(np.ones(4)) == 1.0
     assert Answerable(question, (even,), groups).answer(np.array([1.0, 1.0, 0.0, 0.0])) < 1.0
+
+
+def test_an_interval_is_promised_only_where_few_blocks_would_show_it_too() -> None:
+    """The jackknife of few blocks scatters: simulated here, nineteen of twenty stay below the bound."""
+    model = Hypothesis((), (), np.zeros((0, 0)))
+    question = Precision("k", ("k",), model, 0, 1.0)
+    blocks = 10
+    evidence = Evidence(np.ones((blocks, 1, 1)), np.zeros((blocks, 1)), np.zeros(blocks), 1e-9 * np.eye(1))
+    one = Answerable(question, (evidence,), Groups(np.full(blocks, 7.0), np.arange(blocks)))
+    draws = np.random.default_rng(0).standard_normal((4000, blocks))
+    stated = stdtrit(blocks - 1.0, 0.975) * draws.std(axis=1, ddof=1) / np.sqrt(blocks)
+    every = np.ones(blocks)
+    assert np.mean(stated <= one.bound(every)) == pytest.approx(0.95, abs=0.01)
+    assert np.mean(stated <= one.measure(every)) < 0.65
 
 
 def test_draws_stay_inside_the_bounds_and_spread_as_is_known() -> None:
@@ -100,6 +115,7 @@ def _run(*arguments: str | Path, code: int = 0) -> str:
     return done.stdout if code == 0 else done.stderr
 
 
+@pytest.mark.long
 def test_a_plan_for_nothing_says_what_it_needs(tmp_path: Path) -> None:
     assert "--vehicle" in _run("plan", "--out", tmp_path / "plan", code=1)
     assert "this is no plan" not in _run("plan", "--check", tmp_path / "gone", "x.mcap", code=1)

@@ -45,12 +45,14 @@ def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
                 "equivalent_to": [],
                 "confused_with": ["wheel_radius"],
                 "sentence": "turns as if its wheels stood 1.93 m apart: or not; other ground tells",
+                "growth": make_growth("k", 0.05),
             },
             {
                 "id": "drive_lag",
                 "parameters": {"tau": {"value": 1.08, "low": 1.01, "high": 1.15, "unit": "s"}},
                 "gain": 0.31,
                 "equivalent_to": ["body_inertia"],
+                "growth": make_growth("tau", 0.07),
             },
         ],
         "undecided": [
@@ -75,6 +77,17 @@ def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
         "noise_floor": {"t_mrmse_m": 0.19, "r_mrmse_rad": 0.07},
         "explained_share": 0.86,
         "budget": [make_budget("slip", 1.87), make_budget("position", 1.12)],
+        "enough": "effective_track.k within 5% after 20 of 90 s of driving",
+    }
+
+
+def make_growth(name: str, last: float) -> dict[str, object]:
+    """Curves that begin without an interval and narrow with the square root of the time."""
+    seconds = [10.0 * count for count in range(1, 10)]
+    halves = [None, *(last * (90.0 / second) ** 0.5 for second in seconds[1:])]
+    return {
+        "evidence": {"seconds": seconds, "t": [0.1 * second for second in seconds]},
+        "parameters": {name: {"seconds": seconds, "half_width": halves}},
     }
 
 

@@ -11,9 +11,9 @@ from barriers import find_barriers
 
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.options import Options
-from pipeline.batch.catalogue import render_catalogue
 from pipeline.cli import main
 from pipeline.report import theme
+from pipeline.report.catalogue import render_catalogue
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 

@@ -301,7 +301,16 @@ def test_without_a_diagnosis_the_page_proposes_one_and_draws_no_model(report: Ru
     page = render_report(RunReport(report.summary, report.tables))
     drawn = {str(found["data-figure"]) for _, found in outline_of(page).tags if "data-figure" in found}
     signatures = {"signature-effective_track", "signature-drive_lag"}
-    of_models = {"ladder", "budget", "residuals", "autocorrelation", "crosscorrelation", "reach", *signatures}
+    of_models = {
+        "enough",
+        "ladder",
+        "budget",
+        "residuals",
+        "autocorrelation",
+        "crosscorrelation",
+        "reach",
+        *signatures,
+    }
     assert set(list_places()) - drawn == of_models
     assert "slip diagnose" in page
     assert "slip serve" not in page

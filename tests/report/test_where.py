@@ -7,35 +7,7 @@ from report_synthesis import make_report
 
 from pipeline.report import RunReport, render_report
 from pipeline.report.scene import Scene
-from pipeline.report.sections.where import find_regions, list_regions
-
-VERBS = ("Turning", "Driving")
-
-
-def make_slip(modulus: np.ndarray, *, f_x: np.ndarray, f_w: np.ndarray) -> pl.DataFrame:
-    return pl.DataFrame({"modulus": modulus, "f_x": f_x, "f_w": f_w}).with_columns(
-        transitory=pl.lit(value=False)
-    )
-
-
-def test_slip_in_fast_turns_is_told_as_such() -> None:
-    rng = np.random.default_rng(3)
-    f_w = rng.uniform(-2.0, 2.0, 5000)
-    turning = np.abs(f_w) > 1.5
-    slip = make_slip(np.where(turning, 2.0, 0.1), f_x=np.full(5000, 1.0), f_w=f_w)
-    regions = find_regions(slip, VERBS)
-    words, share, time = regions[0]
-    assert words in {"Turning faster than 1.4 rad/s", "Turning faster than 1.5 rad/s"}
-    assert share > 0.95
-    assert time == pytest.approx(turning.mean(), abs=0.06)
-
-
-def test_slip_that_is_the_same_everywhere_has_no_place() -> None:
-    rng = np.random.default_rng(4)
-    slip = make_slip(np.ones(5000), f_x=rng.uniform(-1, 1, 5000), f_w=rng.uniform(-2, 2, 5000))
-    assert find_regions(slip, VERBS) == []
-    assert find_regions(slip.with_columns(modulus=pl.lit(0.0)), VERBS) == []
-    assert find_regions(None, VERBS) == []
+from pipeline.report.sections.where import list_regions
 
 
 def test_where_is_what_the_screen_says() -> None:

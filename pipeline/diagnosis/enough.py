@@ -1,0 +1,92 @@
+"""Is the log long enough: intervals of numbers and evidence for names against the seconds that were used."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.identification.growth import INTERVAL_SHARE, find_goal, last_until
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.diagnosis.diagnosis import Json, Named
+    from pipeline.identification.growth import Curve
+
+_POINTS = 60
+# By less than this share the rest of a drive makes no interval narrower.
+_NO_NARROWER = 0.1
+# Where driving is all alike, a fifth of it is as little.
+_WORTH_SAYING = 0.25
+_DIGITS = 4
+
+
+@dataclass(frozen=True)
+class Growth:
+    """What was known of an effect by when.
+
+    Attributes:
+        evidence: t of its name, by which the loss on unseen data rises without it; None where it was not
+            searched for.
+        widths: half-width of the 95 % interval by parameter.
+    """
+
+    evidence: Curve | None
+    widths: Mapping[str, Curve]
+
+    def to_json(self) -> dict[str, Json]:
+        """Curves of at most sixty points each."""
+        return {
+            "evidence": None if self.evidence is None else _list_points(self.evidence, "t"),
+            "parameters": {name: _list_points(one, "half_width") for name, one in self.widths.items()},
+        }
+
+
+def _list_points(curve: Curve, name: str) -> dict[str, Json]:
+    places = np.unique(np.linspace(0, curve.seconds.size - 1, _POINTS).round().astype(int))
+    return {
+        "seconds": [round(float(one), 1) for one in curve.seconds[places]],
+        name: [float(f"{one:.{_DIGITS}g}") if math.isfinite(one) else None for one in curve.values[places]],
+    }
+
+
+def describe_enough(effects: Sequence[Named]) -> str:
+    """Since when the numbers of a diagnosis were known, and how much of the drive made no difference.
+
+    Returns:
+        A sentence or two; empty where nothing was named that grows with driving.
+    """
+    known, vague, needed, driven = [], [], 0.0, 0.0
+    for effect in effects:
+        for name, curve in () if effect.growth is None else effect.growth.widths.items():
+            value = effect.parameters.get(name)
+            if value is None or not math.isfinite(curve.values[-1]):
+                continue
+            label, half = f"{effect.id}.{name}", float(curve.values[-1])
+            goal = find_goal(effect.id, name, value.value)
+            since = last_until(curve, goal)
+            driven = max(driven, float(curve.seconds[-1]))
+            needed = max(needed, last_until(curve, half * (1.0 + _NO_NARROWER)))
+            if math.isfinite(since):
+                known.append((since, label))
+            else:
+                vague.append((half / goal * INTERVAL_SHARE, label))
+    if not known and not vague:
+        return ""
+    told = []
+    if known:
+        since, label = max(known)
+        who = label if len(known) == 1 else f"{len(known)} numbers"
+        told.append(f"{who} within {INTERVAL_SHARE:.0%} after {since:.0f} of {driven:.0f} s of driving")
+    if vague:
+        share, label = max(vague)
+        # Intervals narrow with the square root of the time.
+        more = driven * (share / INTERVAL_SHARE) ** 2
+        told.append(f"{label} within {share:.0%} only, {more / 60.0:.0f} min of such driving are needed")
+    idle = 1.0 - needed / driven
+    if idle >= _WORTH_SAYING:
+        told.append(f"the last {idle:.0%} of this drive made no interval narrower by a tenth")
+    return "; ".join(told)

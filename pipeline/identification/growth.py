@@ -1,0 +1,64 @@
+"""Curves of what is known against the seconds that were driven for it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.identification.intervals import narrow_part
+from pipeline.models.catalogue import find_effect
+
+if TYPE_CHECKING:
+    from pipeline.identification.fit import Fitted
+
+Floats = NDArray[np.float64]
+
+INTERVAL_SHARE = 0.05
+"""Of a number's size: half of a 95 % interval that is narrow enough."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Values by the seconds of driving behind them, both of shape (k,)."""
+
+    seconds: Floats
+    values: Floats
+
+
+def narrow_intervals(fitted: Fitted) -> dict[str, Curve]:
+    """Half-widths of the 95 % intervals of all smooth numbers of effects, by label ``effect.name``.
+
+    See `narrow_part`; numbers of one run alone are left out.
+    """
+    found: dict[str, Curve] = {}
+    for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
+        if not fit.free:
+            continue
+        seconds, halves = narrow_part(part, fit)
+        found |= {
+            number.label: Curve(seconds, halves[:, place])
+            for place, number in enumerate(fit.free)
+            if number.effect and number.run is None and number.is_smooth
+        }
+    return found
+
+
+def find_goal(effect: str, name: str, value: float) -> float:
+    """Half-width that is narrow enough for a number: a share of it, or of a usual one where it is smaller."""
+    parameter = find_effect(effect)().parameter(name)
+    neutral = parameter.neutral if math.isfinite(parameter.neutral) else 0.0
+    return INTERVAL_SHARE * max(abs(value), abs(parameter.typical - neutral))
+
+
+def last_until(curve: Curve, goal: float) -> float:
+    """Seconds after which a curve stays at or below a goal; infinite where it ends above it."""
+    above = np.flatnonzero(~(curve.values <= goal))
+    if above.size == 0:
+        return float(curve.seconds[0])
+    if above[-1] == curve.seconds.size - 1:
+        return math.inf
+    return float(curve.seconds[above[-1] + 1])

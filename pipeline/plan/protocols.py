@@ -1,0 +1,125 @@
+"""Other ways to drive, as commands within the same limits: what each would need for the same questions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.plan.errors import PlanError
+from pipeline.plan.limits import is_steered
+from pipeline.plan.manoeuvres import LEAD_S, hold_within, join, wait
+from pipeline.plan.plan import since_when
+from pipeline.plan.questions import Judge
+from pipeline.plan.rehearsal import Rehearsal
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from pipeline.plan.knowledge import Knowledge
+    from pipeline.plan.limits import Limits
+    from pipeline.plan.questions import Question
+    from pipeline.vehicles import Vehicle
+
+Floats = NDArray[np.float64]
+Stages = list[tuple[float, float, float]]
+
+LONGEST_S = 300.0
+"""A question that a protocol has not answered by then it does not answer."""
+_STEP_S = 6.0
+_HALF = 0.5
+
+
+@dataclass(frozen=True)
+class Needed:
+    """Seconds of a protocol until each question is answered; infinite where it is not, shape of questions."""
+
+    protocol: str
+    seconds: tuple[float, ...]
+
+
+def compare_protocols(
+    knowledge: Knowledge, questions: Sequence[Question], limits: Limits, names: Sequence[str], seed: int = 0
+) -> list[Needed]:
+    """How long each protocol would have to be driven; none is held to an area.
+
+    Args:
+        knowledge: where they start from.
+        questions: to answer.
+        limits: of the vehicle, the same for all.
+        names: of `PROTOCOLS`.
+        seed: of those that are drawn.
+
+    Raises:
+        PlanError: ``unknown_protocol``.
+    """
+    found = []
+    for name in names:
+        if name not in PROTOCOLS:
+            raise PlanError(
+                "unknown_protocol",
+                f"no protocol is called {name!r}",
+                where="--compare",
+                hint=f"Give some of {', '.join(PROTOCOLS)}.",
+            )
+        stages = PROTOCOLS[name](limits, knowledge.vehicle, np.random.default_rng(seed))
+        commands = join([wait(LEAD_S), hold_within(stages, knowledge.vehicle, limits)])
+        begins = LEAD_S + np.cumsum([0.0, *(seconds for _, _, seconds in stages[:-1])])
+        rehearsal = Rehearsal(commands, knowledge.vehicle, knowledge.senses, begins)
+        edges = np.arange(0.0, commands.duration_s + 1.0)
+        judged = Judge(rehearsal, knowledge, edges, stretches=True).judge(questions)
+        found.append(Needed(name, tuple(since_when(one, edges) for one in judged)))
+    return found
+
+
+def _drive(limits: Limits, _: Vehicle, generator: np.random.Generator) -> Stages:
+    """Random steps of six seconds out of the whole command space (DRIVE; Baril et al., 2024)."""
+    count = round(LONGEST_S / _STEP_S)
+    speeds = generator.uniform(-limits.speed_mps, limits.speed_mps, count).tolist()
+    turns = generator.uniform(-limits.turn, limits.turn, count).tolist()
+    return [(speed, turn, _STEP_S) for speed, turn in zip(speeds, turns, strict=True)]
+
+
+def _human(limits: Limits, _: Vehicle, generator: np.random.Generator) -> Stages:
+    """A person who drives about: mostly ahead at half speed, turning a little, every two to six seconds."""
+    stages: Stages = []
+    while sum(stage[2] for stage in stages) < LONGEST_S:
+        speed = float(np.clip(generator.normal(0.4, 0.3), -1.0, 1.0)) * limits.speed_mps
+        turn = float(np.clip(generator.normal(0.0, 0.4), -1.0, 1.0)) * limits.turn
+        stages.append((speed, turn, float(generator.uniform(2.0, 6.0))))
+    return stages
+
+
+def _straight_and_circle(limits: Limits, vehicle: Vehicle, _: np.random.Generator) -> Stages:
+    """Ahead, back, once round to the left and once to the right, at half speed, again and again."""
+    speed, around = _HALF * limits.speed_mps, _round_s(limits, vehicle)
+    lap = [
+        (speed, 0.0, 10.0),
+        (-speed, 0.0, 10.0),
+        (speed, _HALF * limits.turn, around),
+        (speed, -_HALF * limits.turn, around),
+    ]
+    return lap * math.ceil(LONGEST_S / (20.0 + 2.0 * around))
+
+
+def _eights(limits: Limits, vehicle: Vehicle, _: np.random.Generator) -> Stages:
+    """Once round to the left and once to the right at half speed."""
+    speed, around = _HALF * limits.speed_mps, _round_s(limits, vehicle)
+    lap = [(speed, _HALF * limits.turn, around), (speed, -_HALF * limits.turn, around)]
+    return lap * math.ceil(LONGEST_S / (2.0 * around))
+
+
+def _round_s(limits: Limits, vehicle: Vehicle) -> float:
+    """Seconds of once round at half of the largest turn; of a steering angle, which says none, twenty."""
+    return 20.0 if is_steered(vehicle) else 2.0 * math.pi / (_HALF * limits.turn)
+
+
+PROTOCOLS: Mapping[str, Callable[[Limits, Vehicle, np.random.Generator], Stages]] = {
+    "drive": _drive,
+    "human": _human,
+    "straight_and_circle": _straight_and_circle,
+    "eights": _eights,
+}

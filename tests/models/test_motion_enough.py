@@ -1,0 +1,99 @@
+"""Is the log long enough: curves end at what is stated, and say what a shorter log would have said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from motion_runs import simulate, vehicle_of
+
+from pipeline.diagnosis import Named, Value
+from pipeline.diagnosis.enough import Growth, describe_enough
+from pipeline.diagnosis.verdict import compare, grow_t
+from pipeline.identification import Fitted, Input, Problem, estimate_intervals, fit_model
+from pipeline.identification.folds import hold_out_part, make_folds
+from pipeline.identification.growth import Curve, last_until, narrow_intervals
+from pipeline.identification.intervals import narrow_part
+from pipeline.models import Model, find_effect
+from pipeline.runs.cut import cut_run, find_driven
+
+HUSKY = vehicle_of("husky_a200")
+TRUTH = {"effective_track": 1.7, "icr_offset": 0.1, "drive_lag": 0.3}
+MODEL = Model(HUSKY, tuple(find_effect(name)() for name in TRUTH))
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Fitted:
+    return fit_model(Problem([simulate(TRUTH, duration_s=180.0)], HUSKY, Input.COMMAND), MODEL, exact=True)
+
+
+def test_the_last_width_is_the_stated_interval(fitted: Fitted) -> None:
+    stated = {
+        item.free.label: 0.5 * (item.high - item.low)
+        for item in estimate_intervals(fitted.problem, fitted).items
+    }
+    curves = narrow_intervals(fitted)
+    assert set(curves) == {"effective_track.k", "icr_offset.x_icr", "drive_lag.tau"}
+    for label, curve in curves.items():
+        assert curve.values[-1] == pytest.approx(stated[label], rel=1e-9)
+        assert np.isinf(curve.values[0])
+        assert (np.diff(curve.seconds) > 0.0).all()
+    # Independent blocks narrow with the square root of the time: four times as many to a half.
+    falls = [curve.values[-1] / curve.values[curve.values.size // 4] for curve in curves.values()]
+    assert 0.3 < np.exp(np.mean(np.log(falls))) < 0.75
+
+
+def test_a_width_on_the_way_is_that_of_a_log_that_ended_there(fitted: Fitted) -> None:
+    run = fitted.problem.runs[0]
+    short = Problem([cut_run(run, end_s=find_driven(run, 90.0))], HUSKY, Input.COMMAND)
+    ended = narrow_intervals(fit_model(short, MODEL, exact=True))
+    ratios = []
+    for label, curve in narrow_intervals(fitted).items():
+        place = np.searchsorted(curve.seconds, float(ended[label].seconds[-1]) - 3.5)
+        ratios.append(curve.values[place] / ended[label].values[-1])
+    assert np.all(np.abs(np.log(ratios)) < np.log(1.6))
+
+
+def test_all_blocks_in_another_order_end_at_the_same_width(fitted: Fitted) -> None:
+    part, fit = fitted.problem.parts[0], fitted.fits[0]
+    seconds, halves = narrow_part(part, fit)
+    other, turned = narrow_part(part, fit, np.arange(seconds.size)[::-1].tolist())
+    assert other[-1] == pytest.approx(seconds[-1])
+    assert turned[-1] == pytest.approx(halves[-1], rel=1e-6)
+    assert not np.allclose(turned[3], halves[3])
+
+
+def test_evidence_grows_to_the_verdict(fitted: Fitted) -> None:
+    part, fit = fitted.problem.parts[0], fitted.fits[0]
+    without = fit_model(fitted.problem, Model(HUSKY, tuple(e for e in MODEL.effects if e.id != "icr_offset")))
+    folds = make_folds(part)
+    before, after = hold_out_part(without.fits[0], folds), hold_out_part(fit, folds)
+    seconds, t = grow_t(part, fit.weights, before, after)
+    assert t[-1] == compare(part, fit.weights, before, after).t
+    assert t[-1] > 2.0 * t[t.size // 6] > 0.0 or t[t.size // 6] == 0.0
+    assert seconds[-1] == pytest.approx(180.0, abs=10.0)
+
+
+def test_a_curve_counts_from_where_it_stays_below() -> None:
+    curve = Curve(np.array([10.0, 20.0, 30.0, 40.0]), np.array([np.inf, 0.04, 0.06, 0.05]))
+    assert last_until(curve, 0.05) == 40.0
+    assert last_until(curve, 0.06) == 20.0
+    assert np.isinf(last_until(curve, 0.04))
+
+
+def _name(half: list[float]) -> Named:
+    curve = Curve(10.0 * np.arange(1.0, len(half) + 1.0), np.array(half))
+    value = Value(1.5, 1.5 - half[-1], 1.5 + half[-1], "1")
+    return Named(
+        "effective_track", {"k": value}, 0.5, (), (), corrected=False, way="command", selected=1.0, motion="",
+        growth=Growth(None, {"k": curve}),
+    )  # fmt: skip
+
+
+def test_words_say_since_when_how_narrow_and_what_was_idle() -> None:
+    idle = describe_enough([_name([0.2, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05])])
+    assert "effective_track.k within 5% after 20 of 100 s" in idle
+    assert "last 80% of this drive made no interval narrower" in idle
+    vague = describe_enough([_name([0.9, 0.6, 0.3])])
+    assert "within 20% only" in vague
+    assert "min of such driving" in vague
+    assert describe_enough([]) == ""
