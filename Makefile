@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: ablate hidden-effect hidden-table inject mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs few-shot fleets format fuzz inspect lock log-seconds map pictures plan-compare plan-game platforms samples \
+.PHONY: ablate detection hidden-effect hidden-table inject mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs few-shot fleets format fuzz inspect lock log-seconds map pictures plan-compare plan-game platforms samples \
 	serve test test-long trend wheel
 
 help: ## print this list
@@ -142,6 +142,9 @@ few-shot: $(VENV)/.ready-dev ## a terrain of OUT left out: error of what the fle
 
 fleets: $(VENV)/.ready-dev ## simulated fleets: is what is hidden said to be the vehicle's, the ground's, a run's [ARGS="--fleets 4"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/fleets.py $$ARGS
+
+detection: $(VENV)/.ready-dev ## how large an effect must be to be seen, against what the diagnosis says [ARGS="--seeds 0-20"]
+	$(BIN)/python benchmarks/detection.py $$ARGS
 
 inject: $(VENV)/.ready-dev ## faults and effects injected into the real recordings: recovered, told, missed [ARGS="--logs sand"]
 	$(BIN)/python benchmarks/inject.py $$ARGS

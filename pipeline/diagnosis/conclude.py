@@ -119,6 +119,7 @@ def summarize(
         immaterial=immaterial,
         undecided=tuple(undecided),
         unobservable=tuple(unobservable.values()),
+        detectable=tuple(one for way in ways for one in way.detectable if one.id not in hidden),
         unexplained=unexplained,
         findings=(
             *_note_cut(body.search.selection.budget),

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from pipeline.diagnosis.context import Context
-    from pipeline.diagnosis.excitation import Unobservable
+    from pipeline.diagnosis.excitation import Detectable, Unobservable
     from pipeline.diagnosis.subject import Recording
     from pipeline.diagnosis.undecided import Undecided
     from pipeline.identification import InputChoice
@@ -45,12 +45,14 @@ class Explored:
         search: the search, its final model with formula terms where they serve better.
         undecided: rivals of what was named.
         unobservable: what this way could not tell.
+        detectable: how large what was not named would have had to be.
         explainable: what can still be predicted; None where it was not asked.
     """
 
     search: Search
     undecided: tuple[Undecided, ...]
     unobservable: tuple[Unobservable, ...]
+    detectable: tuple[Detectable, ...]
     explainable: Explainable | None
 
 
@@ -117,22 +119,18 @@ def _explore_body(context: Context, source: Input, known: Sequence[Effect], budg
     features, _ = describe_windows(comparisons)
     explainable = boost_residuals(found.selection, final, features)
     found = replace(found, final=final)
-    return Explored(
-        found,
-        tuple(find_undecided(found.selection, final)),
-        tuple(find_unobservable(found.selection, final)),
-        explainable,
-    )
+    return _gather(found, explainable)
 
 
 def _explore_wheels(context: Context, known: Sequence[Effect], body: Search, budget: Budget) -> Explored:
     found = search_wheels(context, known, body, budget)
-    return Explored(
-        found,
-        tuple(find_undecided(found.selection, found.final)),
-        tuple(find_unobservable(found.selection, found.final)),
-        None,
-    )
+    return _gather(found, None)
+
+
+def _gather(found: Search, explainable: Explainable | None) -> Explored:
+    undecided = find_undecided(found.selection, found.final)
+    unobservable, detectable = find_unobservable(found.selection, found.final)
+    return Explored(found, tuple(undecided), tuple(unobservable), tuple(detectable), explainable)
 
 
 def _conclude(

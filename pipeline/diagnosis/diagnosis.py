@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from pipeline.diagnosis.enough import Growth
     from pipeline.diagnosis.error_regions import Region
-    from pipeline.diagnosis.excitation import Unobservable
+    from pipeline.diagnosis.excitation import Detectable, Unobservable
     from pipeline.diagnosis.materiality import Moves
     from pipeline.diagnosis.undecided import Undecided
     from pipeline.identification.apportion import Share, SlipBudget
@@ -198,6 +198,7 @@ class RunDiagnosis:
         immaterial: what is missing, too, but moves no prediction so far that it would be felt.
         undecided: explanations that are as good as each other.
         unobservable: what this log could not tell.
+        detectable: how large the other effects that are not named would have had to be to be seen.
         unexplained: structure without a name; None without.
         findings: what the stages and the diagnosis noticed.
         ladder: rungs with their held-out errors.
@@ -221,6 +222,7 @@ class RunDiagnosis:
     immaterial: tuple[Named, ...] = ()
     undecided: tuple[Undecided, ...] = ()
     unobservable: tuple[Unobservable, ...] = ()
+    detectable: tuple[Detectable, ...] = ()
     unexplained: Unexplained | None = None
     findings: tuple[Mapping[str, Json], ...] = ()
     ladder: tuple[Mapping[str, Json], ...] = ()
@@ -257,6 +259,15 @@ class RunDiagnosis:
             "unobservable_why": {
                 item.id: {"reason": item.reason, "manoeuvre": item.manoeuvre} for item in self.unobservable
             },
+            "detectable": [
+                {
+                    "effect": one.id,
+                    "parameter": one.parameter,
+                    "size": _clean(one.size),
+                    "unit": one.unit,
+                }
+                for one in self.detectable
+            ],
             "unexplained": None if self.unexplained is None else self.unexplained.to_json(),
             "findings": list(self.findings),
             "ladder": list(self.ladder),

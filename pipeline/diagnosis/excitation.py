@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.diagnosis.verdict import LEAST_STRETCHES, SHORT_S
 from pipeline.identification.parts import number_units
-from pipeline.models.effect import Excitation
+from pipeline.models.effect import Excitation, Search
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 _STANDARD_ERRORS = 4.0
+_DETECTED = 9.0
+"""Standard errors at which nine of ten hidden effects are found (`benchmarks/detection.py`)."""
 
 MANOEUVRES: Mapping[Excitation, str] = {
     Excitation.DRIVING: "drive for a few minutes",
@@ -52,12 +55,34 @@ class Unobservable:
     manoeuvre: str
 
 
-def find_unobservable(selection: Selection, final: CandidateModel) -> list[Unobservable]:
+@dataclass(frozen=True)
+class Detectable:
+    """What an effect that was not named would have had to be to be seen in this log.
+
+    Attributes:
+        id: of the effect.
+        parameter, unit: its number.
+        size: distance of the number from where the effect does nothing.
+    """
+
+    id: str
+    parameter: str
+    unit: str
+    size: float
+
+
+def find_unobservable(
+    selection: Selection, final: CandidateModel
+) -> tuple[list[Unobservable], list[Detectable]]:
     """Candidates of which a usual size would move the prediction by less than four standard errors.
 
     Neither can be told what shows but once: an event of its own would look the same.
+
+    Returns:
+        What could not be told, and how large the other effects that are linear in one number would have had
+        to be.
     """
-    found = []
+    found, seen = [], []
     for candidate in selection.candidates:
         if final.state.find(candidate.id) is not None:
             continue
@@ -65,12 +90,25 @@ def find_unobservable(selection: Selection, final: CandidateModel) -> list[Unobs
         alone, beside = _evidence(selection, final, column)
         rare = _count_stretches(selection, column) < LEAST_STRETCHES
         if beside >= _STANDARD_ERRORS and not rare:
+            seen += _find_detectable(candidate().make_usual(selection.largest), beside)
             continue
         reason: Literal["no excitation", "collinear with what was named"] = (
             "no excitation" if alone < _STANDARD_ERRORS or rare else "collinear with what was named"
         )
         found.append(Unobservable(candidate.id, reason, suggest_manoeuvre(candidate())))
-    return found
+    return found, seen
+
+
+def _find_detectable(usual: Effect, standard_errors: float) -> list[Detectable]:
+    """The size of an effect of one number that would be seen; its motion grows with it."""
+    (parameter, *more) = usual.parameters
+    distance = abs(usual.values[parameter.name] - parameter.neutral)
+    if more or parameter.search is not Search.DIRECT or not math.isfinite(distance):
+        return []
+    size = distance * _DETECTED / standard_errors
+    if parameter.least is not None:
+        size = max(size, parameter.least.size)
+    return [Detectable(usual.id, parameter.name, parameter.unit, size)]
 
 
 def suggest_manoeuvre(*effects: Effect) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 from pipeline.diagnosis.enough import describe_enough
 from pipeline.diagnosis.materiality import describe_threshold
+from pipeline.models.catalogue import find_effect
 from pipeline.runs.windows import HORIZON_S
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ _LABEL = 10
 _SENTENCE = 90
 _WHERE_SHOWN = 3
 _UNOBSERVABLE_SHOWN = 8
+_DETECTABLE_SHOWN = 5
 _WAYS = {"command": "from the command", "measured": "from the measured wheels"}
 
 
@@ -77,7 +79,8 @@ def _list_shared(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
     lines += _label("budget", _describe_budget(diagnosis))
     enough = describe_enough(diagnosis.effects)
     lines += _label("enough", [enough] if enough else [])
-    return [*lines, *_label("below", _describe_immaterial(diagnosis)), *_describe_unobservable(diagnosis)]
+    lines += _label("below", _describe_immaterial(diagnosis))
+    return [*lines, *_describe_unobservable(diagnosis), *_label("excluded", _describe_detectable(diagnosis))]
 
 
 def _label(label: str, texts: Sequence[str]) -> list[tuple[str, str]]:
@@ -178,6 +181,19 @@ def _describe_unobservable(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
         ("cannot", f"tell of {shown}{more} from this log"),
         ("", f"to see them: {'; '.join(manoeuvres[:3])}"),
     ]
+
+
+def _describe_detectable(diagnosis: RunDiagnosis) -> list[str]:
+    """What would have been seen had it been there: the effects that the log tells of most sharply."""
+    usual = {one.id: find_effect(one.id)().parameter(one.parameter) for one in diagnosis.detectable}
+    sharpest = sorted(
+        diagnosis.detectable, key=lambda one: one.size / abs(usual[one.id].typical - usual[one.id].neutral)
+    )
+    shown = [
+        f"{one.id} {100.0 * one.size:.2g} %" if one.unit == "1" else f"{one.id} {one.size:.2g} {one.unit}"
+        for one in sharpest[:_DETECTABLE_SHOWN]
+    ]
+    return [f"what is larger than {', '.join(shown)}"] if shown else []
 
 
 def _grave(diagnosis: RunDiagnosis) -> list[Mapping[str, Json]]:

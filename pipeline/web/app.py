@@ -225,7 +225,8 @@ def build_app(
 
 def _load_heavy() -> None:
     """Load what the first fit needs while somebody still looks for a run."""
-    import_module("scipy.stats")
+    for name in ("scipy.signal", "scipy.special"):
+        import_module(name)
 
 
 def _serve_own(package: str, name: str, kind: str) -> Answer:
