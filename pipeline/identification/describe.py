@@ -110,7 +110,7 @@ def list_parameters(file: ModelFile) -> dict[str, dict[str, object]]:
     """Every parameter of a model file by ``effect.name``, with the intervals of its last fit."""
     parameters = parameters_as_json(file.model, NOT_FITTED)
     for label, (low, high) in file.intervals.items():
-        parameters[label] |= {"low": low, "high": high}
+        parameters[label] |= {"low": _round(low), "high": _round(high)}
     return parameters
 
 
