@@ -198,8 +198,13 @@ class Diagnosis:
 
     def _repr_html_(self) -> str:
         texts = [self.sentences[label.partition(".")[0]] for label in self.parameters["parameter"]]
-        notes = [text for label, text in self._lines if label in {"error", "cannot", "findings"}]
-        title = f"{self._content['run']}: missing {', '.join(self.effects) or 'nothing'}"
+        notes, part = [], ""
+        for label, text in self._lines:
+            part = label or part
+            is_in_table = part == "missing" and text.startswith((" ", *self.effects))
+            if part in {"error", "missing", "cannot", "findings"} and not is_in_table:
+                notes.append(" ".join(f"{label} {text}".split()))
+        title = f"{self._content['run']}: {', '.join(self.effects) or 'no effect'} named as missing"
         return write_html(
             title, self.parameters.with_columns(sentence=pl.Series(texts, dtype=pl.String)), notes
         )
