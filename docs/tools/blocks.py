@@ -37,7 +37,7 @@ PATIENCE_S = 1800.0
 LOSSY = 3
 
 _BLOCK = re.compile(r"^```(console|pycon)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-_PROMPTS = {"console": ("$ ", "$ "), "pycon": (">>> ", "... ")}
+_PROMPTS = {"console": ("$ ", ()), "pycon": (">>> ", ("... ", "...\n"))}
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])")
 _HASH = re.compile(r"\b[0-9a-f]{12,}\b")
 _NEAR = {"rel_tol": 0.1, "abs_tol": 0.03}
@@ -93,7 +93,7 @@ def read_commands(text: str) -> list[Command]:
                     found.append(Command(typed, tuple(shown), start, place - len(line), block[1] == "pycon"))
                 typed, shown, start = line.removeprefix(first).rstrip(), [], place
             elif typed and not shown and line.startswith(more):
-                typed, start = f"{typed}\n{line.removeprefix(more).rstrip()}", place
+                typed, start = f"{typed}\n{line[4:].rstrip()}", place
             elif typed:
                 shown.append(line.rstrip("\n"))
             else:

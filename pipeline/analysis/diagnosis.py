@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.analysis.geometry import agree_on_vehicle
 from pipeline.analysis.keys import hash_json
+from pipeline.analysis.options import INPUTS
 from pipeline.analysis.work import stored_keys
 from pipeline.core.errors import SlipError
 
@@ -75,12 +76,15 @@ def diagnose_work(work: Work) -> dict[str, JSON] | None:
 
 
 def read_diagnosis(manifest: Manifest) -> dict[str, object] | None:
-    """What `diagnose_work` kept with a run; None where it is not there, of another version, or named nothing.
+    """What `diagnose_work` kept with a run: the object of ``slip diagnose --json``, and its lines.
 
-    Of a log too poor to diagnose it holds no ``input``: who asks again is told why.
+    Returns:
+        None where it is not there, of another version, not of both inputs, or of a log too poor to diagnose:
+        who asks again is told why.
     """
     keys = stored_keys(manifest)
-    if "slip" not in keys or not has_diagnosis(manifest, key_diagnosis(keys)):
+    is_whole = "slip" in keys and manifest.details.get("inputs") == list(INPUTS)
+    if not is_whole or not has_diagnosis(manifest, key_diagnosis(keys)):
         return None
     content = manifest.read_json(DIAGNOSIS)
     return {**content, **read_choices(manifest)} if "input" in content else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -93,8 +94,11 @@ class Model:
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Read a model file; Python that it names runs only where it was trusted (`slip model trust`)."""
-        return cls.of(read_model(Path(path)))
+        """Read a model file; Python that it names runs only where it was trusted, else a warning says so."""
+        file = read_model(Path(path))
+        for text in file.warnings:
+            warnings.warn(text, stacklevel=2)
+        return cls.of(file)
 
     def write(self, path: str | Path) -> None:
         """Write it as a model file."""

@@ -146,7 +146,8 @@ class Run:
         facts = [self.name, self.vehicle.name, str(self.summary["terrain"])]
         duration, distance = number_in(log, "duration_s"), number_in(self.summary, "distance_m")
         facts += [] if duration is None else [say_duration(duration)]
-        return ", ".join([*facts, *([] if distance is None else [say_distance(distance)])])
+        facts += [] if distance is None else [say_distance(distance)]
+        return ", ".join(facts if log.get("complete") else [*facts, "the log has losses"])
 
     def _repr_html_(self) -> str:
         slip = mapping_in(self.summary, "by_input")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import polars as pl
@@ -16,7 +17,6 @@ from pipeline.simulate import simulate_case
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
 EFFECT = "effective_track"
 
@@ -92,7 +92,9 @@ def test_a_fit_is_that_of_the_command_line(
     assert set(told) - set(content) == {"model", "prior", "carried_over", "warnings"}
     assert fit.errors == told["by_run"][run.name]
     assert slip.Model.read(path).parameters.equals(fit.model.parameters)
-    assert fit.model.export("python") == slip.Model.read(path).export("python")
+    fit.model.write(tmp_path / "again.toml")
+    assert (tmp_path / "again.toml").read_text() == path.read_text()
+    assert slip.Model.read(path).export("python").startswith('"""')
 
     compared = ask(run, capsys, "model", "compare", str(path), str(path), "--on", run.name)["compared"][0]
     errors = fit.model.errors(run)
@@ -159,6 +161,21 @@ def test_what_is_wrong_is_said_in_one_line(
     (shown,) = error.value._render_traceback_()
     assert line in shown
     assert "\n" not in shown
+
+
+def test_what_a_model_leaves_out_and_a_log_lost_is_said(run: slip.Run, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("raise RuntimeError\n")
+    model = tmp_path / "husky.toml"
+    model.write_text('effects = ["mine.py"]\n[vehicle]\npreset = "husky_a200"\n')
+    with pytest.warns(UserWarning, match="not trusted is not run"):
+        slip.Model.read(model)
+
+    log = run.summary["log"]
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(Path(str(log["path"])).read_bytes()[: 3 * int(log["bytes"]) // 4])  # type: ignore[index]
+    with_losses = slip.analyze(cut, out=tmp_path / "results", report=False, diagnosis=False)
+    assert repr(with_losses).endswith("the log has losses")
+    assert "losses" not in repr(run)
 
 
 def test_the_name_alone_loads_nothing_and_verbs_do_without_it() -> None:
