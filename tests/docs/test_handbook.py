@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 import shlex
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 import pytest
-from blocks import find_difference, list_pages, open_session, read_commands
+from blocks import find_difference, list_pages, read_commands
 from effects_pages import list_settings
 from reference import list_verbs, write_reference
 
@@ -159,18 +158,6 @@ def test_the_readme_answers_first_and_its_links_lead_somewhere() -> None:
 )
 def test_other_words_and_other_numbers_are_noticed(shown: str, printed: str, *, differs: bool) -> None:
     assert bool(find_difference(tuple(shown.splitlines()), printed)) == differs
-
-
-def test_python_of_a_page_is_one_session(tmp_path: Path) -> None:
-    text = (
-        "```pycon\n>>> for k in (1, 2):\n...     print(k)\n...\n1\n2\n```\nand\n```pycon\n>>> k + 1\n3\n```\n"
-    )
-    commands = read_commands(text)
-    with open_session(tmp_path) as run:
-        assert [find_difference(command.shown, run(command)) for command in commands] == ["", ""]
-        assert [command.shown for command in commands] == [("1", "2"), ("3",)]
-        with pytest.raises(RuntimeError, match="missing"):
-            run(replace(commands[0], text="missing"))
 
 
 def test_a_block_that_begins_with_no_command_is_refused() -> None:

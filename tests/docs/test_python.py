@@ -1,21 +1,35 @@
-"""The notebooks run from the first cell to the last, and show what their words say."""
+"""Python of the handbook is run as one session; notebooks run from the first cell to the last."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import nbformat
 import pytest
+from blocks import find_difference, open_session, read_commands
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 SAID = {
     "first_log": "wheel_separation_multiplier: 1.7985",
-    "hidden_effect": "missing wheel_asymmetry",
+    "hidden_effect": "wheel_asymmetry named as missing",
     "own_effect": "mine.k",
 }
+
+
+def test_python_of_a_page_is_one_session(tmp_path: Path) -> None:
+    text = (
+        "```pycon\n>>> for k in (1, 2):\n...     print(k)\n...\n1\n2\n```\nand\n```pycon\n>>> k + 1\n3\n```\n"
+    )
+    commands = read_commands(text)
+    with open_session(tmp_path) as run:
+        assert [find_difference(command.shown, run(command)) for command in commands] == ["", ""]
+        assert [command.shown for command in commands] == [("1", "2"), ("3",)]
+        with pytest.raises(RuntimeError, match="missing"):
+            run(replace(commands[0], text="missing"))
 
 
 def test_each_notebook_is_stored_without_outputs() -> None:
