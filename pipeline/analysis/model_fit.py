@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from pipeline.identification.inputs import InputChoice
     from pipeline.identification.judgement import Judgement
     from pipeline.identification.scoring import Errors
-    from pipeline.identification.transfer import Transfer
     from pipeline.models.model_file import ModelFile
     from pipeline.runs.recording import MotionRun
     from pipeline.store import Manifest
@@ -141,16 +140,3 @@ def fit_to_runs(
     if after.model.effects != before.model.effects:
         new = judge_model(problem, after.model, per_run=after.per_run)
     return ModelFit(note_fit(after, new), old, new, chosen)
-
-
-def transfer_as_json(item: Transfer) -> dict[str, object]:
-    """A model on a run that it was not fitted on, as in `slip model compare --json`."""
-    return {
-        "run": item.run,
-        "terrain": item.terrain,
-        "carried": errors_as_json(item.carried.pooled),
-        "own_fit": errors_as_json(item.own.pooled),
-        "ideal": errors_as_json(item.ideal.pooled),
-        "ratio": item.ratio,
-        "warning": item.warning,
-    }

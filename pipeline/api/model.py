@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Self
 import polars as pl
 from threadpoolctl import threadpool_limits
 
-from pipeline.analysis.model_fit import fit_to_runs, read_runs, transfer_as_json
+from pipeline.analysis.model_fit import fit_to_runs, read_runs
 from pipeline.api.shown import tabulate_ladder, tabulate_parameters, write_html
 from pipeline.identification.describe import (
     describe_ladder,
@@ -26,7 +26,6 @@ from pipeline.models import Model as MotionModel
 from pipeline.models.export import export_model, read_current
 from pipeline.models.formula.formula_effect import CHANNELS, FormulaEffect, make_parameter
 from pipeline.report import RunReport, make_charts
-from pipeline.report.run import mapping_in, number_in
 from pipeline.runs import MotionError
 from pipeline.vehicles import Vehicle, resolve_vehicle
 from pipeline.vehicles.configuration import VehicleSection
@@ -42,7 +41,7 @@ if TYPE_CHECKING:
 
     Source = Literal["command", "measured"]
 
-_ROWS = {"as it is": "carried", "fitted to this run": "own_fit", "ideal": "ideal"}
+_OVER_2S = ("t_mrmse_m", "r_mrmse_rad")
 
 
 def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Effect:
@@ -150,12 +149,14 @@ class Model:
         file, read = self._read(runs, vehicle_of)
         source = choose_input(read, input, file.model, last=file.last_input).source
         with threadpool_limits(1):
-            found = [transfer_as_json(item) for item in carry_over(file.model, read, source)]
-        keys = ("t_mrmse_m", "r_mrmse_rad")
-        return pl.DataFrame(
-            {"run": one["run"], "model": of, **{key: number_in(mapping_in(one, part), key) for key in keys}}
-            for one in found for of, part in _ROWS.items()
-        )  # fmt: skip
+            found = carry_over(file.model, read, source)
+        rows = []
+        for item in found:
+            judged = {"as it is": item.carried, "fitted to this run": item.own, "ideal": item.ideal}
+            for words, held_out in judged.items():
+                errors = errors_as_json(held_out.pooled)
+                rows.append({"run": item.run, "model": words, **{key: errors[key] for key in _OVER_2S}})
+        return pl.DataFrame(rows)
 
     def export(self, to: str, *, current: str | Path | None = None) -> str:
         """Its values as parameters of what people run, as `slip model export` writes them.

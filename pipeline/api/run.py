@@ -151,9 +151,9 @@ class Run:
 
     def _repr_html_(self) -> str:
         slip = mapping_in(self.summary, "by_input")
-        keys = ("median_modulus", "median_window_norm")
+        keys = {"median modulus [m/s]": "median_modulus", "2 s window norm": "median_window_norm"}
         rows = [
-            {"slip on": name, **{key: number_in(mapping_in(slip, name), key) for key in keys}}
+            {"slip on": name, **{head: number_in(mapping_in(slip, name), key) for head, key in keys.items()}}
             for name in slip
         ]
         notes = [f"! {one['text']}" for one in self.findings if one.get("severity") != "info"]

@@ -357,9 +357,18 @@ def _terrains(file: ModelFile) -> list[str]:
 
 
 def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
-    from pipeline.analysis.model_fit import transfer_as_json  # noqa: PLC0415 - heavy
+    from pipeline.identification.describe import errors_as_json  # noqa: PLC0415 - heavy
 
-    return {"model": name, **transfer_as_json(item)}
+    return {
+        "model": name,
+        "run": item.run,
+        "terrain": item.terrain,
+        "carried": errors_as_json(item.carried.pooled),
+        "own_fit": errors_as_json(item.own.pooled),
+        "ideal": errors_as_json(item.ideal.pooled),
+        "ratio": item.ratio,
+        "warning": item.warning,
+    }
 
 
 def _describe(fit: ModelFit) -> list[str]:
