@@ -18,7 +18,6 @@ from pipeline.api.shown import tabulate_ladder, tabulate_parameters, write_html
 from pipeline.diagnosis.budget import parse_budget
 from pipeline.report import RunReport, make_charts, view_diagnosis
 from pipeline.report.diagnosed import read_model_text
-from pipeline.report.figures.figure import Section
 from pipeline.report.motion_run import load_vehicle
 from pipeline.report.run import mapping_in, number_in, objects_in
 from pipeline.report.words import say_distance, say_duration
@@ -103,7 +102,7 @@ class Run:
 
     def figures(self) -> dict[str, Chart]:
         """The figures of its report by id."""
-        return self._draw(mapping_in(self.summary, "diagnosis"), list(Section))
+        return self._draw(mapping_in(self.summary, "diagnosis"))
 
     def diagnose(
         self,
@@ -133,13 +132,13 @@ class Run:
                     vehicle_of,
                     None if budget is None else parse_budget(budget),
                 )
-        return Diagnosis(found, lambda: self._draw(found, [Section.WHY]))
+        return Diagnosis(found, lambda: self._draw(found))
 
-    def _draw(self, diagnosis: Content, sections: Sequence[Section]) -> dict[str, Chart]:
+    def _draw(self, diagnosis: Content) -> dict[str, Chart]:
         tables = {name: self.manifest.read(name) for name in self.tables}
         motion = view_diagnosis(tables, self.vehicle, diagnosis)
         peers = find_peers(self._store, dict(self.manifest.read_json(SUMMARY)))
-        return make_charts(RunReport(self.summary, tables, diagnosis, motion, peers), sections)
+        return make_charts(RunReport(self.summary, tables, diagnosis, motion, peers))
 
     def __repr__(self) -> str:
         log = mapping_in(self.summary, "log")
@@ -191,7 +190,7 @@ class Diagnosis:
         return {key: value for key, value in self._content.items() if key != LINES}
 
     def figures(self) -> dict[str, Chart]:
-        """The figures that answer *why*, by id: the ladder, residuals before and after, ..."""
+        """The figures of the run with the model that was named, by id: ladder, residuals, budget, ..."""
         return self._draw()
 
     def __repr__(self) -> str:

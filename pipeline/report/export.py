@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
 from pipeline.report.errors import ReportError
-from pipeline.report.figures.figure import Section
 from pipeline.report.page import draw_pictures
 from pipeline.report.scene import Scene
 from pipeline.report.specs import fill_chart, fill_spec
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
+    from collections.abc import Iterable
 
     from pipeline.report.elements import Picture
     from pipeline.report.figures.figure import Picture as Chart
@@ -26,18 +25,11 @@ _PNG_SCALE = 2.0
 _ID = re.compile(r"(?<=url\(#)\w+(?=\))|(?<= id=\")\w+(?=\")")
 
 
-def make_charts(report: RunReport, sections: Collection[Section] = tuple(Section)) -> dict[str, Chart]:
-    """Every figure that the run has rows for as an Altair chart with its rows and title, by id.
-
-    Args:
-        report: the run.
-        sections: of the page; figures of others are left out.
-    """
-    drawn = draw_pictures(Scene(report))
+def make_charts(report: RunReport) -> dict[str, Chart]:
+    """Every figure that the run has rows for as an Altair chart with its rows and title, by id."""
+    drawn = draw_pictures(Scene(report)).values()
     return {
-        picture.id: fill_chart(picture.drawing, picture.title)
-        for section in sections
-        for picture in drawn[section]
+        picture.id: fill_chart(picture.drawing, picture.title) for pictures in drawn for picture in pictures
     }
 
 
