@@ -1,6 +1,7 @@
 """slip in Python: runs, diagnoses and models as objects, with the numbers of the command line.
 
-Users import the names from `pipeline` itself; each is thin over the functions that the verbs call.
+Users import the names from `pipeline` itself; each is thin over the functions that the verbs call. What
+cannot be done raises `SlipError`: one line that says what is wrong, where, and what to do.
 """
 
 from pipeline.api.model import Fit, Model, effect

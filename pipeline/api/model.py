@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
     Source = Literal["command", "measured"]
 
+_PARTS = 3
 _OVER_2S = ("t_mrmse_m", "r_mrmse_rad")
 
 
@@ -53,7 +54,9 @@ def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Ef
             ``v_y``, ``v_w``, and for each parameter unit and bounds, ``k=("m/s", -1, 1)``.
     """
     texts = {key: value for key, value in values.items() if isinstance(value, str) and key in CHANNELS}
-    tuples = {key: value for key, value in values.items() if isinstance(value, tuple)}
+    tuples = {
+        key: value for key, value in values.items() if isinstance(value, tuple) and len(value) == _PARTS
+    }
     numbers = {key: value for key, value in values.items() if isinstance(value, int | float)}
     odd = [key for key in values if key not in {**texts, **(tuples if texts else numbers)}]
     if odd:
@@ -65,6 +68,13 @@ def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Ef
         )
     if not texts:
         return find_effect(name)().change(**numbers)
+    if not name.isidentifier():
+        raise MotionError(
+            "bad_value",
+            f"{name!r} cannot be the id of an effect",
+            where="effect",
+            hint="Use letters, digits and _, a letter first.",
+        )
     parameters = [make_parameter(key, unit, (low, high)) for key, (unit, low, high) in tuples.items()]
     return FormulaEffect(name, texts, tuple(parameters))
 
@@ -76,7 +86,6 @@ class Model:
 
     Args:
         vehicle: name of a preset, or the vehicle of a run.
-
     """
 
     def __init__(self, vehicle: str | Vehicle) -> None:
