@@ -6,16 +6,15 @@ slip analyze run.mcap && python examples/where_it_turns.py results
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import polars as pl
 
-from pipeline.store import Store
+import pipeline as slip
 
-slip = Store(Path(sys.argv[1] if len(sys.argv) > 1 else "results")).scan("slip")
+steps = slip.table("slip", out=sys.argv[1] if len(sys.argv) > 1 else "results")
 turning = (pl.col("f_w").abs() / 0.25).floor() * 0.25  # rad/s, lower edge
 table = (
-    slip.filter(~pl.col("suspect"))
+    steps.filter(~pl.col("suspect"))
     .group_by("run", "input", turning_faster_than=turning)
     .agg(seconds=pl.len() / 20.0, median_modulus=pl.col("modulus").median(), bias_w=pl.col("g_w").mean())
     .sort("run", "input", "turning_faster_than")

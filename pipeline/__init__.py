@@ -1,1 +1,25 @@
-"""From the MCAP logs of field robots to knowledge about their motion."""
+"""From the MCAP logs of field robots to knowledge about their motion.
+
+In Python: ``import pipeline as slip``. What `__all__` lists is for everybody; all else may change.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pipeline.api import Diagnosis, Fit, Model, Run, SlipError, analyze, effect, load, table
+
+__all__ = ["Diagnosis", "Fit", "Model", "Run", "SlipError", "analyze", "effect", "load", "table"]
+
+
+def __getattr__(name: str) -> object:
+    """A public name; what it needs is loaded when it is first asked for, so that verbs start without it."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module("pipeline.api"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

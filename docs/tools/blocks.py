@@ -1,7 +1,8 @@
 """The commands of handbook and README: run as a reader would, what they print compared or renewed.
 
 A fenced block of the language `console` holds commands, each behind `$ `, and below each what it prints on
-stdout. Nothing below a command means that only its exit code counts: 0, or 3 for losses.
+stdout. Nothing below a command means that only its exit code counts: 0, or 3 for losses. A block of the
+language `pycon` holds Python behind `>>> ` and `... `; all those of a page are one session.
 
     python docs/tools/blocks.py            runs all pages and says where they differ
     python docs/tools/blocks.py --write PAGE...    puts what is printed into these pages
@@ -10,6 +11,7 @@ stdout. Nothing below a command means that only its exit code counts: 0, or 3 fo
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import re
@@ -18,18 +20,24 @@ import signal
 import subprocess
 import sys
 import tempfile
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipeline.simulate import simulate_case
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ROOT / "docs" / "pages"
 PATIENCE_S = 1800.0
 LOSSY = 3
 
-_BLOCK = re.compile(r"^```console\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_BLOCK = re.compile(r"^```(console|pycon)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_PROMPTS = {"console": ("$ ", ()), "pycon": (">>> ", ("... ", "...\n"))}
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])")
 _HASH = re.compile(r"\b[0-9a-f]{12,}\b")
 _NEAR = {"rel_tol": 0.1, "abs_tol": 0.03}
@@ -51,12 +59,14 @@ class Command:
         text: what is typed.
         shown: lines below it.
         start, end: where those lines stand in the page's text.
+        is_python: whether it is Python, not of the shell.
     """
 
     text: str
     shown: tuple[str, ...]
     start: int
     end: int
+    is_python: bool = False
 
 
 def list_pages() -> list[Path]:
@@ -72,20 +82,23 @@ def read_commands(text: str) -> list[Command]:
     """
     found = []
     for block in _BLOCK.finditer(text):
-        place = block.start(1)
+        place = block.start(2)
+        first, more = _PROMPTS[block[1]]
         typed, start = "", place
         shown: list[str] = []
-        for line in block[1].splitlines(keepends=True):
+        for line in block[2].splitlines(keepends=True):
             place += len(line)
-            if line.startswith("$ "):
+            if line.startswith(first):
                 if typed:
-                    found.append(Command(typed, tuple(shown), start, place - len(line)))
-                typed, shown, start = line[2:].strip(), [], place
+                    found.append(Command(typed, tuple(shown), start, place - len(line), block[1] == "pycon"))
+                typed, shown, start = line.removeprefix(first).rstrip(), [], place
+            elif typed and not shown and line.startswith(more):
+                typed, start = f"{typed}\n{line[4:].rstrip()}", place
             elif typed:
                 shown.append(line.rstrip("\n"))
             else:
-                raise ValueError(f"a console block begins with {line!r}, not with a command")
-        found.append(Command(typed, tuple(shown), start, place))
+                raise ValueError(f"a {block[1]} block begins with {line!r}, not with a command")
+        found.append(Command(typed, tuple(shown), start, place, block[1] == "pycon"))
     return found
 
 
@@ -170,30 +183,67 @@ def _is_alike(one: str, other: str) -> bool:
     return all(math.isclose(float(a), float(b), **_NEAR) for a, b in pairs)
 
 
+_DRIVER = """
+import contextlib, io, json, sys
+names = {"__name__": "__main__"}
+for line in sys.stdin:
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        exec(compile(json.loads(line) + "\\n", "<page>", "single"), names)
+    print(json.dumps(printed.getvalue()), flush=True)
+"""
+
+
+@contextmanager
+def open_session(folder: Path) -> Iterator[Callable[[Command], str]]:
+    """A shell and one Python for the commands of a page, each asked for what it prints on stdout.
+
+    Raises:
+        RuntimeError: a command fails.
+    """
+    with subprocess.Popen(  # noqa: S603 - a page of this repository
+        [sys.executable, "-c", _DRIVER],
+        cwd=folder,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as python:
+
+        def run(command: Command) -> str:
+            if not command.is_python:
+                return run_command(command.text, folder)
+            print(json.dumps(command.text), file=python.stdin, flush=True)
+            line = python.stdout.readline() if python.stdout else ""
+            if not line:
+                raise RuntimeError(f"{command.text}\nfails, see above")
+            return str(json.loads(line))
+
+        yield run
+
+
 def check_page(page: Path, folder: Path) -> list[str]:
     """Run a page's commands in their order; where they differ from what is shown."""
     wrong = []
-    place = furnish(folder)
-    for command in read_commands(page.read_text(encoding="utf-8")):
-        printed = run_command(command.text, place)
-        difference = find_difference(command.shown, printed) if command.shown else ""
-        if difference:
-            wrong.append(f"{page.name}: $ {command.text}\n{difference}")
+    with open_session(furnish(folder)) as run:
+        for command in read_commands(page.read_text(encoding="utf-8")):
+            printed = run(command)
+            difference = find_difference(command.shown, printed) if command.shown else ""
+            if difference:
+                wrong.append(f"{page.name}: {command.text}\n{difference}")
     return wrong
 
 
 def write_page(page: Path, folder: Path) -> None:
     """Run a page's commands and put what they print below those that show something."""
     text = page.read_text(encoding="utf-8")
-    place = furnish(folder)
     parts, end = [], 0
-    for command in read_commands(text):
-        printed = run_command(command.text, place)
-        parts.append(text[end : command.start])
-        if command.shown:
-            lines = (line.rstrip() for line in printed.rstrip("\n").splitlines())
-            parts.append("".join(f"{line}\n" for line in lines))
-        end = command.end
+    with open_session(furnish(folder)) as run:
+        for command in read_commands(text):
+            printed = run(command)
+            parts.append(text[end : command.start])
+            if command.shown:
+                lines = (line.rstrip() for line in printed.rstrip("\n").splitlines())
+                parts.append("".join(f"{line}\n" for line in lines))
+            end = command.end
     page.write_text("".join((*parts, text[end:])), encoding="utf-8")
 
 

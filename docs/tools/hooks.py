@@ -30,9 +30,12 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the generated pages; one that is written by hand as well is an error of mkdocs."""
+    """Add generated pages and notebooks; one that is written by hand as well is an error of mkdocs."""
     for path, text in write_reference().items():
         files.append(File.generated(config, path, content=text))
+    for notebook in (Path(__file__).parents[2] / "examples").glob("*.ipynb"):
+        text = notebook.read_text(encoding="utf-8")
+        files.append(File.generated(config, f"notebooks/{notebook.name}", content=text))
     return files
 
 

@@ -5,20 +5,26 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
+from pipeline.analysis.geometry import agree_on_vehicle
 from pipeline.analysis.keys import hash_json
+from pipeline.analysis.options import INPUTS
+from pipeline.analysis.work import stored_keys
 from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     import polars as pl
 
+    from pipeline.analysis.geometry import Owner
     from pipeline.analysis.work import Work
     from pipeline.diagnosis import Recording
+    from pipeline.models import Model
     from pipeline.store import JSON, Manifest
     from pipeline.vehicles import Vehicle
 
 STAGE = "diagnosis"
+LINES = "lines"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
@@ -69,6 +75,51 @@ def diagnose_work(work: Work) -> dict[str, JSON] | None:
     return content
 
 
+def read_diagnosis(manifest: Manifest) -> dict[str, object] | None:
+    """What `diagnose_work` kept with a run: the object of ``slip diagnose --json``, and its lines.
+
+    Returns:
+        None where it is not there, of another version, not of both inputs, or of a log too poor to diagnose:
+        who asks again is told why.
+    """
+    keys = stored_keys(manifest)
+    is_whole = "slip" in keys and manifest.details.get("inputs") == list(INPUTS)
+    if not is_whole or not has_diagnosis(manifest, key_diagnosis(keys)):
+        return None
+    content = manifest.read_json(DIAGNOSIS)
+    return {**content, **read_choices(manifest)} if "input" in content else None
+
+
+def diagnose_stored(
+    manifests: Sequence[Manifest],
+    inputs: tuple[str, ...],
+    known: Model | None,
+    owner: Owner | None,
+    budget_s: float | None,
+) -> dict[str, object]:
+    """Stored runs diagnosed together, and what is said of the first, as `read_diagnosis` has it.
+
+    Args:
+        manifests: of the runs.
+        inputs: what the model may be fed with.
+        known: say what is missing beyond it; None for the ideal model of the first run's vehicle.
+        owner: whose geometry counts where vehicles differ.
+        budget_s: CPU time of the search [s]; None for the usual one.
+
+    Raises:
+        SlipError: a run is too poor, or vehicles differ.
+    """
+    from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy
+    from pipeline.diagnosis.words import list_lines  # noqa: PLC0415 - heavy
+
+    read = [read_recording(manifest) for manifest in manifests]
+    vehicles = {recording.name: vehicle for vehicle, recording in read}
+    vehicle = agree_on_vehicle(read[0][0] if known is None else known.vehicle, vehicles, owner)
+    recordings = [recording for _, recording in read]
+    (first, *_) = diagnose_runs(recordings, vehicle, inputs=inputs, model=known, budget_s=budget_s).runs
+    return {**first.to_json(), **read_choices(manifests[0]), LINES: list_lines(first)}
+
+
 def _diagnose(work: Work) -> dict[str, JSON]:
     from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy
     from pipeline.diagnosis.words import list_lines  # noqa: PLC0415 - heavy
@@ -95,7 +146,7 @@ def _diagnose(work: Work) -> dict[str, JSON]:
     ):
         if not frame.is_empty():
             work.write(table, frame)
-    return {**diagnosis.to_json()[0], "lines": [list(line) for line in list_lines(diagnosis.runs[0])]}
+    return {**diagnosis.to_json()[0], LINES: [list(line) for line in list_lines(diagnosis.runs[0])]}
 
 
 def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:

@@ -33,11 +33,10 @@ def gather_runs(
     Raises:
         SlipError: a log cannot be read, there is no such run, or its vehicle contradicts the model's.
     """
-    from pipeline.analysis.geometry import agree_on_vehicle  # noqa: PLC0415 - heavy
+    from pipeline.analysis.model_fit import read_runs  # noqa: PLC0415 - heavy
     from pipeline.analysis.options import Options  # noqa: PLC0415
     from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
     from pipeline.cli.output import say, show_progress  # noqa: PLC0415
-    from pipeline.report.motion_run import load_motion_run, load_vehicle  # noqa: PLC0415 - heavy
 
     options = Options(out=out, report=False, diagnosis=True)
     manifests, notes = [], []
@@ -48,11 +47,10 @@ def gather_runs(
         ):
             manifests.append(opened.manifest)
         notes += [opened.note] if opened.note and not quiet else []
-    known = {found.run: load_vehicle(found) for found in manifests}
-    chosen = agree_on_vehicle(vehicle or next(iter(known.values())), known, owner)
+    found = read_runs(manifests, vehicle, owner)
     for note in notes:
         say(f"slip: {note}")
-    return chosen, [load_motion_run(manifest, chosen) for manifest in manifests]
+    return found
 
 
 def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path) -> ModelFile:

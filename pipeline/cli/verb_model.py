@@ -22,11 +22,9 @@ from pipeline.cli.model_trust import TrustCode, open_model, trust, trusted, untr
 from pipeline.cli.output import CLEAN, print_json, print_lines, say
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
-    from pipeline.identification.inputs import InputChoice
-    from pipeline.identification.judgement import Judgement
-    from pipeline.identification.scoring import Errors
+    from pipeline.analysis.model_fit import ModelFit
     from pipeline.identification.transfer import Transfer
     from pipeline.models.model_file import ModelFile
     from pipeline.runs.recording import MotionRun
@@ -109,18 +107,15 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
         trust_code: trust the Python that the model file names, now and later.
         json: print one JSON object.
     """
-    from pipeline.identification.describe import describe_parameters, parameters_as_json  # noqa: PLC0415 - heavy
-    from pipeline.identification.intervals import NOTHING  # noqa: PLC0415
+    from pipeline.identification.describe import describe_parameters, list_parameters  # noqa: PLC0415 - heavy
     from pipeline.models.export import export_model  # noqa: PLC0415
 
     file = open_model(model, trust_code=trust_code)
     if json:
         sys.stdout.write(export_model(file, "json"))
         return CLEAN
-    parameters = parameters_as_json(file.model, NOTHING)
-    for label, (low, high) in file.intervals.items():
-        parameters[label] |= {"low": low, "high": high}
-    lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *describe_parameters(parameters)]
+    parameters = describe_parameters(list_parameters(file))
+    lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *parameters]
     runs = file.fit.get("runs")
     if isinstance(runs, list):
         lines.append(f"fitted on {file.fit.get('input')}: {', '.join(str(run['run']) for run in runs)}")
@@ -214,7 +209,7 @@ def compare(  # noqa: D417 - the shared options document themselves
     left_out = [text for file in opened for text in file.warnings]
     files = [_gather(spoken, file, spoken.on) for file in opened]
     # Both are fed with the same, or their errors could not be compared.
-    last = {_last_input(file) for file, _ in files}
+    last = {file.last_input for file, _ in files}
     effects = [effect for file, _ in files for effect in file.model]
     chosen = choose_input(files[0][1], spoken.input, effects, last=last.pop() if len(last) == 1 else None)
     rows: list[tuple[str, Transfer]] = []
@@ -288,9 +283,7 @@ def _change(
     Raises:
         MotionError: ``error_rises``, with ``keep_if_rises``: the file stays as it is.
     """
-    from pipeline.identification.inputs import choose_input  # noqa: PLC0415 - heavy
-    from pipeline.identification.judgement import judge_model, note_fit  # noqa: PLC0415
-    from pipeline.identification.problem import Problem  # noqa: PLC0415
+    from pipeline.analysis.model_fit import fit_to_runs  # noqa: PLC0415 - heavy
     from pipeline.identification.transfer import carry_over  # noqa: PLC0415
     from pipeline.models.model_text import format_model, write_model  # noqa: PLC0415
 
@@ -298,31 +291,35 @@ def _change(
     format_model(after)
     after, gathered = _gather(spoken, after, [*spoken.on, *predict])
     runs, others = gathered[: len(spoken.on)], gathered[len(spoken.on) :]
-    chosen = choose_input(runs, spoken.input, after.model, last=_last_input(before))
-    problem = Problem(
-        runs if first_s is None else cut_first(runs, first_s), after.model.vehicle, chosen.source
+    model = after.model
+    fit = fit_to_runs(
+        before,
+        after,
+        runs if first_s is None else cut_first(runs, first_s),
+        spoken.input,
+        None if prior is None else lambda problem: tie_to_fleet(problem, model, spoken.out),
     )
-    if prior is not None:
-        problem = tie_to_fleet(problem, after.model, spoken.out)
-    model_before = replace(before.model, vehicle=after.model.vehicle)
-    old = judge_model(problem, model_before, per_run=before.per_run)
-    new_one = old
-    if after.model.effects != before.model.effects:
-        new_one = judge_model(problem, after.model, per_run=after.per_run)
     if keep_if_rises:
-        _require_no_rise(str(path), old, new_one)
-    written = note_fit(after, new_one)
-    said = {"first_s": first_s, "prior": prior}
-    written = replace(written, fit={**written.fit, **{key: value for key, value in said.items() if value}})
+        _require_no_rise(str(path), fit)
+    said = {key: value for key, value in (("first_s", first_s), ("prior", prior)) if value}
+    written = replace(fit.file, fit={**fit.file.fit, **said})
     if path is not None:
         write_model(written, path)
     terrains = [run.terrain for run in runs]
-    carried = carry_over(written.model, others, chosen.source, fitted_on=terrains) if others else []
-    warnings = [text for text in (chosen.warning, *(item.warning for item in carried)) if text]
+    carried = carry_over(written.model, others, fit.chosen.source, fitted_on=terrains) if others else []
+    warnings = [text for text in (fit.chosen.warning, *(item.warning for item in carried)) if text]
     if spoken.json:
-        print_json(_as_json(path, old, new_one, chosen, carried, [*before.warnings, *warnings]))
+        print_json(
+            {
+                "model": None if path is None else str(path),
+                **fit.to_json(),
+                "prior": prior_as_json(fit.after.problem),
+                "carried_over": [_transfer_as_json(str(path), item) for item in carried],
+                "warnings": [*before.warnings, *warnings],
+            }
+        )
     elif not spoken.quiet:
-        lines = _describe(old, new_one, chosen)
+        lines = _describe(fit)
         if carried:
             lines += ["", *_describe_transfers([(str(path), item) for item in carried])]
         print_lines(lines)
@@ -330,14 +327,15 @@ def _change(
     return CLEAN
 
 
-def _require_no_rise(path: str, old: Judgement, new_one: Judgement) -> None:
+def _require_no_rise(path: str, fit: ModelFit) -> None:
     from pipeline.identification.describe import describe_rises  # noqa: PLC0415 - heavy
     from pipeline.identification.ladder import CHANCE  # noqa: PLC0415
     from pipeline.runs.errors import MotionError  # noqa: PLC0415
 
-    rises = describe_rises(old.whole.errors, new_one.whole.errors, CHANCE)
+    old, new = fit.before.whole, fit.after.whole
+    rises = describe_rises(old.errors, new.errors, CHANCE)
     if rises:
-        added = [name for name in new_one.whole.effects if name not in old.whole.effects]
+        added = [name for name in new.effects if name not in old.effects]
         raise MotionError(
             "error_rises",
             f"with {', '.join(added)} {' and '.join(rises)} on data not seen: the model is as it was",
@@ -353,70 +351,9 @@ def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFil
     return replace(file, model=replace(file.model, vehicle=vehicle)), runs
 
 
-def _last_input(file: ModelFile) -> str | None:
-    found = file.fit.get("input")
-    return found if isinstance(found, str) else None
-
-
 def _terrains(file: ModelFile) -> list[str]:
     runs = file.fit.get("runs")
     return [str(run.get("terrain")) for run in runs] if isinstance(runs, list) else []
-
-
-def _as_json(
-    path: Path | None,
-    old: Judgement,
-    new_one: Judgement,
-    chosen: InputChoice,
-    carried: Sequence[Transfer],
-    warnings: Sequence[str],
-) -> Mapping[str, object]:
-    from pipeline.identification.describe import (  # noqa: PLC0415 - heavy
-        correlations_as_json,
-        errors_as_json,
-        ladder_as_json,
-        parameters_as_json,
-        step_as_json,
-    )
-    from pipeline.identification.scoring import measure_by_terrain  # noqa: PLC0415
-
-    problem, fitted = new_one.problem, new_one.fitted
-    floor = _choose_floor(old, new_one)
-    return {
-        "model": None if path is None else str(path),
-        "input": chosen.source.value,
-        "input_reason": chosen.reason,
-        "runs": list(problem.names),
-        "ladder_before": ladder_as_json(old.ladder, floor),
-        "ladder": ladder_as_json(new_one.ladder, floor),
-        "step": step_as_json(old.whole, new_one.whole),
-        "idle": list(new_one.ladder.idle),
-        "not_fitted": list(chosen.idle),
-        "by_run": {
-            name: errors_as_json(errors)
-            for name, errors in zip(problem.names, new_one.whole.held_out.by_run, strict=True)
-        },
-        "by_terrain": {
-            terrain: errors_as_json(errors)
-            for terrain, errors in measure_by_terrain(problem, new_one.whole.held_out).items()
-        },
-        "noise_floor": errors_as_json(floor),
-        "parameters": parameters_as_json(fitted.model, new_one.estimates),
-        "prior": prior_as_json(problem),
-        "correlated": correlations_as_json(new_one.estimates),
-        "timing": [
-            {
-                "run": comparison.run.name,
-                "pose_delay_s": comparison.run.alignment.heading_delay_s,
-                "wheel_delay_s": timing.wheel_delay_s,
-                "latency_spread_s": comparison.run.alignment.latency_spread_s,
-                "outlier_s": comparison.run.alignment.outlier_s,
-            }
-            for comparison, timing in zip(problem.comparisons, fitted.state.timing, strict=True)
-        ],
-        "carried_over": [_transfer_as_json(str(path), item) for item in carried],
-        "warnings": list(warnings),
-    }
 
 
 def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
@@ -434,7 +371,7 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
     }
 
 
-def _describe(old: Judgement, new_one: Judgement, chosen: InputChoice) -> list[str]:
+def _describe(fit: ModelFit) -> list[str]:
     from pipeline.identification.describe import (  # noqa: PLC0415 - heavy
         describe_ladder,
         describe_parameters,
@@ -443,26 +380,21 @@ def _describe(old: Judgement, new_one: Judgement, chosen: InputChoice) -> list[s
         parameters_as_json,
     )
 
-    runs = ", ".join(new_one.problem.names)
-    floor = _choose_floor(old, new_one)
+    old, new, chosen = fit.before, fit.after, fit.chosen
+    runs = ", ".join(new.problem.names)
     lines = [f"on {chosen.source.value} of {runs} ({chosen.reason})"]
-    lines += describe_recordings([comparison.run for comparison in new_one.problem.comparisons])
-    if old is not new_one:
-        lines += ["", "before", *describe_ladder(old.ladder, floor), "", "after"]
-    lines += describe_ladder(new_one.ladder, floor)
-    if old is not new_one:
-        lines += describe_step(old.whole, new_one.whole)
+    lines += describe_recordings([comparison.run for comparison in new.problem.comparisons])
+    if old is not new:
+        lines += ["", "before", *describe_ladder(old.ladder, fit.floor), "", "after"]
+    lines += describe_ladder(new.ladder, fit.floor)
+    if old is not new:
+        lines += describe_step(old.whole, new.whole)
     if chosen.warning:
         lines.append(chosen.warning)
-    parameters = parameters_as_json(new_one.fitted.model, new_one.estimates)
-    prior = prior_as_json(new_one.problem)
+    parameters = parameters_as_json(new.fitted.model, new.estimates)
+    prior = prior_as_json(new.problem)
     lines += ["", "parameters", *describe_parameters(parameters)]
     return [*lines, "", "known before", *describe_parameters(prior)] if prior else lines
-
-
-def _choose_floor(old: Judgement, new_one: Judgement) -> Errors:
-    """One floor for the ladders before and after: it is the runs', and the better model sees it sharper."""
-    return min(old.floor, new_one.floor, key=lambda errors: errors.t_mrmse_m)
 
 
 def _describe_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:

@@ -33,6 +33,10 @@ class SlipError(Exception):
         place = f"{self.where}: " if self.where else ""
         return f"{place}{self.what}. {self.hint.rstrip('.')}."
 
+    def _render_traceback_(self) -> list[str]:
+        """The same line in place of a traceback, where a notebook asks for one."""
+        return [f"slip: {' '.join(str(self).split())}"]
+
     def __reduce__(self) -> tuple[object, ...]:
         """Keep every part when the error crosses a process boundary."""
         return _rebuild, (type(self), self.code, self.what, self.where, self.hint)

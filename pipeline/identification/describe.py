@@ -6,6 +6,7 @@ import inspect
 import math
 from typing import TYPE_CHECKING
 
+from pipeline.identification.intervals import NOTHING as NOT_FITTED
 from pipeline.identification.ladder import ERRORS_OVER_2S, NOTHING, list_rises
 from pipeline.models.effect import Search
 from pipeline.models.formula.formula_effect import FormulaEffect
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from pipeline.identification.scoring import Errors
     from pipeline.models.effect import Effect, Parameter
     from pipeline.models.model import Model
+    from pipeline.models.model_file import ModelFile
     from pipeline.runs.recording import MotionRun
 
 _DIGITS = 6
@@ -102,6 +104,14 @@ def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str
             if isinstance(runs, list):
                 runs.append({"run": item.free.run, **entry})
     return found
+
+
+def list_parameters(file: ModelFile) -> dict[str, dict[str, object]]:
+    """Every parameter of a model file by ``effect.name``, with the intervals of its last fit."""
+    parameters = parameters_as_json(file.model, NOT_FITTED)
+    for label, (low, high) in file.intervals.items():
+        parameters[label] |= {"low": _round(low), "high": _round(high)}
+    return parameters
 
 
 def correlations_as_json(estimates: Estimates) -> list[dict[str, object]]:

@@ -65,6 +65,12 @@ class ModelFile:
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
+    @property
+    def last_input(self) -> str | None:
+        """What the model was fed with in its last fit; None before one."""
+        found = self.fit.get("input")
+        return found if isinstance(found, str) else None
+
     def find_wheel_delay(self, run: str) -> float:
         """How late the encoders of a run were in the last fit [s]; zero where it was not fitted on it."""
         runs = self.fit.get("runs")

@@ -8,7 +8,7 @@ and the summary.
 from pipeline.report.bundle import warm_bundle
 from pipeline.report.diagnosed import view_diagnosis
 from pipeline.report.errors import ReportError
-from pipeline.report.export import FORMATS, write_figures
+from pipeline.report.export import FORMATS, make_charts, write_figures
 from pipeline.report.page import render_report
 from pipeline.report.run import RunReport
 
@@ -16,6 +16,7 @@ __all__ = [
     "FORMATS",
     "ReportError",
     "RunReport",
+    "make_charts",
     "render_report",
     "view_diagnosis",
     "warm_bundle",

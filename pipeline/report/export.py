@@ -1,4 +1,4 @@
-"""Figures as files, for papers."""
+"""Figures as files, for papers, and as charts, for notebooks."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Literal, get_args
 from pipeline.report.errors import ReportError
 from pipeline.report.page import draw_pictures
 from pipeline.report.scene import Scene
-from pipeline.report.specs import fill_spec
+from pipeline.report.specs import fill_chart, fill_spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from pipeline.report.elements import Picture
+    from pipeline.report.figures.figure import Picture as Chart
     from pipeline.report.run import RunReport
 
 Format = Literal["svg", "pdf", "png"]
@@ -22,6 +23,14 @@ FORMATS: tuple[Format, ...] = get_args(Format)
 
 _PNG_SCALE = 2.0
 _ID = re.compile(r"(?<=url\(#)\w+(?=\))|(?<= id=\")\w+(?=\")")
+
+
+def make_charts(report: RunReport) -> dict[str, Chart]:
+    """Every figure that the run has rows for as an Altair chart with its rows and title, by id."""
+    drawn = draw_pictures(Scene(report)).values()
+    return {
+        picture.id: fill_chart(picture.drawing, picture.title) for pictures in drawn for picture in pictures
+    }
 
 
 def write_figures(

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from pipeline.report.figures import Drawing
+    from pipeline.report.figures.figure import Picture
 
 _DIGITS = 4
 
@@ -27,12 +28,22 @@ def build_spec(drawing: Drawing) -> dict[str, object]:
 
 def fill_spec(drawing: Drawing) -> dict[str, object]:
     """The specification with its rows inside, for one picture of its own."""
-    spec = build_spec(drawing)
-    spec["datasets"] = {name: _round_floats(frame).to_dicts() for name, frame in drawing.rows.items()}
-    spec["background"] = theme.PAPER
-    spec["padding"] = 12
+    spec = {**build_spec(drawing), **_fill(drawing)}
     spec.pop("usermeta", None)
     return spec
+
+
+def fill_chart(drawing: Drawing, title: str) -> Picture:
+    """The same as a chart with a title, for notebooks."""
+    chart = drawing.chart.copy(deep=False)
+    for key, value in {**_fill(drawing), "title": title, "config": theme.chart_config()}.items():
+        setattr(chart, key, value)
+    return chart
+
+
+def _fill(drawing: Drawing) -> dict[str, object]:
+    rows = {name: _round_floats(frame).to_dicts() for name, frame in drawing.rows.items()}
+    return {"datasets": rows, "background": theme.PAPER, "padding": 12}
 
 
 def share_rows(drawings: Iterable[Drawing]) -> dict[str, Columns]:

@@ -6,8 +6,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-import pipeline
-
 
 class Places:
     """Folders of the server, and what the page is told in their place.
@@ -20,7 +18,7 @@ class Places:
         told = {
             str(results.resolve()): str(results),
             str(Path.cwd()): ".",
-            str(Path(pipeline.__file__).parents[1]): "slip",
+            str(Path(__file__).parents[2]): "slip",
             sys.prefix: "python",
             sys.base_prefix: "python",
             str(Path.home()): "~",

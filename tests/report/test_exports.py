@@ -327,7 +327,7 @@ def test_a_place_that_cannot_be_written_is_named(source: ExportSource, tmp_path:
     ("name", "more", "words"),
     [
         ("where_it_turns.py", (), "median_modulus"),
-        ("fit_by_hand.py", ("effective_track",), "over 2 s"),
+        ("fit_by_hand.py", ("effective_track",), "effective_track.k"),
     ],
 )
 def test_the_examples_run(

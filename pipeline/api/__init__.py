@@ -1,0 +1,11 @@
+"""slip in Python: runs, diagnoses and models as objects, with the numbers of the command line.
+
+Users import the names from `pipeline` itself; each is thin over the functions that the verbs call. What
+cannot be done raises `SlipError`: one line that says what is wrong, where, and what to do.
+"""
+
+from pipeline.api.model import Fit, Model, effect
+from pipeline.api.run import Diagnosis, Run, analyze, load, table
+from pipeline.core.errors import SlipError
+
+__all__ = ["Diagnosis", "Fit", "Model", "Run", "SlipError", "analyze", "effect", "load", "table"]

@@ -1,0 +1,210 @@
+"""Runs and their diagnoses: logs that are analyzed, and what is missing from their models."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import polars as pl
+from threadpoolctl import threadpool_limits
+
+from pipeline.analysis.analyze import REPORT, SUMMARY, analyze_log, update_datasets
+from pipeline.analysis.diagnosis import LINES, diagnose_stored, read_diagnosis
+from pipeline.analysis.lookup import find_run
+from pipeline.analysis.options import INPUTS, Options
+from pipeline.analysis.peers import find_peers
+from pipeline.api.model import Model
+from pipeline.api.shown import tabulate_ladder, tabulate_parameters, write_html
+from pipeline.diagnosis.budget import parse_budget
+from pipeline.report import RunReport, make_charts, view_diagnosis
+from pipeline.report.diagnosed import read_model_text
+from pipeline.report.motion_run import load_vehicle
+from pipeline.report.run import mapping_in, number_in, objects_in
+from pipeline.report.words import say_distance, say_duration
+from pipeline.store import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from typing import Literal
+
+    from pipeline.analysis.geometry import Owner
+    from pipeline.report.figures.figure import Picture as Chart
+    from pipeline.store import Manifest
+
+    Content = Mapping[str, object]
+
+
+def analyze(
+    log: str | Path,
+    *,
+    out: str | Path = "results",
+    settings: Content | None = None,
+    report: bool = True,
+    diagnosis: bool = True,
+    force: bool = False,
+) -> Run:
+    """Analyze a log as `slip analyze` does; what has not changed is not computed again.
+
+    Args:
+        log: an MCAP file, or a folder of a split recording.
+        out: results folder.
+        settings: what a `run.toml` would say, for example ``{"vehicle": {"preset": "husky_a200"}}``.
+        report: write `report.html`.
+        diagnosis: name what is missing from the model.
+        force: compute again what is there.
+    """
+    options = Options(
+        out=Path(out), overrides=settings or {}, report=report, diagnosis=diagnosis, force=force
+    )
+    store = Store(options.out)
+    with threadpool_limits(1):
+        outcome = analyze_log(Path(log), options)
+    if outcome.computed:
+        update_datasets(store)
+    return Run(outcome.manifest, store)
+
+
+def load(run: str, *, out: str | Path = "results") -> Run:
+    """A run that is analyzed already, by its name or the path of its log."""
+    store = Store(Path(out))
+    return Run(find_run(run, store), store)
+
+
+def table(name: str, *, out: str | Path = "results") -> pl.LazyFrame:
+    """A table over all runs of a results folder; of the table ``runs`` each row is one."""
+    return Store(Path(out)).scan(name)
+
+
+class Run:
+    """An analyzed log.
+
+    Attributes:
+        name: of the run, unique in its results folder.
+        summary: the JSON object of `slip analyze --json`.
+        vehicle: the vehicle it was analyzed with.
+        findings: what was noticed: id, severity, text, where, t_start and t_end [s]; gravest first.
+        report: the offline page; None where it was not asked for.
+        tables: names of its tables; `slip explain RUN TABLE.COLUMN` tells units and frames.
+    """
+
+    def __init__(self, manifest: Manifest, store: Store) -> None:
+        self.manifest, self._store = manifest, store
+        self.name = manifest.run
+        self.summary: Content = manifest.read_json(SUMMARY)
+        self.vehicle = load_vehicle(manifest)
+        self.findings = objects_in(self.summary, "findings")
+        self.report = manifest.path(REPORT) if REPORT in manifest.files else None
+        self.tables = tuple(sorted(manifest.tables))
+
+    def table(self, name: str) -> pl.LazyFrame:
+        """One of its tables."""
+        return self.manifest.read(name).lazy()
+
+    def figures(self) -> dict[str, Chart]:
+        """The figures of its report by id."""
+        return self._draw(mapping_in(self.summary, "diagnosis"))
+
+    def diagnose(
+        self,
+        *others: Run,
+        input: Literal["command", "measured", "both"] = "both",
+        model: Model | None = None,
+        vehicle_of: Owner | None = None,
+        budget: str | None = None,
+    ) -> Diagnosis:
+        """Name what is missing from the model, as `slip diagnose` does.
+
+        Args:
+            others: runs of the same vehicle, to be judged together with it.
+            input: what the model is fed with; of both the command leads.
+            model: what is known already: say what is missing beyond it.
+            vehicle_of: whose geometry counts where the run is of another vehicle than the model.
+            budget: CPU time that a search may take, for example ``60s``.
+        """
+        is_plain = not others and input == "both" and model is None and budget is None
+        found = read_diagnosis(self.manifest) if is_plain else None
+        if found is None:
+            with threadpool_limits(1):
+                found = diagnose_stored(
+                    [run.manifest for run in (self, *others)],
+                    INPUTS if input == "both" else (input,),
+                    None if model is None else model.file.model,
+                    vehicle_of,
+                    None if budget is None else parse_budget(budget),
+                )
+        return Diagnosis(found, lambda: self._draw(found))
+
+    def _draw(self, diagnosis: Content) -> dict[str, Chart]:
+        tables = {name: self.manifest.read(name) for name in self.tables}
+        motion = view_diagnosis(tables, self.vehicle, diagnosis)
+        peers = find_peers(self._store, dict(self.manifest.read_json(SUMMARY)))
+        return make_charts(RunReport(self.summary, tables, diagnosis, motion, peers))
+
+    def __repr__(self) -> str:
+        log = mapping_in(self.summary, "log")
+        facts = [self.name, self.vehicle.name, str(self.summary["terrain"])]
+        duration, distance = number_in(log, "duration_s"), number_in(self.summary, "distance_m")
+        facts += [] if duration is None else [say_duration(duration)]
+        facts += [] if distance is None else [say_distance(distance)]
+        return ", ".join(facts if log.get("complete") else [*facts, "the log has losses"])
+
+    def _repr_html_(self) -> str:
+        slip = mapping_in(self.summary, "by_input")
+        keys = {"median modulus [m/s]": "median_modulus", "2 s window norm": "median_window_norm"}
+        rows = [
+            {"slip on": name, **{head: number_in(mapping_in(slip, name), key) for head, key in keys.items()}}
+            for name in slip
+        ]
+        notes = [f"! {one['text']}" for one in self.findings if one.get("severity") != "info"]
+        notes += [] if self.report is None else [f"report: {self.report}"]
+        return write_html(repr(self), pl.DataFrame(rows), notes)
+
+
+class Diagnosis:
+    """What is missing from the model of a run. As text it is what `slip diagnose` prints.
+
+    Attributes:
+        effects: ids of the effects.
+        sentences: by id what the vehicle does.
+        parameters: their numbers: ``parameter value low high unit``, a 95 % interval.
+        ladder: held-out errors over 2 s, effect by effect: ``added t_mrmse_m r_mrmse_rad explained_share``.
+        model: the model with these effects; None where nothing could be judged.
+    """
+
+    def __init__(self, content: Content, draw: Callable[[], dict[str, Chart]]) -> None:
+        self._content, self._draw = content, draw
+        self._lines = cast("Sequence[tuple[str, str]]", content[LINES])
+        found = {str(effect["id"]): effect for effect in objects_in(content, "effects")}
+        self.effects = tuple(found)
+        self.sentences = {name: str(effect["sentence"]) for name, effect in found.items()}
+        self.parameters = tabulate_parameters(
+            {f"{name}.{key}": mapping_in(mapping_in(effect, "parameters"), key)
+             for name, effect in found.items() for key in mapping_in(effect, "parameters")}
+        )  # fmt: skip
+        self.ladder = tabulate_ladder(content)
+        file = read_model_text(content)
+        self.model = None if file is None else Model.of(file)
+
+    def to_json(self) -> dict[str, object]:
+        """The object of one run of `slip diagnose --json`."""
+        return {key: value for key, value in self._content.items() if key != LINES}
+
+    def figures(self) -> dict[str, Chart]:
+        """The figures of the run with the model that was named, by id: ladder, residuals, budget, ..."""
+        return self._draw()
+
+    def __repr__(self) -> str:
+        return "\n".join(f"{label:<10}{text}".rstrip() for label, text in self._lines if label != "next")
+
+    def _repr_html_(self) -> str:
+        texts = [self.sentences[label.partition(".")[0]] for label in self.parameters["parameter"]]
+        notes, part = [], ""
+        for label, text in self._lines:
+            part = label or part
+            is_in_table = part == "missing" and text.startswith((" ", *self.effects))
+            if part in {"error", "missing", "cannot", "findings"} and not is_in_table:
+                notes.append(" ".join(f"{label} {text}".split()))
+        title = f"{self._content['run']}: {', '.join(self.effects) or 'no effect'} named as missing"
+        return write_html(
+            title, self.parameters.with_columns(sentence=pl.Series(texts, dtype=pl.String)), notes
+        )

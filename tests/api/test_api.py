@@ -1,0 +1,189 @@
+"""Python's face: the numbers of the command line, tables, charts, and errors of one line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import polars as pl
+import pytest
+
+import pipeline as slip
+from pipeline.cli import main
+from pipeline.simulate import simulate_case
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+EFFECT = "effective_track"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> slip.Run:
+    folder = tmp_path_factory.mktemp("face")
+    log = simulate_case("husky_tile", out=folder / "<b>field" / "run.mcap", duration_s=40.0)
+    return slip.analyze(log, out=folder / "results", report=False, diagnosis=False)
+
+
+@pytest.fixture(scope="module")
+def diagnosis(run: slip.Run) -> slip.Diagnosis:
+    return run.diagnose()
+
+
+def ask(run: slip.Run, capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
+    """The JSON object of a verb."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        main([*words, "--out", str(find_results(run)), "--json"])
+    assert ended.value.code == 0
+    content: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return content
+
+
+def find_results(run: slip.Run) -> Path:
+    return run.manifest.folder.parents[3]
+
+
+def as_json(content: object) -> object:
+    return json.loads(json.dumps(content))
+
+
+def test_a_diagnosis_is_that_of_the_command_line(
+    run: slip.Run, diagnosis: slip.Diagnosis, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (told,) = ask(run, capsys, "diagnose", run.name)["runs"]
+
+    assert as_json(diagnosis.to_json()) == told
+    assert list(diagnosis.effects) == [effect["id"] for effect in told["effects"]]
+    assert EFFECT in diagnosis.effects
+    number = diagnosis.parameters.row(by_predicate=pl.col("parameter") == f"{EFFECT}.k", named=True)
+    (effect,) = (one for one in told["effects"] if one["id"] == EFFECT)
+    assert {key: number[key] for key in ("value", "low", "high", "unit")} == {
+        key: effect["parameters"]["k"][key] for key in ("value", "low", "high", "unit")
+    }
+    assert diagnosis.sentences[EFFECT] == effect["sentence"]
+    assert diagnosis.ladder["t_mrmse_m"].to_list() == [rung["t_mrmse_m"] for rung in told["ladder"]]
+
+
+def test_what_the_analysis_found_is_not_looked_for_again(
+    run: slip.Run, diagnosis: slip.Diagnosis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where = {"out": find_results(run), "report": False}
+    again = slip.analyze(str(run.summary["log"]["path"]), **where)  # type: ignore[index, arg-type]
+    monkeypatch.setattr("pipeline.api.run.diagnose_stored", None)
+    assert as_json(again.diagnose().to_json()) == as_json(diagnosis.to_json())
+    assert repr(again.diagnose()) == repr(diagnosis)
+
+
+def test_a_fit_is_that_of_the_command_line(
+    run: slip.Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = slip.Model("husky_a200") + slip.effect(EFFECT)
+    path = tmp_path / "husky.toml"
+    model.write(path)
+    fit = model.fit(run, input="measured")
+    told = ask(run, capsys, "model", "fit", str(path), "--on", run.name, "--input", "measured")
+
+    content = json.loads(json.dumps(fit.to_json()))
+    assert content == {key: told[key] for key in content}
+    assert set(told) - set(content) == {"model", "prior", "carried_over", "warnings"}
+    assert fit.errors == told["by_run"][run.name]
+    assert slip.Model.read(path).parameters.equals(fit.model.parameters)
+    fit.model.write(tmp_path / "again.toml")
+    assert (tmp_path / "again.toml").read_text() == path.read_text()
+    assert slip.Model.read(path).export("python").startswith('"""')
+
+    compared = ask(run, capsys, "model", "compare", str(path), str(path), "--on", run.name)["compared"][0]
+    errors = fit.model.errors(run)
+    assert errors["t_mrmse_m"].to_list() == [
+        compared[key]["t_mrmse_m"] for key in ("carried", "own_fit", "ideal")
+    ]
+
+
+def test_a_formula_is_fitted_as_the_effect_that_it_spells(run: slip.Run) -> None:
+    ideal = slip.Model(run.vehicle) + EFFECT
+    formula = slip.effect("skid", v_y="-c * v0 * w0", c=("s", -0.5, 0.5))
+    one, other = (ideal + effect for effect in (formula, slip.effect("lateral_skid")))
+    values = [model.fit(run).model.parameters["value"].to_list() for model in (one, other)]
+    assert values[0] == pytest.approx(values[1], rel=1e-3)
+    assert repr((one - "skid").parameters) == repr(ideal.parameters)
+
+
+def test_tables_are_lazy_and_charts_hold_their_rows(run: slip.Run, diagnosis: slip.Diagnosis) -> None:
+    table = run.table("slip")
+    assert isinstance(table, pl.LazyFrame)
+    all_runs = slip.table("slip", out=find_results(run))
+    assert table.collect().height == all_runs.collect().height > 0
+    charts = diagnosis.figures()
+    assert {"ladder", "residuals"} <= set(charts)
+    ladder = charts["ladder"].to_dict()
+    assert ladder["title"] == "The ladder: error after each effect"
+    rows = ladder["datasets"]["ladder"]
+    assert [row["t"] for row in rows] == pytest.approx(diagnosis.ladder["t_mrmse_m"].to_list(), abs=1e-4)
+
+
+def test_a_notebook_shows_names_as_text(run: slip.Run, diagnosis: slip.Diagnosis) -> None:
+    assert "<b>field" in run.name
+    for shown in (
+        run,
+        diagnosis,
+        slip.Model(run.vehicle) + EFFECT,
+        slip.load(run.name, out=find_results(run)),
+    ):
+        page = shown._repr_html_()
+        assert "<table>" in page
+        assert "<b>field" not in page
+    assert "&lt;b&gt;field" in run._repr_html_()
+    assert repr(diagnosis).startswith("error     of the ideal model over 2 s")
+
+
+@pytest.mark.parametrize(
+    ("act", "line"),
+    [
+        (lambda _: slip.effect("effectiv_track"), "no effect is called 'effectiv_track'"),
+        (lambda _: slip.effect(EFFECT, k="wide"), "'wide' is no value of k"),
+        (lambda _: slip.effect("mine", v_y="k *", k=("m/s", -1, 1)), "is no formula"),
+        (lambda _: slip.effect("mine", v_y="k * v0", k=(-1, 1)), "(-1, 1) is no value of k"),
+        (lambda _: slip.effect("my own", v_y="k * v0", k=("1", -1, 1)), "'my own' cannot be the id"),
+        (lambda _: slip.Model("hunky"), "no vehicle preset is called 'hunky'"),
+        (lambda _: slip.analyze("missing.mcap"), "there is no such file"),
+        (lambda run: run.table("tables"), "hold no 'tables'"),
+        (lambda run: slip.load("monday", out=find_results(run)), "there is no run 'monday'"),
+        (lambda run: slip.Model("warthog").fit(run), "the run is of a Clearpath Husky A200"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(
+    act: Callable[[slip.Run], object], line: str, run: slip.Run
+) -> None:
+    with pytest.raises(slip.SlipError) as error:
+        act(run)
+    (shown,) = error.value._render_traceback_()
+    assert line in shown
+    assert "\n" not in shown
+
+
+def test_what_a_model_leaves_out_and_a_log_lost_is_said(run: slip.Run, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("raise RuntimeError\n")
+    model = tmp_path / "husky.toml"
+    model.write_text('effects = ["mine.py"]\n[vehicle]\npreset = "husky_a200"\n')
+    with pytest.warns(UserWarning, match="not trusted is not run"):
+        slip.Model.read(model)
+
+    log = run.summary["log"]
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(Path(str(log["path"])).read_bytes()[: 3 * int(log["bytes"]) // 4])  # type: ignore[index]
+    with_losses = slip.analyze(cut, out=tmp_path / "results", report=False, diagnosis=False)
+    assert repr(with_losses).endswith("the log has losses")
+    assert "losses" not in repr(run)
+
+
+def test_the_name_alone_loads_nothing_and_verbs_do_without_it() -> None:
+    heavy = "{'numpy', 'polars', 'altair', 'pipeline.api'} & set(sys.modules)"
+    code = f"import sys, pipeline, pipeline.cli.app as a; a.build_app(); print({heavy}); print(dir(pipeline))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded, names = done.stdout.splitlines()
+    assert loaded == "set()"
+    assert names == repr(sorted(slip.__all__))
