@@ -91,7 +91,7 @@ def judge(
     injection: Injection, before: Answer, after: Answer, usual: AbstractSet[str] = frozenset()
 ) -> tuple[str, list[str]]:
     """One of `_VERDICTS`, and names without a reason: `usual` are those of the vehicle's unchanged logs."""
-    if injection.findings and set(injection.findings) & set(after.findings):
+    if set(injection.findings) & set(after.findings) - set(before.findings):
         return "told", []
     effects = {label.split(".")[0] for label in injection.numbers}
     extra = sorted(after.names - usual - effects)
@@ -99,11 +99,9 @@ def judge(
         close = all(is_close(before.numbers[label], after.numbers[label]) for label in shared(before, after))
         lost = before.names - after.names - set(after.undecided)
         return ("recovered" if close and not lost else "missed"), extra
-    for label, expected in injection.numbers.items():
-        effect, parameter = label.split(".")
-        neutral = find_effect(effect).parameters
-        start = before.numbers.get(label, (next(p.neutral for p in neutral if p.name == parameter), 0.0))
-        if label in after.numbers and is_close((expected(start[0]), start[1]), after.numbers[label]):
+    for effect in effects:
+        labels = [label for label in injection.numbers if label.split(".")[0] == effect]
+        if all(is_recovered(injection, label, before, after) for label in labels):
             return "recovered", extra
     named = effects & after.names
     if named:
@@ -115,16 +113,28 @@ def judge(
     ), extra  # fmt: skip
 
 
+def is_recovered(injection: Injection, label: str, before: Answer, after: Answer) -> bool:
+    """Whether a number is what was injected on top of that of the unchanged recording."""
+    effect, parameter = label.split(".")
+    start = before.numbers.get(label, (find_effect(effect)().parameter(parameter).neutral, 0.0))
+    expected = (injection.numbers[label](start[0]), start[1])
+    return label in after.numbers and is_close(expected, after.numbers[label])
+
+
 def shared(before: Answer, after: Answer) -> list[str]:
-    """Labels that both answers have."""
-    return [label for label in before.numbers if label in after.numbers]
+    """Labels of numbers that both answers have with an interval."""
+    return [
+        label
+        for label, (_, half) in before.numbers.items()
+        if label in after.numbers and math.isfinite(half + after.numbers[label][1])
+    ]
 
 
 def is_close(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    """Whether two numbers with half-widths are within both together; what has no interval says nothing."""
-    if not math.isfinite(other[1]):
-        return True
-    return abs(one[0] - other[0]) <= math.hypot(one[1] if math.isfinite(one[1]) else 0.0, other[1])
+    """Whether two numbers are within their half-widths together; one without an interval is taken as exact."""
+    return abs(one[0] - other[0]) <= math.hypot(
+        *(half if math.isfinite(half) else 0.0 for _, half in (one, other))
+    )
 
 
 def describe(rows: Iterable[Json]) -> str:

@@ -12,6 +12,8 @@ from pipeline.core.robust import fit_robustly
 from pipeline.stages.finding import Finding
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from pipeline.stages.samples import Samples
     from pipeline.vehicles import Vehicle
 
@@ -23,9 +25,10 @@ _FEWEST = 100
 _SPAN = 0.5
 _FEWEST_SPANS = 20
 _SIDEWAYS = 1e-4
-_HALF_STEP = 0.06
-"""Half the time between two steps of slow odometry [s]."""
 _UNEVEN = 0.05
+"""Part of the drift of such steps that unlike ones leave, and by how much they differ from a sensor's period."""
+_FAST_STEP = 0.015
+"""Half the time between two steps of fast odometry [s]: no skid worth a name drifts as little."""
 _ROUNDING = 5e-3
 _ROUNDING_ANY_WAY = 1e-3
 """Of a vehicle that moves sideways no lack of such motion tells an odometry: its ways must fit better."""
@@ -35,12 +38,17 @@ _MOVES = 0.1
 _ZERO = 1e-6
 
 
-def check_independence(samples: Samples, vehicle: Vehicle) -> list[Finding]:
+def check_independence(samples: Samples, vehicle: Vehicle, periods_s: Sequence[float]) -> list[Finding]:
     """A pose that is integrated from the wheels gives zero slip by construction.
 
     Wheel odometry never moves sideways where the vehicle cannot, while any localization has noise there; and
     its speed is that of the wheels, perhaps by another radius and a little later. Its heading may come from a
     gyro.
+
+    Args:
+        samples: of the run.
+        vehicle: its vehicle.
+        periods_s: between two readings of the wheels, and between two poses [s].
     """
     if samples.measured is None:
         return []
@@ -49,7 +57,7 @@ def check_independence(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     sideways = samples.velocity[moving, 1] - samples.measured[moving, 1]
     is_driven = vehicle.kinematics.has_inputs("sideways")
     swing = samples.measured[moving, 0] * samples.measured[moving, 2]
-    if sideways.size < _FEWEST or not (is_driven or _keeps_straight(sideways, swing)):
+    if sideways.size < _FEWEST or not (is_driven or _keeps_straight(sideways, swing, periods_s)):
         return []
     ahead, aside, turning = _share_beside_wheels(samples, samples.measured, known)
     moved = [share for share in (ahead, aside if is_driven else None) if share is not None]
@@ -65,18 +73,21 @@ def check_independence(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     return [Finding("pose_from_wheels", "error", text, where="pose", value=share)]
 
 
-def _keeps_straight(sideways: Floats, swing: Floats) -> bool:
+def _keeps_straight(sideways: Floats, swing: Floats, periods_s: Sequence[float]) -> bool:
     """Whether there is no motion sideways, but for that of steps along the heading before or after each turn.
 
     Args:
         sideways: speed beside the wheels' [m/s], shape (n,).
         swing: speed times yaw rate of the wheels: such steps drift by half a step's time of it, shape (n,).
+        periods_s: that steps may have [s].
     """
     if float(np.median(np.abs(sideways))) <= _SIDEWAYS:
         return True
     (half_step,), rest = fit_robustly(swing[:, None], sideways)
     drift = float(np.median(np.abs(half_step * swing)))
-    return abs(half_step) <= _HALF_STEP and float(np.median(np.abs(rest))) <= max(_UNEVEN * drift, _SIDEWAYS)
+    known = any(abs(2.0 * abs(half_step) / period - 1.0) <= _UNEVEN for period in periods_s if period > 0.0)
+    regular = float(np.median(np.abs(rest))) <= max(_UNEVEN * drift, _SIDEWAYS)
+    return regular and (known or abs(half_step) <= _FAST_STEP)
 
 
 def _share_beside_wheels(

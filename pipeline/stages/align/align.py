@@ -96,7 +96,9 @@ def align_tables(
         grid = _Grid(velocities, bad, _tabulate_steps(velocities, known, cut.step, bad))
         samples = gather_samples(velocities, known, cut, body_commanded=body_commanded)
         scale = measure_command_scale(samples, vehicle)
-        independent = check_independence(samples, vehicle)
+        independent = check_independence(
+            samples, vehicle, [_find_period(table) for table in (wheels, tables["poses"])]
+        )
         findings += [*scale.findings, *independent]
         grid = replace(grid, recorded=_measure_moduli(samples, bad), is_localization=not independent)
     corrected = {**tables, "commands": _correct_commands(commands, vehicle, scale)}
@@ -139,6 +141,11 @@ class _Grid:
     steps: pl.DataFrame
     recorded: Mapping[str, float | None] = field(default_factory=dict)
     is_localization: bool = True
+
+
+def _find_period(table: pl.DataFrame) -> float:
+    """Median time between two rows [s]; zero where there are none."""
+    return float(np.median(np.diff(table["t"].to_numpy()))) if table.height > 1 else 0.0
 
 
 def _tabulate_steps(
