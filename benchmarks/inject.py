@@ -131,10 +131,9 @@ def shared(before: Answer, after: Answer) -> list[str]:
 
 
 def is_close(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    """Whether two numbers are within their half-widths together; one without an interval is taken as exact."""
-    return abs(one[0] - other[0]) <= math.hypot(
-        *(half if math.isfinite(half) else 0.0 for _, half in (one, other))
-    )
+    """Whether two numbers are within their half-widths together; without an interval they are exact."""
+    halves = [half if math.isfinite(half) else 0.0 for _, half in (one, other)]
+    return abs(one[0] - other[0]) <= math.hypot(*halves)
 
 
 def describe(rows: Iterable[Json]) -> str:

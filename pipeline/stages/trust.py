@@ -26,7 +26,7 @@ _SPAN = 0.5
 _FEWEST_SPANS = 20
 _SIDEWAYS = 1e-4
 _UNEVEN = 0.05
-"""Part of the drift of such steps that unlike ones leave, and by how much they differ from a sensor's period."""
+"""Part of that drift which uneven steps leave, and by how much a step differs from a sensor's period."""
 _FAST_STEP = 0.015
 """Half the time between two steps of fast odometry [s]: no skid worth a name drifts as little."""
 _ROUNDING = 5e-3

@@ -1,0 +1,47 @@
+"""Poses that are integrated wheels are told from a localization that sees how the wheels skid."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.stages.samples import Samples
+from pipeline.stages.trust import check_independence
+from pipeline.vehicles import find_preset
+
+PERIODS_S = (0.05, 0.1)
+
+
+def make_samples(drift_s: float) -> Samples:
+    """Wheels that drive curves of all kinds, and poses that follow them but for v_y = drift_s v w."""
+    times = np.arange(0.0, 60.0, 0.05)
+    speed, turn = 1.0 + 0.5 * np.sin(0.7 * times), 0.6 * np.sin(0.4 * times)
+    yaw = np.cumsum(turn) * 0.05
+    velocity = np.column_stack((speed, drift_s * speed * turn, turn))
+    moved = np.cumsum((velocity[:, 0] + 1j * velocity[:, 1]) * np.exp(1j * yaw)) * 0.05
+    measured = np.column_stack((speed, np.zeros(times.size), turn))
+    return Samples(
+        times=times,
+        segment=np.zeros(times.size, dtype=np.int32),
+        steady=np.ones(times.size, dtype=bool),
+        step=np.zeros(times.size, dtype=np.int32),
+        position=np.column_stack((moved.real, moved.imag)),
+        yaw=yaw,
+        velocity=velocity,
+        gyro=np.full(times.size, np.nan),
+        command=None,
+        measured=measured,
+        body_commanded=False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("drift_s", "found"),
+    [(0.0, True), (0.025, True), (-0.025, True), (0.05, True), (0.005, True), (-0.04, False), (-0.1, False)],
+)
+def test_steps_before_or_after_the_turn_are_odometry_and_a_skid_is_not(
+    drift_s: float,
+    found: bool,  # noqa: FBT001 - one of the cases
+) -> None:
+    told = check_independence(make_samples(drift_s), find_preset("husky_a200"), PERIODS_S)
+    assert [finding.id for finding in told] == (["pose_from_wheels"] if found else [])
