@@ -36,7 +36,7 @@ def test_the_wheel_carries_presets_contracts_and_pages(wheel: Path) -> None:
         ("pipeline/report", "page.*"),
         ("pipeline/report", "*.js"),
         ("pipeline/report/templates", "**/*.html"),
-        ("pipeline/batch", "catalogue.*"),
+        ("pipeline/report", "catalogue.*"),
         ("pipeline", "py.typed"),
         ("pipeline/web", "page.*"),
         ("pipeline/web", "*.js"),
