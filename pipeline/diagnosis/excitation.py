@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 _STANDARD_ERRORS = 4.0
 _DETECTED = 9.0
-"""Standard errors at which nine of ten hidden effects are found (`benchmarks/detection.py`)."""
+"""Standard errors of a size that is seen: 10 of 12 hidden effects were named at it, 4 at half of it and 12 at
+twice (`make detection`, seeds 300 to 311)."""
 
 MANOEUVRES: Mapping[Excitation, str] = {
     Excitation.DRIVING: "drive for a few minutes",
