@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.identification.growth import INTERVAL_SHARE, find_goal, last_until
+from pipeline.identification.growth import INTERVAL_SHARE, extrapolate, find_goal, last_until
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 _POINTS = 60
 # By less than this share the rest of a drive makes no interval narrower.
 _NO_NARROWER = 0.1
+# Nobody drives so many times as long for a number.
+_TOO_LONG = 10.0
 # Where driving is all alike, a fifth of it is as little.
 _WORTH_SAYING = 0.25
 _DIGITS = 4
@@ -53,8 +55,14 @@ def _list_points(curve: Curve, name: str) -> dict[str, Json]:
     }
 
 
+def _say(half: float, unit: str) -> str:
+    return f"{half:.2g}" if unit == "1" else f"{half:.2g} {unit}"
+
+
 def describe_enough(effects: Sequence[Named]) -> str:
     """Since when the numbers of a diagnosis were known, and how much of the drive made no difference.
+
+    A number is known when its interval is a twentieth of it, or of a usual one where it is smaller.
 
     Returns:
         A sentence or two; empty where nothing was named that grows with driving.
@@ -73,7 +81,7 @@ def describe_enough(effects: Sequence[Named]) -> str:
             if math.isfinite(since):
                 known.append((since, label))
             else:
-                vague.append((half / goal * INTERVAL_SHARE, label))
+                vague.append((half / goal, f"{label} only within {_say(half, value.unit)}", curve, goal))
     if not known and not vague:
         return ""
     told = []
@@ -82,10 +90,14 @@ def describe_enough(effects: Sequence[Named]) -> str:
         who = label if len(known) == 1 else f"{len(known)} numbers"
         told.append(f"{who} within {INTERVAL_SHARE:.0%} after {since:.0f} of {driven:.0f} s of driving")
     if vague:
-        share, label = max(vague)
-        # Intervals narrow with the square root of the time.
-        more = driven * (share / INTERVAL_SHARE) ** 2
-        told.append(f"{label} within {share:.0%} only, {more / 60.0:.0f} min of such driving are needed")
+        _, text, curve, goal = max(vague, key=lambda one: one[0])
+        seconds = extrapolate(curve, goal)
+        more = (
+            f"{seconds / 60.0:.0f} min of such driving are needed"
+            if seconds < _TOO_LONG * driven
+            else "which more of such driving hardly narrows"
+        )
+        told.append(f"{text}, {more}")
     idle = 1.0 - needed / driven
     if idle >= _WORTH_SAYING:
         told.append(f"the last {idle:.0%} of this drive made no interval narrower by a tenth")

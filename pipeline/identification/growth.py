@@ -62,3 +62,20 @@ def last_until(curve: Curve, goal: float) -> float:
     if above[-1] == curve.seconds.size - 1:
         return math.inf
     return float(curve.seconds[above[-1] + 1])
+
+
+def extrapolate(curve: Curve, goal: float) -> float:
+    """Seconds of such driving after which a width would reach a goal; infinite where it never would.
+
+    The square of a width is a part that falls with the time driven, and one that stays: what is not known of
+    the clocks does not go away by driving on. Both are read from the later half of the curve.
+    """
+    seconds, squares = curve.seconds, curve.values**2
+    later = np.isfinite(squares) & (seconds >= 0.5 * seconds[-1])
+    if later.sum() < 2:  # noqa: PLR2004 - two numbers are read from it
+        return float(seconds[-1] * squares[-1] / goal**2)
+    slope, stays = np.polyfit(1.0 / seconds[later], squares[later], 1)
+    # From the last width on, whatever the fit says of it.
+    falls = float(np.clip(slope / seconds[-1], 0.0, squares[-1]))
+    stays = float(squares[-1]) - falls
+    return math.inf if stays >= goal**2 else float(seconds[-1]) * falls / (goal**2 - stays)

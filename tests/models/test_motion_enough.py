@@ -11,7 +11,7 @@ from pipeline.diagnosis.enough import Growth, describe_enough
 from pipeline.diagnosis.verdict import compare, grow_t
 from pipeline.identification import Fitted, Input, Problem, estimate_intervals, fit_model
 from pipeline.identification.folds import hold_out_part, make_folds
-from pipeline.identification.growth import Curve, last_until, narrow_intervals
+from pipeline.identification.growth import Curve, extrapolate, last_until, narrow_intervals
 from pipeline.identification.intervals import narrow_part
 from pipeline.models import Model, find_effect
 from pipeline.runs.cut import cut_run, find_driven
@@ -80,6 +80,15 @@ def test_a_curve_counts_from_where_it_stays_below() -> None:
     assert np.isinf(last_until(curve, 0.04))
 
 
+def test_what_stays_is_not_driven_away() -> None:
+    seconds = np.arange(10.0, 210.0, 10.0)
+    falling = Curve(seconds, np.sqrt(4.0 / seconds))
+    assert extrapolate(falling, 0.1) == pytest.approx(400.0, rel=1e-6)
+    stays = Curve(seconds, np.sqrt(4.0 / seconds + 0.09))
+    assert np.isinf(extrapolate(stays, 0.29))
+    assert extrapolate(stays, 0.32) == pytest.approx(4.0 / (0.32**2 - 0.09), rel=1e-6)
+
+
 def _name(half: list[float]) -> Named:
     curve = Curve(10.0 * np.arange(1.0, len(half) + 1.0), np.array(half))
     value = Value(1.5, 1.5 - half[-1], 1.5 + half[-1], "1")
@@ -94,6 +103,8 @@ def test_words_say_since_when_how_narrow_and_what_was_idle() -> None:
     assert "effective_track.k within 5% after 20 of 100 s" in idle
     assert "last 80% of this drive made no interval narrower" in idle
     vague = describe_enough([_name([0.9, 0.6, 0.3])])
-    assert "within 20% only" in vague
-    assert "min of such driving" in vague
+    assert "only within 0.3" in vague
+    assert "hardly narrows" in vague
+    falling = _name((0.6 / np.sqrt(np.arange(1.0, 25.0))).tolist())
+    assert "11 min of such driving are needed" in describe_enough([falling])
     assert describe_enough([]) == ""
