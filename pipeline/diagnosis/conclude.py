@@ -123,6 +123,7 @@ def summarize(
         unexplained=unexplained,
         findings=(
             *_note_cut(body.search.selection.budget),
+            *_note_grounds(context),
             *_note_doubts(doubts),
             *(_note_idle(effect) for effect in idle),
         ),
@@ -195,6 +196,18 @@ def _note_cut(budget: Budget) -> list[Mapping[str, Json]]:
         f"explanations of it were not all tried (--budget {2.0 * budget.seconds:g}s lets it go on)"
     )
     return [{"id": "search_cut", "text": text, "where": "diagnosis", "severity": "warning"}]
+
+
+def _note_grounds(context: Context) -> list[Mapping[str, Json]]:
+    """A word where runs on unlike ground were judged as one."""
+    grounds = sorted({run.terrain for run in context.runs})
+    if len(grounds) == 1:
+        return []
+    text = (
+        f"these runs are on {', '.join(grounds)} and were judged as one: what differs between them may be "
+        "named as a change within (slip compare --causes and slip fleet fit tell grounds apart)"
+    )
+    return [{"id": "unlike_grounds", "text": text, "where": "diagnosis", "severity": "warning"}]
 
 
 def _note_idle(effect: Effect) -> Mapping[str, Json]:

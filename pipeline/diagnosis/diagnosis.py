@@ -237,6 +237,11 @@ class RunDiagnosis:
     budgets: tuple[SlipBudget, ...] = ()
     estimates: tuple[EstimatedNumber, ...] = ()
 
+    def find_held(self, item: Undecided) -> str | None:
+        """Which of the candidates stands in the model, so that its error is that of any of them."""
+        ids = () if self.proposal is None else self.proposal.model.ids
+        return next((name for name in item.candidates if name in ids), None)
+
     def to_json(self) -> dict[str, Json]:
         """The promised keys of `slip diagnose --json` for one run, and more."""
         return {
@@ -252,7 +257,11 @@ class RunDiagnosis:
                 "horizon_s": HORIZON_S,
             },
             "undecided": [
-                {"candidates": list(item.candidates), "separate_by": item.separate_by}
+                {
+                    "candidates": list(item.candidates),
+                    "separate_by": item.separate_by,
+                    "in_model": self.find_held(item),
+                }
                 for item in self.undecided
             ],
             "unobservable": [item.id for item in self.unobservable],

@@ -102,9 +102,12 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
         note = f"  ({'; '.join(notes)})" if notes else ""
         rows.append(f"{effect.id:<20}{_values(effect):<{width}}{falls.get(effect.id, '')}{note}")
         rows += [f"{'':<20}{line}" for line in wrap(effect.sentence, _SENTENCE)]
-    rows += [
-        f"{'undecided':<20}{' or '.join(item.candidates)}: {item.separate_by}" for item in diagnosis.undecided
-    ]
+    for item in diagnosis.undecided:
+        held = diagnosis.find_held(item)
+        fall = f"  {falls[held]}" if held in falls else ""
+        rows.append(f"{'undecided':<20}{' or '.join(item.candidates)}{fall}")
+        text = f"{held} stands for them in the model; {item.separate_by}" if held else item.separate_by
+        rows += [f"{'':<20}{line}" for line in wrap(text, _SENTENCE)]
     if diagnosis.unexplained is not None:
         left = diagnosis.unexplained
         rows.append(f"{'unexplained':<20}{left.share:.0%} of what is left: {left.where}")

@@ -237,6 +237,24 @@ def test_one_circle_leaves_it_undecided_with_a_manoeuvre(tmp_path: Path) -> None
     assert run.effects == ()
     assert "turning_resistance" in run.undecided[0].candidates
     assert run.undecided[0].separate_by
+    held = run.find_held(run.undecided[0])
+    assert run.proposal is not None
+    assert held in run.proposal.model.ids
+    assert f"{held} stands for them in the model" in " ".join(text for _, text in list_lines(run))
+
+
+def test_runs_on_unlike_ground_are_not_judged_as_one_in_silence(tmp_path: Path) -> None:
+    taken = []
+    for number, terrain in enumerate(("tile", "snow")):
+        scenario = replace(_SCENE, seed=number, duration_s=60.0, recording=Recorded(terrain=terrain))
+        (tmp_path / terrain).mkdir()
+        taken.append(_record(scenario, tmp_path / terrain))
+    (first, vehicle), (second, _) = taken
+    together = diagnose_runs([first, second], vehicle)
+    for run in together.runs:
+        assert [f["id"] for f in run.findings].count("unlike_grounds") == 1
+    alone = diagnose_runs([first], vehicle).runs[0]
+    assert "unlike_grounds" not in [f["id"] for f in alone.findings]
 
 
 def test_a_vehicle_that_does_not_move_gets_no_name(tmp_path: Path) -> None:
