@@ -78,7 +78,7 @@ def study(
     forecast = _forecast(known, vehicle, terrain, without=[run.sha256 for run in here])
     if len(here) < len(runs):
         expected = assume(vehicle, forecast.effects, forecast.prior).base
-        return Studied(diagnosis, replace(learn(runs, vehicle, named), base=expected), forecast)
+        return Studied(diagnosis, replace(learn(runs, vehicle, named), base=expected, fitted=None), forecast)
     rest = [effect for effect in forecast.effects if effect.id not in {one.id for one in named}]
     return Studied(diagnosis, learn(runs, vehicle, [*named, *rest], forecast.prior), forecast)
 
@@ -120,7 +120,14 @@ def ask(
     Raises:
         SlipError: an effect is unknown or does not exist on the vehicle.
     """
-    from pipeline.plan import ask_numbers, ask_presence, ask_undecided, find_largest, list_names  # noqa: PLC0415
+    from pipeline.plan import (  # noqa: PLC0415
+        ask_apart,
+        ask_numbers,
+        ask_presence,
+        ask_undecided,
+        find_largest,
+        list_names,
+    )
 
     questions: list[Question] = []
     names = [name for name in wanted if name not in {UNDECIDED, ALL}]
@@ -128,6 +135,7 @@ def ask(
     if len(names) < len(wanted):
         groups = [] if diagnosis is None else [group.candidates for group in diagnosis.undecided]
         questions += ask_undecided(knowledge, groups)
+        questions += ask_apart(knowledge, {name for group in groups for name in group})
         numbers |= knowledge.base.names.difference(*groups)
     questions += [one for one in ask_numbers(knowledge.base) if numbers & set(one.effects)]
     if ALL in wanted:

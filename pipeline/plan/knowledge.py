@@ -8,7 +8,7 @@ what is known before, of the fleet or of what is usual, adds to it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -95,6 +95,7 @@ class Knowledge:
         base: the model that explains the logs so far; the ideal one without logs.
         noise: deviation of a window's residual by part and channel, larger by what repeats it; infinite in
             channels that say nothing, shape (parts, 3).
+        fitted: the base's fit to the logs so far; None without logs on this ground.
         problem: the logs so far; None without.
     """
 
@@ -103,6 +104,7 @@ class Knowledge:
     base: Hypothesis
     noise: Floats
     problem: Problem | None = None
+    fitted: Fitted | None = field(default=None, repr=False)
 
     @property
     def driven_s(self) -> float:
@@ -114,6 +116,22 @@ class Knowledge:
         if self.problem is None:
             return _assume(tuple(effects), {})
         return _inform(fit_model(self.problem, Model(self.problem.vehicle, tuple(effects))))
+
+    def rival(self, effects: Sequence[Effect]) -> tuple[Hypothesis, float]:
+        """These effects fitted to the logs so far, and the block t by which the base explains these better.
+
+        Raises:
+            ValueError: there are no logs on this ground.
+        """
+        if self.fitted is None:
+            raise ValueError("nothing was driven")
+        problem, power = self.fitted.problem, 0.0
+        other = fit_model(problem, Model(problem.vehicle, tuple(effects)))
+        for part, own, fit in zip(problem.parts, self.fitted.fits, other.fits, strict=True):
+            # Under the same weights.
+            more = own.weights.loss(fit.residual) - own.weights.loss(own.residual)
+            power += more * fit.residual.shape[0] / _inflate(part, own)
+        return _inform(other), 0.5 * math.sqrt(max(power, 0.0))
 
 
 def learn(
@@ -152,7 +170,7 @@ def learn(
         problem = tie_to_prior(problem, model, prior)
     fitted = fit_model(problem, model)
     noise = [_measure_noise(part, fit) for part, fit in zip(problem.parts, fitted.fits, strict=True)]
-    return Knowledge(problem.vehicle, read_senses(used), _inform(fitted), np.array(noise), problem)
+    return Knowledge(problem.vehicle, read_senses(used), _inform(fitted), np.array(noise), problem, fitted)
 
 
 def assume(
