@@ -13,6 +13,7 @@ from pipeline.report import theme
 from pipeline.report.elements import Picture
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
+from pipeline.report.specs import build_spec, share_rows
 
 if TYPE_CHECKING:
     from pipeline.plan import Plan
@@ -21,6 +22,19 @@ if TYPE_CHECKING:
 _EVERY = 4
 _MOST_WAYS = 24
 _WIDTH = 640
+
+
+def preview_plan(plan: Plan) -> dict[str, object]:
+    """The way and the promises in short, for a page that draws it: figures, rows, and lines of text."""
+    picture = _draw_ways(plan, most=8, every=2 * _EVERY)
+    return {
+        "figures": {picture.id: build_spec(picture.drawing)},
+        "rows": share_rows([picture.drawing]),
+        "dark": dict(theme.DARK_TWINS),
+        "words": picture.words,
+        "safety": SAFETY,
+        **_say(plan),
+    }
 
 
 def render_plan(plan: Plan, catalogue: str = "") -> str:
@@ -44,20 +58,27 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
             f"at most {limits.speed_mps:.3g} m/s, {turn}, {limits.acceleration_mps2:.3g} m/s2",
         ],
         safety=SAFETY,
-        play=f"ros2 bag play plan.mcap ({plan.topic}, {plan.type_name})",
-        promises=[
-            f"after {one.decided_after_s:.0f} s: {one.question} "
-            + (f"(t = {one.expected:.1f})" if one.kind == "separation" else f"(+- {one.expected:.2g})")
-            for one in plan.promises
-        ],
-        impossible=[f"{one.question}: {one.because}" for one in plan.impossible],
+        **_say(plan),
         manoeuvres=[f"{start:.0f} s: {name}" for name, start in plan.manoeuvres],
     )
 
 
-def _draw_ways(plan: Plan) -> Picture:
+def _say(plan: Plan) -> dict[str, object]:
+    """How it is played, what it promises, and what it leaves open."""
+    return {
+        "play": f"ros2 bag play plan.mcap ({plan.topic}, {plan.type_name})",
+        "promises": [
+            f"after {one.decided_after_s:.0f} s: {one.question} "
+            + (f"(t = {one.expected:.1f})" if one.kind == "separation" else f"(+- {one.expected:.2g})")
+            for one in plan.promises
+        ],
+        "impossible": [f"{one.question}: {one.because}" for one in plan.impossible],
+    }
+
+
+def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Picture:
     """The way that is expected, those of other models, and the area."""
-    ways = plan.ways[:: max(len(plan.ways) // _MOST_WAYS, 1), ::_EVERY]
+    ways = plan.ways[:: max(len(plan.ways) // most, 1), ::every]
     rows = pl.concat(
         pl.DataFrame(
             {"x": way.real, "y": way.imag, "model": np.full(way.size, number), "order": np.arange(way.size)}
@@ -86,7 +107,11 @@ def _draw_ways(plan: Plan) -> Picture:
         line("plan_area", theme.QUIET, 1.0),
         line("plan_ways", theme.CROSS, 0.4, "model:N"),
         line("plan_way", theme.ON_COMMAND, 1.0),
-    ).properties(width=_WIDTH, height=round(_WIDTH * plan.area.width_m / plan.area.length_m))
+    ).properties(
+        width=_WIDTH,
+        height=round(_WIDTH * plan.area.width_m / plan.area.length_m),
+        usermeta={"equal": {"x": [-half_x, half_x], "y": [-half_y, half_y], "lowest": 80, "highest": 640}},
+    )
     tables = {"plan_area": edge, "plan_ways": rows, "plan_way": rows.filter(pl.col("model") == 0)}
     words = (
         f"From the middle of the area and back to within {plan.home_m:.1f} m: in blue by the model that "
