@@ -30,11 +30,12 @@ const showPlan = (pane, made) => {
   if (pane.planned?.of === `${pane.run} ${made}`) return pane.planned.node;
   const node = h("div", { class: "planned" });
   pane.planned = { of: `${pane.run} ${made}`, node };
-  fill(node, pane.run).catch((error) => toast(error.message));
+  fill(pane.planned, pane.run).catch((error) => toast(error.message));
   return node;
 };
 
-const fill = async (node, run) => {
+const fill = async (planned, run) => {
+  const { node } = planned;
   const link = (file) => `/plan?${new URLSearchParams({ run, file })}`;
   const plan = await get(link("plan.json"));
   const list = (texts) => h("ul", {}, texts.map((text) => h("li", {}, text)));
@@ -50,7 +51,7 @@ const fill = async (node, run) => {
     list(plan.promises), left,
     h("p", {}, h("a", { class: "download button", href: link("plan.mcap") }, "Download plan.mcap"), " ", h("code", {}, plan.play)),
     h("div", { class: "doubts" }, list(plan.safety))].filter(Boolean));
-  const paint = () => slipPlots(plan, { strict: true }).draw(place);
-  await paint();
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", paint);
+  const plots = slipPlots(plan, { strict: true });
+  planned.paint = () => plots.draw(place);
+  await planned.paint();
 };

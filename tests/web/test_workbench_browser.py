@@ -400,7 +400,7 @@ def test_a_report_leads_to_all_runs_and_they_lead_back(
 def test_a_drive_is_planned_on_request_and_its_files_are_there(
     chrome: Chrome, pictures: Path, tmp_path: Path
 ) -> None:
-    hidden: dict[str, object] = {"effective_track": 1.6, "drive_lag": 0.25, "icr_offset": 0.08}
+    hidden: dict[str, object] = {"effective_track": 1.6, "drive_lag": 0.25, "lateral_skid": 0.1}
     log = simulate_case(
         None, hidden, out=tmp_path / "circle.mcap", seed=9, duration_s=40.0, vehicle="husky", program="circle"
     )

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 _EVERY = 4
 _MOST_WAYS = 24
 _WIDTH = 640
+# The part of the area that is drawn: times as far as the drive leads, and at least.
+_ROOM = 1.2
+_LEAST = 0.1
 
 
 def preview_plan(plan: Plan) -> dict[str, object]:
@@ -86,6 +89,10 @@ def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Pictu
         for number, way in enumerate(ways)
     )
     half_x, half_y = 0.5 * plan.area.length_m, 0.5 * plan.area.width_m
+    # A drive that needs little of the area is drawn larger.
+    share = _ROOM * max(float(np.abs(ways.real).max()) / half_x, float(np.abs(ways.imag).max()) / half_y)
+    share = min(max(share, _LEAST), 1.0)
+    seen_x, seen_y = share * half_x, share * half_y
     edge = pl.DataFrame(
         {
             "x": [-half_x, half_x, half_x, -half_x, -half_x],
@@ -94,12 +101,14 @@ def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Pictu
         }
     )
     along = alt.X(
-        "x:Q", title="ahead of the start [m]", scale=alt.Scale(domain=[-half_x, half_x], nice=False)
+        "x:Q", title="ahead of the start [m]", scale=alt.Scale(domain=[-seen_x, seen_x], nice=False)
     )
-    aside = alt.Y("y:Q", title="to the left [m]", scale=alt.Scale(domain=[-half_y, half_y], nice=False))
+    aside = alt.Y("y:Q", title="to the left [m]", scale=alt.Scale(domain=[-seen_y, seen_y], nice=False))
 
     def line(name: str, colour: str, opacity: float, *detail: str) -> alt.Chart:
-        chart = alt.Chart(alt.NamedData(name)).mark_line(color=colour, opacity=opacity, strokeWidth=1.5)
+        chart = alt.Chart(alt.NamedData(name)).mark_line(
+            color=colour, opacity=opacity, strokeWidth=1.5, clip=True
+        )
         drawn: alt.Chart = chart.encode(x=along, y=aside, order="order:Q", detail=list(detail))
         return drawn
 
@@ -109,13 +118,14 @@ def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Pictu
         line("plan_way", theme.ON_COMMAND, 1.0),
     ).properties(
         width=_WIDTH,
-        height=round(_WIDTH * plan.area.width_m / plan.area.length_m),
-        usermeta={"equal": {"x": [-half_x, half_x], "y": [-half_y, half_y], "lowest": 80, "highest": 640}},
+        height=round(_WIDTH * seen_y / seen_x),
+        usermeta={"equal": {"x": [-seen_x, seen_x], "y": [-seen_y, seen_y], "lowest": 80, "highest": 640}},
     )
     tables = {"plan_area": edge, "plan_ways": rows, "plan_way": rows.filter(pl.col("model") == 0)}
     words = (
-        f"From the middle of the area and back to within {plan.home_m:.1f} m: in blue by the model that "
-        "explains the logs so far, in grey by others that they do not rule out."
+        f"From the middle of an area of {plan.area.length_m:g} x {plan.area.width_m:g} m and back to within "
+        f"{plan.home_m:.1f} m: in blue by the model that explains the logs so far, in grey by others that "
+        "they do not rule out."
     )
     return Picture("ways", "Where it leads", Drawing(chart, tables, words), words)
 
