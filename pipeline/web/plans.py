@@ -61,8 +61,8 @@ def write_run_plan(results: Path, manifest: Manifest, area: str) -> None:
     make_folder(preview.parent)
     if plan.manoeuvres:
         write_plan(plan, preview.parent, render_plan(plan, lead_to(results, preview.parent)))
-    shown = preview_plan(plan) if plan.manoeuvres else {"impossible": preview_plan(plan)["impossible"]}
-    told = {"key": manifest.key, "area": area, "duration_s": plan.commands.duration_s, **shown}
+    drives = {"drives": bool(plan.manoeuvres), "area": area, "duration_s": plan.commands.duration_s}
+    told = {"key": manifest.key, **drives, **preview_plan(plan)}
     replace_file(preview, json.dumps(told, allow_nan=False).encode())
 
 
