@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis import Recording, RunDiagnosis
+    from pipeline.fleet.forecast import Forecast
     from pipeline.plan import Knowledge, Limits
     from pipeline.plan.questions import Question
     from pipeline.store import Manifest
@@ -30,14 +31,25 @@ class Studied:
     Attributes:
         diagnosis: of all of them together.
         knowledge: of the same model.
+        forecast: of the fleet, which the knowledge holds; None where it was not asked.
     """
 
     diagnosis: RunDiagnosis
     knowledge: Knowledge
+    forecast: Forecast | None = None
 
 
-def study(recordings: Sequence[Recording], vehicle: Vehicle) -> Studied:
+def study(
+    recordings: Sequence[Recording], vehicle: Vehicle, terrain: str | None = None, known: Path | None = None
+) -> Studied:
     """Diagnose runs together, and fit what was named and what is undecided.
+
+    Args:
+        recordings: of one vehicle.
+        vehicle: which.
+        terrain: to drive on; what the fleet lets expect there adds to what runs on it say, and stands in
+            place of what runs elsewhere say.
+        known: results folder of the fleet; needed with a terrain.
 
     Raises:
         SlipError: nothing can be judged, or a run has no commands.
@@ -45,7 +57,7 @@ def study(recordings: Sequence[Recording], vehicle: Vehicle) -> Studied:
     from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy
     from pipeline.diagnosis.subject import load_recording  # noqa: PLC0415 - heavy
     from pipeline.models import list_effects  # noqa: PLC0415 - heavy
-    from pipeline.plan import learn  # noqa: PLC0415 - heavy
+    from pipeline.plan import assume, learn  # noqa: PLC0415 - heavy
 
     diagnosis = diagnose_runs(recordings, vehicle).runs[0]
     if diagnosis.proposal is None:
@@ -59,7 +71,38 @@ def study(recordings: Sequence[Recording], vehicle: Vehicle) -> Studied:
     catalogue = {effect.id for effect in list_effects()}
     named = [effect for effect in diagnosis.proposal.model.effects if effect.id in catalogue]
     runs = [load_recording(recording, vehicle) for recording in recordings]
-    return Studied(diagnosis, learn(runs, vehicle, named))
+    if terrain is None or known is None:
+        return Studied(diagnosis, learn(runs, vehicle, named))
+    here = [run for run in runs if run.terrain == terrain]
+    # Runs that are fitted themselves are not known before; those on another ground are.
+    forecast = _forecast(known, vehicle, terrain, without=[run.sha256 for run in here])
+    if len(here) < len(runs):
+        expected = assume(vehicle, forecast.effects, forecast.prior).base
+        return Studied(diagnosis, replace(learn(runs, vehicle, named), base=expected, fitted=None), forecast)
+    rest = [effect for effect in forecast.effects if effect.id not in {one.id for one in named}]
+    return Studied(diagnosis, learn(runs, vehicle, [*named, *rest], forecast.prior), forecast)
+
+
+def expect(vehicle: Vehicle, terrain: str | None, known: Path) -> tuple[Knowledge, Forecast | None]:
+    """What is known of a vehicle without a log: the fleet's forecast on a terrain, or the ideal model.
+
+    Raises:
+        SlipError: the results know nothing of the vehicle.
+    """
+    from pipeline.plan import assume  # noqa: PLC0415 - heavy
+
+    if terrain is None:
+        return assume(vehicle), None
+    forecast = _forecast(known, vehicle, terrain)
+    return assume(vehicle, forecast.effects, forecast.prior), forecast
+
+
+def _forecast(known: Path, vehicle: Vehicle, terrain: str, without: Sequence[str] = ()) -> Forecast:
+    from pipeline.analysis.fleet import find_estimates  # noqa: PLC0415 - heavy
+    from pipeline.fleet.forecast import forecast_vehicle  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    return forecast_vehicle(find_estimates(Store(known), without=without), vehicle.id, terrain)
 
 
 def ask(
@@ -77,14 +120,24 @@ def ask(
     Raises:
         SlipError: an effect is unknown or does not exist on the vehicle.
     """
-    from pipeline.plan import ask_numbers, ask_presence, ask_undecided, find_largest, list_names  # noqa: PLC0415
+    from pipeline.plan import (  # noqa: PLC0415
+        ask_apart,
+        ask_numbers,
+        ask_presence,
+        ask_undecided,
+        find_largest,
+        list_names,
+    )
 
     questions: list[Question] = []
     names = [name for name in wanted if name not in {UNDECIDED, ALL}]
-    if diagnosis is not None and len(names) < len(wanted):
-        questions += ask_undecided(knowledge, [group.candidates for group in diagnosis.undecided])
-        open_ids = {name for group in diagnosis.undecided for name in group.candidates}
-        questions += [one for one in ask_numbers(knowledge.base) if not open_ids & set(one.effects)]
+    numbers = knowledge.base.names & set(names)
+    if len(names) < len(wanted):
+        groups = [] if diagnosis is None else [group.candidates for group in diagnosis.undecided]
+        questions += ask_undecided(knowledge, groups)
+        questions += ask_apart(knowledge, {name for group in groups for name in group})
+        numbers |= knowledge.base.names.difference(*groups)
+    questions += [one for one in ask_numbers(knowledge.base) if numbers & set(one.effects)]
     if ALL in wanted:
         names += [u.id for u in diagnosis.unobservable] if diagnosis is not None else list_names(knowledge)
     elif diagnosis is None and not names:

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
     from pipeline.analysis.options import Options
     from pipeline.diagnosis import Recording, RunDiagnosis
-    from pipeline.plan import Knowledge, Needed, Plan
+    from pipeline.fleet.forecast import Forecast
+    from pipeline.plan import Needed, Plan
     from pipeline.vehicles import Vehicle
 
 
@@ -54,6 +55,8 @@ def plan(  # noqa: D417 - the runs document themselves
     max_acceleration: PositiveFloat | None = None,
     topic: str | None = None,
     type_name: Annotated[str | None, Parameter(name="--type")] = None,
+    terrain: str | None = None,
+    known: Path | None = None,
     check: Path | None = None,
     compare: str | None = None,
     seed: int = 0,
@@ -67,6 +70,8 @@ def plan(  # noqa: D417 - the runs document themselves
 
     Args:
         vehicle: vehicle preset; without any log the plan looks for all of its effects.
+        terrain: to drive on; the plan starts from what the runs of --known let expect there.
+        known: results folder with diagnosed runs of the vehicle (default: --results).
         wanted: what to decide; by default what is undecided in the runs.
         time: longest duration, for example 60s or 2min.
         area: free ground: length along the heading at the start, and width; the start is its middle.
@@ -91,7 +96,7 @@ def plan(  # noqa: D417 - the runs document themselves
         names = list(runs or [])
         if check is not None:
             return _check(check, names, options, json=json, quiet=quiet)
-        from pipeline.analysis.plan import UNDECIDED, ask, choose_topic, study  # noqa: PLC0415 - heavy
+        from pipeline.analysis.plan import UNDECIDED, ask, choose_topic, expect, study  # noqa: PLC0415 - heavy
         from pipeline.plan import Request, choose_limits, make_plan, parse_area, write_plan  # noqa: PLC0415
         from pipeline.plan.limits import parse_time  # noqa: PLC0415 - heavy
 
@@ -103,11 +108,12 @@ def plan(  # noqa: D417 - the runs document themselves
             place = parse_area(area, found)
             with show_progress(names[0], quiet=quiet or json) as progress:
                 progress("diagnosis")
-                studied = study(recordings, found)
-            diagnosis, knowledge = studied.diagnosis, studied.knowledge
+                studied = study(recordings, found, terrain, known or results)
+            diagnosis, knowledge, forecast = studied.diagnosis, studied.knowledge, studied.forecast
             usual = choose_topic(found, chosen, recordings[0].path)
         else:
-            found, knowledge = _assume(vehicle)
+            found = _find_vehicle(vehicle)
+            knowledge, forecast = expect(found, terrain, known or results)
             recordings, place = [], parse_area(area, found)
             usual = choose_topic(found, {}, "")
         limits = choose_limits(
@@ -150,11 +156,27 @@ def plan(  # noqa: D417 - the runs document themselves
             one.protocol: {text: _finite(second) for text, second in zip(asked, one.seconds, strict=True)}
             for one in others
         }
-        written = {"files": [str(file) for file in files], "errors": []}
+        written = {**_known_as_json(forecast), "files": [str(file) for file in files], "errors": []}
         print_json({**made.to_json(), **({"compare": told} if others else {}), **written})
     elif not quiet:
-        print_lines([*_describe(made, diagnosis, files), *_list_others(made, asked, others)])
+        print_lines(
+            [*_tell_known(forecast), *_describe(made, diagnosis, files), *_list_others(made, asked, others)]
+        )
     return LOSSY if lossy else CLEAN
+
+
+def _known_as_json(forecast: Forecast | None) -> dict[str, object]:
+    if forecast is None:
+        return {}
+    there = {"terrain": forecast.terrain, "runs_on_terrain": len(forecast.here)}
+    return {"known": {**there, "runs_elsewhere": len(forecast.elsewhere)}}
+
+
+def _tell_known(forecast: Forecast | None) -> list[str]:
+    if forecast is None:
+        return []
+    runs = f"{len(forecast.here)} runs there, {len(forecast.elsewhere)} elsewhere"
+    return [f"known        of {forecast.vehicle} on {forecast.terrain}: {runs}"]
 
 
 def _finite(seconds: float) -> float | None:
@@ -210,8 +232,7 @@ def _gather(
     return vehicles[0], recordings, chosen, lossy
 
 
-def _assume(name: str | None) -> tuple[Vehicle, Knowledge]:
-    from pipeline.plan import assume  # noqa: PLC0415 - heavy
+def _find_vehicle(name: str | None) -> Vehicle:
     from pipeline.vehicles import find_preset, list_presets  # noqa: PLC0415 - heavy
 
     vehicle = None if name is None else find_preset(name)
@@ -222,7 +243,7 @@ def _assume(name: str | None) -> tuple[Vehicle, Knowledge]:
             "a plan needs a run or a vehicle" if name is None else f"no preset is called {name!r}",
             hint=f"Give a log, a run, or --vehicle as one of {known}.",
         )
-    return vehicle, assume(vehicle)
+    return vehicle
 
 
 def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet: bool) -> int:

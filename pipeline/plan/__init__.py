@@ -6,7 +6,7 @@ they will answer, `write_plan` writes what a robot plays.
 
 from __future__ import annotations
 
-from pipeline.plan.ask import ask_numbers, ask_presence, ask_undecided, list_names
+from pipeline.plan.ask import ask_apart, ask_numbers, ask_presence, ask_undecided, list_names
 from pipeline.plan.check import check_plan
 from pipeline.plan.errors import PlanError
 from pipeline.plan.files import read_promises, write_plan
@@ -25,6 +25,7 @@ __all__ = [
     "Plan",
     "PlanError",
     "Request",
+    "ask_apart",
     "ask_numbers",
     "ask_presence",
     "ask_undecided",

@@ -9,10 +9,10 @@ import numpy as np
 from pipeline.identification.growth import find_goal
 from pipeline.models import find_effect, list_effects
 from pipeline.plan.errors import PlanError
-from pipeline.plan.questions import Precision, Separation
+from pipeline.plan.questions import DECIDED_T, Precision, Separation
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Container, Iterable, Sequence
 
     from pipeline.models.evidence import Largest
     from pipeline.plan.knowledge import Hypothesis, Knowledge
@@ -30,6 +30,37 @@ def ask_undecided(knowledge: Knowledge, groups: Iterable[Sequence[str]]) -> list
             Separation(f"{group[0]} or {name}", (group[0], name), (first, other))
             for name, other in zip(group[1:], others, strict=True)
         ]
+    return found
+
+
+def ask_apart(knowledge: Knowledge, settled: Container[str] = ()) -> list[Separation]:
+    """Whether what is named may be something else that looks alike: one effect that stands for one or more.
+
+    Asked is what the logs so far leave open.
+
+    Args:
+        knowledge: where the plan starts from.
+        settled: ids of effects of which something else is asked.
+    """
+    base = knowledge.base
+    named = [effect for effect in base.effects if effect.id not in settled]
+    if knowledge.fitted is None:
+        return []
+    swaps: dict[tuple[tuple[str, ...], str], None] = {}
+    for effect in named:
+        for name in effect.confused_with:
+            alike = tuple(one.id for one in named if name in one.confused_with)
+            swaps |= dict.fromkeys([((effect.id,), name), (alike, name)])
+    found = []
+    for dropped, name in swaps:
+        other = find_effect(name)()
+        if knowledge.vehicle.kind not in other.kinds or set(dropped) & {name, *other.contains}:
+            continue
+        rest = [effect for effect in base.effects if effect.id not in {*dropped, name}]
+        rival, apart = knowledge.rival([*rest, other])
+        if apart < DECIDED_T:
+            text = f"{' and '.join(dropped)} or {name}"
+            found.append(Separation(text, (*dropped, name), (base, rival), both_ways=False))
     return found
 
 

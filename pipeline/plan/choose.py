@@ -83,23 +83,25 @@ class Chooser:
                 break
         return chosen
 
-    def add_up(self, chosen: Sequence[int]) -> float:
-        """Sum of the shares of all questions that these manoeuvres answer."""
-        key = tuple(sorted(chosen))
-        if key not in self._answers:
-            weight = np.bincount(np.array(key, dtype=np.int64), minlength=self.durations.size).astype(
-                np.float64
+    def add_up(self, trials: Sequence[Sequence[int]]) -> list[float]:
+        """Of each trial, the sum of the shares of all questions that its manoeuvres answer."""
+        keys = [tuple(sorted(chosen)) for chosen in trials]
+        new = [key for key in dict.fromkeys(keys) if key not in self._answers]
+        if new:
+            weight = np.array(
+                [np.bincount(np.array(key, np.int64), minlength=self.durations.size) for key in new]
             )
-            self._answers[key] = sum(question.answer(weight, self.reserve) for question in self.questions)
-        return self._answers[key]
+            shares = sum(
+                question.answer(weight.astype(np.float64), self.reserve) for question in self.questions
+            )
+            self._answers |= zip(new, np.broadcast_to(shares, len(new)).tolist(), strict=True)
+        return [self._answers[key] for key in keys]
 
     def _find_next(self, chosen: list[int]) -> int | None:
-        now = self.add_up(chosen)
+        (now,) = self.add_up([chosen])
         left = self.time_s - float(self.durations[chosen].sum())
-        rates = [
-            (self.add_up([*chosen, one]) - now) / float(self.durations[one])
-            for one in range(self.durations.size)
-        ]
+        more = self.add_up([[*chosen, one] for one in range(self.durations.size)])
+        rates = (np.array(more) - now) / self.durations
         for one in np.argsort(rates)[::-1].tolist():
             if rates[one] < _NOTHING:
                 return None
@@ -113,12 +115,10 @@ class Chooser:
         for place in reversed(range(len(chosen))):
             rest = chosen[:place] + chosen[place + 1 :]
             spent = float(self.durations[rest].sum())
-            best, trial = self._rank(chosen), chosen
-            for one in (None, *range(self.durations.size)):
-                other = rest if one is None else [*chosen[:place], one, *chosen[place + 1 :]]
-                if one is not None and spent + self.durations[one] > self.time_s:
-                    continue
-                rank = self._rank(other)
+            short = np.flatnonzero(spent + self.durations <= self.time_s).tolist()
+            trials = [chosen, rest, *([*chosen[:place], one, *chosen[place + 1 :]] for one in short)]
+            (best, *ranks), trial = self._rank(trials), chosen
+            for rank, other in zip(ranks, trials[1:], strict=True):
                 if rank > best and self.fits(other):
                     best, trial = rank, other
             if trial is not chosen:
@@ -126,8 +126,11 @@ class Chooser:
                 changed = True
         return changed
 
-    def _rank(self, chosen: Sequence[int]) -> tuple[float, float]:
-        return round(self.add_up(chosen), 3), -float(self.durations[list(chosen)].sum())
+    def _rank(self, trials: Sequence[Sequence[int]]) -> list[tuple[float, float]]:
+        return [
+            (round(answered, 3), -float(self.durations[list(chosen)].sum()))
+            for chosen, answered in zip(trials, self.add_up(trials), strict=True)
+        ]
 
     def fits(self, chosen: Sequence[int]) -> bool:
         """Whether all models stay inside the area and end near their start."""

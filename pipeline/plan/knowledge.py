@@ -1,19 +1,21 @@
 """What is known before a drive: models that may be true, how well their numbers are known, and the noise.
 
 A hypothesis is a model with values. What the logs so far say of its numbers is an information matrix: that of
-the fit, over the variance of its weighted residuals times the number of neighbours that repeat each of them.
+the fit, over the variance of its weighted residuals times the number of neighbours that repeat each of them;
+what is known before, of the fleet or of what is usual, adds to it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.identification import Input, Problem, fit_model
+from pipeline.identification.few_shot import tie_to_prior
 from pipeline.identification.intervals import count_repeats
 from pipeline.models import Model
 from pipeline.plan.errors import PlanError
@@ -21,7 +23,7 @@ from pipeline.plan.limits import is_steered
 from pipeline.plan.rehearsal import Senses, read_senses, start_state
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.identification.fit import Fitted, PartFit
     from pipeline.identification.parts import Part
@@ -66,7 +68,7 @@ class Hypothesis:
 
     def extend(self, effect: Effect) -> Hypothesis:
         """The model with one effect more, of which the logs say nothing."""
-        both = _assume(start_state(self.effects).add(effect).effects)
+        both = _assume(start_state(self.effects).add(effect).effects, {})
         old = {number.label: index for index, number in enumerate(self.free)}
         rows = [index for index, number in enumerate(both.free) if number.label in old]
         mine = [old[both.free[index].label] for index in rows]
@@ -93,6 +95,7 @@ class Knowledge:
         base: the model that explains the logs so far; the ideal one without logs.
         noise: deviation of a window's residual by part and channel, larger by what repeats it; infinite in
             channels that say nothing, shape (parts, 3).
+        fitted: the base's fit to the logs so far; None without logs on this ground.
         problem: the logs so far; None without.
     """
 
@@ -101,6 +104,7 @@ class Knowledge:
     base: Hypothesis
     noise: Floats
     problem: Problem | None = None
+    fitted: Fitted | None = field(default=None, repr=False)
 
     @property
     def driven_s(self) -> float:
@@ -110,17 +114,39 @@ class Knowledge:
     def suppose(self, effects: Sequence[Effect]) -> Hypothesis:
         """These effects, fitted to the logs so far where there are any; neutral values are searched."""
         if self.problem is None:
-            return _assume(tuple(effects))
+            return _assume(tuple(effects), {})
         return _inform(fit_model(self.problem, Model(self.problem.vehicle, tuple(effects))))
 
+    def rival(self, effects: Sequence[Effect]) -> tuple[Hypothesis, float]:
+        """These effects fitted to the logs so far, and the block t by which the base explains these better.
 
-def learn(runs: Sequence[MotionRun], vehicle: Vehicle, effects: Sequence[Effect] = ()) -> Knowledge:
+        Raises:
+            ValueError: there are no logs on this ground.
+        """
+        if self.fitted is None:
+            raise ValueError("nothing was driven")
+        problem, power = self.fitted.problem, 0.0
+        other = fit_model(problem, Model(problem.vehicle, tuple(effects)))
+        for part, own, fit in zip(problem.parts, self.fitted.fits, other.fits, strict=True):
+            # Under the same weights.
+            more = own.weights.loss(fit.residual) - own.weights.loss(own.residual)
+            power += more * fit.residual.shape[0] / _inflate(part, own)
+        return _inform(other), 0.5 * math.sqrt(max(power, 0.0))
+
+
+def learn(
+    runs: Sequence[MotionRun],
+    vehicle: Vehicle,
+    effects: Sequence[Effect] = (),
+    prior: Mapping[str, tuple[float, float]] | None = None,
+) -> Knowledge:
     """What runs of one vehicle say.
 
     Args:
         runs: the logs so far.
         vehicle: geometry.
         effects: what was named in them; fitted once more, to all of them together.
+        prior: what was known of their numbers before: mean and standard deviation by label.
 
     Raises:
         PlanError: ``no_command``, a run does not say what was asked of the vehicle.
@@ -139,21 +165,32 @@ def learn(runs: Sequence[MotionRun], vehicle: Vehicle, effects: Sequence[Effect]
     if not is_steered(vehicle) and all(run.wheels is not None for run in runs):
         used = list(runs)
     problem = Problem(used, vehicle, Input.COMMAND)
-    fitted = fit_model(problem, Model(problem.vehicle, tuple(effects)))
+    model = Model(problem.vehicle, tuple(effects))
+    if prior:
+        problem = tie_to_prior(problem, model, prior)
+    fitted = fit_model(problem, model)
     noise = [_measure_noise(part, fit) for part, fit in zip(problem.parts, fitted.fits, strict=True)]
-    return Knowledge(problem.vehicle, read_senses(used), _inform(fitted), np.array(noise), problem)
+    return Knowledge(problem.vehicle, read_senses(used), _inform(fitted), np.array(noise), problem, fitted)
 
 
-def assume(vehicle: Vehicle) -> Knowledge:
-    """What is known of a vehicle that was not driven yet: poses alone, of usual noise."""
+def assume(
+    vehicle: Vehicle, effects: Sequence[Effect] = (), prior: Mapping[str, tuple[float, float]] | None = None
+) -> Knowledge:
+    """What is known of a vehicle that was not driven yet: poses alone, of usual noise.
+
+    Args:
+        vehicle: geometry.
+        effects: that are expected, at their expected values; none of the ideal model.
+        prior: of their numbers: mean and standard deviation by label.
+    """
     noise = np.sqrt(_OVERLAP) * np.array([_USUAL_NOISE])
     senses = Senses(track_multiplier=vehicle.controller_track_multiplier)
-    return Knowledge(vehicle, senses, _assume(()), noise)
+    return Knowledge(vehicle, senses, _assume(tuple(effects), prior or {}), noise)
 
 
-def _assume(effects: tuple[Effect, ...]) -> Hypothesis:
+def _assume(effects: tuple[Effect, ...], prior: Mapping[str, tuple[float, float]]) -> Hypothesis:
     free = tuple(number for number in start_state(effects).list_free(()) if number.is_smooth)
-    return Hypothesis(effects, free, np.diag(_expect(effects, free)))
+    return Hypothesis(effects, free, np.diag(_expect(effects, free, prior)))
 
 
 def _inform(fitted: Fitted) -> Hypothesis:
@@ -161,7 +198,7 @@ def _inform(fitted: Fitted) -> Hypothesis:
     effects = fitted.state.effects
     free = tuple(number for number in start_state(effects).list_free(()) if number.is_smooth)
     place = {number.label: index for index, number in enumerate(free)}
-    total = np.diag(_expect(effects, free))
+    total = np.diag(_expect(effects, free, fitted.problem.parts[0].prior.numbers))
     for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
         columns = fit.jacobian[:, :, fit.smooth] * fit.weights.factors(fit.residual)[:, :, None]
         normal = np.einsum("ncp,ncq->pq", columns, columns) / _inflate(part, fit)
@@ -177,15 +214,21 @@ def _inform(fitted: Fitted) -> Hypothesis:
     return Hypothesis(effects, free, total)
 
 
-def _expect(effects: Sequence[Effect], free: Sequence[Free]) -> Floats:
-    """Information of what is usual: a number is off by about its own size, or by a usual one, shape (p,)."""
+def _expect(
+    effects: Sequence[Effect], free: Sequence[Free], prior: Mapping[str, tuple[float, float]]
+) -> Floats:
+    """Information before any log, shape (p,): of the prior, else of what is usual.
+
+    Usually a number is off by about its own size, or by a typical one.
+    """
     found = {effect.id: effect for effect in effects}
     spread = []
     for number in free:
         parameter = found[number.effect].parameter(number.name)
         neutral = parameter.neutral if math.isfinite(parameter.neutral) else 0.0
         value = found[number.effect].values[number.name]
-        spread.append(max(abs(value - neutral), abs(parameter.typical - neutral), parameter.step))
+        usual = max(abs(value - neutral), abs(parameter.typical - neutral))
+        spread.append(max(prior.get(number.label, (0.0, usual))[1], parameter.step))
     return np.array(spread, dtype=np.float64) ** -2.0
 
 

@@ -354,14 +354,16 @@ def _promise(
     promises, impossible, answered = [], [], 0.0
     for one in Judge(rehearsal, knowledge, edges, stretches=True).judge(questions):
         full = np.ones(edges.size - 1)
-        reached, measured = one.answer(full), one.measure(full)
+        reached, measured = float(one.answer(full)), float(one.measure(full))
         answered += reached
         if reached >= 1.0:
             promises.append(_keep_promise(one, edges, measured))
         else:
             impossible.append(
                 Impossible(
-                    one.question.text, one.question.effects, _explain(one, reached, measured, one.bound(full))
+                    one.question.text,
+                    one.question.effects,
+                    _explain(one, reached, measured, float(one.bound(full))),
                 )
             )
     promises.sort(key=lambda promise: promise.decided_after_s)

@@ -9,7 +9,6 @@ end at rest add up.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -96,21 +95,28 @@ class Evidence:
     prior: Floats
 
     def separate(self, weight: Floats) -> Floats:
-        """Squared difference that a refit leaves in each group, shape (k,).
+        """Squared difference that a refit leaves in each group, shape (..., k).
 
         Args:
-            weight: how often each group is driven, shape (k,).
+            weight: how often each group is driven, shape (..., k).
         """
         pull = weight @ self.pull
-        total = self.prior + np.tensordot(weight, self.normal, 1)
-        step = np.linalg.solve(total, pull)
-        left = self.power - 2.0 * self.pull @ step + self.normal @ step @ step
+        step = np.linalg.solve(self._add_up(weight), pull[..., None])
+        curved = (step * step.swapaxes(-1, -2)).reshape(*pull.shape[:-1], -1)
+        left = (
+            self.power
+            - 2.0 * step[..., 0] @ self.pull.T
+            + curved @ self.normal.reshape(len(self.power), -1).T
+        )
         return np.maximum(np.asarray(left, dtype=np.float64), 0.0)
 
-    def spread(self, weight: Floats, number: int) -> float:
-        """Standard error of a number of the model."""
-        total = self.prior + np.tensordot(weight, self.normal, 1)
-        return float(np.sqrt(np.linalg.inv(total)[number, number]))
+    def spread(self, weight: Floats, number: int) -> Floats:
+        """Standard error of a number of the model, shape (...)."""
+        return np.asarray(np.sqrt(np.linalg.inv(self._add_up(weight))[..., number, number]))
+
+    def _add_up(self, weight: Floats) -> Floats:
+        """Information on the model's numbers, shape (..., q, q)."""
+        return np.asarray(self.prior + np.tensordot(weight, self.normal, 1))
 
 
 @dataclass(frozen=True)
@@ -119,7 +125,8 @@ class Groups:
 
     Attributes:
         seconds: how long each is [s], shape (k,).
-        stretch: number of the stretch of driving of each, of which a block t needs several, shape (k,).
+        stretch: number of the stretch of driving of each, of which a block t needs several, rising from 0,
+            shape (k,).
         before_s: driven in the logs so far [s].
     """
 
@@ -136,53 +143,58 @@ class Answerable:
     evidence: tuple[Evidence, ...] = field(repr=False)
     groups: Groups = field(repr=False)
 
-    def measure(self, weight: Floats) -> float:
-        """Expected block t of a separation; half-width of a number's 95 % interval."""
-        if isinstance(self.question, Separation):
-            return 0.5 * float(np.sqrt(min(weight @ one.separate(weight) for one in self.evidence)))
-        return self._widen(weight) * self.evidence[0].spread(weight, self.question.number)
-
-    def bound(self, weight: Floats) -> float:
-        """Half-width that the jackknife states at most in 95 of 100 drives: of few blocks it scatters."""
-        freedom = self._count_freedom(weight)
-        return self.measure(weight) * math.sqrt(float(chdtri(freedom, 0.05)) / freedom)
-
-    def answer(self, weight: Floats, reserve: float = 1.0) -> float:
-        """Share of what is asked, in time: one when it is answered.
+    def measure(self, weight: Floats) -> Floats:
+        """Expected block t of a separation; half-width of a number's 95 % interval; shape (...).
 
         Args:
-            weight: how often each group is driven, shape (k,).
+            weight: how often each group is driven, shape (..., k).
+        """
+        if isinstance(self.question, Separation):
+            powers = [np.sum(weight * one.separate(weight), axis=-1) for one in self.evidence]
+            return np.asarray(0.5 * np.sqrt(np.min(powers, axis=0)))
+        # Student's t of the blocks that the jackknife will have.
+        wide = stdtrit(self._count_freedom(weight), 0.975)
+        return np.asarray(wide * self.evidence[0].spread(weight, self.question.number))
+
+    def bound(self, weight: Floats) -> Floats:
+        """Half-width that the jackknife states at most in 95 of 100 drives: of few blocks it scatters."""
+        freedom = self._count_freedom(weight)
+        return np.asarray(self.measure(weight) * np.sqrt(chdtri(freedom, 0.05) / freedom))
+
+    def answer(self, weight: Floats, reserve: float = 1.0) -> Floats:
+        """Share of what is asked, in time: one when it is answered; shape (...).
+
+        Args:
+            weight: how often each group is driven, shape (..., k).
             reserve: factor by which more is asked, of t, of stretches and of the interval's width.
         """
         if isinstance(self.question, Precision):
             shown = self.evidence[0].normal[:, self.question.number, self.question.number]
             share = (self.question.goal / reserve / self.bound(weight)) ** 2
-            return min(share, 1.0) * self._spread_out(weight, shown, reserve)
+            return np.minimum(share, 1.0) * self._spread_out(weight, shown, reserve)
         shares = []
         for one in self.evidence:
             left = one.separate(weight)
-            decided = 0.25 * float(weight @ left) / (reserve * DECIDED_T) ** 2
-            shares.append(min(decided, 1.0) * self._spread_out(weight, left, reserve))
-        return min(shares)
+            decided = 0.25 * np.sum(weight * left, axis=-1) / (reserve * DECIDED_T) ** 2
+            shares.append(np.minimum(decided, 1.0) * self._spread_out(weight, left, reserve))
+        return np.asarray(np.min(shares, axis=0))
 
-    def _spread_out(self, weight: Floats, shown: Floats, reserve: float) -> float:
-        """Share of the stretches that a decision needs, by what each group shows, shape (k,)."""
+    def _spread_out(self, weight: Floats, shown: Floats, reserve: float) -> Floats:
+        """Share of the stretches that a decision needs, by what each group shows, shape (..., k)."""
         # A group that is driven twice stands in two stretches.
         first, again = np.minimum(weight, 1.0) * shown, np.maximum(weight - 1.0, 0.0)
-        sums = np.bincount(self.groups.stretch, first)
-        power = float(np.sum(sums**2) + np.sum(again * shown**2))
-        if power <= 0.0:
-            return 0.0
-        stretches = min(float(weight @ shown) ** 2 / power, float(weight @ self.groups.seconds) / STRETCH_S)
-        return min(stretches / (reserve * STRETCHES), 1.0)
+        starts = np.flatnonzero(np.diff(self.groups.stretch, prepend=-1))
+        sums = np.add.reduceat(first, starts, axis=-1)
+        power = np.sum(sums**2, axis=-1) + np.sum(again * shown**2, axis=-1)
+        whole = np.sum(weight * shown, axis=-1) ** 2
+        stretches = np.minimum(
+            whole / np.where(power > 0.0, power, np.inf), weight @ self.groups.seconds / STRETCH_S
+        )
+        return np.asarray(np.minimum(stretches / (reserve * STRETCHES), 1.0))
 
-    def _widen(self, weight: Floats) -> float:
-        """Half-width over standard error: Student's t of the blocks that the jackknife will have."""
-        return float(stdtrit(self._count_freedom(weight), 0.975))
-
-    def _count_freedom(self, weight: Floats) -> float:
-        seconds = self.groups.before_s + float(weight @ self.groups.seconds)
-        return max(seconds / _BLOCK_S - 1.0, 1.0)
+    def _count_freedom(self, weight: Floats) -> Floats:
+        seconds = self.groups.before_s + weight @ self.groups.seconds
+        return np.asarray(np.maximum(seconds / _BLOCK_S - 1.0, 1.0))
 
 
 class Judge:

@@ -23,6 +23,7 @@ from pipeline.web.errors import WorkbenchError
 from pipeline.web.guard import LOOPBACK, Guard
 from pipeline.web.limits import Limits
 from pipeline.web.places import Places
+from pipeline.web.plans import KINDS, PREVIEW, find_file
 from pipeline.web.requests import read_ask
 from pipeline.web.runs import find_run, list_runs
 from pipeline.web.sessions import Sessions
@@ -48,6 +49,7 @@ _PAGES = {
     "/pane.js": ("pipeline.web", "pane.js", "text/javascript"),
     "/model.js": ("pipeline.web", "model.js", "text/javascript"),
     "/parts.js": ("pipeline.web", "parts.js", "text/javascript"),
+    "/plan.js": ("pipeline.web", "plan.js", "text/javascript"),
     "/difference.js": ("pipeline.web", "difference.js", "text/javascript"),
     "/marks.js": ("pipeline.report", "marks.js", "text/javascript"),
     "/plots.js": ("pipeline.report", "plots.js", "text/javascript"),
@@ -86,6 +88,8 @@ class Web:
             Route("/api/save", self.save, methods=["POST"]),
             Route("/api/upload", self.upload, methods=["POST"]),
             Route("/api/diagnose", self.diagnose, methods=["POST"]),
+            Route("/api/plan", self.plan, methods=["POST"]),
+            Route("/plan", self.plan_file),
             Route("/api/sample", self.sample, methods=["POST"]),
             Route("/api/retry", self.retry, methods=["POST"]),
             Route("/api/dismiss", self.dismiss, methods=["POST"]),
@@ -171,6 +175,27 @@ class Web:
         ask = await read_ask(request)
         manifest = await run_in_threadpool(find_run, self._sessions.store, ask.run)
         return answer({"job": self._sessions.jobs.diagnose(manifest).show()})
+
+    async def plan(self, request: Request) -> Response:
+        """Begin to plan the drive that decides what a run could not."""
+        ask = await read_ask(request)
+        manifest = await run_in_threadpool(find_run, self._sessions.store, ask.run)
+        return answer({"job": self._sessions.jobs.plan(manifest, ask.area).show()})
+
+    async def plan_file(self, request: Request) -> Response:
+        """A file of the plan of a run; its page is shut off from this one."""
+        run, name = request.query_params.get("run", ""), request.query_params.get("file", "")
+        manifest = await run_in_threadpool(find_run, self._sessions.store, run)
+        path = find_file(self._sessions.results, manifest.run, name)
+        if not path.is_file():
+            raise WorkbenchError("no_plan", "nothing is planned", where=run, hint="Plan a drive first.")
+        if name == PREVIEW:
+            return FileResponse(path, media_type=KINDS[name])
+        headers = {"content-security-policy": _REPORT_POLICY}
+        shown = "inline" if name.endswith(".html") else "attachment"
+        return FileResponse(
+            path, media_type=KINDS[name], filename=name, content_disposition_type=shown, headers=headers
+        )
 
     async def sample(self, _: Request) -> Response:
         """Begin to make a sample log and to analyze it."""

@@ -17,7 +17,7 @@ from pipeline.core.errors import SlipError
 from pipeline.store import LogSighting, Store, see_log
 from pipeline.web.errors import WorkbenchError
 from pipeline.web.uploads import Upload, Uploads, clean_name
-from pipeline.web.workers import ANALYZE, DIAGNOSE, Errand, Workers
+from pipeline.web.workers import ANALYZE, DIAGNOSE, PLAN, Errand, Workers
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -38,6 +38,7 @@ WORDS = {
     "aggregate": "aggregating",
     "diagnosis": "naming what is missing",
     "report": "drawing the report",
+    "plan": "planning the next drive",
 }
 
 _STEPS = ("upload", "read", *STAGES, "diagnosis", "report")
@@ -211,15 +212,26 @@ class Jobs:
         Raises:
             WorkbenchError: ``busy``, that is being done already.
         """
-        name = f"diagnosis of {manifest.run}"
+        return self._begin_on(manifest, f"diagnosis of {manifest.run}", "diagnosis", DIAGNOSE)
+
+    def plan(self, manifest: Manifest, area: str) -> Job:
+        """Plan the drive that decides what a stored run could not, in the background.
+
+        Raises:
+            WorkbenchError: ``busy``, that is being done already.
+        """
+        return self._begin_on(manifest, f"plan after {manifest.run}", "plan", PLAN, area)
+
+    def _begin_on(self, manifest: Manifest, name: str, stage: str, basis: str, area: str = "") -> Job:
+        """Begin an errand on a stored run."""
         if any(job.name == name and not job.done for job in tuple(self._jobs.values())):
             raise WorkbenchError(
                 "busy", "that is being done already", where=manifest.run, hint="Wait for it."
             )
         job = Job(secrets.token_hex(4), name)
-        job.tell("diagnosis")
+        job.tell(stage)
         self._add(job)
-        self._begin(job, partial(self._make_diagnosis, manifest))
+        self._begin(job, partial(self._make_errand, manifest, basis, area))
         return job
 
     def _add(self, job: Job) -> None:
@@ -271,7 +283,7 @@ class Jobs:
         log = see_log(upload.path)
         return Errand(path=upload.path, log=log, basis=ANALYZE, options=options, notes=upload.notes)
 
-    def _make_diagnosis(self, manifest: Manifest) -> Errand:
+    def _make_errand(self, manifest: Manifest, basis: str, area: str) -> Errand:
         options = Options(out=self._results, run=manifest.run)
         log = LogSighting(path=manifest.run, size=0, mtime_ns=0, inode=0, seen_ns=0)
-        return Errand(path=manifest.folder, log=log, basis=DIAGNOSE, options=options, notes=None)
+        return Errand(path=manifest.folder, log=log, basis=basis, options=options, notes=None, area=area)

@@ -1,5 +1,6 @@
 // The model of a session: its effects as cards, and what to add next, one row an effect.
 import { h, say, sayShare } from "./parts.js";
+import { buildPlan } from "./plan.js";
 
 const REST_MS = 350;
 const FIRST_ROWS = 7;
@@ -106,10 +107,6 @@ const buildNext = (pane) => {
   const found = diagnosis?.unexplained?.formula ? buildFound(pane, diagnosis.unexplained, there) : null;
   const undecided = (diagnosis?.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. ${entry.separate_by ?? ""}`));
   const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Not explained yet: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}`) : null;
-  const isOpen = undecided.length || (diagnosis?.unobservable ?? []).length;
-  const plan = !diagnosis ? null : isOpen
-    ? h("p", { class: "quiet plan" }, "What to drive next: ", h("code", {}, `slip plan ${pane.run} --for ${undecided.length ? "undecided" : "all"} --out plan`), ", then play plan/plan.mcap (look at plan/plan.html before).")
-    : h("p", { class: "quiet plan" }, "Nothing is open that a drive could decide.");
   const build = (row, number) => buildRow(pane, row, number === 0 && !running);
   return h("div", { class: "next" },
     running && h("p", { class: "quiet trying" }, `trying every effect: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.tried / trial.total })),
@@ -119,7 +116,7 @@ const buildNext = (pane) => {
     named > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, onclick: () => pane.addAll() }, `Add all ${named} that are named`),
     trial && !running && !rows.length && !found && h("p", { class: "nothing" }, tellNothing(session)),
     !diagnosis && h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", data: { keep: "diagnose" }, onclick: () => pane.diagnose() }, "Diagnose")),
-    undecided, plan, rest,
+    undecided, rest, buildPlan(pane),
     buildCatalogue(pane, catalogue.filter((entry) => !there.has(entry.id))));
 };
 

@@ -31,6 +31,7 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         parameter: name of the parameter it concerns.
         value: new value.
         channel, formula, parameters: of a formula, as typed.
+        area: free ground for a plan, as typed.
     """
 
     run: str
@@ -58,6 +59,7 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     value: float = 0.0
     channel: str = ""
     formula: str = ""
+    area: str = ""
     parameters: str = ""
 
 

@@ -19,6 +19,7 @@ from pipeline.web.errors import WorkbenchError, evaluating
 from pipeline.web.figure_cache import FigureCache
 from pipeline.web.formulas import make_formula
 from pipeline.web.jobs import Jobs
+from pipeline.web.plans import find_plan
 from pipeline.web.proposals import Trials
 from pipeline.web.run_cache import RunCache
 from pipeline.web.runs import describe_run, find_run
@@ -205,6 +206,7 @@ class Sessions:
             "inputs": self._cache.list_inputs(prepared.manifest),
             "catalogue": list_catalogue(prepared.vehicle),
             "diagnosis": read_diagnosis(self.results, prepared.manifest),
+            "plan": find_plan(self.results, prepared.manifest),
             "trial": trial.show() if trial is not None else None,
             "slot": file.slot,
         }

@@ -18,6 +18,7 @@ from pipeline.batch.work import Report, Task
 from pipeline.store import Store
 from pipeline.web.diagnoses import write_diagnosis
 from pipeline.web.errors import WorkbenchError
+from pipeline.web.plans import write_run_plan
 from pipeline.web.runs import find_run
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from pipeline.web.limits import Limits
 
 DIAGNOSE = "diagnose"
+PLAN = "plan"
 ANALYZE = "analyze"
 
 _LOOK_S = 0.2
@@ -39,13 +41,15 @@ _HINTS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Errand(Task):
-    """A task of the workbench; ``basis`` says which, ``DIAGNOSE`` or ``ANALYZE``.
+    """A task of the workbench; ``basis`` says which, ``DIAGNOSE``, ``PLAN`` or ``ANALYZE``.
 
     Attributes:
         notes: file that the worker keeps the name of the present stage in; None where it has only one.
+        area: free ground for a plan.
     """
 
     notes: Path | None
+    area: str = ""
 
 
 class Workers:
@@ -113,7 +117,7 @@ def _read_notes(errand: Errand) -> str:
 
 
 def work_on_errand(task: Task) -> Report:
-    """Analyze a log, or diagnose a stored run.
+    """Analyze a log, or diagnose a stored run or plan what to drive after it.
 
     Raises:
         SlipError: it cannot be done.
@@ -125,6 +129,10 @@ def work_on_errand(task: Task) -> Report:
         if task.basis == DIAGNOSE:
             store = Store(task.options.out)
             write_diagnosis(task.options.out, find_run(store, entry.run))
+            return Report(entry=replace(entry, state="done"))
+        if isinstance(task, Errand) and task.basis == PLAN:
+            store = Store(task.options.out)
+            write_run_plan(task.options.out, find_run(store, entry.run), task.area)
             return Report(entry=replace(entry, state="done"))
         return Report(entry=_analyze(task, entry))
     except SlipError as error:

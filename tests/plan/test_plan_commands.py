@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -30,6 +31,7 @@ from pipeline.plan.limits import is_steered, parse_time
 from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, join, limit_yaw_rate, list_manoeuvres, wait
 from pipeline.plan.plan import Plan, find_largest
 from pipeline.plan.rehearsal import Rehearsal
+from pipeline.report.plan import preview_plan
 from pipeline.simulate import find_vehicle
 from pipeline.simulate.played import read_played
 from pipeline.vehicles import Vehicle, find_preset, list_presets
@@ -95,6 +97,21 @@ def test_a_plan_begins_gently_and_stays_inside_the_area(plan: Plan) -> None:
     assert plan.area.holds(plan.ways)
     assert len(plan.ways) > len(TURNING)
     assert plan.home_m <= 0.5 * plan.area.width_m
+
+
+def test_a_preview_shows_the_way_with_its_spread_and_the_promises(plan: Plan) -> None:
+    shown = json.loads(json.dumps(preview_plan(plan), allow_nan=False))
+    ways = shown["rows"]["plan_ways"]
+    assert len(set(ways["model"])) > 4
+    assert len(ways["x"]) < 3000
+    assert np.abs(ways["x"]).max() <= 0.5 * plan.area.length_m
+    assert len(shown["promises"]) == len(plan.promises)
+    (promise, *_) = plan.promises
+    assert f"after {promise.decided_after_s:.0f} s: {promise.question}" in shown["promises"][0]
+    # Metres are as long on both axes.
+    equal = shown["figures"]["ways"]["usermeta"]["equal"]
+    assert equal["x"][1] / equal["y"][1] == pytest.approx(plan.area.length_m / plan.area.width_m)
+    assert np.abs(ways["x"]).max() <= equal["x"][1]
 
 
 @pytest.mark.parametrize("hidden", [{"limit": 2.0}, {"limit": 3.27}, {"limit": 5.0}])

@@ -5,20 +5,24 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from plan_game import draw_scenario, record
 from scipy.special import stdtrit
 
 from pipeline.diagnosis import Named, RunDiagnosis, Value
+from pipeline.diagnosis.subject import load_recording
 from pipeline.diagnosis.undecided import Undecided
 from pipeline.models import find_effect
-from pipeline.plan import assume, check_plan
+from pipeline.plan import ask_apart, assume, check_plan, learn
 from pipeline.plan.files import Promised
 from pipeline.plan.knowledge import Hypothesis
 from pipeline.plan.plan import Promise
 from pipeline.plan.questions import DECIDED_T, Answerable, Evidence, Groups, Precision, Separation
+from pipeline.simulate import Program
 from pipeline.vehicles import find_preset
 
 
@@ -49,6 +53,54 @@ def test_a_decision_needs_several_stretches_however_large_one_is() -> None:
     even = Evidence(np.zeros((4, 0, 0)), np.zeros((4, 0)), np.full(4, 1e3), np.zeros((0, 0)))
     assert Answerable(question, (even,), groups).answer(np.ones(4)) == 1.0
     assert Answerable(question, (even,), groups).answer(np.array([1.0, 1.0, 0.0, 0.0])) < 1.0
+
+
+def test_many_weights_at_once_give_what_each_gives_alone() -> None:
+    generator = np.random.default_rng(2)
+    columns = generator.standard_normal((6, 30, 2))
+    apart = generator.standard_normal((6, 30))
+    evidence = Evidence(
+        np.einsum("grp,grq->gpq", columns, columns),
+        np.einsum("grp,gr->gp", columns, apart),
+        (apart**2).sum(axis=1),
+        np.eye(2),
+    )
+    model = Hypothesis((), (), np.zeros((0, 0)))
+    groups = Groups(generator.uniform(5.0, 12.0, 6), np.array([0, 0, 1, 2, 2, 2]), 20.0)
+    weights = generator.integers(0, 3, (5, 6)).astype(np.float64)
+    for question in (
+        Separation("a or b", ("a", "b"), (model, model)),
+        Precision("k", ("k",), model, 1, 0.3),
+    ):
+        one = Answerable(question, (evidence, evidence), groups)
+        for method in (one.measure, one.bound, one.answer):
+            alone = [float(method(weight)) for weight in weights]
+            assert method(weights).tolist() == pytest.approx(alone)
+            assert np.ptp(alone) > 0.0
+    # Groups of one stretch count together: of two stretches no decision is made.
+    strong = Evidence(np.zeros((6, 0, 0)), np.zeros((6, 0)), np.full(6, 1e3), np.zeros((0, 0)))
+    pair = Answerable(Separation("a or b", ("a", "b"), (model, model)), (strong, strong), groups)
+    assert pair.answer(np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])) < 0.7
+    assert pair.answer(np.ones(6)) > 0.7
+
+
+def test_what_is_named_is_kept_apart_from_what_looks_like_it(tmp_path: Path) -> None:
+    """Two lags of a car that only drove a circle may be one delay, until both are driven differently."""
+    scenario = draw_scenario(2003)[1]
+    assert sorted(scenario.effects) == ["drive_lag", "steering_lag"]
+    vehicle, recording = record(scenario, tmp_path / "circle.mcap")
+    effects = [find_effect(name)() for name in ("drive_lag", "steering_lag")]
+    knowledge = learn([load_recording(recording, vehicle)], vehicle, effects)
+    asked = {question.text: question for question in ask_apart(knowledge)}
+    both = asked["drive_lag and steering_lag or transport_delay"]
+    assert [model.names for model in both.models] == [{"drive_lag", "steering_lag"}, {"transport_delay"}]
+    assert {"drive_lag or transport_delay", "steering_lag or transport_delay"} < set(asked)
+    assert not any("steering_lag" in one.effects for one in ask_apart(knowledge, ["steering_lag"]))
+    # A log that tells them apart leaves nothing to ask.
+    program = Program("drive_steps")
+    vehicle, recording = record(replace(scenario, program=program, duration_s=90.0), tmp_path / "long.mcap")
+    knowledge = learn([load_recording(recording, vehicle)], vehicle, effects)
+    assert ask_apart(knowledge) == []
 
 
 def test_an_interval_is_promised_only_where_few_blocks_would_show_it_too() -> None:
@@ -156,5 +208,6 @@ def test_a_circle_leaves_open_what_the_plan_then_decides(tmp_path: Path) -> None
     checked = json.loads(_run("plan", "--check", folder, after, "--results", tmp_path / "results", "--json"))
     assert len(checked["kept"]) == len(made["promises"])
     assert all(one["kept"] for one in checked["kept"])
-    assert {one["measured"] for one in checked["kept"] if "or" in one["question"].split()} == {"icr_offset"}
+    rivals = [one for one in checked["kept"] if {"or", "icr_offset"} <= set(one["question"].split())]
+    assert {one["measured"] for one in rivals} == {"icr_offset"}
     assert checked["next"] is None

@@ -394,3 +394,38 @@ def test_a_report_leads_to_all_runs_and_they_lead_back(
         chrome.click("tbody th a")
     chrome.wait(f"document.querySelector('h1')?.textContent === {json.dumps(RUN)}")
     assert chrome.errors == []
+
+
+@pytest.mark.long
+def test_a_drive_is_planned_on_request_and_its_files_are_there(
+    chrome: Chrome, pictures: Path, tmp_path: Path
+) -> None:
+    hidden: dict[str, object] = {"effective_track": 1.6, "drive_lag": 0.25, "lateral_skid": 0.1}
+    log = simulate_case(
+        None, hidden, out=tmp_path / "circle.mcap", seed=9, duration_s=40.0, vehicle="husky", program="circle"
+    )
+    husky = {"vehicle": {"preset": "husky_a200"}}
+    analyze_log(log, Options(out=tmp_path / "out", report=False, diagnosis=True, overrides=husky))
+    with closing(Workbench(tmp_path / "out")) as workbench:
+        chrome.size(LAPTOP, 900)
+        chrome.open(workbench.address)
+        chrome.wait("document.querySelector('.plan .ask button')")
+        chrome.run("document.querySelector('.plan input').value = '2x2m'")
+        chrome.click(".plan .ask button")
+        chrome.wait("document.querySelector('.job.failed p')?.textContent.includes('area')")
+        chrome.run("document.querySelector('.plan input').value = '20x10m'")
+        chrome.click(".plan .ask button")
+        chrome.wait("document.querySelector('.planned .plot.drawn')", patience_s=60.0)
+        assert "icr_offset" in str(chrome.run("document.querySelector('.planned ul').textContent"))
+        run = workbench.get("/api/runs")["runs"][0]["run"]  # type: ignore[index]
+        for name, start in (("plan.mcap", b"\x89MCAP"), ("plan.html", b"<!doctype html>")):
+            status, _, body = workbench.request("GET", f"/plan?run={run}&file={name}")
+            assert status == 200
+            assert body[: len(start)].lower() == start.lower()
+        for width, dark in ((LAPTOP, False), (PHONE, False), (PHONE, True)):
+            chrome.size(width, 900, dark=dark)
+            chrome.wait("document.querySelector('.planned .plot.drawn')")
+            chrome.run("document.querySelector('.planned').scrollIntoView()")
+            assert chrome.run("document.documentElement.scrollWidth <= innerWidth")
+            chrome.picture(pictures / f"workbench_plan_{width}_{'dark' if dark else 'light'}.png")
+        look_for_trouble(chrome)

@@ -24,6 +24,7 @@ EVERYTHING = (
     ("GET", "/"), ("GET", "/page.js"), ("GET", "/vega.js"), ("GET", "/api/runs"), ("GET", "/api/jobs"),
     ("GET", f"/report?run={RUN}"), ("GET", f"/model.toml?run={RUN}"), ("GET", "/nowhere"), ("HEAD", "/"),
     ("POST", "/api/session"), ("POST", "/api/upload?name=x.mcap"), ("POST", "/api/diagnose"), ("PUT", "/"),
+    ("POST", "/api/plan"), ("GET", f"/plan?run={RUN}&file=plan.mcap"),
 )  # fmt: skip
 STRANGERS: tuple[dict[str, str], ...] = (
     {},

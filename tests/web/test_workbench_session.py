@@ -240,6 +240,18 @@ def test_a_diagnosis_that_is_asked_for_is_kept_beside_the_results(workbench: Wor
     assert [effect["id"] for effect in named["effects"]] == ["effective_track"]
 
 
+def test_a_plan_that_is_not_there_is_one_clear_error(workbench: Workbench) -> None:
+    assert workbench.session(RUN)["plan"] is None
+    for run, name, code in (
+        (RUN, "plan.mcap", "no_plan"),
+        (RUN, "../../manifest.json", "no_plan"),
+        ("nobody", "plan.mcap", "no_such_run"),
+    ):
+        status, _, body = workbench.request("GET", f"/plan?run={run}&file={name}")
+        assert status >= 400
+        assert json.loads(body)["error"]["code"] == code
+
+
 def test_what_cannot_be_done_is_said_and_changes_nothing(workbench: Workbench) -> None:
     assert workbench.refuse("/api/session", run="nobody")["code"] == "no_such_run"
     assert workbench.refuse("/api/session", run=RUN, action="add_found")["code"] == "no_formula"

@@ -13,6 +13,7 @@ from pipeline.report import theme
 from pipeline.report.elements import Picture
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
+from pipeline.report.specs import build_spec, share_rows
 
 if TYPE_CHECKING:
     from pipeline.plan import Plan
@@ -21,6 +22,22 @@ if TYPE_CHECKING:
 _EVERY = 4
 _MOST_WAYS = 24
 _WIDTH = 640
+# The part of the area that is drawn: times as far as the drive leads, and at least.
+_ROOM = 1.2
+_LEAST = 0.1
+
+
+def preview_plan(plan: Plan) -> dict[str, object]:
+    """The way and the promises in short, for a page that draws it: figures, rows, and lines of text."""
+    picture = _draw_ways(plan, most=8, every=2 * _EVERY)
+    return {
+        "figures": {picture.id: build_spec(picture.drawing)},
+        "rows": share_rows([picture.drawing]),
+        "dark": dict(theme.DARK_TWINS),
+        "words": picture.words,
+        "safety": SAFETY,
+        **_say(plan),
+    }
 
 
 def render_plan(plan: Plan, catalogue: str = "") -> str:
@@ -44,20 +61,27 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
             f"at most {limits.speed_mps:.3g} m/s, {turn}, {limits.acceleration_mps2:.3g} m/s2",
         ],
         safety=SAFETY,
-        play=f"ros2 bag play plan.mcap ({plan.topic}, {plan.type_name})",
-        promises=[
-            f"after {one.decided_after_s:.0f} s: {one.question} "
-            + (f"(t = {one.expected:.1f})" if one.kind == "separation" else f"(+- {one.expected:.2g})")
-            for one in plan.promises
-        ],
-        impossible=[f"{one.question}: {one.because}" for one in plan.impossible],
+        **_say(plan),
         manoeuvres=[f"{start:.0f} s: {name}" for name, start in plan.manoeuvres],
     )
 
 
-def _draw_ways(plan: Plan) -> Picture:
+def _say(plan: Plan) -> dict[str, object]:
+    """How it is played, what it promises, and what it leaves open."""
+    return {
+        "play": f"ros2 bag play plan.mcap ({plan.topic}, {plan.type_name})",
+        "promises": [
+            f"after {one.decided_after_s:.0f} s: {one.question} "
+            + (f"(t = {one.expected:.1f})" if one.kind == "separation" else f"(+- {one.expected:.2g})")
+            for one in plan.promises
+        ],
+        "impossible": [f"{one.question}: {one.because}" for one in plan.impossible],
+    }
+
+
+def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Picture:
     """The way that is expected, those of other models, and the area."""
-    ways = plan.ways[:: max(len(plan.ways) // _MOST_WAYS, 1), ::_EVERY]
+    ways = plan.ways[:: max(len(plan.ways) // most, 1), ::every]
     rows = pl.concat(
         pl.DataFrame(
             {"x": way.real, "y": way.imag, "model": np.full(way.size, number), "order": np.arange(way.size)}
@@ -65,6 +89,10 @@ def _draw_ways(plan: Plan) -> Picture:
         for number, way in enumerate(ways)
     )
     half_x, half_y = 0.5 * plan.area.length_m, 0.5 * plan.area.width_m
+    # A drive that needs little of the area is drawn larger.
+    share = _ROOM * max(float(np.abs(ways.real).max()) / half_x, float(np.abs(ways.imag).max()) / half_y)
+    share = min(max(share, _LEAST), 1.0)
+    seen_x, seen_y = share * half_x, share * half_y
     edge = pl.DataFrame(
         {
             "x": [-half_x, half_x, half_x, -half_x, -half_x],
@@ -73,12 +101,14 @@ def _draw_ways(plan: Plan) -> Picture:
         }
     )
     along = alt.X(
-        "x:Q", title="ahead of the start [m]", scale=alt.Scale(domain=[-half_x, half_x], nice=False)
+        "x:Q", title="ahead of the start [m]", scale=alt.Scale(domain=[-seen_x, seen_x], nice=False)
     )
-    aside = alt.Y("y:Q", title="to the left [m]", scale=alt.Scale(domain=[-half_y, half_y], nice=False))
+    aside = alt.Y("y:Q", title="to the left [m]", scale=alt.Scale(domain=[-seen_y, seen_y], nice=False))
 
     def line(name: str, colour: str, opacity: float, *detail: str) -> alt.Chart:
-        chart = alt.Chart(alt.NamedData(name)).mark_line(color=colour, opacity=opacity, strokeWidth=1.5)
+        chart = alt.Chart(alt.NamedData(name)).mark_line(
+            color=colour, opacity=opacity, strokeWidth=1.5, clip=True
+        )
         drawn: alt.Chart = chart.encode(x=along, y=aside, order="order:Q", detail=list(detail))
         return drawn
 
@@ -86,11 +116,16 @@ def _draw_ways(plan: Plan) -> Picture:
         line("plan_area", theme.QUIET, 1.0),
         line("plan_ways", theme.CROSS, 0.4, "model:N"),
         line("plan_way", theme.ON_COMMAND, 1.0),
-    ).properties(width=_WIDTH, height=round(_WIDTH * plan.area.width_m / plan.area.length_m))
+    ).properties(
+        width=_WIDTH,
+        height=round(_WIDTH * seen_y / seen_x),
+        usermeta={"equal": {"x": [-seen_x, seen_x], "y": [-seen_y, seen_y], "lowest": 80, "highest": 640}},
+    )
     tables = {"plan_area": edge, "plan_ways": rows, "plan_way": rows.filter(pl.col("model") == 0)}
     words = (
-        f"From the middle of the area and back to within {plan.home_m:.1f} m: in blue by the model that "
-        "explains the logs so far, in grey by others that they do not rule out."
+        f"From the middle of an area of {plan.area.length_m:g} x {plan.area.width_m:g} m and back to within "
+        f"{plan.home_m:.1f} m: in blue by the model that explains the logs so far, in grey by others that "
+        "they do not rule out."
     )
     return Picture("ways", "Where it leads", Drawing(chart, tables, words), words)
 

@@ -60,4 +60,4 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
             ("Look at plan/plan.html, lift the wheels, and play it", "ros2 bag play plan/plan.mcap"),
             ("See whether it kept what it promised", "slip plan --check plan NEW.mcap"),
         ]
-    return [*steps, ("Try other effects and watch the error", "slip serve")]
+    return [*steps, ("Try other effects, and plan the next drive, in the browser", "slip serve")]
