@@ -8,7 +8,7 @@ and lag when both intervals are within 5 %; a pair when the loss on unseen data 
 its rival with t = 5. Plans know the vehicle and the noise of a slow first log of half a minute, no number of
 any effect; they are played again and again. `plan` may ask for steps as DRIVE does, `gentle` has the usual
 limits of `slip plan`. One line a target, then medians; a target that 150 s do not answer counts as longer
-than any.
+than any, and as 150 s in the ratio, which is the median over all draws.
 """
 
 from __future__ import annotations
@@ -225,10 +225,11 @@ def main() -> None:
                 if options.out is not None:
                     with options.out.open("a", encoding="utf-8") as file:
                         file.write(json.dumps(row) + "\n")
-    _report(rows)
+    report(rows)
 
 
-def _report(rows: list[dict[str, object]]) -> None:
+def report(rows: list[dict[str, object]]) -> None:
+    """Print medians by target, and how many times longer DRIVE takes than the plan."""
     targets = list(dict.fromkeys(str(row["target"]) for row in rows))
     print(
         f"{'median seconds':<40}{'draws':>6}" + "".join(f"{name:>9}" for name in PROTOCOLS) + "  DRIVE/plan"
@@ -237,9 +238,8 @@ def _report(rows: list[dict[str, object]]) -> None:
         mine = [row for row in rows if target in {"all", row["target"]}]
         times = {name: np.array([float(str(row[name])) for row in mine]) for name in PROTOCOLS}
         told = "".join(f"{_say(float(np.median(times[name]))):>9}" for name in PROTOCOLS)
-        both = np.isfinite(times["plan"])
-        ratio = float(np.median(times["DRIVE"][both] / times["plan"][both])) if both.any() else math.nan
-        print(f"{target:<40}{len(mine):>6}{told}  {_say(ratio)}")
+        drive, plan = (np.minimum(times[name], _DURATION_S) for name in ("DRIVE", "plan"))
+        print(f"{target:<40}{len(mine):>6}{told}  {np.median(drive / plan):.1f}")
     open_ = {name: sum(math.isinf(float(str(row[name]))) for row in rows) for name in PROTOCOLS}
     print(
         f"not answered in {_DURATION_S:g} s: {', '.join(f'{name} {count}' for name, count in open_.items())}"

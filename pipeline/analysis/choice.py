@@ -19,7 +19,7 @@ from pipeline.logs import TransformBuffer, read_topics
 from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.extract.choice import PoseRating, rate_poses, replace_pose
 from pipeline.stages.extract.geometry import fit_controller, fit_geometry
-from pipeline.stages.extract.reading import find_sideways_share
+from pipeline.stages.extract.reading import find_sideways_share, with_texts
 from pipeline.stages.finding import Finding
 from pipeline.vehicles import (
     CONFIGURED,
@@ -41,12 +41,13 @@ from pipeline.vehicles import (
     resolve_vehicle,
 )
 from pipeline.vehicles.candidates import LOCALIZED
+from pipeline.vehicles.message_types import find_type
 from pipeline.vehicles.topics import list_topics
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
-    from pipeline.logs import LogData, LogIndex
+    from pipeline.logs import ChannelInfo, LogData, LogIndex, TopicColumns
     from pipeline.store import JSON
     from pipeline.vehicles import Configuration, Controller, VehicleSource
 
@@ -145,12 +146,12 @@ def choose(
         if error.code != "vehicle_unknown" or configuration.vehicle.preset is not None:
             raise
         problem, vehicle, source = error, _stand_in(index, configuration), "fitted"
-    sources = choose_sources(index.channels, configuration, vehicle, where=where)
+    channels, sources, findings = _leave_out_silent(index, configuration, vehicle, sha256)
     if source not in {"flag", "configuration"} and _asks_sideways(index, vehicle, sources, sha256):
         vehicle = find_preset(vehicle.sideways_preset) or vehicle
-        sources = choose_sources(index.channels, configuration, vehicle, where=where)
+        sources = choose_sources(channels, configuration, vehicle, where=where)
     vehicle = _apply_controller(vehicle, sources, configuration, controller)
-    findings = [
+    findings += [
         Finding("vehicle_choice", "info", note, where="vehicle") for note in (told.notes if told else ())
     ]
     findings += _check_contradiction(told, vehicle, source)
@@ -227,10 +228,36 @@ def _asks_sideways(index: LogIndex, vehicle: Vehicle, sources: Sources, sha256: 
     """Whether a platform that has such wheels, too, is commanded to move sideways."""
     if not vehicle.sideways_preset or sources.command is None:
         return False
-    command = Sources(sources.command, None, None, None, None)
+    return find_sideways_share(_read_command(index, sources.command, sha256), sources.command) > 0.0
+
+
+def _leave_out_silent(
+    index: LogIndex, configuration: Configuration, vehicle: Vehicle, sha256: str | None
+) -> tuple[Sequence[ChannelInfo], Sources, list[Finding]]:
+    """Channels and topics of every role without commands of which no text can be read, and what they were."""
+    channels, findings = list(index.channels), []
+    while True:
+        sources = choose_sources(channels, configuration, vehicle, where=str(index.path))
+        if sources.command is None or not _is_silent(index, sources.command, sha256):
+            return channels, sources, findings
+        topic = sources.command.signals[0].topic
+        text = f"no text of {topic} is a command that can be read: the topic was left out"
+        findings.append(Finding("no_readable_text", "warning", text, where=topic))
+        channels = [channel for channel in channels if channel.topic != topic]
+
+
+def _is_silent(index: LogIndex, command: DriveSource, sha256: str | None) -> bool:
+    """Whether a command that nobody named is a topic of texts which all say something else."""
     types = {channel.topic: channel.type_name for channel in index.channels}
-    data = read_topics(index, list_wanted(command, types), sha256=sha256 or "unused")
-    return find_sideways_share(data.topics, sources.command) > 0.0
+    if command.reason == CONFIGURED or find_type(types[command.signals[0].topic]).text is None:
+        return False
+    return not any(with_texts(columns).log_time.size for columns in _read_command(index, command, sha256))
+
+
+def _read_command(index: LogIndex, command: DriveSource, sha256: str | None) -> Sequence[TopicColumns]:
+    types = {channel.topic: channel.type_name for channel in index.channels}
+    wanted = list_wanted(Sources(command, None, None, None, None), types)
+    return read_topics(index, wanted, sha256=sha256 or "unused").topics
 
 
 def _apply_controller(

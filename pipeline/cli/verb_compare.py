@@ -100,7 +100,7 @@ def _compare_causes(
         ]
         for budget in found.budgets:
             parts = ", ".join(
-                f"{found.names.get(one.name, one.name)} {one.share:.0%}" for one in budget.parts
+                f"{found.names.get(one.name, one.name)} {one.share:z.0%}" for one in budget.parts
             )
             lines += [
                 "",

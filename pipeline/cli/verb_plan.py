@@ -97,10 +97,19 @@ def plan(  # noqa: D417 - the runs document themselves
         if check is not None:
             return _check(check, names, options, json=json, quiet=quiet)
         from pipeline.analysis.plan import UNDECIDED, ask, choose_topic, expect, study  # noqa: PLC0415 - heavy
-        from pipeline.plan import Request, choose_limits, make_plan, parse_area, write_plan  # noqa: PLC0415
+        from pipeline.plan import (  # noqa: PLC0415 - heavy
+            Request,
+            choose_limits,
+            compare_protocols,
+            make_plan,
+            parse_area,
+            parse_protocols,
+            write_plan,
+        )
         from pipeline.plan.limits import parse_time  # noqa: PLC0415 - heavy
 
         seconds = parse_time(time)
+        protocols = () if compare is None else parse_protocols(compare)
         diagnosis, lossy = None, False
         if names:
             found, recordings, chosen, lossy = _gather(names, options, quiet=quiet or json)
@@ -134,11 +143,7 @@ def plan(  # noqa: D417 - the runs document themselves
             seed,
         )
         made = make_plan(knowledge, questions, request)
-        others: list[Needed] = []
-        if compare is not None:
-            from pipeline.plan import compare_protocols  # noqa: PLC0415 - heavy
-
-            others = compare_protocols(knowledge, questions, limits, compare.split(","), seed)
+        others = compare_protocols(knowledge, questions, limits, protocols, seed)
         asked = [question.text for question in questions]
         files: tuple[Path, ...] = ()
         if made.manoeuvres:

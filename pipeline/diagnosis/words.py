@@ -123,7 +123,7 @@ def _describe_budget(diagnosis: RunDiagnosis) -> list[str]:
     rows = []
     for budget in diagnosis.budgets:
         if (budget.input, budget.quantity) == (diagnosis.input, "slip") and diagnosis.effects:
-            parts = [f"{one.name.replace('_noise', ' noise')} {one.share:.0%}" for one in budget.shares]
+            parts = [f"{one.name.replace('_noise', ' noise')} {one.share:z.0%}" for one in budget.shares]
             rows.append(f"of {math.sqrt(budget.total):.3g} m/s of slip (mean square): {', '.join(parts)}")
     return rows
 

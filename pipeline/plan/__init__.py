@@ -13,7 +13,7 @@ from pipeline.plan.files import read_promises, write_plan
 from pipeline.plan.knowledge import Knowledge, assume, learn
 from pipeline.plan.limits import Area, Limits, choose_limits, parse_area
 from pipeline.plan.plan import SAFETY, Plan, Request, find_largest, make_plan
-from pipeline.plan.protocols import PROTOCOLS, Needed, compare_protocols
+from pipeline.plan.protocols import PROTOCOLS, Needed, compare_protocols, parse_protocols
 
 __all__ = [
     "PROTOCOLS",
@@ -38,6 +38,7 @@ __all__ = [
     "list_names",
     "make_plan",
     "parse_area",
+    "parse_protocols",
     "read_promises",
     "write_plan",
 ]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.plan.errors import PlanError
 from pipeline.plan.limits import is_steered
-from pipeline.plan.manoeuvres import LEAD_S, hold_within, join, wait
+from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, Commands, hold_within, join, wait
 from pipeline.plan.plan import since_when
 from pipeline.plan.questions import Judge
 from pipeline.plan.rehearsal import Rehearsal
@@ -41,6 +41,24 @@ class Needed:
     seconds: tuple[float, ...]
 
 
+def parse_protocols(text: str) -> tuple[str, ...]:
+    """Names of `PROTOCOLS` between commas.
+
+    Raises:
+        PlanError: ``unknown_protocol``.
+    """
+    names = tuple(text.split(","))
+    for name in names:
+        if name not in PROTOCOLS:
+            raise PlanError(
+                "unknown_protocol",
+                f"no protocol is called {name!r}",
+                where="--compare",
+                hint=f"Give some of {', '.join(PROTOCOLS)}.",
+            )
+    return names
+
+
 def compare_protocols(
     knowledge: Knowledge, questions: Sequence[Question], limits: Limits, names: Sequence[str], seed: int = 0
 ) -> list[Needed]:
@@ -50,29 +68,27 @@ def compare_protocols(
         knowledge: where they start from.
         questions: to answer.
         limits: of the vehicle, the same for all.
-        names: of `PROTOCOLS`.
+        names: as of `parse_protocols`.
         seed: of those that are drawn.
-
-    Raises:
-        PlanError: ``unknown_protocol``.
     """
     found = []
     for name in names:
-        if name not in PROTOCOLS:
-            raise PlanError(
-                "unknown_protocol",
-                f"no protocol is called {name!r}",
-                where="--compare",
-                hint=f"Give some of {', '.join(PROTOCOLS)}.",
-            )
-        stages = PROTOCOLS[name](limits, knowledge.vehicle, np.random.default_rng(seed))
-        commands = join([wait(LEAD_S), hold_within(stages, knowledge.vehicle, limits)])
-        begins = LEAD_S + np.cumsum([0.0, *(seconds for _, _, seconds in stages[:-1])])
+        commands, begins = drive_protocol(name, knowledge.vehicle, limits, seed)
         rehearsal = Rehearsal(commands, knowledge.vehicle, knowledge.senses, begins)
         edges = np.arange(0.0, commands.duration_s + 1.0)
         judged = Judge(rehearsal, knowledge, edges, stretches=True).judge(questions)
         found.append(Needed(name, tuple(since_when(one, edges) for one in judged)))
     return found
+
+
+def drive_protocol(name: str, vehicle: Vehicle, limits: Limits, seed: int) -> tuple[Commands, Floats]:
+    """The commands of a protocol up to `LONGEST_S`, and the times [s] at which its stages begin."""
+    stages = PROTOCOLS[name](limits, vehicle, np.random.default_rng(seed))
+    whole = join([wait(LEAD_S), hold_within(stages, vehicle, limits)])
+    count = round(LONGEST_S * RATE_HZ)
+    commands = Commands(whole.speed[:count], whole.turn[:count])
+    begins = LEAD_S + np.cumsum([0.0, *(seconds for _, _, seconds in stages[:-1])])
+    return commands, begins[begins < commands.duration_s]
 
 
 def _drive(limits: Limits, _: Vehicle, generator: np.random.Generator) -> Stages:

@@ -1,4 +1,4 @@
-"""The pages over all runs of a results folder, and the links between them: only to those that are there."""
+"""The pages over all runs of a results folder, and their links: only to those that are there."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
+
+from pipeline.report.catalogue import render_catalogue
 
 if TYPE_CHECKING:
     from pipeline.store import Store
@@ -24,18 +26,17 @@ _PLACE = re.compile(r'(<nav id="pages"[^>]*>).*?(</nav>)', re.DOTALL)
 
 
 def write_page(store: Store, name: str, page: str) -> Path:
-    """Write one of `PAGES`, and link it and those that are there to each other.
+    """Write one of `PAGES` with links to those that are there, and the catalogue anew, which so knows it.
+
+    Other pages are left as they are: what stands in them was made by others, or is damaged.
 
     Raises:
         StoreError: the disk refuses.
     """
-    if not (store.root / name).is_file():
-        # A new page: the others are to know of it.
-        store.write_results_text(name, page)
-        for other in (other for other in PAGES if other != name and (store.root / other).is_file()):
-            text = (store.root / other).read_text(encoding="utf-8")
-            store.write_results_text(other, _link(store, other, text))
-    return store.write_results_text(name, _link(store, name, page))
+    path = store.write_results_text(name, _link(store, name, page))
+    if name != CATALOGUE:
+        store.write_results_text(CATALOGUE, _link(store, CATALOGUE, render_catalogue(store)))
+    return path
 
 
 def is_page(place: str) -> bool:
@@ -60,6 +61,6 @@ def _link(store: Store, name: str, page: str) -> str:
     links = "".join(
         f"<b>{title}</b>" if other == name else f'<a href="{html.escape(other)}">{title}</a>'
         for other, title in PAGES.items()
-        if other == name or (store.root / other).is_file()
+        if other in {name, CATALOGUE} or (store.root / other).is_file()
     )
     return _PLACE.sub(lambda found: found[1] + links + found[2], page, count=1)

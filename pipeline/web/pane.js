@@ -5,6 +5,9 @@ import { h, post, runTo, say, sayDuration, sayShare, toast } from "./parts.js";
 const WAIT_MS = 60;
 const HEADROOM = 1.05;
 
+// The effects whose signatures can be drawn: not those that are off, or neutral.
+const listSignatures = (rows) => Object.keys(rows).filter((name) => name.startsWith("signature_"));
+
 // Seen only where an answer takes longer than a moment.
 const working = () => h("i", { class: "working", role: "progressbar", "aria-label": "working" });
 
@@ -16,6 +19,7 @@ export class Pane {
     this.state = null;
     this.album = null;
     this.plots = null;
+    this.signatures = [];
     this.turn = 0;
     this.hero = h("section", { class: "hero", "aria-label": "Run" });
     this.glance = h("section", { class: "glance", "aria-label": "Error of the model" });
@@ -69,7 +73,7 @@ export class Pane {
     }
   }
 
-  // A change of structure: all figures anew. A change of values: only their rows.
+  // The numbers first, then the figures.
   async act(action, more = {}) {
     await this.settle();
     if (await this.ask(action, more)) await this.redraw();
@@ -321,6 +325,7 @@ export class Pane {
     }
     if (turn !== this.turn) return;
     this.album = album;
+    this.signatures = listSignatures(album.rows);
     this.tellWhere(album.where);
     this.figures.replaceChildren(this.marking, ...album.shown.map((figure) =>
       h("figure", { class: figure.width, data: { id: figure.id } },
@@ -359,7 +364,8 @@ export class Pane {
     await this.planned?.paint?.();
   }
 
-  // Steps of the staircase come and go: that figure changes its height and is drawn whole.
+  // Where effects came or went their signatures do: all figures anew. Else only their rows; steps of the staircase
+  // come and go as well, so that figure changes its height and is drawn whole.
   async redraw() {
     if (!this.plots) {
       await this.draw();
@@ -369,12 +375,14 @@ export class Pane {
     try {
       const answer = await post("/api/rows", this.request);
       if (turn !== this.turn) return;
-      const fed = this.take(answer);
-      const ladder = this.figures.querySelector("[data-figure=ladder]");
-      if (ladder) await this.plots.draw(ladder);
-      await fed;
-      if (turn !== this.turn) return;
-      this.root.dataset.drawn = String(turn);
+      if (listSignatures(answer.rows).join() === this.signatures.join()) {
+        const fed = this.take(answer);
+        const ladder = this.figures.querySelector("[data-figure=ladder]");
+        if (ladder) await this.plots.draw(ladder);
+        await fed;
+        if (turn !== this.turn) return;
+        this.root.dataset.drawn = String(turn);
+      } else await this.draw();
       if (this.state.trial) this.follow();
     } catch (error) {
       toast(error.message);

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from platforms import hidden_effects, try_platform
 
 from pipeline.analysis.analyze import analyze_log
@@ -13,6 +16,7 @@ from pipeline.analysis.choice import Choice, choose
 from pipeline.analysis.errors import JobError
 from pipeline.analysis.log_setup import describe_subject
 from pipeline.analysis.options import Options
+from pipeline.core.errors import SlipError
 from pipeline.logs import Wanted, open_log, read_topics
 from pipeline.simulate import PLATFORMS, simulate_case
 from pipeline.vehicles import load_configuration
@@ -161,6 +165,46 @@ def test_requests_of_another_kind_are_no_commands(tmp_path: Path) -> None:
     (requests,) = read_topics(tmp_path / "run.mcap", [Wanted("/api/sport/request")]).topics
     assert commands.height == len(requests) - 1
     assert not ((commands["body_x"] - 0.3).abs() + (commands["body_w"] - 0.5).abs() < 1e-9).any()
+
+
+def rewrite_requests(log: Path, text: bytes) -> None:
+    """Have all requests to the service of a log say a text, filled up with spaces."""
+    out = log.with_suffix(".new")
+    with log.open("rb") as source, out.open("wb") as stream:
+        reader, writer = make_reader(source), Writer(stream)
+        writer.start(reader.get_header().profile)
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            if channel.id not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
+            data = message.data
+            if channel.topic == "/api/sport/request":
+                data, count = re.subn(rb'{"x"[^}]*}', lambda found: text.ljust(len(found[0])), data)
+                assert count == 1
+            writer.add_message(channels[channel.id], message.log_time, data, message.publish_time)
+        writer.finish()
+    out.replace(log)
+
+
+@pytest.mark.parametrize("text", [b"not JSON", b'{"speed": 1}'])
+def test_requests_that_all_say_something_else_are_left_out_with_a_word(tmp_path: Path, text: bytes) -> None:
+    record("go2_w", tmp_path)
+    log = tmp_path / "run.mcap"
+    rewrite_requests(log, text)
+    chosen = choose(open_log(log), load_configuration(log), {})
+    assert chosen.sources.command is None
+    assert str(chosen.sources.wheels) == "/lf/lowstate"
+    notes = {finding.id: finding.text for finding in chosen.findings}
+    assert "/api/sport/request" in notes["no_readable_text"]
+    assert "no_command" in notes
+    manifest = analyze_log(log, Options(out=tmp_path / "out", report=False)).manifest
+    assert "no_readable_text" in str(manifest.read_json("summary.json")["findings"])
+    # Who names the topic is told that it holds none.
+    (tmp_path / "run.toml").write_text('[command]\ntopic = "/api/sport/request"\n', encoding="utf-8")
+    with pytest.raises(SlipError, match="has no readable message"):
+        analyze_log(log, Options(out=tmp_path / "out", report=False))
 
 
 def test_an_odometry_of_the_wheels_is_never_preferred_and_says_what_it_is(tmp_path: Path) -> None:

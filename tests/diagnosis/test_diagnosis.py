@@ -167,6 +167,16 @@ def test_the_screen_names_each_effect_and_the_fall(skidding: Diagnosis) -> None:
     assert "->" in text
 
 
+def test_a_share_that_rounds_to_nothing_has_no_sign(skidding: Diagnosis) -> None:
+    run = skidding.runs[0]
+    budgets = tuple(
+        replace(budget, shares=(replace(budget.shares[0], share=-0.004), *budget.shares[1:]))
+        for budget in run.budgets
+    )
+    text = describe(Diagnosis((replace(run, budgets=budgets),)))
+    assert f"(mean square): {budgets[0].shares[0].name} 0%, " in text
+
+
 def test_what_runs_judged_together_share_is_said_once(skidding: Diagnosis) -> None:
     run = skidding.runs[0]
     spoiled = {"id": "imu_sign", "text": "the gyro turns the wrong way", "severity": "warning"}

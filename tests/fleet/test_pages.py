@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
+import pytest
 from comparison_store import Run, write_run
 
 from pipeline.analysis.analyze import update_datasets
@@ -34,17 +35,37 @@ def links_of(path: Path) -> list[str]:
     return re.findall(r'href="([^"]+)"', nav[1])
 
 
-def test_pages_link_to_those_that_are_there_and_back(tmp_path: Path) -> None:
+def test_a_page_leads_to_those_that_are_there_and_the_catalogue_to_all(tmp_path: Path) -> None:
     store = make_results(tmp_path)
     assert links_of(tmp_path / "index.html") == []
     write_map(store, draw_up_map(store))
     assert links_of(tmp_path / "index.html") == ["map.html"]
     assert links_of(tmp_path / "map.html") == ["index.html"]
     write_trend(store, follow_trend(store, by=("dataset",), threshold=0.1, limits={}))
+    assert links_of(tmp_path / "index.html") == ["trend.html", "map.html"]
+    assert links_of(tmp_path / "trend.html") == ["index.html", "map.html"]
+    write_map(store, draw_up_map(store))
     assert links_of(tmp_path / "map.html") == ["index.html", "trend.html"]
     update_datasets(store)
     assert links_of(tmp_path / "index.html") == ["trend.html", "map.html"]
-    assert links_of(tmp_path / "trend.html") == ["index.html", "map.html"]
+
+
+@pytest.mark.parametrize("bad", [b"?", b"\xff"])
+def test_a_damaged_page_is_not_signed_again_when_another_is_written(tmp_path: Path, bad: bytes) -> None:
+    store = make_results(tmp_path)
+    write_map(store, draw_up_map(store))
+    page = tmp_path / "map.html"
+    content = page.read_bytes()
+    page.write_bytes(content[:-10] + bad + content[-9:])
+    damaged = page.read_bytes()
+    assert damaged != content
+    problems = store.verify()
+    assert [problem.path.name for problem in problems] == ["map.html"]
+    write_trend(store, follow_trend(store, by=("dataset",), threshold=0.1, limits={}))
+    assert page.read_bytes() == damaged
+    assert store.verify() == problems
+    write_map(store, draw_up_map(store))
+    assert store.verify() == ()
 
 
 def test_a_page_elsewhere_leads_to_the_catalogue_that_is_there(tmp_path: Path) -> None:

@@ -14,8 +14,11 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.analysis.plan import choose_topic
+from pipeline.cli import main
+from pipeline.cli.output import FAILED
 from pipeline.models import find_effect
 from pipeline.plan import (
+    PROTOCOLS,
     PlanError,
     Request,
     ask_presence,
@@ -30,6 +33,7 @@ from pipeline.plan.files import WHEELS, list_types, read_promises
 from pipeline.plan.limits import is_steered, parse_time
 from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, join, limit_yaw_rate, list_manoeuvres, wait
 from pipeline.plan.plan import Plan, find_largest
+from pipeline.plan.protocols import LONGEST_S, drive_protocol
 from pipeline.plan.rehearsal import Rehearsal
 from pipeline.report.plan import preview_plan
 from pipeline.simulate import find_vehicle
@@ -244,8 +248,25 @@ def test_other_protocols_are_timed_for_the_same_questions_within_the_same_limits
     assert all(10.0 < second < 300.0 for second in drive.seconds)
     # Once round takes longer than two random steps, and nothing turns before it.
     assert drive.seconds[0] < laps.seconds[0]
-    with pytest.raises(PlanError, match="straight_and_circle"):
-        compare_protocols(knowledge, questions, limits, ["dance"])
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_protocol_is_driven_no_longer_than_is_said(name: str) -> None:
+    vehicle = _find("turtlebot4")
+    commands, begins = drive_protocol(name, vehicle, choose_limits(vehicle), 0)
+    assert LONGEST_S - 10.0 < commands.duration_s <= LONGEST_S
+    assert begins[0] == LEAD_S
+    assert begins[-1] < commands.duration_s
+
+
+def test_an_unknown_protocol_is_refused_before_anything_is_worked_out(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("pipeline.plan.make_plan", lambda *_: pytest.fail("the plan was made first"))
+    with pytest.raises(SystemExit) as ended:
+        main(["plan", "--vehicle", "husky_a200", "--compare", "drive,dance", "--out", str(tmp_path / "plan")])
+    assert ended.value.code == FAILED
+    assert "straight_and_circle" in capsys.readouterr().err
 
 
 def test_a_plan_is_written_only_in_a_type_that_carries_its_commands(plan: Plan, tmp_path: Path) -> None:

@@ -389,5 +389,6 @@ def test_durations_shares_and_dates_are_said_in_words() -> None:
     assert say_duration(3.25) == "3.2 s"
     assert say_duration(7380.0) == "2 h 03 min"
     assert say_share(0.385) == "38\u202f%"
+    assert say_share(-0.004) == "0\u202f%"
     assert say_date(0) == ""
     assert say_date(2**62) == "2116-02-20 23:53 UTC"

@@ -159,6 +159,59 @@ def count_marks(figure: str, pane: str = "a") -> str:
 
 
 @pytest.mark.long
+def test_the_signature_of_an_effect_comes_goes_and_follows_its_value(
+    chrome: Chrome, workbench: Workbench, pictures: Path
+) -> None:
+    drawn = "document.querySelector('.plot.drawn[data-figure=signature] .mark-line path')"
+    gone = "!document.querySelector('[data-figure=signature]')"
+    # How far the curve stands out of its panel [px].
+    outside = (
+        "(() => { const line = document.querySelector('[data-figure=signature] .mark-line path');"
+        " const panel = line.closest('.mark-group').querySelector('.background').getBoundingClientRect();"
+        " const { top, bottom } = line.getBoundingClientRect();"
+        " return Math.max(panel.top - top, bottom - panel.bottom); })()"
+    )
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(SHOWN)
+    before = cast("float", chrome.run(ERROR))
+    assert chrome.run(gone)
+    # What stands there when the number has begun to move: the figures are still those of before.
+    chrome.run(
+        "new MutationObserver((_, watch) => { window.first ??= "
+        f"{gone}; watch.disconnect(); }}).observe(document.querySelector('.number.r .value'),"
+        " { childList: true, characterData: true, subtree: true })"
+    )
+    chrome.click(".proposals li[data-effect=effective_track] .add")
+    chrome.wait(drawn)
+    assert chrome.run("window.first") is True
+    chrome.wait(f"{ERROR} < {0.1 * before}")
+    chrome.picture(pictures / "workbench_signature.png", whole=True)
+    assert cast("float", chrome.run(outside)) < 1.0
+
+    # While the slider is held at its end the axis grows with the curve; at the neutral value there is none.
+    shape = f"{drawn}.getAttribute('d')"
+    ticks = "document.querySelector('.plot[data-figure=signature]').textContent"
+    fitted = f"{json.dumps(chrome.run(shape))} + {json.dumps(chrome.run(ticks))}"
+    slide = (
+        "(() => {{ const input = document.querySelector('.slider input'); input.step = 'any';"
+        " input.value = {}; for (const kind of {}) input.dispatchEvent(new Event(kind)); }})()"
+    )
+    chrome.run(slide.format("input.min", "['input']"))
+    chrome.wait(f"{drawn} && {shape} + {ticks} !== {fitted}")
+    assert cast("float", chrome.run(outside)) < 1.0
+    chrome.run(slide.format("1", "['input', 'change']"))
+    chrome.wait(gone)
+    chrome.click(".undo")
+    chrome.wait(drawn)
+    chrome.click(".switch")
+    chrome.wait(gone)
+    chrome.click(".switch")
+    chrome.wait(drawn)
+    look_for_trouble(chrome)
+
+
+@pytest.mark.long
 def test_a_stretch_that_is_brushed_shows_on_the_map_and_in_command_space(
     chrome: Chrome, workbench: Workbench, pictures: Path
 ) -> None:

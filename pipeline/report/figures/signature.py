@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from pipeline.report.figures.figure import Picture
     from pipeline.report.scene import Scene
 
-_ROOM = 0.2
 _SERIES = {"before": "error without it", "after": "with it", "curve": "what it does"}
 
 
@@ -99,19 +98,15 @@ def _draw_panel(signature: Signature, colour: str) -> Picture:
         scale=alt.Scale(zero=False, nice=False, padding=8),
         axis=alt.Axis(title=variable, format=",~r", tickCount=6, grid=False),
     )
-    ends = np.concatenate((signature.before, signature.after, signature.curve, np.zeros(1)))
-    room = _ROOM * float(np.ptp(ends))
     y = alt.Y(
         "mean:Q",
-        scale=alt.Scale(domain=[float(ends.min()) - room, float(ends.max()) + room], nice=False),
+        scale=alt.Scale(nice=False, padding=12),
         axis=alt.Axis(title=None, format=",~r", tickCount=5, minExtent=parts.GUTTER - 10),
     )
     base = alt.Chart(alt.NamedData(_name_rows(signature)))
     zero = base.mark_rule(color=theme.QUIET, strokeWidth=0.8).encode(y=alt.datum(0.0))
     measured = base.transform_filter("datum.series !== 'curve'")
-    bars = measured.mark_rule(strokeWidth=1.2, clip=True).encode(
-        x=x, y=alt.Y("low:Q"), y2="high:Q", color=shade
-    )
+    bars = measured.mark_rule(strokeWidth=1.2).encode(x=x, y=alt.Y("low:Q"), y2="high:Q", color=shade)
     points = measured.mark_circle(size=42, opacity=1).encode(x=x, y=y, color=shade)
     curve = base.transform_filter("datum.series === 'curve'").mark_line(strokeWidth=1.8, order=False)
     return alt.layer(zero, curve.encode(x=x, y=y, color=shade), bars, points).properties(

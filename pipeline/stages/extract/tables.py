@@ -119,11 +119,10 @@ class _Extraction:
         self.where = where
         self.frames = ("", "")
         self._orders: dict[str, NDArray[np.int64]] = {}
-        self.columns = {
-            topic: reading.with_stamps(found)
-            for topic in dict.fromkeys(columns.topic for columns in topics)
-            if (found := self._join_channels(topic)) is not None
-        }
+        joined = map(self._join_channels, dict.fromkeys(columns.topic for columns in topics))
+        stamped = [reading.with_stamps(columns) for columns in joined if columns is not None]
+        # None of a topic's texts may be one that can be read.
+        self.columns = {columns.topic: columns for columns in stamped if columns.log_time.size}
         pose = sources.pose
         self.chain = chain_poses(topics, pose, where) if pose and pose.from_transforms else None
         self.clocks = self._align()
