@@ -96,6 +96,16 @@ def test_a_log_counts_once_and_the_later_version_counts(features: pl.DataFrame) 
         merge_features([features, features.with_columns(pl.col("median_modulus") * 2.0)], "a and b")
 
 
+def test_runs_without_a_mass_are_shared(tmp_path: Path) -> None:
+    made = Store(tmp_path)
+    write_run(made, Run(name="light", sha256="a" * 64, mass_kg=None))
+    write_run(made, Run(name="of_no_size", terrain="ice", sha256="b" * 64, sized=False))
+    shared = gather_features(made)[0].filter(input="command")
+    assert shared["mass"].to_list() == [None, 470.0]
+    assert shared["inertia"].to_list() == [None, None]
+    assert shared["lost_energy"].is_null().to_list() == [False, True]
+
+
 def table_of(path: Path) -> pa.Table:
     return pq.read_table(path)
 
