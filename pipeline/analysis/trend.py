@@ -13,7 +13,13 @@ from pipeline.analysis.compared_runs import ComparedRuns, find_material
 from pipeline.analysis.errors import JobError
 from pipeline.core.errors import SlipError
 from pipeline.fleet import gather_runs
-from pipeline.fleet.parameter_trend import PLACES, describe_parameter, follow_parameters, say_power
+from pipeline.fleet.parameter_trend import (
+    PLACES,
+    describe_parameter,
+    find_latest,
+    follow_parameters,
+    say_power,
+)
 from pipeline.fleet.trend import (
     FEWEST_RUNS,
     LEVEL,
@@ -91,12 +97,15 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
     )
     series = follow_quantities(values)
     estimates = compared.scan("estimates").filter(pl.col("run").is_in(dated["run"].to_list())).collect()
-    parameters = follow_parameters(estimates, dated.select("order", "run", "day"), level=LEVEL / 2)
+    days = dated.select("order", "run", "day")
+    parameters = follow_parameters(estimates, days, level=LEVEL / 2)
+    latest = find_latest(estimates, days)
     notes += _note_what_lacks(series, parameters)
     alerts = raise_alerts(
-        series, parameters, vehicles=_find_vehicles(dated), threshold=threshold, limits=limits
+        series, parameters, latest, vehicles=_find_vehicles(dated), threshold=threshold, limits=limits
     )
-    names = [one.quantity for one in series] + [one.label for one in parameters]
+    numbers = latest.select(pl.format("{}.{}", "effect", "parameter")).to_series()
+    names = [*(one.quantity for one in series), *numbers]
     known = {*names, *(name.split(" (")[0] for name in names)}
     notes += [f"no run has the quantity {name!r} that a limit is for" for name in limits if name not in known]
     keys = tuple(f"{run}/{compared.manifests[run].key}" for run in dated["run"])

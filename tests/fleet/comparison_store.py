@@ -42,6 +42,7 @@ class Run:
     findings: Sequence[tuple[str, str, float | None]] = field(default=())
     estimates: Sequence[tuple[str, str, float, float]] = field(default=())
     budget: pl.DataFrame | None = None
+    at_bound: bool = False
     still: bool = False
     sized: bool = True
     moves: bool = True
@@ -256,7 +257,7 @@ def _list_estimates(run: Run) -> pl.DataFrame:
         pl.lit("measured").cast(_INPUTS).alias("input"),
         pl.lit("1").alias("unit"),
         pl.lit(value=True).alias("named"),
-        pl.lit(value=False).alias("at_bound"),
+        pl.lit(value=run.at_bound).alias("at_bound"),
     )
 
 
