@@ -171,6 +171,24 @@ def test_a_limit_holds_for_a_last_run_that_is_odd_or_at_a_bound(store: Store, *,
     assert text in [alert.text for alert in found.alerts]
 
 
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        (["--limit", "median_modulus=inf"], "'median_modulus=inf' is no limit"),
+        (["--limit", "warnings=nan"], "'warnings=nan' is no limit"),
+        (["--threshold", "inf"], "inf is no threshold"),
+    ],
+)
+def test_limits_that_are_not_finite_are_one_line(
+    store: Store, asked: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive_a_season(store, [1.8])
+    with pytest.raises(SystemExit) as ended:
+        main(["trend", str(store.root), *asked])
+    assert ended.value.code == 1
+    assert told in capsys.readouterr().err
+
+
 def test_several_limits_and_unknown_ones(store: Store) -> None:
     drive_a_season(store, [1.8, 1.8])
     found = follow(store, limits={"warnings": 0.0, "beauty": 1.0})
