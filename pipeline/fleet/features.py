@@ -171,19 +171,22 @@ def merge_features(frames: Sequence[pl.DataFrame], where: str) -> tuple[pl.DataF
     """Features of several files as one, sorted, and how many rows of them stood twice.
 
     A log is told by the hash of its content. What two versions of slip made of it is not the same: the row of
-    the later one stays.
+    the later one stays. Of which results the same numbers are does not matter.
 
     Raises:
         ComparisonError: ``bad_features``: one version says two things of the same log.
     """
-    joined = pl.concat(frames).unique(maintain_order=True)
+    told = [name for name in Features.column_names() if name != "from_results"]
+    joined = pl.concat(frames).sort("from_results").unique(told, keep="first", maintain_order=True)
     newest = pl.col("made_by").map_elements(_order_version, return_dtype=pl.List(pl.Int64))
     ranked = joined.with_columns(newest.alias("order")).sort(*_PARTS, "order")
     last = ranked.filter(pl.col("order") == pl.col("order").last().over(_PARTS)).drop("order")
     twice = last.filter(last.select(_PARTS).is_duplicated())
     if twice.height:
         logs = ", ".join(twice["run"].unique().sort().head(5))
-        raise _refuse(where, f"they contradict each other on the logs {logs}")
+        counts = twice.group_by(_PARTS).n_unique()
+        differ = ", ".join(name for name in told if name not in _PARTS and (counts[name] > 1).any())
+        raise _refuse(where, f"they contradict each other on the logs {logs}, in {differ}")
     return last, sum(frame.height for frame in frames) - last.height
 
 

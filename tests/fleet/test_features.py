@@ -97,8 +97,14 @@ def test_a_log_counts_once_and_the_later_version_counts(features: pl.DataFrame) 
         merged, twice = merge_features(order, "")
         assert merged.equals(newer.sort("sha256", "input"))
         assert twice == 4
-    with pytest.raises(ComparisonError, match="contradict each other on the logs 0000"):
-        merge_features([features, features.with_columns(pl.col("median_modulus") * 2.0)], "a and b")
+    again = features.with_columns(pl.lit("other").alias("from_results"))
+    for order in ([features, again], [again, features]):
+        merged, twice = merge_features(order, "")
+        assert (merged.height, twice) == (4, 4)
+        assert merged.equals(merge_features(order[::-1], "")[0])
+    changed = features.with_columns(pl.col("median_modulus") * 2.0, pl.lit(None, pl.Float64).alias("mass"))
+    with pytest.raises(ComparisonError, match=r"on the logs 0000.*, in mass, median_modulus\. "):
+        merge_features([again, changed], "a and b")
 
 
 def test_runs_without_a_mass_are_shared(tmp_path: Path) -> None:
