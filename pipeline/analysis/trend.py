@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,8 +12,7 @@ import polars as pl
 
 from pipeline.analysis.compared_runs import ComparedRuns, find_material
 from pipeline.analysis.errors import JobError
-from pipeline.core.errors import SlipError
-from pipeline.fleet import gather_runs
+from pipeline.fleet import ComparisonError, gather_runs
 from pipeline.fleet.parameter_trend import (
     PLACES,
     describe_parameter,
@@ -157,12 +157,18 @@ def update_trend(store: Store) -> None:
     path = store.root / TREND
     if not path.is_file():
         return
-    unreadable = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError)
-    with contextlib.suppress(SlipError, *unreadable):
+    try:
         asked = json.loads(path.read_text(encoding="utf-8"))["asked"]
         limits = {str(name): float(value) for name, value in asked["limits"].items()}
         by = [str(name) for name in asked["by"]]
-        write_trend(store, follow_trend(store, by, threshold=float(asked["threshold"]), limits=limits))
+        threshold = float(asked["threshold"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return
+    if not all(math.isfinite(value) for value in (threshold, *limits.values())):
+        return
+    # No run with a date, or no such column to group by.
+    with contextlib.suppress(JobError, ComparisonError):
+        write_trend(store, follow_trend(store, by, threshold=threshold, limits=limits))
 
 
 def describe_trend(trend: Trend) -> dict[str, object]:
