@@ -138,7 +138,7 @@ def measure_runs(compared: ComparedRuns) -> tuple[ComparedRuns, pl.DataFrame, li
     if runs.is_empty():
         return compared, runs, notes
     scales = runs.unique("run").select("run", "length_scale")
-    vehicles = compared.labels.select("run", "mass", "inertia").join(scales, on="run")
+    vehicles = compared.labels.select("run", "mass", "squared_gyration").join(scales, on="run")
     slip = compared.scan("slip").filter(pl.col("run").is_in(list(compared.manifests)))
     return compared, add_measures(runs, measure_difficulty(slip, vehicles)), notes
 

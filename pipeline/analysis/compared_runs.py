@@ -28,7 +28,7 @@ _SCHEMA = {
     "day": pl.String,
     "start": pl.Int64,
     "mass": pl.Float64,
-    "inertia": pl.Float64,
+    "squared_gyration": pl.Float64,
 }
 
 
@@ -37,7 +37,7 @@ class ComparedRuns:
     """Runs to compare.
 
     Attributes:
-        labels: one row a run: labels, ``key``, ``group``, ``mass`` [kg], ``inertia`` [kg m^2].
+        labels: one row a run: labels, ``key``, ``group``, ``mass`` [kg], ``squared_gyration`` [m^2].
         manifests: their generations by run.
         root: the results folder.
         notes: which runs were left out, and why.
@@ -152,7 +152,7 @@ def _label_run(manifest: Manifest) -> dict[str, str | float | int | None]:
     details = manifest.details
     vehicle = details.get("vehicle")
     facts = vehicle if isinstance(vehicle, dict) else {}
-    mass, inertia = _weigh(facts)
+    mass = facts.get("mass_kg")
     return {
         "run": manifest.run,
         "key": manifest.key,
@@ -161,22 +161,16 @@ def _label_run(manifest: Manifest) -> dict[str, str | float | int | None]:
         "terrain": str(details.get("terrain") or "unknown"),
         "day": read_day(manifest.run) or _read_day_of(_read_start(manifest)),
         "start": _read_start(manifest),
-        "mass": mass,
-        "inertia": inertia,
+        "mass": float(mass) if isinstance(mass, (int, float)) else None,
+        "squared_gyration": _square_gyration(facts),
     }
 
 
-def _weigh(vehicle: Mapping[str, object]) -> tuple[float | None, float | None]:
-    """Mass [kg] and yaw inertia [kg m^2] of a plate as wide as the track and as long as the wheelbase."""
-    mass = vehicle.get("mass_kg")
-    if not isinstance(mass, (int, float)):
-        return None, None
+def _square_gyration(vehicle: Mapping[str, object]) -> float | None:
+    """Yaw inertia over mass [m^2] of a plate as wide as the track and as long as the wheelbase."""
     sides = [vehicle.get(name) for name in ("track_width_m", "wheelbase_m")]
     known = [float(side) for side in sides if isinstance(side, (int, float))]
-    if not known:
-        return float(mass), None
-    squared = known[0] ** 2 + known[-1] ** 2
-    return float(mass), float(mass) * squared / 12.0
+    return (known[0] ** 2 + known[-1] ** 2) / 12.0 if known else None
 
 
 def _read_start(manifest: Manifest) -> int | None:

@@ -11,7 +11,6 @@ from pipeline.analysis.compare import choose_input, measure_runs
 from pipeline.analysis.compared_runs import find_material, read_digest
 from pipeline.fleet import pool_runs
 from pipeline.fleet.deployments import find_own_table, read_deployments
-from pipeline.fleet.features import read_features
 from pipeline.fleet.measures import MEASURES, Measure
 from pipeline.fleet.place import place_datasets, place_deployments
 
@@ -52,7 +51,7 @@ def draw_up_map(
     *,
     fed: str | None = None,
     show: str = "slip",
-    shared: Path | None = None,
+    shared: pl.DataFrame | None = None,
 ) -> DeploymentMap:
     """Place the literature and the results' datasets.
 
@@ -61,10 +60,10 @@ def draw_up_map(
         table: a table of deployments; by default the project's own.
         fed: what u is; None: as `compare_results` chooses it.
         show: key of `MEASURES` that colours the datasets.
-        shared: features of others, as of `slip share`; what is of the results' own logs does not count twice.
+        shared: table `features` of others; what is of the results' own logs does not count twice.
 
     Raises:
-        ComparisonError: the table is not there or breaks its schema; ``bad_features``.
+        ComparisonError: the table is not there or breaks its schema.
     """
     deployments = read_deployments(table or find_own_table())
     compared, runs, _ = measure_runs(find_material(store, ("dataset",), trusted_only=True))
@@ -73,9 +72,7 @@ def draw_up_map(
     keys: tuple[str, ...] = ()
     parts = [] if runs.is_empty() else [pool_runs(runs, ("dataset",))]
     if shared is not None:
-        parts.append(
-            _pool_shared(read_features(shared), [read_digest(m) for m in compared.manifests.values()])
-        )
+        parts.append(_pool_shared(shared, [read_digest(m) for m in compared.manifests.values()]))
     if parts:
         pooled = pl.concat(
             [part.with_columns(pl.col("input").cast(pl.String)) for part in parts], how="diagonal"

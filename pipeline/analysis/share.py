@@ -46,6 +46,7 @@ def gather_features(store: Store) -> tuple[pl.DataFrame, tuple[str, ...]]:
         pl.col("input").cast(pl.String),
         pl.lit(read_version()).alias("made_by"),
         pl.col("key").alias("from_results"),
+        (pl.col("mass") * pl.col("squared_gyration")).alias("inertia"),
     ).with_columns(pl.col("sha256").str.slice(0, 16).alias("run"))
     typed = shared.select(pl.col(name).cast(kind) for name, kind in schema.items())
     return check_features(typed.sort("sha256", "input"), str(store.root)), tuple(notes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,9 +12,14 @@ import polars as pl
 
 from pipeline.analysis.compared_runs import ComparedRuns, find_material
 from pipeline.analysis.errors import JobError
-from pipeline.core.errors import SlipError
-from pipeline.fleet import gather_runs
-from pipeline.fleet.parameter_trend import PLACES, describe_parameter, follow_parameters, say_power
+from pipeline.fleet import ComparisonError, gather_runs
+from pipeline.fleet.parameter_trend import (
+    PLACES,
+    describe_parameter,
+    find_latest,
+    follow_parameters,
+    say_power,
+)
 from pipeline.fleet.trend import (
     FEWEST_RUNS,
     LEVEL,
@@ -91,12 +97,15 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
     )
     series = follow_quantities(values)
     estimates = compared.scan("estimates").filter(pl.col("run").is_in(dated["run"].to_list())).collect()
-    parameters = follow_parameters(estimates, dated.select("order", "run", "day"), level=LEVEL / 2)
+    days = dated.select("order", "run", "day")
+    parameters = follow_parameters(estimates, days, level=LEVEL / 2)
+    latest = find_latest(estimates, days)
     notes += _note_what_lacks(series, parameters)
     alerts = raise_alerts(
-        series, parameters, vehicles=_find_vehicles(dated), threshold=threshold, limits=limits
+        series, parameters, latest, vehicles=_find_vehicles(dated), threshold=threshold, limits=limits
     )
-    names = [one.quantity for one in series] + [one.label for one in parameters]
+    numbers = latest.select(pl.format("{}.{}", "effect", "parameter")).to_series()
+    names = [*(one.quantity for one in series), *numbers]
     known = {*names, *(name.split(" (")[0] for name in names)}
     notes += [f"no run has the quantity {name!r} that a limit is for" for name in limits if name not in known]
     keys = tuple(f"{run}/{compared.manifests[run].key}" for run in dated["run"])
@@ -148,12 +157,18 @@ def update_trend(store: Store) -> None:
     path = store.root / TREND
     if not path.is_file():
         return
-    unreadable = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError)
-    with contextlib.suppress(SlipError, *unreadable):
+    try:
         asked = json.loads(path.read_text(encoding="utf-8"))["asked"]
         limits = {str(name): float(value) for name, value in asked["limits"].items()}
         by = [str(name) for name in asked["by"]]
-        write_trend(store, follow_trend(store, by, threshold=float(asked["threshold"]), limits=limits))
+        threshold = float(asked["threshold"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return
+    if not all(math.isfinite(value) for value in (threshold, *limits.values())):
+        return
+    # No run with a date, or no such column to group by.
+    with contextlib.suppress(JobError, ComparisonError):
+        write_trend(store, follow_trend(store, by, threshold=threshold, limits=limits))
 
 
 def describe_trend(trend: Trend) -> dict[str, object]:

@@ -53,12 +53,25 @@ def load_libraries() -> None:
 
 
 def refresh_remote_pools(mirror: Mirror) -> None:
-    """As `refresh_pools`, for results on an object store, with the runs that other machines have added."""
+    """As `refresh_pools`, for results on an object store, with the runs that other machines have added.
+
+    A fleet model or a trend that was asked for fetches the tables that it takes. All pages are published, as
+    the catalogue links them.
+    """
+    from pipeline.analysis.fleet import FLEET  # noqa: PLC0415 - heavy
+    from pipeline.analysis.trend import TREND  # noqa: PLC0415 - heavy
+    from pipeline.report.pages import PAGES  # noqa: PLC0415 - heavy
+
     mirror.pull_index()
-    mirror.pull_tables(("aggregates",), mirror.store.manifests())
+    tables = ["aggregates"]
+    if (mirror.store.root / FLEET).is_file():
+        tables.append("estimates")
+    if (mirror.store.root / TREND).is_file():
+        tables += ["slip", "findings", "estimates"]
+    mirror.pull_tables(tables, mirror.store.manifests())
     forget_pools(mirror.store)
     refresh_pools(mirror.store)
-    for name in (*POOLED, "quarantine_datasets.parquet"):
+    for name in ("datasets.parquet", "quarantine_datasets.parquet", FLEET, "fleet.parquet", TREND, *PAGES):
         mirror.push_file(name)
 
 

@@ -1,4 +1,4 @@
-"""What `slip analyze` and `slip diagnose` do when a log takes more memory than it may."""
+"""What verbs do when a file takes more memory than it may."""
 
 from __future__ import annotations
 
@@ -19,14 +19,18 @@ _SHARE = 0.8
 
 @contextmanager
 def limited_memory(
-    size: str | None, name_log: Callable[[], str], conclude: Callable[[SlipError], None]
+    size: str | None,
+    name_log: Callable[[], str],
+    conclude: Callable[[SlipError], None],
+    hint: str = "Give it more with --memory, or leave the log out",
 ) -> Iterator[None]:
     """End the program with one line when it holds too much memory.
 
     Args:
         size: most memory, for example ``2GB``; None for a share of the machine's.
-        name_log: which log is being worked on.
+        name_log: which file is being worked on.
         conclude: prints what was found before, where JSON was asked for.
+        hint: what to do then.
 
     Raises:
         BatchError: ``bad_size``.
@@ -41,7 +45,7 @@ def limited_memory(
             "out_of_memory",
             f"it held {held / 1e9:.2g} GB of memory, more than {limit / 1e9:.2g} GB",
             where=name_log(),
-            hint="Give it more with --memory, or leave the log out",
+            hint=hint,
         )
         print_error(error)
         conclude(error)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 _OWN = Path("deployments.csv")
+_FEATURES_MEMORY = "2GB"
 
 
 def register(app: App) -> None:
@@ -61,7 +62,8 @@ def draw(  # noqa: D417 - arguments document themselves
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     store = Store(out or results)
-    drawn = draw_up_map(store, deployments, fed=fed, show=show, shared=shared)
+    features = None if shared is None else _read_features(shared)
+    drawn = draw_up_map(store, deployments, fed=fed, show=show, shared=features)
     page = write_map(store, drawn, figures)
     if json:
         print_json(
@@ -152,11 +154,22 @@ def _are_features(*paths: Path) -> bool:
     return False
 
 
+def _read_features(path: Path) -> pl.DataFrame:
+    """As `read_features`, which ends the program where a stranger's file fills the memory."""
+    from pipeline.cli.memory_limit import limited_memory  # noqa: PLC0415 - heavy
+    from pipeline.fleet.features import read_features  # noqa: PLC0415 - heavy
+
+    with limited_memory(_FEATURES_MEMORY, lambda: str(path), lambda _: None, "Do not trust this file"):
+        return read_features(path)
+
+
 def _merge_features(first: Path, second: Path, to: Path, *, json: bool, quiet: bool) -> None:
-    from pipeline.fleet.features import merge_features, read_features, write_features  # noqa: PLC0415 - heavy
+    from pipeline.fleet.features import merge_features, write_features  # noqa: PLC0415 - heavy
 
     to = to if to != _OWN else Path("features.parquet")
-    merged, twice = merge_features([read_features(path) for path in (first, second)], f"{first} and {second}")
+    merged, twice = merge_features(
+        [_read_features(path) for path in (first, second)], f"{first} and {second}"
+    )
     write_features(merged, to)
     runs = merged["sha256"].n_unique()
     if json:

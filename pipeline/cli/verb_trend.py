@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -53,6 +54,8 @@ def trend(  # noqa: D417 - arguments document themselves
     from pipeline.analysis.trend import describe_trend, follow_trend, write_trend  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
+    if not math.isfinite(threshold):
+        raise SlipError("bad_limit", f"{threshold} is no threshold", hint="Write --threshold 0.1 for a tenth")
     store = Store(out or results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
     found = follow_trend(store, names, threshold=threshold, limits=dict(map(_read_limit, limit)))
@@ -67,11 +70,14 @@ def trend(  # noqa: D417 - arguments document themselves
 def _read_limit(text: str) -> tuple[str, float]:
     name, _, value = text.rpartition("=")
     try:
-        return name.strip() or text, float(value)
-    except ValueError as error:
+        limit = float(value)
+    except ValueError:
+        limit = math.nan
+    if not math.isfinite(limit):
         raise SlipError(
             "bad_limit", f"{text!r} is no limit", hint="Write --limit QUANTITY=VALUE, as median_modulus=1.2"
-        ) from error
+        )
+    return name.strip() or text, limit
 
 
 def _describe(found: Trend, page: Path) -> str:

@@ -1,7 +1,10 @@
 """Features of deployments as one file to share: written, read as from a stranger, merged.
 
-A file that others send is not trusted: it is read whole and only if it is small, none of it is compressed, so
-that nothing in it can inflate, and it has exactly the columns, types and ranges of its contract.
+A file that others send is not trusted: it is read whole and only if it is small, none of it is compressed,
+and it has exactly the columns, types and ranges of its contract. Parquet inflates without compression, too:
+texts are read as dictionaries, so that a text that many rows share is in memory once, and their lengths are
+checked before they are written out. Pages may be encoded otherwise than the file says, so that callers limit
+the memory as well.
 """
 
 from __future__ import annotations
@@ -25,8 +28,10 @@ if TYPE_CHECKING:
 MAGIC = b"PAR1"
 LARGEST_BYTES = 64 * 2**20
 MOST_ROWS = 100_000
+_LONGEST_TEXT = 1024
 _LARGEST_PART = 10**9
 _PARTS = ("sha256", "input")
+_STORED = {pl.String(): "BYTE_ARRAY", pl.Float64(): "DOUBLE", pl.Int64(): "INT64"}
 
 
 def write_features(frame: pl.DataFrame, path: Path) -> None:
@@ -71,6 +76,7 @@ def read_features(path: Path) -> pl.DataFrame:
     data = _read_small(path)
     try:
         table = _open_table(data, str(path))
+        table = _write_out_texts(table, str(path))
         # Texts that are no UTF-8, in rows or in the schema, would end the program further on.
         table.validate(full=True)
         frame = pl.from_arrow(pa.Table.from_arrays(table.columns, names=table.column_names))
@@ -105,9 +111,11 @@ def _open_table(data: bytes, where: str) -> pa.Table:
     import pyarrow as pa  # noqa: PLC0415 - heavy
     import pyarrow.parquet as pq  # noqa: PLC0415 - heavy
 
+    texts = [name for name, kind in Features.create_empty().schema.items() if kind == pl.String]
     file = pq.ParquetFile(
-        pa.BufferReader(data), thrift_string_size_limit=2**20, thrift_container_size_limit=2**16
-    )
+        pa.BufferReader(data), thrift_string_size_limit=2**20, thrift_container_size_limit=2**16,
+        read_dictionary=texts,
+    )  # fmt: skip
     about, contract = file.metadata, contract_of("features")
     told = {key: value for key, value in (about.metadata or {}).items() if key != b"ARROW:schema"}
     version = told.get(b"contract_version", b"").decode("utf-8", "replace")[:20]
@@ -117,6 +125,12 @@ def _open_table(data: bytes, where: str) -> pa.Table:
         raise _refuse(where, f"it has more than {MOST_ROWS} rows")
     if sorted(file.schema_arrow.names) != sorted(Features.column_names()):
         raise _refuse(where, "its columns are not those of the contract")
+    stored = {
+        column.path: column.physical_type
+        for column in (about.schema.column(i) for i in range(about.num_columns))
+    }
+    if stored != {name: _STORED[kind] for name, kind in Features.create_empty().schema.items()}:
+        raise _refuse(where, "its columns are of other types than the contract's")
     ours = contract.metadata_of
     theirs = {
         name: (file.schema_arrow.field(name).metadata or {}).get(b"unit", b"")
@@ -124,33 +138,55 @@ def _open_table(data: bytes, where: str) -> pa.Table:
     }
     if wrong := sorted(name for name, unit in theirs.items() if unit != ours(name).get("unit", "").encode()):
         raise _refuse(where, f"units are others than the contract's: of {', '.join(wrong)}")
-    chunks = [
-        about.row_group(group).column(column)
-        for group in range(about.num_row_groups)
-        for column in range(about.num_columns)
-    ]
+    groups = [about.row_group(group) for group in range(about.num_row_groups)]
+    chunks = [group.column(column) for group in groups for column in range(about.num_columns)]
+    # What is read is what the chunks say, whatever the file says of itself.
+    if sum(chunk.num_values for chunk in chunks) != about.num_rows * about.num_columns:
+        raise _refuse(where, "its parts hold other numbers of rows than it says")
+    if sum(chunk.total_compressed_size for chunk in chunks) > len(data):
+        raise _refuse(where, "its parts hold more bytes than it has")
     if any(chunk.compression != "UNCOMPRESSED" for chunk in chunks):
         raise _refuse(where, "a part of it is compressed, and might be anything")
     return file.read()
+
+
+def _write_out_texts(table: pa.Table, where: str) -> pa.Table:
+    """The table with its dictionaries as plain texts, if none of these is long."""
+    import pyarrow as pa  # noqa: PLC0415 - heavy
+    import pyarrow.compute as pc  # noqa: PLC0415 - heavy
+
+    for place, field in enumerate(table.schema):
+        if pa.types.is_dictionary(field.type):
+            column = table.column(place)
+            if any(
+                (pc.max(pc.binary_length(chunk.dictionary)).as_py() or 0) > _LONGEST_TEXT
+                for chunk in column.chunks
+            ):
+                raise _refuse(where, f"a text of {field.name} is longer than {_LONGEST_TEXT} bytes")
+            table = table.set_column(place, field.name, column.cast(pa.large_string()))
+    return table
 
 
 def merge_features(frames: Sequence[pl.DataFrame], where: str) -> tuple[pl.DataFrame, int]:
     """Features of several files as one, sorted, and how many rows of them stood twice.
 
     A log is told by the hash of its content. What two versions of slip made of it is not the same: the row of
-    the later one stays.
+    the later one stays. Of which results the same numbers are does not matter.
 
     Raises:
         ComparisonError: ``bad_features``: one version says two things of the same log.
     """
-    joined = pl.concat(frames).unique(maintain_order=True)
+    told = [name for name in Features.column_names() if name != "from_results"]
+    joined = pl.concat(frames).sort("from_results").unique(told, keep="first", maintain_order=True)
     newest = pl.col("made_by").map_elements(_order_version, return_dtype=pl.List(pl.Int64))
     ranked = joined.with_columns(newest.alias("order")).sort(*_PARTS, "order")
     last = ranked.filter(pl.col("order") == pl.col("order").last().over(_PARTS)).drop("order")
     twice = last.filter(last.select(_PARTS).is_duplicated())
     if twice.height:
         logs = ", ".join(twice["run"].unique().sort().head(5))
-        raise _refuse(where, f"they contradict each other on the logs {logs}")
+        counts = twice.group_by(_PARTS).n_unique()
+        differ = ", ".join(name for name in told if name not in _PARTS and (counts[name] > 1).any())
+        raise _refuse(where, f"they contradict each other on the logs {logs}, in {differ}")
     return last, sum(frame.height for frame in frames) - last.height
 
 

@@ -64,6 +64,7 @@ class ParameterTrend:
         odd: runs that stand apart, left out.
         named: runs whose diagnosis names the effect.
         worth: smallest change that is worth an alert.
+        latest: estimate of the last run, odd or at a bound as it may be.
     """
 
     vehicle: str
@@ -77,16 +78,28 @@ class ParameterTrend:
     odd: tuple[str, ...]
     named: int
     worth: float
+    latest: float
 
     @property
     def label(self) -> str:
         """``effect.parameter``."""
         return f"{self.effect}.{self.parameter}"
 
-    @property
-    def latest(self) -> float:
-        """The last run's value."""
-        return float(self.points["value"][-1])
+
+def find_latest(estimates: pl.DataFrame, dated: pl.DataFrame) -> pl.DataFrame:
+    """The last run's estimate of every number that a run names, odd or at a bound as it may be.
+
+    Returns:
+        ``vehicle``, ``effect``, ``parameter``, ``unit``, ``value``, ``run``; of two inputs the command's.
+    """
+    rows = estimates.join(dated, on="run").with_columns(pl.col("input").cast(pl.String))
+    return (
+        rows.sort("order", "input", descending=[False, True])
+        .group_by("vehicle", "effect", "parameter", maintain_order=True)
+        .agg(pl.col("unit", "value", "run").last(), pl.col("named").any())
+        .filter("named")
+        .drop("named")
+    )
 
 
 def follow_parameters(
@@ -105,16 +118,20 @@ def follow_parameters(
     """
     found = []
     numbers = list_numbers(estimates.join(dated, on="run"))
+    latest = {row[:3]: row[4] for row in find_latest(estimates, dated).iter_rows()}
     counts: dict[str, int] = {}
     for vehicle, *_ in numbers:
         counts[vehicle] = counts.get(vehicle, 0) + 1
     for vehicle, effect, parameter, rows in numbers:
         own = rows.sort("order")
-        found.append(_follow(vehicle, effect, parameter, own, level / counts[vehicle]))
+        last = latest[vehicle, effect, parameter]
+        found.append(_follow(vehicle, effect, parameter, own, level / counts[vehicle], last))
     return tuple(sorted(found, key=lambda one: (one.vehicle, one.label)))
 
 
-def _follow(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame, level: float) -> ParameterTrend:
+def _follow(
+    vehicle: str, effect: str, parameter: str, rows: pl.DataFrame, level: float, latest: float
+) -> ParameterTrend:
     kept, odd = _leave_out_odd(rows)
     terrains = kept["terrain"].to_list()
     search = find_shifts(kept["value"], kept["standard_error"], terrains, level=level)
@@ -152,7 +169,7 @@ def _follow(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame, level
     least = find_effect(effect)().parameter(parameter).least
     return ParameterTrend(
         vehicle, effect, parameter, str(rows["unit"][0]), points, changes, search.least, need, odd,
-        int(rows["named"].sum()), 0.0 if least is None else least.size,
+        int(rows["named"].sum()), 0.0 if least is None else least.size, latest,
     )  # fmt: skip
 
 

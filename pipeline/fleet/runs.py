@@ -89,9 +89,11 @@ def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFra
       0.1 m/s: what share of what was asked did not become motion.
     - ``slip_energy`` [J]: median of 1/2 m |g_xy|^2 + 1/2 I g_w^2, the kinetic energy of the slip velocity.
       I is that of a plate as wide as the track and as long as the wheelbase, m (b^2 + l^2) / 12.
+      Null without the mass.
     - ``lost_energy`` [1]: slip path over path driven, of the vehicle's plate: root mean square over its mass
       of the velocities at its points, both integrated. Ground that slips at Coulomb's friction mu takes
-      mu g times as much energy per metre and mass; mu is not known, and drops out of comparisons.
+      mu g times as much energy per metre and mass; mu is not known, and drops out of comparisons. Null where
+      track and wheelbase are unknown, or where nothing moved.
     - ``transitory_slip`` [m]: median over command steps of the integral of modulus minus the step's steady
       median over its transitory span: the slip path that a change of command costs on top of steady driving.
     - ``largest_kinetic_energy`` [J]: 1/2 m v^2 of the 99th percentile of the speed's running median over one
@@ -101,8 +103,8 @@ def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFra
 
     Args:
         slip: table `slip` of all runs; only the columns needed are read, suspect rows are left out.
-        vehicles: one row a run: ``run``, ``mass`` [kg], ``inertia`` [kg m^2] (null where unknown),
-            ``length_scale`` [m].
+        vehicles: one row a run: ``run``, ``mass`` [kg], ``squared_gyration`` (I / m) [m^2] (null where
+            unknown), ``length_scale`` [m].
 
     Returns:
         ``run``, ``input`` and the measures.
@@ -111,7 +113,7 @@ def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFra
     squared_yaw = (pl.col("length_scale") * pl.col("f_w")) ** 2
     ideal = (pl.col("f_x") ** 2 + pl.col("f_y") ** 2 + squared_yaw).sqrt()
     moved = pl.col("g_x") ** 2 + pl.col("g_y") ** 2
-    energy = 0.5 * pl.col("mass") * moved + 0.5 * pl.col("inertia") * pl.col("g_w") ** 2
+    energy = 0.5 * pl.col("mass") * (moved + pl.col("squared_gyration") * pl.col("g_w") ** 2)
     speed = (pl.col("v_x") ** 2 + pl.col("v_y") ** 2).sqrt()
     calm = speed.rolling_median(_CALM_SAMPLES, min_samples=3)
     simple = sound.group_by("run", "input").agg(
@@ -138,14 +140,19 @@ def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFra
         [simple.join(steps, on=["run", "input"], how="left"), measure_unpredictability(sound)]
     )
     whole = joined.join(left, on=["run", "input"], how="left").sort("run", "input")
+    ratios = {
+        "lost_energy": pl.col("lost_energy"),
+        "relative_unpredictability": pl.col("unpredictability") / pl.col("ideal"),
+    }
+    # Sums of nulls are zero, and so are paths of what stands still.
     return whole.with_columns(
-        (pl.col("unpredictability") / pl.col("ideal")).alias("relative_unpredictability")
+        pl.when(ratio.is_finite()).then(ratio).alias(name) for name, ratio in ratios.items()
     ).drop("ideal")
 
 
 def _plate(of: str) -> pl.Expr:
-    """Root mean square velocity of the points of a plate with the vehicle's mass and inertia."""
-    turning = pl.col("inertia") / pl.col("mass") * pl.col(f"{of}_w") ** 2
+    """Root mean square velocity of the points of the vehicle's plate."""
+    turning = pl.col("squared_gyration") * pl.col(f"{of}_w") ** 2
     return (pl.col(f"{of}_x") ** 2 + pl.col(f"{of}_y") ** 2 + turning).sqrt()
 
 

@@ -121,6 +121,7 @@ class _Event:
 def raise_alerts(
     series: Sequence[Series],
     parameters: Sequence[ParameterTrend],
+    latest: pl.DataFrame,
     *,
     vehicles: Mapping[str, str],
     threshold: float,
@@ -134,6 +135,7 @@ def raise_alerts(
     Args:
         series: as of `follow_quantities`.
         parameters: as of `follow_parameters`; they count where they move by what is worth a name.
+        latest: as of `find_latest`.
         vehicles: vehicle of each group that has one only.
         threshold: relative change of a series that matters, for example 0.1.
         limits: highest value allowed, by quantity (with or without the input in brackets).
@@ -159,7 +161,10 @@ def raise_alerts(
         told = "; ".join(one.short for one in same)
         alerts.append(Alert(head.group, head.quantity, head.text + (f"; with it: {told}" if told else "")))
     lasts = [(one.group, one.quantity, one.unit, one.latest, one.points["run"][-1]) for one in series]
-    lasts += [(one.vehicle, one.label, one.unit, one.latest, one.points["run"][-1]) for one in parameters]
+    lasts += [
+        (vehicle, f"{effect}.{parameter}", unit, value, run)
+        for vehicle, effect, parameter, unit, value, run in latest.iter_rows()
+    ]
     for group, quantity, unit, value, run in lasts:
         limit = limits.get(quantity, limits.get(quantity.split(" (")[0]))
         if limit is not None and value > limit:

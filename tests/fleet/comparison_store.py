@@ -42,7 +42,10 @@ class Run:
     findings: Sequence[tuple[str, str, float | None]] = field(default=())
     estimates: Sequence[tuple[str, str, float, float]] = field(default=())
     budget: pl.DataFrame | None = None
+    at_bound: bool = False
     still: bool = False
+    sized: bool = True
+    moves: bool = True
 
 
 def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
@@ -86,6 +89,8 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
             ).with_columns(pl.lit(name).cast(_INPUTS).alias("input"), *_WITHOUT_MODEL)
         )
     slip = pl.concat(parts)
+    if not run.moves:
+        slip = slip.with_columns(pl.col("^[fv]_[xyw]$") * 0.0)
     tables = {
         "slip": slip,
         "windows": _cut_windows(slip),
@@ -109,8 +114,8 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
                 "vehicle": {
                     "id": run.vehicle,
                     "mass_kg": run.mass_kg,
-                    "track_width_m": 1.08,
-                    "wheelbase_m": 0.914,
+                    "track_width_m": 1.08 if run.sized else None,
+                    "wheelbase_m": 0.914 if run.sized else None,
                     "max_speed_mps": 5.0,
                     "max_yaw_rate_radps": 4.0,
                 },
@@ -252,7 +257,7 @@ def _list_estimates(run: Run) -> pl.DataFrame:
         pl.lit("measured").cast(_INPUTS).alias("input"),
         pl.lit("1").alias("unit"),
         pl.lit(value=True).alias("named"),
-        pl.lit(value=False).alias("at_bound"),
+        pl.lit(value=run.at_bound).alias("at_bound"),
     )
 
 

@@ -181,6 +181,30 @@ def test_measures_of_difficulty_have_their_definition(store: Store) -> None:
     assert row["relative_unpredictability"] == pytest.approx(row["unpredictability"] / ideal)
 
 
+def test_what_cannot_be_measured_is_empty_and_lost_energy_takes_no_mass(store: Store) -> None:
+    for vehicle in ("a", "b"):
+        for terrain in TERRAINS:
+            name = f"{vehicle}_{terrain}"
+            write_run(store, Run(name=name, dataset=name, vehicle=vehicle, terrain=terrain, mass_kg=None))
+    write_run(store, Run(name="weighed", dataset="weighed", terrain="mud"))
+    write_run(store, Run(name="of_no_size", dataset="of_no_size", terrain="mud", sized=False))
+    write_run(store, Run(name="parked", dataset="parked", terrain="mud", moves=False))
+    answer = ask(store)
+    write_answer(store, answer)
+    written = pl.read_parquet(store.root / "datasets.parquet")
+    assert written.height == answer.datasets.height == 2 * 9
+    command = {row["dataset"]: row for row in written.rows(named=True) if row["input"] == "command"}
+    assert command["a_gravel"]["lost_energy"] > 0.0
+    assert command["a_gravel"]["slip_energy"] is None
+    assert command["weighed"]["lost_energy"] > 0.0
+    assert command["of_no_size"]["lost_energy"] is None
+    assert command["parked"]["lost_energy"] is None
+    assert command["parked"]["relative_unpredictability"] is None
+    found = compare_orders(answer.datasets.filter(input="command"))
+    orders = {one.measure: one for one in found if (one.a, one.b) == ("a", "b")}
+    assert orders["energy"].tau is not None
+
+
 def test_vehicles_agree_on_the_order_of_grounds_or_there_are_too_few(store: Store) -> None:
     for vehicle, scale in (("warthog", 1.0), ("husky_a200", 0.2)):
         for place, terrain in enumerate(("asphalt", "gravel", "grass", "sand", "ice")):

@@ -154,6 +154,41 @@ def test_the_exit_code_serves_a_nightly_job(store: Store, capsys: pytest.Capture
             assert bool(json.loads(spoken)["alerts"]) == (code == 4)
 
 
+@pytest.mark.parametrize("at_bound", [False, True])
+def test_a_limit_holds_for_a_last_run_that_is_odd_or_at_a_bound(store: Store, *, at_bound: bool) -> None:
+    wobble = [0.0, 0.004, -0.004, 0.002]
+    drive_a_season(store, [0.3 + wobble[i % 4] for i in range(10)] + [0.6 + wobble[i % 4] for i in range(10)])
+    write_run(
+        store,
+        Run(
+            name="last", vehicle="warthog-2", seconds=30.0, start_ns=stamp_of(FIRST + timedelta(days=30)),
+            estimates=[("effective_track", "k", 0.75, 0.004)], at_bound=at_bound,
+        ),
+    )  # fmt: skip
+    found = follow(store, limits={"effective_track.k": 0.7})
+    assert found.parameters[0].points["run"][-1] != "last"
+    text = "effective_track.k of warthog-2 is 0.75 1 in last, above the limit of 0.7"
+    assert text in [alert.text for alert in found.alerts]
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        (["--limit", "median_modulus=inf"], "'median_modulus=inf' is no limit"),
+        (["--limit", "warnings=nan"], "'warnings=nan' is no limit"),
+        (["--threshold", "inf"], "inf is no threshold"),
+    ],
+)
+def test_limits_that_are_not_finite_are_one_line(
+    store: Store, asked: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive_a_season(store, [1.8])
+    with pytest.raises(SystemExit) as ended:
+        main(["trend", str(store.root), *asked])
+    assert ended.value.code == 1
+    assert told in capsys.readouterr().err
+
+
 def test_several_limits_and_unknown_ones(store: Store) -> None:
     drive_a_season(store, [1.8, 1.8])
     found = follow(store, limits={"warnings": 0.0, "beauty": 1.0})

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -77,10 +79,13 @@ def test_the_verbs_share_merge_and_draw(
             main(arguments)
         assert ended.value.code == 0
     assert json.loads(capsys.readouterr().out) == {"file": str(merged), "runs": 2, "rows": 4, "twice": 4}
-    alone = draw_up_map(Store(tmp_path / "none"), shared=merged)
+    alone = draw_up_map(Store(tmp_path / "none"), shared=read_features(merged))
     assert alone.own["dataset"].to_list() == ["warthog_gravel (shared)", "warthog_ice (shared)"]
     # Own logs do not stand on the map twice.
-    assert draw_up_map(store, shared=merged).own["dataset"].to_list() == ["warthog_gravel", "warthog_ice"]
+    assert draw_up_map(store, shared=read_features(merged)).own["dataset"].to_list() == [
+        "warthog_gravel",
+        "warthog_ice",
+    ]
 
 
 def test_a_log_counts_once_and_the_later_version_counts(features: pl.DataFrame) -> None:
@@ -92,8 +97,24 @@ def test_a_log_counts_once_and_the_later_version_counts(features: pl.DataFrame) 
         merged, twice = merge_features(order, "")
         assert merged.equals(newer.sort("sha256", "input"))
         assert twice == 4
-    with pytest.raises(ComparisonError, match="contradict each other on the logs 0000"):
-        merge_features([features, features.with_columns(pl.col("median_modulus") * 2.0)], "a and b")
+    again = features.with_columns(pl.lit("other").alias("from_results"))
+    for order in ([features, again], [again, features]):
+        merged, twice = merge_features(order, "")
+        assert (merged.height, twice) == (4, 4)
+        assert merged.equals(merge_features(order[::-1], "")[0])
+    changed = features.with_columns(pl.col("median_modulus") * 2.0, pl.lit(None, pl.Float64).alias("mass"))
+    with pytest.raises(ComparisonError, match=r"on the logs 0000.*, in mass, median_modulus\. "):
+        merge_features([again, changed], "a and b")
+
+
+def test_runs_without_a_mass_are_shared(tmp_path: Path) -> None:
+    made = Store(tmp_path)
+    write_run(made, Run(name="light", sha256="a" * 64, mass_kg=None))
+    write_run(made, Run(name="of_no_size", terrain="ice", sha256="b" * 64, sized=False))
+    shared = gather_features(made)[0].filter(input="command")
+    assert shared["mass"].to_list() == [None, 470.0]
+    assert shared["inertia"].to_list() == [None, None]
+    assert shared["lost_energy"].is_null().to_list() == [False, True]
 
 
 def table_of(path: Path) -> pa.Table:
@@ -122,7 +143,8 @@ def with_unit(table: pa.Table) -> pa.Table:
         (with_column("median_modulus", float("nan")), "rows break the contract"),
         (with_column("median_modulus", float("inf")), "rows break the contract"),
         (with_column("vehicle", PLACE), "rows break the contract (vehicle|regex)"),
-        (with_column("vehicle", "x" * 10_000), "rows break the contract"),
+        (with_column("vehicle", "x" * 1_000), "rows break the contract"),
+        (with_column("vehicle", "x" * 10_000), "a text of vehicle is longer than 1024 bytes"),
         (with_column("terrain", "ice\x1b[2J"), "rows break the contract"),
         (with_column("sha256", "0" * 63), "rows break the contract"),
         (with_column("samples", 10**15), "rows break the contract"),
@@ -155,6 +177,78 @@ def test_other_types_and_compressed_parts_are_refused(features: pl.DataFrame, tm
     field = table.schema.field(place).with_type(pa.string())
     pq.write_table(table.set_column(place, field, pa.array(["1"] * 4)), path, compression="none")
     assert "of other types" in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "why"),
+    [
+        ("dictionary", "a text of vehicle is longer than 1024 bytes"),
+        ("DELTA_BYTE_ARRAY", "it cannot be read"),
+    ],
+)
+def test_a_file_that_inflates_without_compression_is_refused_in_little_memory(
+    encoding: str, why: str, features: pl.DataFrame, tmp_path: Path
+) -> None:
+    path = tmp_path / "f.parquet"
+    write_features(features, path)
+    large = with_column("vehicle", "x" * 2**18)(pa.concat_tables([table_of(path)] * 100))
+    others = [name for name in large.column_names if name != "vehicle"]
+    options = (
+        {}
+        if encoding == "dictionary"
+        else {"use_dictionary": others, "column_encoding": {"vehicle": encoding}}
+    )
+    pq.write_table(large, path, compression="none", **options)
+    assert large.nbytes > 100 * 2**20
+    assert path.stat().st_size < 2**20
+    script = (
+        "import sys, pyarrow as pa; from pathlib import Path\n"
+        "from pipeline.fleet.features import read_features\n"
+        "try: read_features(Path(sys.argv[1]))\n"
+        "except Exception as error: print(error)\n"
+        "print(pa.default_memory_pool().max_memory())"
+    )
+    told, peak = subprocess.run(
+        [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    assert why in told
+    assert int(peak) < 40 * 2**20
+
+
+def test_the_number_of_rows_is_that_of_the_parts(features: pl.DataFrame, tmp_path: Path) -> None:
+    path = tmp_path / "f.parquet"
+    write_features(features, path)
+    pq.write_table(pa.concat_tables([table_of(path)] * 40_000), path, compression="none")
+    data = path.read_bytes()
+    # 160,000 and 20,000 as they stand in the footer: zigzag and seven bits a byte.
+    many, few = b"\x16\x80\xc4\x13", b"\x16\xc0\xb8\x02"
+    footer = data.index(many)
+    path.write_bytes(data[:footer] + few + data[footer + len(few) :])
+    assert pq.read_metadata(path).num_rows == 20_000
+    assert "other numbers of rows than it says" in refused(path)
+
+
+def test_a_file_that_fills_the_memory_all_the_same_ends_the_program_with_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "f.parquet"
+    path.write_bytes(b"PAR1")
+    script = (
+        "import sys, time, pipeline.fleet.features as features, pipeline.cli.verb_map as verb\n"
+        "features.read_features = lambda path: time.sleep(60)\n"
+        "verb._FEATURES_MEMORY = '1MB'\n"
+        "from pipeline.cli.app import main\n"
+        "main(sys.argv[1:])"
+    )
+    for arguments in (["map", "merge", str(path), str(path)], ["map", str(tmp_path), "--shared", str(path)]):
+        ended = subprocess.run(
+            [sys.executable, "-c", script, *arguments],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=30,
+        )
+        assert ended.returncode == 1
+        assert "of memory, more than 0.001 GB" in ended.stderr
+        assert "f.parquet" in ended.stderr
 
 
 def test_what_is_no_small_plain_file_is_refused_at_once(tmp_path: Path) -> None:

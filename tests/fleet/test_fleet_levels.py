@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +12,12 @@ import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.batch.pooling import refresh_pools
+from pipeline.analysis.trend import update_trend
+from pipeline.batch.pooling import refresh_pools, refresh_remote_pools
 from pipeline.cli import main
 from pipeline.fleet.hierarchy import FleetModel, FleetNumber, fit_fleet
 from pipeline.models.level import Level
-from pipeline.store import Store
+from pipeline.store import Mirror, Store
 
 ERROR = 0.02
 ICE_AND_OTHERS = {"asphalt": 1.0, "gravel": 0.98, "ice": 0.7}
@@ -230,9 +232,51 @@ def test_a_batch_keeps_a_trend_that_was_asked_for_up_to_date(
     assert told["asked"]["by"] == ["vehicle"]
     assert any("in new, above the limit of 1.5" in alert["text"] for alert in told["alerts"])
     assert "above the limit of 1.5" in (results.root / "trend.html").read_text(encoding="utf-8")
-    (results.root / "trend.json").write_text('{"asked": 3}', encoding="utf-8")
-    write_run(results, Run(name="newer", terrain="ice", seconds=6.0))
-    assert refresh_pools(results)
+    for number, text in enumerate(
+        ('{"asked": 3}', '{"asked": {"by": ["x"], "threshold": 1e999, "limits": {}}}')
+    ):
+        (results.root / "trend.json").write_text(text, encoding="utf-8")
+        write_run(results, Run(name=f"newer_{number}", terrain="ice", seconds=6.0))
+        assert refresh_pools(results)
+
+
+def test_a_trend_that_cannot_be_made_is_not_passed_over(
+    results: Store, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_slip(capsys, "trend", str(results.root), "--quiet")
+    monkeypatch.setattr("pipeline.analysis.trend.follow_parameters", lambda *_, **__: {}["gone"])
+    with pytest.raises(KeyError, match="gone"):
+        update_trend(results)
+
+
+def test_on_an_object_store_a_batch_keeps_fleet_and_trend_up_to_date_as_well(
+    results: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fsspec = pytest.importorskip("fsspec", reason="the extra s3 is not installed")
+    objects = fsspec.filesystem("memory")
+    objects.store.clear()
+    new = Run(name="new", terrain="ice", seconds=6.0, estimates=[("wheel_radius", "k", 1.6, ERROR)])
+    run_slip(capsys, "fleet", "fit", str(results.root))
+    run_slip(capsys, "trend", str(results.root), "--by", "vehicle", "--limit", "wheel_radius.k=1.5")
+    write_run(results, replace(new, start_ns=new.start_ns + 10**15))
+    for path in results.root.rglob("*"):
+        if path.is_file() and "latest" not in path.parts and path.name != ".lock":
+            objects.pipe_file(
+                f"/field/results/{path.relative_to(results.root).as_posix()}", path.read_bytes()
+            )
+    mirror = Mirror("memory://field/results", tmp_path / "mirror")
+    mirror.store.write_results_text("map.html", "drawn here")
+    refresh_remote_pools(mirror)
+    published = {
+        name: objects.cat_file(f"/field/results/{name}").decode("utf-8")
+        for name in ("fleet.json", "trend.json", "trend.html", "index.html", "map.html")
+    }
+    objects.store.clear()
+    assert '"new/k0"' in published["fleet.json"]
+    assert "in new, above the limit of 1.5" in published["trend.json"]
+    assert "above the limit of 1.5" in published["trend.html"]
+    linked = set(re.findall(r'href="(\w+\.html)"', published["index.html"]))
+    assert {"map.html", "trend.html"} <= linked <= set(published)
 
 
 def test_without_a_fleet_or_estimates_one_line_says_what_to_do(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
+import time
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -162,6 +164,22 @@ def test_a_step_in_a_series_is_found_where_it_is() -> None:
     assert change.after == pytest.approx(2.1, abs=0.03)
     assert ps.find_changes(series[:5]) == ()
     assert ps.find_changes(np.ones(30)) == ()
+
+
+def test_a_small_level_takes_time_where_there_is_a_step_and_little_memory() -> None:
+    rng = np.random.default_rng(7)
+    still, stepped = rng.normal(0.0, 1.0, 40), np.repeat([0.0, 9.0], 20) + rng.normal(0.0, 1.0, 40)
+    took = []
+    tracemalloc.start()
+    for series in (still, stepped):
+        start = time.process_time()
+        found = ps.find_changes(series, level=0.025 / 1_000)
+        took.append(time.process_time() - start)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert [change.index for change in found] == [20]
+    assert peak < 10e6
+    assert took[0] < took[1] / 10.0
 
 
 def test_orders_are_compared_and_contradictions_named() -> None:

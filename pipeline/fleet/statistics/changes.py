@@ -17,6 +17,8 @@ FEWEST_RUNS = 3
 _DRAWS = 1_999
 # Orders beyond what the level takes, so that p can be below it.
 _PER_LEVEL = 4.0
+# Orders at a time, which bounds the memory.
+_CHUNK = 2_000
 _TIE = 1e-9
 
 
@@ -77,16 +79,18 @@ def _split(
         return []
     observed = _weigh_splits(piece[None, :], fewest)[0]
     draws = max(_DRAWS, round(_PER_LEVEL / level))
-    orders = generator.permuted(np.tile(piece, (draws, 1)), axis=1)
-    largest = _weigh_splits(orders, fewest).max(axis=1)
-    as_large = int(np.count_nonzero(largest >= observed.max() - _TIE * float(largest.max())))
-    p = (1 + as_large) / (draws + 1)
-    if p > level:
-        return []
+    least = float(observed.max()) * (1.0 - _TIE)
+    as_large = 1
+    for done in range(0, draws, _CHUNK):
+        orders = generator.permuted(np.tile(piece, (min(_CHUNK, draws - done), 1)), axis=1)
+        as_large += int(np.count_nonzero(_weigh_splits(orders, fewest).max(axis=1) >= least))
+        # However the rest turns out, it is chance.
+        if as_large / (draws + 1) > level:
+            return []
     middle = start + fewest + int(observed.argmax())
     return [
         *_split(series, start, middle, level / 2.0, fewest, generator),
-        (middle, p),
+        (middle, as_large / (draws + 1)),
         *_split(series, middle, end, level / 2.0, fewest, generator),
     ]
 
