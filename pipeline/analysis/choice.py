@@ -235,7 +235,7 @@ def _leave_out_silent(
     index: LogIndex, configuration: Configuration, vehicle: Vehicle, sha256: str | None
 ) -> tuple[Sequence[ChannelInfo], Sources, list[Finding]]:
     """Channels and topics of every role without commands of which no text can be read, and what they were."""
-    channels, findings = list(index.channels), []
+    channels, findings = list(index.channels), list[Finding]()
     while True:
         sources = choose_sources(channels, configuration, vehicle, where=str(index.path))
         if sources.command is None or not _is_silent(index, sources.command, sha256):

@@ -254,7 +254,9 @@ def _find_vehicle(name: str | None) -> Vehicle:
 def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet: bool) -> int:
     """Promises against the joint diagnosis of the runs before and the drive."""
     from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy
+    from pipeline.diagnosis.subject import load_recording  # noqa: PLC0415 - heavy
     from pipeline.plan import check_plan, read_promises  # noqa: PLC0415 - heavy
+    from pipeline.plan.playback import require_played  # noqa: PLC0415 - heavy
 
     promised = read_promises(path)
     if not names:
@@ -265,9 +267,11 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
     vehicle, recordings, _, lossy = _gather([*before, *names], options, quiet=quiet)
     with show_progress(names[0], quiet=quiet or json) as progress:
         progress("diagnosis")
+        driven = [load_recording(recording, vehicle) for recording in recordings[len(before) :]]
+        require_played((path if path.is_dir() else path.parent) / "plan.csv", driven, vehicle)
         diagnosis = diagnose_runs(recordings, vehicle).runs[0]
     checked = check_plan(promised, diagnosis)
-    following = f"slip plan {' '.join([*before, *names])}"
+    following = f"slip plan {' '.join(dict.fromkeys([*before, *names]))}"
     if json:
         print_json({**checked.to_json(), "next": following if diagnosis.undecided else None, "errors": []})
     elif not quiet:
@@ -289,7 +293,7 @@ def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path])
     from pipeline.plan import SAFETY  # noqa: PLC0415 - heavy
 
     if not made.manoeuvres and not made.impossible:
-        what = "" if diagnosis is None else ": everything that was found is decided and known to 5 %"
+        what = "" if diagnosis is None else ": what was found is decided, and driving narrows no number"
         return [f"nothing is open{what}"]
     lines = []
     for one in made.promises:
