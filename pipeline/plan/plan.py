@@ -193,6 +193,9 @@ def make_plan(knowledge: Knowledge, questions: Sequence[Question], request: Requ
             best = trial
         if not best.impossible:
             break
+    if not best.promises:
+        # Nobody sends a robot out for nothing.
+        best = replace(best, manoeuvres=(), starts=())
     commands, ways = best.commands, best.ways
     return Plan(
         vehicle=knowledge.vehicle.id,
