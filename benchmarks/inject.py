@@ -17,7 +17,7 @@ import tempfile
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
@@ -41,18 +41,23 @@ if TYPE_CHECKING:
 
 LOGS = Path(__file__).parents[2] / "shared" / "logs"
 _STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
+_SURE = 1.96
 _VERDICTS = ("recovered", "told", "undecided", "cannot", "missed")
 Json = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What was said of a recording: names with numbers (value, half-width), findings, what it left open."""
+    """What was said of a recording: names with numbers (value, half-width), findings, what it left open.
+
+    Numbers of effects that were not named stand in `estimates`.
+    """
 
     numbers: Mapping[str, tuple[float, float]]
     findings: tuple[str, ...]
     undecided: tuple[str, ...]
     unobservable: tuple[str, ...]
+    estimates: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def names(self) -> set[str]:
@@ -84,7 +89,12 @@ def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
     undecided = tuple(name for item in told.undecided for name in item.candidates)
     more = tuple(str(finding["id"]) for finding in told.findings)
     unobservable = tuple(item.id for item in told.unobservable)
-    return Answer(numbers, tuple(dict.fromkeys((*findings, *more))), undecided, unobservable)
+    estimates = {
+        f"{one.effect}.{one.parameter}": (one.value, _SURE * one.standard_error)
+        for one in told.estimates
+        if one.input == "measured"
+    }
+    return Answer(numbers, tuple(dict.fromkeys((*findings, *more))), undecided, unobservable, estimates)
 
 
 def judge(
@@ -116,7 +126,8 @@ def judge(
 def is_recovered(injection: Injection, label: str, before: Answer, after: Answer) -> bool:
     """Whether a number is what was injected on top of that of the unchanged recording."""
     effect, parameter = label.split(".")
-    start = before.numbers.get(label, (find_effect(effect)().parameter(parameter).neutral, 0.0))
+    neutral = (find_effect(effect)().parameter(parameter).neutral, 0.0)
+    start = before.numbers.get(label) or before.estimates.get(label, neutral)
     expected = (injection.numbers[label](start[0]), start[1])
     return label in after.numbers and is_close(expected, after.numbers[label])
 
