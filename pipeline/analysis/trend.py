@@ -14,7 +14,6 @@ from pipeline.analysis.compared_runs import ComparedRuns, find_material
 from pipeline.analysis.errors import JobError
 from pipeline.fleet import ComparisonError, gather_runs
 from pipeline.fleet.parameter_trend import (
-    PLACES,
     describe_parameter,
     find_latest,
     follow_parameters,
@@ -181,13 +180,7 @@ def describe_trend(trend: Trend) -> dict[str, object]:
                 "quantity": one.quantity,
                 "unit": one.unit,
                 "points": one.points.drop("order").to_dicts(),
-                "changes": [
-                    {
-                        **{key: value for key, value in vars(step).items() if key not in PLACES},
-                        "text": describe_step(one, step),
-                    }
-                    for step in one.steps
-                ],
+                "changes": [step.describe(describe_step(one, step)) for step in one.steps],
             }
             for one in trend.series
         ],

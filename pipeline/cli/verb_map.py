@@ -120,7 +120,10 @@ def merge(  # noqa: D417 - arguments document themselves
     second: Annotated[Path, Parameter(help="another")],
     /,
     *,
-    to: Annotated[Path, Parameter(help="table to write; may be one of them")] = _OWN,
+    to: Annotated[
+        Path | None,
+        Parameter(help="file to write; may be one of them (default: deployments.csv or features.parquet)"),
+    ] = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -133,10 +136,11 @@ def merge(  # noqa: D417 - arguments document themselves
         quiet: print nothing.
     """
     if _are_features(first, second):
-        _merge_features(first, second, to, json=json, quiet=quiet)
+        _merge_features(first, second, to or Path("features.parquet"), json=json, quiet=quiet)
         return CLEAN
     from pipeline.fleet.deployments import merge_deployments, write_deployments  # noqa: PLC0415 - heavy
 
+    to = to or _OWN
     table = merge_deployments(first, second)
     write_deployments(table, to)
     _tell(table, to, json=json, quiet=quiet)
@@ -166,7 +170,6 @@ def _read_features(path: Path) -> pl.DataFrame:
 def _merge_features(first: Path, second: Path, to: Path, *, json: bool, quiet: bool) -> None:
     from pipeline.fleet.features import merge_features, write_features  # noqa: PLC0415 - heavy
 
-    to = to if to != _OWN else Path("features.parquet")
     merged, twice = merge_features(
         [_read_features(path) for path in (first, second)], f"{first} and {second}"
     )

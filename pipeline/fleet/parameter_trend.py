@@ -17,20 +17,19 @@ from pipeline.models.level import Level
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-PLACES = ("order", "earliest", "latest")
-"""Of a change: places among all dated runs, which say nothing to others."""
+_PLACES = ("earliest", "latest")
 _PERIOD = "period"
 _HALF = 1.959964
 
 
 @dataclass(frozen=True)
-class ParameterChange:
-    """Since when a parameter is another one.
+class LevelChange:
+    """Since when a quantity is another one.
 
     Attributes:
         since: day of the first run of the new level; `run` that run.
-        order: its place among all dated runs; `earliest` and `latest`, between which it is at 95 %.
-        before, after: levels, on average over the grounds.
+        earliest, latest: between which places among all dated runs the change is.
+        before, after: levels.
         runs_before, runs_after: runs of these levels.
         p: chance of as large a change anywhere where there is none.
         likely: what makes such a change, in words; empty where nothing is known.
@@ -38,7 +37,6 @@ class ParameterChange:
 
     since: str
     run: str
-    order: int
     earliest: int
     latest: int
     before: float
@@ -46,7 +44,16 @@ class ParameterChange:
     runs_before: int
     runs_after: int
     p: float
-    likely: str
+    likely: str = ""
+
+    @property
+    def size(self) -> float:
+        """Change over the level before; infinite where that is zero."""
+        return abs(self.after - self.before) / abs(self.before) if self.before else math.inf
+
+    def describe(self, text: str) -> dict[str, object]:
+        """The JSON object of a change that is told as ``text``; places say nothing to others."""
+        return {name: value for name, value in vars(self).items() if name not in _PLACES} | {"text": text}
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,7 @@ class ParameterTrend:
     parameter: str
     unit: str
     points: pl.DataFrame
-    changes: tuple[ParameterChange, ...]
+    changes: tuple[LevelChange, ...]
     least: float
     need: str
     odd: tuple[str, ...]
@@ -146,10 +153,9 @@ def _follow(
     edges = [0, *(shift.index for shift in search.shifts), kept.height]
     orders = kept["order"].to_list()
     changes = tuple(
-        ParameterChange(
+        LevelChange(
             since=str(kept["day"][shift.index]),
             run=str(kept["run"][shift.index]),
-            order=orders[shift.index],
             # The change itself lies behind the run before.
             earliest=orders[shift.earliest - 1] + 1,
             latest=orders[shift.latest],
@@ -192,7 +198,7 @@ def _find_likely(effect: str, before: list[str], after: list[str]) -> str:
     return ", or ".join(causes)
 
 
-def describe_change(trend: ParameterTrend, change: ParameterChange) -> str:
+def describe_change(trend: ParameterTrend, change: LevelChange) -> str:
     """A change in a sentence: what, since when, how sure, and what is likely."""
     sure = f"p = {change.p:.2g}" if change.p > 1e-3 else "p < 0.001"  # noqa: PLR2004 - the draws tell no more
     likely = f": likely {change.likely}" if change.likely else ""
@@ -202,7 +208,7 @@ def describe_change(trend: ParameterTrend, change: ParameterChange) -> str:
     )
 
 
-def say_change(trend: ParameterTrend, change: ParameterChange) -> str:
+def say_change(trend: ParameterTrend, change: LevelChange) -> str:
     """What moved from what to what."""
     unit = "" if trend.unit == "1" else f" {trend.unit}"
     return f"{trend.label} of {trend.vehicle} {change.before:.3g} -> {change.after:.3g}{unit}"
@@ -226,13 +232,7 @@ def describe_parameter(trend: ParameterTrend) -> Mapping[str, object]:
         "parameter": trend.parameter,
         "unit": trend.unit,
         "points": trend.points.drop("order").to_dicts(),
-        "changes": [
-            {
-                **{name: value for name, value in vars(change).items() if name not in PLACES},
-                "text": describe_change(trend, change),
-            }
-            for change in trend.changes
-        ],
+        "changes": [change.describe(describe_change(trend, change)) for change in trend.changes],
         "least_change": trend.least if math.isfinite(trend.least) else None,
         "need": trend.need or None,
         "odd": list(trend.odd),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from pipeline.fleet.parameter_trend import describe_change, say_change
+from pipeline.fleet.parameter_trend import LevelChange, describe_change, say_change
 from pipeline.fleet.statistics import find_changes
 
 if TYPE_CHECKING:
@@ -19,38 +19,6 @@ FEWEST_RUNS = 8
 LEVEL = 0.05
 """Chance of an alert where nothing moved: half of it for the parameters of a vehicle, half for all else."""
 _SLIP_FIRST = ("median_modulus (command)", "median_modulus (measured)")
-
-
-@dataclass(frozen=True)
-class Step:
-    """A change of level.
-
-    Attributes:
-        since: day of the first run of the new level.
-        run: that run.
-        earliest, latest: between which places among all dated runs the change is, a run of the series off
-            on either side.
-        before: level before, the mean over runs.
-        after: level after.
-        runs_before: runs of the level before.
-        runs_after: runs of the level after.
-        p: how often the runs in random order would step as much somewhere.
-    """
-
-    since: str
-    run: str
-    earliest: int
-    latest: int
-    before: float
-    after: float
-    runs_before: int
-    runs_after: int
-    p: float
-
-    @property
-    def size(self) -> float:
-        """Change over the level before; infinite where that is zero."""
-        return abs(self.after - self.before) / abs(self.before) if self.before else float("inf")
 
 
 @dataclass(frozen=True)
@@ -69,7 +37,7 @@ class Series:
     quantity: str
     unit: str
     points: pl.DataFrame
-    steps: tuple[Step, ...]
+    steps: tuple[LevelChange, ...]
 
     @property
     def latest(self) -> float:
@@ -188,13 +156,13 @@ def describe_quiet(series: Sequence[Series], parameters: Sequence[ParameterTrend
     )
 
 
-def say_step(series: Series, step: Step) -> str:
+def say_step(series: Series, step: LevelChange) -> str:
     """What moved from what to what."""
     unit = f" {series.unit}" if series.unit not in ("", "1") else ""
     return f"{series.quantity} of {series.group} {step.before:.3g} -> {step.after:.3g}{unit}"
 
 
-def describe_step(series: Series, step: Step) -> str:
+def describe_step(series: Series, step: LevelChange) -> str:
     """A step in a sentence: whose quantity moved from what to what, since when, how sure."""
     return (
         f"{say_step(series, step)} since {step.since} ({step.runs_before} runs before, {step.runs_after} "
@@ -206,12 +174,12 @@ def _can_step(rows: pl.DataFrame) -> bool:
     return rows.height >= FEWEST_RUNS and rows["value"].n_unique() > 1
 
 
-def _find_steps(points: pl.DataFrame, level: float) -> tuple[Step, ...]:
+def _find_steps(points: pl.DataFrame, level: float) -> tuple[LevelChange, ...]:
     changes = find_changes(points["value"].to_numpy(), level=level)
     edges = [0, *(change.index for change in changes), points.height]
     orders = points["order"].to_list()
     return tuple(
-        Step(
+        LevelChange(
             since=points["day"][change.index],
             run=points["run"][change.index],
             earliest=orders[max(change.index - 2, 0)] + 1,

@@ -82,8 +82,15 @@ def test_what_moves_with_a_parameter_is_told_with_it(store: Store) -> None:
                 estimates=[("effective_track", "k", 2.0 + 0.01 * (i % 2), 0.004)],
             ),
         )  # fmt: skip
-    (alert,) = follow(store).alerts
+    found = follow(store)
+    (alert,) = found.alerts
     assert alert.quantity == "effective_track.k"
+    told = json.loads((write_trend(store, found).parent / "trend.json").read_text(encoding="utf-8"))
+    kinds = {
+        tuple(change) for part in ("series", "parameters") for one in told[part] for change in one["changes"]
+    }
+    (kind,) = kinds
+    assert kind == ("since", "run", "before", "after", "runs_before", "runs_after", "p", "likely", "text")
     with_it = alert.text.split("; with it: ")[1]
     assert with_it.startswith("median_modulus (command) of warthog-2 ")
     assert "finding heading_skew of warthog-2 0.1 -> 0.3" in with_it

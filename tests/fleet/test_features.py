@@ -88,6 +88,19 @@ def test_the_verbs_share_merge_and_draw(
     ]
 
 
+def test_a_merge_writes_where_it_is_told(
+    features: pl.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_features(features, Path("a.parquet"))
+    for asked, written in (([], "features.parquet"), (["--to", "deployments.csv"], "deployments.csv")):
+        with pytest.raises(SystemExit) as ended:
+            main(["map", "merge", "a.parquet", "a.parquet", "--quiet", *asked])
+        assert ended.value.code == 0
+        assert read_features(Path(written)).equals(features)
+        Path(written).unlink()
+
+
 def test_a_log_counts_once_and_the_later_version_counts(features: pl.DataFrame) -> None:
     newer = features.with_columns(pl.lit("99.0.10").alias("made_by"), pl.col("median_modulus") * 2.0)
     older = features.with_columns(pl.lit("99.0.9").alias("made_by"))
