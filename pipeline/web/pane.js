@@ -355,8 +355,6 @@ export class Pane {
       await this.plots.draw(place);
     }
     this.root.dataset.drawn = String(turn);
-    // Another width, or other colours.
-    await this.planned?.paint?.();
   }
 
   // Steps of the staircase come and go: that figure changes its height and is drawn whole.
