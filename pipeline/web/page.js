@@ -225,7 +225,10 @@ let timer = 0;
 let width = document.documentElement.clientWidth;
 const again = () => {
   clearTimeout(timer);
-  timer = setTimeout(() => Object.values(panes).forEach((pane) => pane?.plots && pane.paint()), 200);
+  timer = setTimeout(() => Object.values(panes).forEach((pane) => {
+    pane?.planned?.paint?.();
+    if (pane?.plots) pane.paint();
+  }), 200);
 };
 addEventListener("resize", () => {
   if (document.documentElement.clientWidth === width) return;

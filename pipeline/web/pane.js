@@ -360,8 +360,6 @@ export class Pane {
       await this.plots.draw(place);
     }
     this.root.dataset.drawn = String(turn);
-    // Another width, or other colours.
-    await this.planned?.paint?.();
   }
 
   // Where effects came or went their signatures do: all figures anew. Else only their rows; steps of the staircase

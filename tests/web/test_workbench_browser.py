@@ -19,6 +19,7 @@ from pipeline.analysis.peers import find_peers
 from pipeline.cli.verb_serve import _open_browser
 from pipeline.logs import LogWriter
 from pipeline.models import model_file
+from pipeline.report import theme
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 
@@ -477,8 +478,12 @@ def test_a_drive_is_planned_on_request_and_its_files_are_there(
             assert body[: len(start)].lower() == start.lower()
         for width, dark in ((LAPTOP, False), (PHONE, False), (PHONE, True)):
             chrome.size(width, 900, dark=dark)
-            chrome.wait("document.querySelector('.planned .plot.drawn')")
+            # Drawn anew for the width and the colours.
+            twin = theme.DARK_TWINS[theme.GRID] if dark else theme.GRID
+            chrome.wait(f"document.querySelector('.planned svg').outerHTML.includes('{twin}')")
+            chrome.wait("document.querySelector('.planned svg').clientWidth <= innerWidth")
             chrome.run("document.querySelector('.planned').scrollIntoView()")
             assert chrome.run("document.documentElement.scrollWidth <= innerWidth")
             chrome.picture(pictures / f"workbench_plan_{width}_{'dark' if dark else 'light'}.png")
+        chrome.wait(SHOWN, patience_s=60.0)
         look_for_trouble(chrome)
