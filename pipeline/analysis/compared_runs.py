@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
+from pipeline.analysis.diagnosis import DIAGNOSED
 from pipeline.fleet import label_runs, read_day
 from pipeline.store.queries import scan_table
 from schemas import contract_of
@@ -137,11 +138,12 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
     for name in tables:
         entry = manifest.tables.get(name)
         if entry is None:
-            return f"it has no table {name}; analyze it again"
+            how = "slip batch LOGS --diagnosis makes it" if name in DIAGNOSED else "analyze its log again"
+            return f"it has no table {name}; {how}"
         if entry.contract_version != contract_of(name).version:
             return (
                 f"its table {name} has contract version {entry.contract_version} instead of "
-                f"{contract_of(name).version}; analyze it again"
+                f"{contract_of(name).version}; analyze its log again"
             )
     return _find_gone(manifest, tables)
 
