@@ -93,4 +93,5 @@ def _describe(content: Mapping[str, object]) -> list[str]:
 
 def _bound(number: Mapping[str, object], unit: str) -> str:
     shown = f"{number['value']:.3g}" + ("" if unit == "1" else f" {unit}")
-    return f"{shown} [{number['low']:.3g}, {number['high']:.3g}]"
+    cut = " (at its bound)" if number.get("at_bound") else ""
+    return f"{shown} [{number['low']:.3g}, {number['high']:.3g}]{cut}"
