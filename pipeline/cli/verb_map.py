@@ -9,6 +9,7 @@ from cyclopts import App, Parameter
 
 from pipeline.analysis.options import FigureFormat
 from pipeline.cli.output import CLEAN, print_json, print_lines
+from pipeline.cli.results_place import open_results
 
 if TYPE_CHECKING:
     import polars as pl
@@ -60,7 +61,9 @@ def draw(  # noqa: D417 - arguments document themselves
     from pipeline.analysis.map import draw_up_map, write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    store = Store(out or results)
+    place = out or results
+    # Without results of one's own the map is that of the literature; a name that is none is a slip of the pen.
+    store = Store(place) if place == Path("results") else open_results(place).open_store()
     drawn = draw_up_map(store, deployments, fed=fed, show=show, shared=shared)
     page = write_map(store, drawn, figures)
     if json:
