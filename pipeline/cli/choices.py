@@ -68,7 +68,7 @@ def build_options(
 
 
 def spell_choices(choices: Choices) -> str:
-    """What was said on the command line, as it is said again: ` --input measured`; empty where nothing was."""
+    """What was said on the command line, to be said again: ` --input measured`; empty where nothing was."""
     said = ((each.name, getattr(choices, each.name)) for each in fields(choices))
     return spell_flags({name: value for name, value in said if value != getattr(Choices(), name)})
 

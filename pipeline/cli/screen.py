@@ -168,7 +168,8 @@ def _describe_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
             _row("unchanged", "log and configuration are as before: nothing was computed (--force does)")
         )
     if _part(summary, "diagnosis").get("effects"):
-        lines.append(_row("next", f"slip diagnose {shlex.quote(str(summary['run']))}{said} --apply model.toml"))
+        name = shlex.quote(str(summary["run"]))
+        lines.append(_row("next", f"slip diagnose {name}{said} --apply model.toml"))
     report = summary.get("report")
     if isinstance(report, str):
         lines.append(_row("report", _relative(report)))

@@ -62,7 +62,7 @@ def draw(  # noqa: D417 - arguments document themselves
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     place = out or results
-    # Without results of one's own the map is that of the literature; a name that is none is a slip of the pen.
+    # Without results of one's own the map is that of the literature; another folder must be there.
     store = Store(place) if place == Path("results") else open_results(place).open_store()
     drawn = draw_up_map(store, deployments, fed=fed, show=show, shared=shared)
     page = write_map(store, drawn, figures)

@@ -75,7 +75,8 @@ def predict(
 
 def _describe(content: Mapping[str, object]) -> list[str]:
     here, elsewhere = content["runs_on_terrain"], content["runs_elsewhere"]
-    lines = [f"{content['vehicle']} on {content['terrain']}: {here} run{'s' * (here != 1)} there, {elsewhere} elsewhere"]
+    there = f"{here} run{'s' * (here != 1)} there, {elsewhere} elsewhere"
+    lines = [f"{content['vehicle']} on {content['terrain']}: {there}"]
     for effect in cast("Sequence[Mapping[str, object]]", content["effects"]):
         parameters = cast("Mapping[str, Mapping[str, object]]", effect["parameters"])
         lines += [
