@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, cast
 
 import msgspec
 
-from pipeline.analysis.diagnosis import diagnose_work, has_diagnosis, key_diagnosis
+from pipeline.analysis.diagnosis import DIAGNOSIS, diagnose_work, has_diagnosis, key_diagnosis
 from pipeline.analysis.keys import hash_json, key_stages
 from pipeline.analysis.log_setup import LogSetup, describe_subject, name_run
-from pipeline.analysis.options import STAGES
+from pipeline.analysis.options import FIGURES, STAGES
 from pipeline.analysis.peers import find_peers
 from pipeline.analysis.provenance import list_versions
 from pipeline.analysis.relative import hash_model
@@ -78,7 +78,7 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
     keys = key_stages(run, sha256, setup, options.inputs, hash_model(options.model))
     current = store.manifest(run)
     if current is not None and store.is_asked_again(current):
-        options = replace(options, force=True)
+        options = _ask_as_before(options, current)
     twin = _find_twin(path, sha256, current)
     if current is not None and not options.force and _is_done(current, keys, options):
         return Outcome(_read_summary(current, options), current, (), twin)
@@ -95,6 +95,19 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
             _write_outputs(work, log, options, progress, diagnose_work(work))
         manifest = generation.commit(_details(work, log, sha256))
     return Outcome(_read_summary(manifest, options), manifest, tuple(work.computed), twin)
+
+
+def _ask_as_before(options: Options, damaged: Manifest) -> Options:
+    """Options that make again all that damaged results had."""
+    had = damaged.files
+    figures = next((kind for kind in FIGURES if any(name.endswith(f".{kind}") for name in had)), None)
+    return replace(
+        options,
+        force=True,
+        report=options.report or REPORT in had,
+        diagnosis=options.diagnosis or DIAGNOSIS in had,
+        figures=options.figures or figures,
+    )
 
 
 def _find_twin(path: Path, sha256: str, current: Manifest | None) -> str:

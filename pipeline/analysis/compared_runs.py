@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
+from pipeline.analysis.diagnosis import DIAGNOSED
 from pipeline.fleet import label_runs, read_day
 from pipeline.store.queries import scan_table
 from schemas import contract_of
@@ -54,7 +55,12 @@ class ComparedRuns:
 
 
 def find_material(
-    store: Store, by: Sequence[str], *, trusted_only: bool, tables: Sequence[str] = _TABLES
+    store: Store,
+    by: Sequence[str],
+    *,
+    trusted_only: bool,
+    tables: Sequence[str] = _TABLES,
+    optional: Sequence[str] = ("findings",),
 ) -> ComparedRuns:
     """The current runs of the results, each recording once.
 
@@ -67,6 +73,7 @@ def find_material(
         by: columns that make a group.
         trusted_only: whether findings of severity `error` leave a run out.
         tables: tables that a run must have.
+        optional: tables that a run need not have, but whose file must be there where it has.
 
     Raises:
         ComparisonError: ``by`` names no column.
@@ -77,7 +84,7 @@ def find_material(
     holders: dict[str, str] = {}
     for manifest in survey.manifests:
         digest = read_digest(manifest)
-        reason = _doubt(manifest, tables)
+        reason = _doubt(manifest, tables) or _find_gone(manifest, optional)
         if digest in holders:
             reason = f"the same recording as {holders[digest]}"
         if reason:
@@ -131,14 +138,22 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
     for name in tables:
         entry = manifest.tables.get(name)
         if entry is None:
-            return f"it has no table {name}; analyze it again"
+            how = "slip batch LOGS --diagnosis makes it" if name in DIAGNOSED else "analyze its log again"
+            return f"it has no table {name}; {how}"
         if entry.contract_version != contract_of(name).version:
             return (
                 f"its table {name} has contract version {entry.contract_version} instead of "
-                f"{contract_of(name).version}; analyze it again"
+                f"{contract_of(name).version}; analyze its log again"
             )
-        if not (manifest.folder / entry.file).exists():
-            return f"its table {name} is gone; analyze it again with --force"
+    return _find_gone(manifest, tables)
+
+
+def _find_gone(manifest: Manifest, tables: Sequence[str]) -> str:
+    """The first of these tables whose file is gone; empty when there is none."""
+    for name in tables:
+        entry = manifest.tables.get(name)
+        if entry is not None and not (manifest.folder / entry.file).exists():
+            return f"its table {name} is gone; slip verify --repair, then slip batch, makes it again"
     return ""
 
 

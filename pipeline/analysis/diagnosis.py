@@ -29,14 +29,14 @@ DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
 VERSION = 8
-_WRITTEN = ("ladder", "parameters", "budget", "estimates")
+DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
 
 
 def key_diagnosis(keys: Mapping[str, str]) -> str:
     """Key of the diagnosis of a run whose stages have these keys."""
     from schemas import contract_of  # noqa: PLC0415 - brings a table library along
 
-    return hash_json([keys["slip"], STAGE, VERSION, *(contract_of(table).version for table in _WRITTEN)])
+    return hash_json([keys["slip"], STAGE, VERSION, *(contract_of(table).version for table in DIAGNOSED)])
 
 
 def has_diagnosis(manifest: Manifest | None, key: str) -> bool:
@@ -59,7 +59,7 @@ def diagnose_work(work: Work) -> dict[str, JSON] | None:
     previous = generation.previous
     if previous is not None and has_diagnosis(previous, key) and not work.options.force:
         generation.reuse_file(DIAGNOSIS)
-        for table in _WRITTEN:
+        for table in DIAGNOSED:
             if table in previous.tables:
                 generation.reuse_table(table)
         content = previous.read_json(DIAGNOSIS)

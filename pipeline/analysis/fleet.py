@@ -43,7 +43,7 @@ def fit_results(store: Store) -> tuple[FleetModel, tuple[str, ...]]:
             "nothing_to_fit",
             "no run has estimates" + "".join(f"; {note}" for note in compared.notes),
             where=str(store.root),
-            hint="Analyze logs with their diagnosis: slip analyze LOG..., or slip batch.",
+            hint="Name the effects of its logs: slip batch LOGS --diagnosis",
         )
     model = fit_fleet(compared.scan("estimates").collect())
     notes = (*compared.notes, *model.notes)
@@ -69,7 +69,7 @@ def find_estimates(store: Store, *, without: Sequence[str] = ()) -> pl.DataFrame
             "nothing_to_fit",
             "no other run has estimates" if compared.manifests else "no run has estimates",
             where=str(store.root),
-            hint="Analyze logs with their diagnosis: slip analyze LOG..., or slip batch.",
+            hint="Name the effects of its logs: slip batch LOGS --diagnosis",
         )
     return compared.scan("estimates").filter(pl.col("run").is_in(list(known))).collect()
 

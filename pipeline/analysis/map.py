@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from pipeline.analysis.options import FigureFormat
     from pipeline.store import Store
 
+_SHARED = " (shared)"
+
 
 @dataclass(frozen=True)
 class DeploymentMap:
@@ -71,8 +73,9 @@ def draw_up_map(
     own, notes = _empty_own(), list(compared.notes)
     keys: tuple[str, ...] = ()
     parts = [] if runs.is_empty() else [pool_runs(runs, ("dataset",))]
+    own_logs = [read_digest(manifest) for manifest in compared.manifests.values()]
     if shared is not None:
-        parts.append(_pool_shared(shared, [read_digest(m) for m in compared.manifests.values()]))
+        parts.append(_pool_shared(shared, own_logs))
     if parts:
         pooled = pl.concat(
             [part.with_columns(pl.col("input").cast(pl.String)) for part in parts], how="diagonal"
@@ -84,6 +87,8 @@ def draw_up_map(
         )
         own, told = place_datasets(datasets, MEASURES[show].column)
         notes += told
+        if shared is not None:
+            notes.append(_count_shared(shared, own_logs, own))
         keys = tuple(f"{row['dataset']}: {row['keys']}" for row in datasets.iter_rows(named=True))
     return DeploymentMap(
         deployments, place_deployments(deployments), own, keys, tuple(notes), chosen, MEASURES[show]
@@ -92,11 +97,20 @@ def draw_up_map(
 
 def _pool_shared(features: pl.DataFrame, own: Sequence[str]) -> pl.DataFrame:
     others = features.filter(~pl.col("sha256").is_in(list(own))).with_columns(
-        pl.format("{} (shared)", "dataset").alias("group"),
+        pl.format("{}" + _SHARED, "dataset").alias("group"),
         pl.col("from_results").alias("key"),
         pl.lit(None, pl.Float64).alias("published_norm"),
     )
     return pool_runs(others, ("dataset",))
+
+
+def _count_shared(features: pl.DataFrame, own_logs: Sequence[str], placed: pl.DataFrame) -> str:
+    """How many runs of others are on the map."""
+    digests = features["sha256"].unique()
+    drawn = placed.filter(pl.col("dataset").str.ends_with(_SHARED))["runs"].sum()
+    twice = digests.is_in(list(own_logs)).sum()
+    known = f"; {twice} of them are of your own logs and count once" if twice else ""
+    return f"{drawn} of {digests.len()} shared runs drawn{known}"
 
 
 def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None = None) -> Path:

@@ -247,6 +247,7 @@ def describe_prediction(prediction: Prediction) -> dict[str, object]:
         low, high = number.ends
         effects.setdefault(number.effect, {})[number.parameter] = {
             "value": number.value, "low": low, "high": high, "unit": number.unit, "runs": number.runs,
+            "at_bound": number.at_bound,
         }  # fmt: skip
     return {
         "vehicle": forecast.vehicle,
@@ -267,11 +268,11 @@ def _describe(number: Expected) -> dict[str, float]:
 
 
 def make_model_file(prediction: Prediction) -> ModelFile:
-    """The expected model as a file, with the intervals of its numbers."""
+    """The expected model as a file, with the intervals of its numbers that no bound of the search cuts."""
     forecast = prediction.forecast
     there = f"{len(forecast.here)} runs on {forecast.terrain}, {len(forecast.elsewhere)} elsewhere"
     return ModelFile(
         Model(prediction.vehicle, forecast.effects),
-        intervals={number.label: number.ends for number in forecast.numbers},
+        intervals={number.label: number.ends for number in forecast.numbers if not number.at_bound},
         note=f"Expected of {forecast.vehicle} on {forecast.terrain}, from {there}; not fitted to a run.",
     )

@@ -8,7 +8,7 @@ import pkgutil
 import sys
 from typing import TYPE_CHECKING
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, CycloptsPanel, MissingArgumentError
 
 import pipeline.cli
 from pipeline.cli.output import FAILED, USAGE, print_error
@@ -39,11 +39,21 @@ def build_app() -> App:
         result_action="return_value",
         # Ctrl-C comes back to `main`, which says what became of the results.
         suppress_keyboard_interrupt=False,
+        error_formatter=_describe_usage,
     )
     for module in sorted(pkgutil.iter_modules(pipeline.cli.__path__), key=lambda found: found.name):
         if module.name.startswith("verb_"):
             importlib.import_module(f"pipeline.cli.{module.name}").register(app)
     return app
+
+
+def _describe_usage(error: CycloptsError) -> object:
+    """The panel of a usage error; what was not given at all is said to be needed, with what it is."""
+    lacking = error.argument
+    if not isinstance(error, MissingArgumentError) or lacking is None or lacking.tokens or error.keyword:
+        return CycloptsPanel(error)
+    about = f": {lacking.parameter.help}" if lacking.parameter.help else ""
+    return CycloptsPanel(f"slip {' '.join(error.command_chain or ())} needs {lacking.name}{about}.")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

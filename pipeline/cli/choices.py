@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -64,6 +65,18 @@ def build_options(
         force=force,
         through=through,
     )
+
+
+def spell_choices(choices: Choices) -> str:
+    """What was said on the command line, to be said again: ` --input measured`; empty where nothing was."""
+    said = ((each.name, getattr(choices, each.name)) for each in fields(choices))
+    return spell_flags({name: value for name, value in said if value != getattr(Choices(), name)})
+
+
+def spell_flags(values: Mapping[str, object]) -> str:
+    """Flags with their values, a space before each; what is None is left out."""
+    said = {name: value for name, value in values.items() if value is not None}
+    return "".join(f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value in said.items())
 
 
 def _list_overrides(choices: Choices) -> Mapping[str, object]:

@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.core.errors import SlipError
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -38,6 +40,8 @@ def gather_runs(
     from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
     from pipeline.cli.output import say, show_progress  # noqa: PLC0415
 
+    if not names:
+        raise SlipError("no_runs", "--on names no run", hint="Give logs, or runs of the results folder")
     options = Options(out=out, report=False, diagnosis=True)
     manifests, notes = [], []
     for name in names:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
@@ -15,8 +16,15 @@ _READ_FROM_LOG = ("robot_description", "namespace", "message_types", "fitted")
 _SHOWN = 6
 
 
-def describe_run(summary: Summary, *, unchanged: bool, twin: str = "") -> str:
-    """The summary of one run as lines of text; ``twin`` is a log of the same content that it shares."""
+def describe_run(summary: Summary, *, unchanged: bool, twin: str = "", said: str = "") -> str:
+    """The summary of one run as lines of text.
+
+    Args:
+        summary: the JSON object of the run.
+        unchanged: whether nothing was computed.
+        twin: a log of the same content that it shares.
+        said: what was chosen on the command line, to be said again by the next command.
+    """
     lines = [
         *_describe_head(summary),
         *_describe_slip(summary),
@@ -24,7 +32,7 @@ def describe_run(summary: Summary, *, unchanged: bool, twin: str = "") -> str:
         *_describe_findings(summary),
         *_describe_diagnosis(summary),
         *([_row("same content", f"as {twin}: counted once, under the name it has")] if twin else []),
-        *_describe_end(summary, unchanged=unchanged),
+        *_describe_end(summary, said, unchanged=unchanged),
     ]
     return "\n".join(tidy_line(line.rstrip()) for line in lines) + "\n"
 
@@ -153,14 +161,15 @@ def _describe_diagnosis(summary: Summary) -> list[str]:
     return described
 
 
-def _describe_end(summary: Summary, *, unchanged: bool) -> list[str]:
+def _describe_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
     lines = []
     if unchanged:
         lines.append(
             _row("unchanged", "log and configuration are as before: nothing was computed (--force does)")
         )
     if _part(summary, "diagnosis").get("effects"):
-        lines.append(_row("next", f"slip diagnose {summary['run']} --apply model.toml"))
+        name = shlex.quote(str(summary["run"]))
+        lines.append(_row("next", f"slip diagnose {name}{said} --apply model.toml"))
     report = summary.get("report")
     if isinstance(report, str):
         lines.append(_row("report", _relative(report)))

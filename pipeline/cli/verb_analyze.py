@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from pipeline.analysis.options import FigureFormat, Options
-from pipeline.cli.choices import Choices, build_options
+from pipeline.cli.choices import Choices, build_options, spell_choices
 from pipeline.cli.memory_limit import limited_memory
 from pipeline.cli.model_trust import TrustCode, trust_named
 from pipeline.cli.output import describe_error, exit_code, print_error, print_json, print_lines, show_progress
@@ -73,7 +73,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     if json:
         _print_json(outcomes, errors)
     elif not quiet:
-        _print_outcomes(outcomes)
+        _print_outcomes(outcomes, spell_choices(choices))
     return exit_code(errors, lossy=any(outcome.lossy for outcome in outcomes))
 
 
@@ -117,9 +117,9 @@ def _warm_report() -> None:
     warm_bundle()
 
 
-def _print_outcomes(outcomes: list[Outcome]) -> None:
+def _print_outcomes(outcomes: list[Outcome], said: str) -> None:
     from pipeline.cli.screen import describe_run  # noqa: PLC0415 - only for people
 
     for outcome in outcomes:
-        text = describe_run(outcome.summary, unchanged=not outcome.computed, twin=outcome.twin)
+        text = describe_run(outcome.summary, unchanged=not outcome.computed, twin=outcome.twin, said=said)
         print_lines(text.split("\n"))

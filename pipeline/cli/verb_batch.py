@@ -152,7 +152,7 @@ def describe_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
         whole = sum(line.size_bytes for line in outcome.lines if line.fetched_bytes)
         lines.append(f"fetched {fetched / 1e6:.1f} MB of {whole / 1e6:.1f} MB")
     if outcome.removed or not is_search:
-        lines.append(f"{'pruned':<14}{outcome.removed:>6} old generations")
+        lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
     for state, word in _EXPLAINED:
         found = [line for line in outcome.lines if line.state == state or (state == "lossy" and line.lossy)]
         if found:

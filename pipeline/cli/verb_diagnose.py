@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.choices import Choices, build_options
+from pipeline.cli.choices import Choices, build_options, spell_choices, spell_flags
 from pipeline.cli.memory_limit import limited_memory
 from pipeline.cli.model_trust import TrustCode, open_model
 from pipeline.cli.output import (
@@ -96,8 +97,16 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     elif not quiet:
         from pipeline.diagnosis.words import describe  # noqa: PLC0415 - only for people
 
+        more = {"model": model, "vehicle_of": vehicle_of, "memory": memory, "budget": budget}
+        said = spell_choices(choices) + spell_flags(more) + " --trust-code" * trust_code
         for diagnosis in diagnoses:
-            print_lines(describe(diagnosis).split("\n"))
+            names = " ".join(shlex.quote(run.run) for run in diagnosis.runs)
+            following = (
+                f"slip diagnose {names}{said} --apply model.toml"
+                if apply is None
+                else f"slip model export {shlex.quote(str(apply))} --to ros2_control"
+            )
+            print_lines(describe(diagnosis, following).split("\n"))
     return exit_code(errors, lossy=lossy)
 
 

@@ -9,6 +9,7 @@ from cyclopts import App, Parameter
 
 from pipeline.analysis.options import FigureFormat
 from pipeline.cli.output import CLEAN, print_json, print_lines
+from pipeline.cli.results_place import open_results
 
 if TYPE_CHECKING:
     import polars as pl
@@ -61,7 +62,9 @@ def draw(  # noqa: D417 - arguments document themselves
     from pipeline.analysis.map import draw_up_map, write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    store = Store(out or results)
+    place = out or results
+    # Without results of one's own the map is that of the literature; another folder must be there.
+    store = Store(place) if place == Path("results") else open_results(place).open_store()
     features = None if shared is None else _read_features(shared)
     drawn = draw_up_map(store, deployments, fed=fed, show=show, shared=features)
     page = write_map(store, drawn, figures)

@@ -173,8 +173,8 @@ def fit(  # noqa: D417 - the shared options document themselves
     """Fit a model's values; with --predict, show what carries over to other runs.
 
     Args:
-        model: the model file. With --prior it may be missing, or be left out: the model is then what the
-            fleet lets expect.
+        model: the model file, which is written over: copy it to keep it. With --prior it may be missing, or
+            be left out: the model is then what the fleet lets expect.
         predict: logs or runs that the fit must not see, to be predicted with it.
         afresh: forget the values there are and search anew.
         first: fit the first seconds of driving only, for example 20s.
@@ -320,6 +320,7 @@ def _change(
         )
     elif not spoken.quiet:
         lines = _describe(fit)
+        lines += [] if path is None else [f"written: {path}"]
         if carried:
             lines += ["", *_describe_transfers([(str(path), item) for item in carried])]
         print_lines(lines)

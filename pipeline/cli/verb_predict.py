@@ -75,7 +75,8 @@ def predict(
 
 def _describe(content: Mapping[str, object]) -> list[str]:
     here, elsewhere = content["runs_on_terrain"], content["runs_elsewhere"]
-    lines = [f"{content['vehicle']} on {content['terrain']}: {here} runs there, {elsewhere} elsewhere"]
+    there = f"{here} run{'s' * (here != 1)} there, {elsewhere} elsewhere"
+    lines = [f"{content['vehicle']} on {content['terrain']}: {there}"]
     for effect in cast("Sequence[Mapping[str, object]]", content["effects"]):
         parameters = cast("Mapping[str, Mapping[str, object]]", effect["parameters"])
         lines += [
@@ -93,4 +94,5 @@ def _describe(content: Mapping[str, object]) -> list[str]:
 
 def _bound(number: Mapping[str, object], unit: str) -> str:
     shown = f"{number['value']:.3g}" + ("" if unit == "1" else f" {unit}")
-    return f"{shown} [{number['low']:.3g}, {number['high']:.3g}]"
+    cut = " (at its bound)" if number.get("at_bound") else ""
+    return f"{shown} [{number['low']:.3g}, {number['high']:.3g}]{cut}"

@@ -71,8 +71,9 @@ def _describe(found: Status) -> list[str]:
     last = (
         "never" if found.last is None else f"{datetime.fromtimestamp(found.last).astimezone():%Y-%m-%d %H:%M}"
     )
+    old = f"{found.old_generations} old generation{'s' * (found.old_generations != 1)}"
     lines = [
-        f"runs          {found.runs}, {found.bytes / 1e6:.1f} MB, {found.old_generations} old generations",
+        f"runs          {found.runs}, {found.bytes / 1e6:.1f} MB, {old}",
         f"last batch    {last}",
     ]
     lines += [f"{_WORDS[state]:<14}{count}" for state, count in found.counts.items()]

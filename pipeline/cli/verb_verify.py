@@ -86,8 +86,11 @@ def _describe(found: Verification) -> list[str]:
     if found.is_clean:
         lines.append("all is as it was written")
     else:
-        lines.append(
-            "`slip verify --repair` has made again what can be, by the next batch over its log; "
-            "copy changed logs from their origin."
+        again = (
+            "`slip batch` over those logs makes it again"
+            if any(each.action == "queued" for each in found.repairs)
+            else "`slip verify --repair` has the next batch over its log make again what can be"
         )
+        lines += [f"{again}."] if found.files else []
+        lines += ["Copy changed logs from their origin."] if found.logs else []
     return lines

@@ -24,19 +24,28 @@ _DETECTABLE_SHOWN = 5
 _WAYS = {"command": "from the command", "measured": "from the measured wheels"}
 
 
-def describe(diagnosis: Diagnosis) -> str:
-    """A diagnosis in plain text; of runs that were judged together what they share is said once."""
-    if len(diagnosis.runs) == 1:
-        return _write(_describe_alone(diagnosis.runs[0]))
+def describe(diagnosis: Diagnosis, following: str = "") -> str:
+    """A diagnosis in plain text; of runs that were judged together what they share is said once.
+
+    Args:
+        diagnosis: what was found.
+        following: the command that goes on from it, where effects were named.
+    """
+    first = diagnosis.runs[0]
+    rows = _describe_alone(first) if len(diagnosis.runs) == 1 else _describe_together(diagnosis)
+    if first.effects and following:
+        rows.append(("next", following))
+    return _write(rows)
+
+
+def _describe_together(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     first = diagnosis.runs[0]
     names = [run.run for run in diagnosis.runs]
     rows = [("runs", names[0]), *(("", name) for name in names[1:]), ("", f"together, {_name_way(first)}")]
     rows += _list_shared(first)
     for run in diagnosis.runs:
         rows += _label("findings", [f"{run.run}: {finding['text']}" for finding in _grave(run)])
-    if first.effects:
-        rows.append(("next", f"slip diagnose {' '.join(names)} --apply model.toml"))
-    return _write(rows)
+    return rows
 
 
 def _write(rows: Sequence[tuple[str, str]]) -> str:
@@ -57,10 +66,7 @@ def list_lines(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
     grave = _label("findings", [str(finding["text"]) for finding in _grave(diagnosis)])
     if not diagnosis.ladder:
         return [*grave, *_list_shared(diagnosis)]
-    lines = [*_list_shared(diagnosis), *grave]
-    if diagnosis.effects:
-        lines.append(("next", f"slip diagnose {diagnosis.run} --apply model.toml"))
-    return lines
+    return [*_list_shared(diagnosis), *grave]
 
 
 def _list_shared(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:

@@ -13,6 +13,7 @@ from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.hierarchy import is_of_one_run, leave_out_odd, take_numbers
 from pipeline.fleet.runs import UNKNOWN
 from pipeline.fleet.statistics import draw_run
+from pipeline.models.bounds import stands_at_bound
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Place
 
@@ -60,6 +61,12 @@ class ForecastNumber:
         """95 % interval."""
         low, high = np.quantile(self.draws, _ENDS).tolist()
         return low, high
+
+    @property
+    def at_bound(self) -> bool:
+        """Whether the interval is cut at a bound of the search, so that it holds no 95 %."""
+        bounds = find_effect(self.effect)().parameter(self.parameter).bounds
+        return any(stands_at_bound(end, bounds) for end in self.ends)
 
     @property
     def deviation(self) -> float:

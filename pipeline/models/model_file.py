@@ -108,7 +108,14 @@ def read_text(path: Path) -> str:
             where=str(path),
             hint=f"Make one: slip model new {path.name} --vehicle husky_a200.",
         ) from None
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        raise MotionError(
+            "model_unreadable",
+            "this is no model file: it is no text",
+            where=str(path),
+            hint="Give the TOML file that `slip diagnose --apply` or `slip model new` wrote.",
+        ) from None
+    except OSError as error:
         raise MotionError(
             "model_unreadable", f"cannot be read: {error}", where=str(path), hint="Check the file."
         ) from None

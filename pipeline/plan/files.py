@@ -106,8 +106,10 @@ def read_promises(path: Path) -> Promised:
         return msgspec.convert(parse_toml(file.read_text(encoding="utf-8")), Promised)
     except OSError as error:
         what = f"the plan cannot be read ({error.strerror})"
-    except (UnicodeDecodeError, TomlError, msgspec.ValidationError) as error:
+    except TomlError as error:
         what = f"this is no plan: {error}"
+    except (UnicodeDecodeError, msgspec.ValidationError):
+        what = "this is no plan.toml that `slip plan` wrote"
     raise PlanError("no_plan", what, where=str(file), hint="Give the folder that `slip plan` wrote.")
 
 

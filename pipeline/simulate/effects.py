@@ -84,12 +84,12 @@ _SPECS: tuple[EffectSpec, ...] = (
         _CAR,
     ),
     EffectSpec("understeer", "v_w = v tan(delta) / (l + K v^2)", _one("K", "s^2/m", 0.0, 0.03), _CAR),
-    EffectSpec("wheel_radius", "v0 = k f_x, w0 = k f_w", _one("k", "1", 1.0, 0.92)),
+    EffectSpec("wheel_radius", "v0 = k * v0, w0 = k * w0", _one("k", "1", 1.0, 0.92)),
     EffectSpec(
         "wheel_asymmetry", "left r (1 - e/2), right r (1 + e/2)", _one("e", "1", 0.0, 0.04), _TWO_SIDED
     ),
-    EffectSpec("effective_track", "w0 = f_w / k", _one("k", "1", 1.0, 1.8), _SKID),
-    EffectSpec("lateral_scale", "s0 = k f_y", _one("k", "1", 1.0, 0.8), _SIDEWAYS),
+    EffectSpec("effective_track", "w0 = w0 / k", _one("k", "1", 1.0, 1.8), _SKID),
+    EffectSpec("lateral_scale", "s0 = k * s0", _one("k", "1", 1.0, 0.8), _SIDEWAYS),
     EffectSpec("time_drift", "v0, w0 scaled by 1 - k t/T", _one("k", "1", 0.0, 0.1)),
     EffectSpec(
         "terrain_change",

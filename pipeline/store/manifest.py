@@ -223,5 +223,5 @@ def file_missing(path: Path) -> StoreError:
         "file_missing",
         "a file of the results is gone",
         where=str(path),
-        hint="Analyze the log again with --force",
+        hint="slip verify --repair has the next slip batch make it again",
     )

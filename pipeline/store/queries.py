@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from pipeline.store.errors import StoreError, name_disk_errors
+from pipeline.store.manifest import file_missing
 from pipeline.store.names import place_inside
 from pipeline.store.partitions import describe_run
 from pipeline.store.tables import QUARANTINE, find_contract, schema_of
@@ -95,7 +96,7 @@ def answer_query(
         allow_files: whether the question may open files and addresses that are none of the results.
 
     Raises:
-        StoreError: ``bad_query``, with what polars says about it; ``files_not_allowed``.
+        StoreError: ``bad_query``, with what polars says about it; ``files_not_allowed``; ``file_missing``.
     """
     reader = None if allow_files else _READERS.search(sql.lower())
     if reader is not None:
@@ -113,6 +114,11 @@ def answer_query(
     try:
         with name_disk_errors(root):
             return pl.SQLContext(frames).execute(sql, eager=True)
+    except StoreError:
+        gone = [path for path in _list_files(list(frames), manifests) if not path.exists()]
+        if gone:
+            raise file_missing(gone[0]) from None
+        raise
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
         raise StoreError(
             "bad_query",
@@ -120,6 +126,10 @@ def answer_query(
             where=_shorten(sql),
             hint=f"The tables are: {', '.join((RUNS_TABLE, *names))}",
         ) from error
+
+
+def _list_files(tables: Sequence[str], manifests: Sequence[Manifest]) -> list[Path]:
+    return [manifest.path(table) for manifest in manifests for table in tables if table in manifest.tables]
 
 
 def _shorten(text: str) -> str:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 from batch_tools import batch, counts, read_tables
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.batch.verification import verify_results
 from pipeline.cli import main
 from pipeline.store import Store
@@ -61,6 +63,24 @@ def test_what_is_damaged_is_made_again_by_the_next_batch(season: Path, tmp_path:
             assert content in tables.values()
     assert tables["datasets.parquet"] == whole["datasets.parquet"]
     assert counts(batch(season, out)) == {"unchanged": 4}
+
+
+def test_a_damaged_run_is_made_again_with_its_diagnosis_report_and_figures(
+    season: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    log = season / "a.mcap"
+    options = Options(out=out, run="season/a", diagnosis=True, figures="svg")
+    had = analyze_log(log, options).manifest
+    had.path("slip").write_bytes(b"x")
+    batch(log, out)
+    verify(out, repair=True)
+    assert counts(batch(log, out)) == {"done": 1}
+    (now,) = Store(out).manifests()
+    assert now.folder != had.folder
+    assert (set(now.tables), set(now.files)) == (set(had.tables), set(had.files))
+    assert {"diagnosis.json", "report.html"} <= set(now.files)
+    assert verify(out).files == ()
 
 
 def test_what_cannot_be_made_again_is_said_and_stays(

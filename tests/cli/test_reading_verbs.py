@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 import shutil
 from pathlib import Path
 
@@ -180,6 +181,26 @@ def test_a_diagnosis_with_other_choices_leaves_the_stored_run(
     # Answered with the vehicle that was asked for: wheels of another radius give another ideal motion.
     assert jackal["ladder"][0]["t_mrmse_m"] > 1.5 * husky["ladder"][0]["t_mrmse_m"]
     assert hash_tree(out) == before
+
+
+def test_the_next_command_writes_the_model_on_the_screen(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    said = ("--input", "measured", "--interval", "all", "--out", str(place / "results"))
+
+    def read_next() -> list[str]:
+        lines = capsys.readouterr().out.splitlines()
+        (line,) = [line for line in lines if line.startswith("next")]
+        return shlex.split(line)[1:]
+
+    assert slip("diagnose", "field/wide", *said) == 0
+    following = read_next()
+    assert following == ["slip", "diagnose", "field/wide", *said, "--apply", "model.toml"]
+    assert slip(*following[1:]) == 0
+    following = read_next()
+    assert following[:4] == ["slip", "model", "export", "model.toml"]
+    assert slip(*following[1:]) == 0
 
 
 def test_what_a_diagnosis_stores_does_not_depend_on_its_input(tmp_path: Path, analyzed: Path) -> None:

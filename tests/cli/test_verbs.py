@@ -171,6 +171,39 @@ def test_usage_errors_exit_2(arguments: tuple[str, ...], tmp_path: Path) -> None
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_was_not_given_is_said_to_be_needed(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(["model", "add", "robot.toml", "drive_lag"])
+    assert left.value.code == 2
+    assert "needs --on: logs, or runs of the results folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("model", "show", "log.mcap"), "this is no model file: it is no text"),
+        (("plan", "--check", "robot.toml", "log.mcap"), "this is no plan.toml"),
+        (("model", "add", "robot.toml", "drive_lag", "--on"), "--on names no run"),
+    ],
+)
+def test_a_file_of_another_kind_is_refused_in_plain_words(
+    arguments: tuple[str, ...],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "log.mcap").write_bytes(b"\x89MCAP0\r\n")
+    with pytest.raises(SystemExit):
+        main(["model", "new", "robot.toml", "--vehicle", "husky_a200", "--quiet"])
+    with pytest.raises(SystemExit) as left:
+        main(list(arguments))
+    (line,) = capsys.readouterr().err.splitlines()
+    assert left.value.code == 1
+    assert words in line
+
+
 def test_a_loss_is_shown_with_the_time_it_took() -> None:
     summary = {
         "run": "field/a",

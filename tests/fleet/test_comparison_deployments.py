@@ -157,6 +157,12 @@ def test_own_datasets_stand_on_the_map_by_their_slip(tmp_path: Path) -> None:
 
 
 def test_the_map_needs_no_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(["map", str(tmp_path / "none"), "--json"])
+    assert left.value.code == 1
+    assert "there are no results" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+    (tmp_path / "none").mkdir()
     with pytest.raises(SystemExit) as ended:
         main(["map", str(tmp_path / "none"), "--json"])
     assert ended.value.code == 0

@@ -81,11 +81,11 @@ def test_the_verbs_share_merge_and_draw(
     assert json.loads(capsys.readouterr().out) == {"file": str(merged), "runs": 2, "rows": 4, "twice": 4}
     alone = draw_up_map(Store(tmp_path / "none"), shared=read_features(merged))
     assert alone.own["dataset"].to_list() == ["warthog_gravel (shared)", "warthog_ice (shared)"]
+    assert "2 of 2 shared runs drawn" in alone.notes
     # Own logs do not stand on the map twice.
-    assert draw_up_map(store, shared=read_features(merged)).own["dataset"].to_list() == [
-        "warthog_gravel",
-        "warthog_ice",
-    ]
+    beside = draw_up_map(store, shared=read_features(merged))
+    assert beside.own["dataset"].to_list() == ["warthog_gravel", "warthog_ice"]
+    assert "0 of 2 shared runs drawn; 2 of them are of your own logs and count once" in beside.notes
 
 
 def test_a_merge_writes_where_it_is_told(

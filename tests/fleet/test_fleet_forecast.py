@@ -6,8 +6,11 @@ import polars as pl
 import pytest
 from test_fleet_levels import ALIKE, ICE_AND_OTHERS, draw
 
+from pipeline.analysis.prediction import Expected, Prediction, describe_prediction, make_model_file
 from pipeline.fleet import ComparisonError
 from pipeline.fleet.forecast import forecast_vehicle
+from pipeline.fleet.statistics import Interval
+from pipeline.vehicles import find_preset
 
 
 def test_on_known_ground_its_own_runs_count_most() -> None:
@@ -15,6 +18,7 @@ def test_on_known_ground_its_own_runs_count_most() -> None:
     ice = forecast_vehicle(estimates, "warthog", "ice", "measured")
     (number,) = ice.numbers
     assert number.label == "wheel_radius.k"
+    assert not number.at_bound
     assert number.ends[0] < 0.7 < number.ends[1] < 0.9
     assert (len(ice.here), len(ice.elsewhere)) == (3, 6)
     mud = forecast_vehicle(estimates, "warthog", "mud", "measured").numbers[0]
@@ -59,7 +63,23 @@ def test_draws_stay_within_the_bounds_of_the_search() -> None:
     lag = draw({"ice": 0.01}, effect="body_inertia", parameter="tau", runs=1)
     (number,) = forecast_vehicle(lag, "warthog", "ice").numbers
     assert number.draws.min() == 0.0
+    assert number.at_bound
     assert forecast_vehicle(lag, "warthog", "ice").draw(0)[0].id == "body_inertia"
+
+
+def test_an_interval_that_a_bound_cuts_is_none_of_the_written_model() -> None:
+    lag = draw({"ice": 0.01}, effect="body_inertia", parameter="tau", runs=1)
+    some = Expected(1.0, Interval(0.5, 2.0, 0.95))
+    kept: dict[str, bool] = {}
+    for estimates, source in ((lag, "command"), (draw(ICE_AND_OTHERS), "measured")):
+        forecast = forecast_vehicle(estimates, "warthog", "ice", source)  # type: ignore[arg-type]
+        vehicle = find_preset("warthog")
+        assert vehicle is not None
+        prediction = Prediction(forecast, vehicle, some, some, some, ())
+        (number,) = forecast.numbers
+        kept[number.label] = number.label in make_model_file(prediction).intervals
+        assert f"'at_bound': {not kept[number.label]}" in str(describe_prediction(prediction))
+    assert kept == {"body_inertia.tau": False, "wheel_radius.k": True}
 
 
 def test_a_vehicle_without_runs_is_refused_in_one_line() -> None:

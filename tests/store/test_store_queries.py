@@ -61,6 +61,14 @@ def test_query_that_cannot_be_answered_says_so(store: Store, sql: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_query_over_a_file_that_is_gone_says_how_it_is_made_again(store: Store) -> None:
+    manifest = write_generation(store, "a", "k", 1)
+    manifest.path("slip").unlink()
+    with pytest.raises(StoreError, match=r"slip verify --repair") as caught:
+        store.query("SELECT count(*) FROM slip")
+    assert (caught.value.code, caught.value.where) == ("file_missing", str(manifest.folder / "slip.parquet"))
+
+
 def test_query_cannot_remove_results(store: Store) -> None:
     write_generation(store, "a", "k", 1)
     store.query("DROP TABLE slip")
