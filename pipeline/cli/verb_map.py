@@ -41,7 +41,7 @@ def draw(  # noqa: D417 - arguments document themselves
         Parameter(name="--input", help="what the ideal model was fed with (default: as slip compare)"),
     ] = None,
     show: Annotated[
-        Literal["slip", "relative", "energy", "unpredictable", "transitory"],
+        Literal["slip", "relative", "energy", "unpredictability", "transitory"],
         Parameter(help="the measure of difficulty that colours own datasets"),
     ] = "slip",
     shared: Annotated[

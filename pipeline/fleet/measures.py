@@ -38,7 +38,7 @@ MEASURES = {
         "1",
         "slip path over path driven: what friction takes per metre and mass, over its coefficient times g",
     ),
-    "unpredictable": Measure(
+    "unpredictability": Measure(
         "relative_unpredictability",
         "unpredictability",
         "1",

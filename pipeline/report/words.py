@@ -13,8 +13,9 @@ _EARLIEST_YEAR = 2000
 
 
 def begin_large(text: str) -> str:
-    """The text with a capital at its start."""
-    return text[:1].upper() + text[1:]
+    """The text with a capital at its start; a name of ours (`drive_lag.tau`) stays as it is written."""
+    first = text.split(maxsplit=1)[0].rstrip(".,:;") if text.strip() else ""
+    return text if "_" in first or "." in first else text[:1].upper() + text[1:]
 
 
 def say_number(value: float | None, *, digits: int = 3) -> str:

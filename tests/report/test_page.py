@@ -17,7 +17,7 @@ from report_synthesis import list_places, make_report
 from pipeline.report import RunReport, render_report, templating
 from pipeline.report.sections.glance import say_standing
 from pipeline.report.templating import render_template, show_text
-from pipeline.report.words import say_date, say_duration, say_number, say_share, say_split
+from pipeline.report.words import begin_large, say_date, say_duration, say_number, say_share, say_split
 
 TEMPLATES = Path(templating.__file__).parents[1]
 HOSTILE = "</script><script>alert(1)</script><!-- <img src=x onerror=alert(2)> \u2028 \" ' & \u202e"
@@ -392,3 +392,8 @@ def test_durations_shares_and_dates_are_said_in_words() -> None:
     assert say_share(-0.004) == "0\u202f%"
     assert say_date(0) == ""
     assert say_date(2**62) == "2116-02-20 23:53 UTC"
+
+
+def test_names_of_ours_stay_as_they_are_written() -> None:
+    written = ("drive_lag.tau of warthog moved.", "husky_a200_wetgrass: 3 runs", "warnings rose", "")
+    assert [begin_large(text) for text in written] == [*written[:2], "Warnings rose", ""]

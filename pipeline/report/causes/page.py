@@ -81,7 +81,7 @@ def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
             )
     kinds = {"dataset": pl.String, "cause": pl.String, "slip": pl.Float64, "told": pl.String}
     order = [*(names.get(name, name) for name in shown), _OTHERS, "disturbance", "localization noise"]
-    colours = [*_COLOURS[: len(shown)], theme.QUIET, *_LEFT.values()]
+    colours = [*_COLOURS[: len(shown)], theme.INK, *_LEFT.values()]
     chart = (
         alt.Chart(alt.NamedData("causes"))
         .mark_bar()

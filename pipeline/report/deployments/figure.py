@@ -17,6 +17,8 @@ _ARROW = 1.9
 _WIDTH, _HEIGHT = 720.0, 520.0
 _PHONE_WIDTH, _NARROW = 260.0, 480
 _BESIDE = 12
+_NEAR = 20.0
+"""Names that stand further above or below their mark have a line to it [pixels]."""
 _ZONE_NAME, _ZONE_LINE = 85.0, 22.0
 _SHAPES = {
     "kinematic": "circle",
@@ -51,7 +53,7 @@ def draw_map(points: pl.DataFrame, own: pl.DataFrame, about: str) -> Drawing:
         "bounds": arrows,
         "own": own,
     }
-    layers = [_shade_zones(), _name_zones(), *_draw_bounds(), *_draw_literature(points)]
+    layers = [_shade_zones(), _name_zones(), *_draw_leaders(), *_draw_bounds(), *_draw_literature(points)]
     if not own.is_empty():
         layers.append(_draw_own(about))
     layers += _draw_names()
@@ -193,6 +195,21 @@ def _draw_own(about: str) -> alt.Chart:
     return marks
 
 
+def _draw_leaders() -> list[alt.Chart]:
+    """Lines from marks to the names that stand lines higher or lower."""
+    base = (
+        alt.Chart(alt.NamedData("names"))
+        .encode(x=_complexity("place"), x2="place:Q", y=_energy("energy"), y2="height:Q")
+        .transform_filter(f"datum.led && datum.wide == (width >= {_NARROW})")
+    )
+    return [
+        base.mark_rule(color=theme.QUIET, strokeWidth=0.8, x2Offset=offset).transform_filter(
+            f"datum.side == '{side}'"
+        )
+        for side, offset in (("right", _BESIDE), ("left", -_BESIDE))
+    ]
+
+
 def _draw_names() -> list[alt.Chart]:
     base = (
         alt.Chart(alt.NamedData("names"))
@@ -258,7 +275,12 @@ def _place_names(marks: pl.DataFrame, width: float, *, furthest: float, apart: f
     return marks.select(
         "name",
         "own",
+        "energy",
         pl.col("complexity").alias("place"),
+        pl.Series(
+            "led",
+            [at is not None and abs(at[1] - y) > _NEAR for at, (_, y) in zip(placed, pixels, strict=True)],
+        ),
         pl.Series("side", [_name_side(at, x) for at, (x, _) in zip(placed, pixels, strict=True)]),
         pl.Series("height", [at and 10.0 ** (at[1] / up) for at in placed], dtype=pl.Float64),
     ).drop_nulls("height")

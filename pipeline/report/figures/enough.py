@@ -13,6 +13,7 @@ from pipeline.report import theme
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
 from pipeline.report.run import mapping_in, number_in, numbers_in, objects_in
+from pipeline.report.words import begin_large
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -23,6 +24,8 @@ _SCHEMA = {"effect": pl.String, "number": pl.String, "seconds": pl.Float64, "val
 _COLOURS = (
     theme.ON_COMMAND, theme.SLIP, theme.ON_MEASURED, theme.MODEL, theme.GROUND, theme.DRIVETRAIN, theme.CROSS,
 )  # fmt: skip
+# Beyond the fourth, colours are told apart by their dashes as well.
+_DASHES = ([1, 0], [1, 0], [1, 0], [1, 0], [8, 3], [3, 3], [8, 3, 2, 3])
 # Half of an interval is not drawn where it is wider than the number itself.
 _WIDEST = 1.0
 
@@ -34,25 +37,26 @@ def draw_enough(scene: Scene) -> Drawing | None:
         return None
     names = pl.concat(list(rows.values()))["effect"].unique(maintain_order=True).to_list()
     colours = [_COLOURS[place % len(_COLOURS)] for place in range(len(names))]
-    colour = alt.Color(
-        "effect:N",
-        scale=alt.Scale(domain=names, range=colours),
-        legend=alt.Legend(title=None, symbolType="stroke", symbolSize=220, orient="top", columns=4),
-    )
+    dashes = [_DASHES[place % len(_DASHES)] for place in range(len(names))]
+    legend = alt.Legend(title=None, symbolType="stroke", symbolSize=220, orient="top", columns=4)
+    colour = alt.Color("effect:N", scale=alt.Scale(domain=names, range=colours), legend=legend)
+    dash = alt.StrokeDash("effect:N", scale=alt.Scale(domain=names, range=dashes), legend=legend)
     end = float(pl.concat(list(rows.values()))["seconds"].max() or 1.0)  # type: ignore[arg-type]
     panels = [
-        _draw_panel("enough_width", "half of the 95 % interval, of the number", colour, end),
-        _draw_panel("enough_evidence", "evidence for the name [t]", colour, end),
+        _draw_panel("enough_width", "half of the 95 % interval, of the number", colour, dash, end),
+        _draw_panel("enough_evidence", "evidence for the name [t]", colour, dash, end),
     ]
     bounds = {"enough_width_bound": INTERVAL_SHARE, "enough_evidence_bound": LEAST_T}
     shown = rows | {name: pl.DataFrame({"value": [value]}) for name, value in bounds.items()}
     told = str(scene.report.diagnosis.get("enough") or "")
-    note = f"{told[:1].upper()}{told[1:]}. " if told else ""
-    note += "Dashed: 5 %, and the t from which a name is given."
+    note = f"{begin_large(told)}. " if told else ""
+    note += "Level: 5 %, and the t from which a name is given."
     return Drawing(alt.vconcat(*panels).properties(usermeta={"gutter": parts.GUTTER}), shown, note)
 
 
-def _draw_panel(name: str, title: str, colour: alt.Color, end: float) -> alt.LayerChart | alt.FacetChart:
+def _draw_panel(
+    name: str, title: str, colour: alt.Color, dash: alt.StrokeDash, end: float
+) -> alt.LayerChart | alt.FacetChart:
     wide = name == "enough_width"
     scale = alt.Scale(type="log", domain=[0.002, _WIDEST]) if wide else alt.Scale(zero=True)
     look = alt.Axis(title=None, tickCount=4, format=",~r", minExtent=parts.GUTTER - 10)
@@ -71,6 +75,7 @@ def _draw_panel(name: str, title: str, colour: alt.Color, end: float) -> alt.Lay
             ),
             y=alt.Y("value:Q", scale=scale, axis=look),
             color=colour,
+            strokeDash=dash,
             detail="number:N",
             tooltip=["number:N", alt.Tooltip("seconds:Q", format=".0f"), alt.Tooltip("value:Q", format=".3")],
         )

@@ -112,27 +112,29 @@ def _say_gain(gain: float | None) -> str:
     return f"{say_share(gain)} larger"
 
 
-def _list_open(report: RunReport) -> Iterator[tuple[str, str]]:
-    """What cannot be told from this log, and what nothing of the catalogue takes."""
+def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
+    """What cannot be told from this log, and what nothing of the catalogue takes, with its formula."""
     diagnosis = report.diagnosis
     for names, advice in report.undecided:
-        yield "undecided", f"{names}: {advice}"
+        yield "undecided", f"{names}: {advice}", ""
     rest = mapping_in(diagnosis, "unexplained")
     if rest:
         share = say_share(number_in(rest, "share"))
-        formula = f", for example {rest['formula']}" if rest.get("formula") else ""
+        formula = str(rest.get("formula") or "")
+        example = ", for example" if formula else ""
         channel = _CHANNELS.get(str(rest.get("channel")), "motion")
-        yield "unexplained", f"{share} of what is left in the {channel}: {rest.get('where', '')}{formula}"
+        told = f"{share} of what is left in the {channel}: {rest.get('where', '')}{example}"
+        yield "unexplained", told, formula
     small = [str(entry.get("id", "")) for entry in objects_in(diagnosis, "immaterial")]
     if small:
-        yield "below what matters", f"{', '.join(small)}: a planner would not feel it, see the JSON"
+        yield "below what matters", f"{', '.join(small)}: a planner would not feel it, see the JSON", ""
     unseen = diagnosis.get("unobservable")
     if isinstance(unseen, list) and unseen:
-        yield "unobservable", f"{', '.join(map(str, unseen))}: this log would not show it"
+        yield "unobservable", f"{', '.join(map(str, unseen))}: this log would not show it", ""
     known = {str(entry.get("text", "")) for entry in list_findings(report)}
     for entry in objects_in(diagnosis, "findings"):
         if str(entry.get("text", "")) not in known:
-            yield "finding", str(entry.get("text", ""))
+            yield "finding", str(entry.get("text", "")), ""
     left = mapping_in(diagnosis, "disturbance").get("text")
     if left and not rest:
-        yield "what is left", str(left)
+        yield "what is left", str(left), ""
