@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.diagnosis import Diagnosis, Json, Named, RunDiagnosis, Value
 
 _LABEL = 10
-_SENTENCE = 90
+_LINE = 88
+_SENTENCE = 68
 _WHERE_SHOWN = 3
 _UNOBSERVABLE_SHOWN = 8
 _DETECTABLE_SHOWN = 5
@@ -82,11 +83,11 @@ def _list_shared(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
         share = max(min(diagnosis.explained_share, 1.0), 0.0)
         now, floor = _number(last, "t_mrmse_m"), _number(diagnosis.noise_floor, "t_mrmse_m")
         lines.append(("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m"))
-    lines += _label("budget", _describe_budget(diagnosis))
-    enough = describe_enough(diagnosis.effects)
-    lines += _label("enough", [enough] if enough else [])
+    lines += _label("budget", wrap(_describe_budget(diagnosis), _LINE))
+    lines += _label("enough", wrap(describe_enough(diagnosis.effects), _LINE))
     lines += _label("below", _describe_immaterial(diagnosis))
-    return [*lines, *_describe_unobservable(diagnosis), *_label("excluded", _describe_detectable(diagnosis))]
+    lines += _label("cannot", _describe_unobservable(diagnosis))
+    return [*lines, *_label("excluded", wrap(_describe_detectable(diagnosis), _LINE))]
 
 
 def _label(label: str, texts: Sequence[str]) -> list[tuple[str, str]]:
@@ -124,14 +125,13 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
     return rows
 
 
-def _describe_budget(diagnosis: RunDiagnosis) -> list[str]:
-    """Who carries the slip on the leading input, in parts of its mean square."""
-    rows = []
-    for budget in diagnosis.budgets:
-        if (budget.input, budget.quantity) == (diagnosis.input, "slip") and diagnosis.effects:
+def _describe_budget(diagnosis: RunDiagnosis) -> str:
+    """Who carries the slip on the leading input, in parts of its mean square; empty where nobody does."""
+    for budget in diagnosis.budgets if diagnosis.effects else ():
+        if (budget.input, budget.quantity) == (diagnosis.input, "slip"):
             parts = [f"{one.name.replace('_noise', ' noise')} {one.share:z.0%}" for one in budget.shares]
-            rows.append(f"of {math.sqrt(budget.total):.3g} m/s of slip (mean square): {', '.join(parts)}")
-    return rows
+            return f"of {math.sqrt(budget.total):.3g} m/s of slip (mean square): {', '.join(parts)}"
+    return ""
 
 
 def _describe_immaterial(diagnosis: RunDiagnosis) -> list[str]:
@@ -175,7 +175,7 @@ def _list_falls(diagnosis: RunDiagnosis) -> dict[str, str]:
     return falls
 
 
-def _describe_unobservable(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
+def _describe_unobservable(diagnosis: RunDiagnosis) -> list[str]:
     hidden = [item.id for item in diagnosis.unobservable]
     if not hidden:
         return []
@@ -187,12 +187,12 @@ def _describe_unobservable(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
             if part not in manoeuvres:
                 manoeuvres.append(part)
     return [
-        ("cannot", f"tell of {shown}{more} from this log"),
-        ("", f"to see them: {'; '.join(manoeuvres[:3])}"),
+        *wrap(f"tell of {shown}{more} from this log", _LINE),
+        *wrap(f"to see them: {'; '.join(manoeuvres[:3])}", _LINE),
     ]
 
 
-def _describe_detectable(diagnosis: RunDiagnosis) -> list[str]:
+def _describe_detectable(diagnosis: RunDiagnosis) -> str:
     """What would have been seen had it been there: the effects that the log tells of most sharply."""
     usual = {one.id: find_effect(one.id)().parameter(one.parameter) for one in diagnosis.detectable}
     sharpest = sorted(
@@ -202,7 +202,7 @@ def _describe_detectable(diagnosis: RunDiagnosis) -> list[str]:
         f"{one.id} {100.0 * one.size:.2g} %" if one.unit == "1" else f"{one.id} {one.size:.2g} {one.unit}"
         for one in sharpest[:_DETECTABLE_SHOWN]
     ]
-    return [f"what is larger than {', '.join(shown)}"] if shown else []
+    return f"what is larger than {', '.join(shown)}" if shown else ""
 
 
 def _grave(diagnosis: RunDiagnosis) -> list[Mapping[str, Json]]:
