@@ -60,7 +60,7 @@ def find_material(
     *,
     trusted_only: bool,
     tables: Sequence[str] = _TABLES,
-    optional: Sequence[str] = ("findings",),
+    optional: Sequence[str] = (),
 ) -> ComparedRuns:
     """The current runs of the results, each recording once.
 
@@ -73,11 +73,13 @@ def find_material(
         by: columns that make a group.
         trusted_only: whether findings of severity `error` leave a run out.
         tables: tables that a run must have.
-        optional: tables that a run need not have, but whose file must be there where it has.
+        optional: tables that a run need not have, but whose file must be there where it has; with
+            ``trusted_only`` the findings are among them.
 
     Raises:
         ComparisonError: ``by`` names no column.
     """
+    optional = (*optional, "findings") if trusted_only else optional
     survey = store.survey()
     notes = [f"left out, damaged: {error}" for error in survey.errors]
     kept: dict[str, Manifest] = {}

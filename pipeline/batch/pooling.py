@@ -65,7 +65,7 @@ def refresh_remote_pools(mirror: Mirror) -> None:
     mirror.pull_index()
     tables = ["aggregates"]
     if (mirror.store.root / FLEET).is_file():
-        tables.append("estimates")
+        tables += ["findings", "estimates"]
     if (mirror.store.root / TREND).is_file():
         tables += ["slip", "findings", "estimates"]
     mirror.pull_tables(tables, mirror.store.manifests())
