@@ -373,14 +373,14 @@ export class Pane {
     try {
       const answer = await post("/api/rows", this.request);
       if (turn !== this.turn) return;
-      if (listSignatures(answer.rows).join() === this.signatures.join()) {
-        const fed = this.take(answer);
-        const ladder = this.figures.querySelector("[data-figure=ladder]");
-        if (ladder) await this.plots.draw(ladder);
-        await fed;
-        if (turn !== this.turn) return;
-        this.root.dataset.drawn = String(turn);
-      } else await this.draw();
+      const fed = this.take(answer);
+      const ladder = this.figures.querySelector("[data-figure=ladder]");
+      if (ladder) await this.plots.draw(ladder);
+      await fed;
+      if (turn !== this.turn) return;
+      // What is there has moved already; panels of effects that came or went take a new page of figures.
+      if (listSignatures(answer.rows).join() === this.signatures.join()) this.root.dataset.drawn = String(turn);
+      else await this.draw();
       if (this.state.trial) this.follow();
     } catch (error) {
       toast(error.message);
