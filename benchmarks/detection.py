@@ -9,7 +9,6 @@ size, and diagnosed. Printed is how often it was named, left undecided, or not s
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 from collections import Counter, defaultdict
@@ -21,6 +20,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent / "hidden"))
 
 from draw import draw_riddle
+from json_lines import add_row, read_rows
 from play import parse_seeds
 
 from pipeline.analysis.analyze import analyze_log
@@ -89,16 +89,12 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="file to add a JSON line to for each log")
     parser.add_argument("--resume", action="store_true", help="go on where the file of --out ends")
     asked = parser.parse_args()
-    rows: list[dict[str, object]] = []
-    if asked.out and asked.resume and asked.out.exists():
-        rows = [json.loads(line) for line in asked.out.read_text().splitlines()]
+    rows = read_rows(asked.out) if asked.resume else []
     done = {row["seed"] for row in rows}
     for seed in asked.seeds:
         for row in play(seed) if seed not in done else ():
             rows.append(row)
-            if asked.out:
-                with asked.out.open("a") as file:
-                    file.write(json.dumps(row) + "\n")
+            add_row(asked.out, row)
     sys.stdout.write(describe(rows))
     return 0
 

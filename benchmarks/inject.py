@@ -10,7 +10,6 @@ Exit code 0; the table says what was missed.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 import tempfile
@@ -23,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
 from injections import Drive, Injection, list_injections
+from json_lines import add_row, read_rows
 
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.diagnosis import read_recording
@@ -199,9 +199,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="file to add a JSON line to for each answer")
     parser.add_argument("--resume", action="store_true", help="go on where the file of --out ends")
     asked = parser.parse_args()
-    rows: list[Json] = []
-    if asked.out and asked.resume and asked.out.exists():
-        rows = [json.loads(line) for line in asked.out.read_text().splitlines()]
+    rows = read_rows(asked.out) if asked.resume else []
     done = {(row["log"], row["injection"]) for row in rows}
     chosen = [one for one in list_injections() if any(word in one.name for word in asked.only)]
     logs = [
@@ -238,9 +236,7 @@ def main() -> int:
             }
             rows.append(row)
             sys.stderr.write(f"{log.stem}: {injection.name}: {verdict} {extra or ''}\n")
-            if asked.out:
-                with asked.out.open("a") as file:
-                    file.write(json.dumps(row) + "\n")
+            add_row(asked.out, row)
     sys.stdout.write(describe(rows))
     return 0
 

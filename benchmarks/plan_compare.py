@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from json_lines import add_row, read_rows
 from plan_game import record
 
 from pipeline.diagnosis.subject import load_recording
@@ -203,9 +204,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    rows = []
-    if options.out is not None and options.out.exists():
-        rows = [json.loads(line) for line in options.out.read_text(encoding="utf-8").splitlines()]
+    rows = read_rows(options.out)
     known = {(row["seed"], row["vehicle"], row["target"]) for row in rows}
     for seed in range(options.seed, options.seed + options.seeds):
         for vehicle in VEHICLES:
@@ -222,9 +221,7 @@ def main() -> None:
                         row[protocol] = round(measure(driven, asked, Path(folder), pair=pair), 1)
                 rows.append(row)
                 print(json.dumps(row), flush=True)
-                if options.out is not None:
-                    with options.out.open("a", encoding="utf-8") as file:
-                        file.write(json.dumps(row) + "\n")
+                add_row(options.out, row)
     report(rows)
 
 

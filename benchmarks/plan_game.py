@@ -19,6 +19,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from json_lines import add_row, read_rows
 
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.diagnosis import read_recording
@@ -212,7 +213,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
-    scores = _read_scores(asked.out)
+    scores = [Score(**row) for row in read_rows(asked.out)]
     known = {score.seed for score in scores}
     for seed in range(asked.seed, asked.seed + asked.draws):
         if seed in known:
@@ -223,16 +224,8 @@ def main() -> None:
         score.cpu_s = round(time.process_time() - begun, 1)
         scores.append(score)
         print(json.dumps(asdict(score)), flush=True)
-        if asked.out is not None:
-            with asked.out.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(asdict(score)) + "\n")
+        add_row(asked.out, asdict(score))
     _report(scores)
-
-
-def _read_scores(path: Path | None) -> list[Score]:
-    if path is None or not path.exists():
-        return []
-    return [Score(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def _report(scores: list[Score]) -> None:

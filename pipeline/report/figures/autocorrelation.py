@@ -15,12 +15,16 @@ from pipeline.report.figures.residuals import QUANTITIES
 from pipeline.report.motion_view import COMPONENTS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import numpy as np
     from numpy.typing import NDArray
 
+    from pipeline.report.motion_view import MotionView
     from pipeline.report.scene import Scene
 
-    Correlation = tuple[NDArray[np.float64], NDArray[np.float64], float]
+    Floats = NDArray[np.float64]
+    Correlation = tuple[Floats, Floats, float]
 
 
 def draw_autocorrelation(scene: Scene) -> Drawing | None:
@@ -70,15 +74,28 @@ def draw_correlations(
 
 
 def list_autocorrelations(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Rows ``lag value low high series`` of every channel; empty without a model or with too few windows."""
+    """As `list_correlations`, of residuals with themselves."""
+    return list_correlations(scene, "autocorrelation", lambda _motion, _component: autocorrelate)
+
+
+def list_correlations(
+    scene: Scene, name: str, choose: Callable[[MotionView, str], Callable[[Floats, Floats], Correlation]]
+) -> dict[str, pl.DataFrame]:
+    """Rows ``lag value low high series`` of every channel; empty without a model or with too few windows.
+
+    Args:
+        scene: the run.
+        name: what rows of a channel are called, before the channel.
+        choose: by run and channel the correlation of residuals at times [s].
+    """
     motion = scene.report.motion
     if motion is None or motion.residuals.height < FEWEST:
         return {}
     t = motion.residuals["t"].to_numpy()
     return {
-        f"autocorrelation_{component}": tabulate_correlations(
+        f"{name}_{component}": _tabulate_correlations(
             {
-                series: autocorrelate(t, motion.residuals[f"{series}_{component}"].to_numpy())
+                series: choose(motion, component)(t, motion.residuals[f"{series}_{component}"].to_numpy())
                 for series in ("ideal", "model")
             }
         )
@@ -86,7 +103,7 @@ def list_autocorrelations(scene: Scene) -> dict[str, pl.DataFrame]:
     }
 
 
-def tabulate_correlations(found: dict[str, Correlation]) -> pl.DataFrame:
+def _tabulate_correlations(found: dict[str, Correlation]) -> pl.DataFrame:
     """Lags, correlations and bounds by series as rows ``lag value low high series``."""
     frames = [
         pl.DataFrame({"lag": lags, "value": values}).with_columns(

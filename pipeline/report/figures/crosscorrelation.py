@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.identification.correlation import FEWEST, LONGEST_S, cross_correlate
-from pipeline.report.figures.autocorrelation import draw_correlations, tabulate_correlations
+from pipeline.identification.correlation import LONGEST_S, cross_correlate
+from pipeline.report.figures.autocorrelation import draw_correlations, list_correlations
 from pipeline.report.figures.figure import Drawing, Figure, Section, Width
 from pipeline.report.figures.residuals import QUANTITIES
 
@@ -37,24 +37,16 @@ def choose_inputs(motion: MotionView) -> dict[str, str]:
 
 
 def list_crosscorrelations(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Rows ``lag value low high series`` of every channel; empty without a model or with too few windows."""
-    motion = scene.report.motion
-    if motion is None or motion.residuals.height < FEWEST:
-        return {}
-    t = motion.residuals["t"].to_numpy()
-    return {
-        f"crosscorrelation_{component}": tabulate_correlations(
-            {
-                series: cross_correlate(
-                    t,
-                    motion.residuals[signal].to_numpy(),
-                    motion.residuals[f"{series}_{component}"].to_numpy(),
-                )
-                for series in ("ideal", "model")
-            }
-        )
-        for component, signal in choose_inputs(motion).items()
-    }
+    """As `list_correlations`, of residuals with the input."""
+    return list_correlations(
+        scene,
+        "crosscorrelation",
+        lambda motion, component: (
+            lambda t, residual: cross_correlate(
+                t, motion.residuals[choose_inputs(motion)[component]].to_numpy(), residual
+            )
+        ),
+    )
 
 
 def describe_crosscorrelation(scene: Scene) -> str:
