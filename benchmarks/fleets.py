@@ -25,7 +25,7 @@ from motion_runs import make_scenario, tables_of, vehicle_of
 
 from pipeline.core.errors import SlipError
 from pipeline.diagnosis import diagnose_runs
-from pipeline.diagnosis.subject import Recording
+from pipeline.diagnosis.recording import Recording
 from pipeline.fleet.hierarchy import decide_level, fit_fleet
 from pipeline.fleet.statistics import Interval, draw_run, split_levels
 from pipeline.simulate import find_vehicle, simulate_run

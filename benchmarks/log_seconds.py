@@ -24,7 +24,7 @@ from pipeline.analysis.options import Options
 from pipeline.core.errors import SlipError
 from pipeline.diagnosis import diagnose_runs
 from pipeline.diagnosis.enough import describe_enough
-from pipeline.diagnosis.subject import load_recording
+from pipeline.diagnosis.recording import load_recording
 from pipeline.identification import Input, Problem, fit_model
 from pipeline.identification.fit import PartFit  # noqa: TC001
 from pipeline.identification.growth import Curve, find_goal, last_until

@@ -25,7 +25,7 @@ import numpy as np
 from json_lines import add_row, read_rows
 from plan_game import record
 
-from pipeline.diagnosis.subject import load_recording
+from pipeline.diagnosis.recording import load_recording
 from pipeline.diagnosis.verdict import grow_t
 from pipeline.identification import Input, Problem, fit_model
 from pipeline.identification.folds import hold_out_part, make_folds

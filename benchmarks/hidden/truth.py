@@ -15,7 +15,7 @@ from pathlib import Path
 from draw import Answer  # noqa: TC002 - it runs as a script, too
 
 from pipeline.diagnosis import Recording  # noqa: TC001
-from pipeline.diagnosis.subject import load_recording
+from pipeline.diagnosis.recording import load_recording
 from pipeline.identification import Input, Problem, fit_model, hold_out
 from pipeline.identification.scoring import measure_errors
 from pipeline.models import Effect, Model, ModelFile, find_effect

@@ -11,13 +11,13 @@ import msgspec
 
 from pipeline.analysis.diagnosis import DIAGNOSIS, diagnose_work, has_diagnosis, key_diagnosis
 from pipeline.analysis.keys import hash_json, key_stages
-from pipeline.analysis.log_setup import LogSetup, describe_subject, name_run
+from pipeline.analysis.log_setup import LogSetup, name_run, set_up_log
 from pipeline.analysis.options import FIGURES, STAGES
 from pipeline.analysis.peers import find_peers
 from pipeline.analysis.provenance import list_versions
 from pipeline.analysis.relative import hash_model
 from pipeline.analysis.summary import summarize_run
-from pipeline.analysis.work import Progress, Work, read_subject, stored_contexts, stored_keys
+from pipeline.analysis.work import Progress, Work, read_wanted, stored_contexts, stored_keys
 from pipeline.core.version import read_version
 from pipeline.logs import spell_location, to_location
 from pipeline.store import JSON, LogIdentities, Manifest, Store, see_log
@@ -72,7 +72,7 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
         SlipError: the log, the configuration or a stage cannot go on; nothing of this run is changed then.
     """
     store = Store(options.out)
-    setup = describe_subject(path, options)
+    setup = set_up_log(path, options)
     sha256, data = _identify(path, setup, store, progress)
     run = options.run or name_run(path, sha256, store)
     keys = key_stages(run, sha256, setup, options.inputs, hash_model(options.model))
@@ -128,7 +128,7 @@ def _identify(path: Path, setup: LogSetup, store: Store, progress: Progress) -> 
         return known, read
     progress("read")
     seen = see_log(path)
-    data = read_subject(setup) if read is None else read
+    data = read_wanted(setup) if read is None else read
     identities.remember(path, data.sha256, seen=seen)
     return data.sha256, data
 

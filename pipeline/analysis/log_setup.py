@@ -1,4 +1,4 @@
-"""The subject of a job: one log, its configuration, its vehicle and its name among the runs."""
+"""One log, its configuration, its vehicle and its name among the runs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class LogSetup:
     choice: Choice
 
 
-def describe_subject(path: Path, options: Options) -> LogSetup:
+def set_up_log(path: Path, options: Options) -> LogSetup:
     """Open a log and settle configuration, vehicle and topics.
 
     Args:

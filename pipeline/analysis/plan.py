@@ -55,7 +55,7 @@ def study(
         SlipError: nothing can be judged, or a run has no commands.
     """
     from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy
-    from pipeline.diagnosis.subject import load_recording  # noqa: PLC0415 - heavy
+    from pipeline.diagnosis.recording import load_recording  # noqa: PLC0415 - heavy
     from pipeline.models import list_effects  # noqa: PLC0415 - heavy
     from pipeline.plan import assume, learn  # noqa: PLC0415 - heavy
 

@@ -13,7 +13,7 @@ import msgspec
 
 from pipeline.analysis.analyze import SUMMARY, analyze_log, update_datasets
 from pipeline.analysis.errors import JobError
-from pipeline.analysis.log_setup import describe_subject, name_run
+from pipeline.analysis.log_setup import name_run, set_up_log
 from pipeline.analysis.lookup import find_run, recorded_path
 from pipeline.analysis.options import INPUTS
 from pipeline.analysis.work import stored_contexts
@@ -72,7 +72,7 @@ def open_run(text: str, options: Options, progress: Progress) -> Iterator[Opened
         path = path if stored is None else _find_recorded(stored)
     if stored is None and options.inputs != INPUTS:
         # Only to complain before anything is computed where the log lacks the input.
-        describe_subject(path, options)
+        set_up_log(path, options)
     options = replace(options, inputs=INPUTS)
     if stored is None:
         outcome = analyze_log(path, options, progress)
@@ -133,7 +133,7 @@ def _find_recorded(stored: Manifest) -> Path:
 def _is_changed(path: Path, stored: Manifest, options: Options, *, asked: bool) -> bool:
     """Whether an analysis would be of another vehicle or configuration now."""
     try:
-        setup = describe_subject(path, options)
+        setup = set_up_log(path, options)
     except SlipError:
         if asked:
             raise

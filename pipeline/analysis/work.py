@@ -148,7 +148,7 @@ class Work:
         return pl.DataFrame()
 
     def _extract(self) -> StageOutcome:
-        data = self.data if self.data is not None else read_subject(self.setup, self.sha256)
+        data = self.data if self.data is not None else read_wanted(self.setup, self.sha256)
         setup = self.setup
         made = extract_tables(data, setup.sources, setup.configuration, setup.vehicle, where=str(setup.path))
         self._extracted = {
@@ -298,7 +298,7 @@ def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:
     return frame
 
 
-def read_subject(setup: LogSetup, sha256: str | None = None) -> LogData:
+def read_wanted(setup: LogSetup, sha256: str | None = None) -> LogData:
     """Read the columns that a run needs; the hash is computed beside it unless it is known."""
     types = {channel.topic: channel.type_name for channel in setup.index.channels}
     return read_topics(setup.index, list_wanted(setup.sources, types), sha256=sha256)

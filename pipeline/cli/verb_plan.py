@@ -254,7 +254,7 @@ def _find_vehicle(name: str | None) -> Vehicle:
 def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet: bool) -> int:
     """Promises against the joint diagnosis of the runs before and the drive."""
     from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy
-    from pipeline.diagnosis.subject import load_recording  # noqa: PLC0415 - heavy
+    from pipeline.diagnosis.recording import load_recording  # noqa: PLC0415 - heavy
     from pipeline.plan import check_plan, read_promises  # noqa: PLC0415 - heavy
     from pipeline.plan.playback import require_played  # noqa: PLC0415 - heavy
 

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.diagnose import Explored
     from pipeline.diagnosis.diagnosis import Json, Value
     from pipeline.diagnosis.naming_rules import Clocks
-    from pipeline.diagnosis.subject import Recording
+    from pipeline.diagnosis.recording import Recording
     from pipeline.identification.judgement import Judgement
     from pipeline.identification.parts import Part
     from pipeline.identification.state import State

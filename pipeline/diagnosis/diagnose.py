@@ -14,7 +14,7 @@ from pipeline.diagnosis.diagnosis import Diagnosis, RunDiagnosis
 from pipeline.diagnosis.excitation import find_unobservable
 from pipeline.diagnosis.naming import Search, search_body, search_wheels
 from pipeline.diagnosis.naming_rules import Clocks, read_clocks
-from pipeline.diagnosis.subject import FATAL, load_recording
+from pipeline.diagnosis.recording import FATAL, load_recording
 from pipeline.diagnosis.undecided import find_undecided
 from pipeline.diagnosis.unexplained import (
     Explainable,
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from pipeline.diagnosis.context import Context
     from pipeline.diagnosis.excitation import Detectable, Unobservable
-    from pipeline.diagnosis.subject import Recording
+    from pipeline.diagnosis.recording import Recording
     from pipeline.diagnosis.undecided import Undecided
     from pipeline.identification import InputChoice
     from pipeline.models import Effect, Model

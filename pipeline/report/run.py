@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from pipeline.diagnosis.subject import FATAL
+from pipeline.diagnosis.recording import FATAL
 
 if TYPE_CHECKING:
     import polars as pl

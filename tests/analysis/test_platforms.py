@@ -14,7 +14,7 @@ from platforms import hidden_effects, try_platform
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.choice import Choice, choose
 from pipeline.analysis.errors import JobError
-from pipeline.analysis.log_setup import describe_subject
+from pipeline.analysis.log_setup import set_up_log
 from pipeline.analysis.options import Options
 from pipeline.core.errors import SlipError
 from pipeline.logs import Wanted, open_log, read_topics
@@ -234,7 +234,7 @@ def test_a_field_of_one_of_several_structures_can_be_a_side(tmp_path: Path) -> N
 
 def test_a_robot_without_a_pose_is_refused_before_its_vehicle_is_asked_for(foreign_logs: Path) -> None:
     with pytest.raises(JobError) as caught:
-        describe_subject(foreign_logs / "abitobot.mcap", Options())
+        set_up_log(foreign_logs / "abitobot.mcap", Options())
     assert caught.value.code == "no_pose"
     assert "/joint_states" in str(caught.value)
 
@@ -259,5 +259,5 @@ def test_a_recorded_robot_description_tells_the_vehicle(foreign_logs: Path) -> N
 
 def test_a_log_without_pose_and_wheels_is_refused_with_that_reason(foreign_logs: Path) -> None:
     with pytest.raises(JobError) as caught:
-        describe_subject(foreign_logs / "philipsltd_full_nav.db3", Options())
+        set_up_log(foreign_logs / "philipsltd_full_nav.db3", Options())
     assert caught.value.code == "no_pose"

@@ -12,7 +12,7 @@ from pipeline.analysis.diagnosis import read_recording
 from pipeline.analysis.options import Options
 from pipeline.diagnosis import RunDiagnosis, diagnose_runs
 from pipeline.diagnosis.plausibility import find_implausible
-from pipeline.diagnosis.subject import load_recording
+from pipeline.diagnosis.recording import load_recording
 from pipeline.identification import Comparison, Errors, Input
 from pipeline.identification.scoring import measure_errors
 from pipeline.models import Timing, find_effect

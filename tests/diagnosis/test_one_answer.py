@@ -16,7 +16,7 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.diagnosis import read_recording
 from pipeline.analysis.options import Options
 from pipeline.diagnosis import diagnose_runs
-from pipeline.diagnosis.subject import load_recording
+from pipeline.diagnosis.recording import load_recording
 from pipeline.diagnosis.words import describe
 from pipeline.identification import Input, Problem, carry_over
 from pipeline.identification.describe import errors_as_json, ladder_as_json, parameters_as_json

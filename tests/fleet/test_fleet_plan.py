@@ -13,7 +13,7 @@ from plan_game import record
 
 from pipeline.analysis.plan import UNDECIDED, ask, expect
 from pipeline.cli import main
-from pipeline.diagnosis.subject import load_recording
+from pipeline.diagnosis.recording import load_recording
 from pipeline.models import find_effect
 from pipeline.plan import choose_limits, learn
 from pipeline.simulate import Program, make_scenario

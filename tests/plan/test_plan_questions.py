@@ -14,7 +14,7 @@ from plan_game import draw_scenario, record
 from scipy.special import stdtrit
 
 from pipeline.diagnosis import Named, RunDiagnosis, Value
-from pipeline.diagnosis.subject import load_recording
+from pipeline.diagnosis.recording import load_recording
 from pipeline.diagnosis.undecided import Undecided
 from pipeline.models import find_effect
 from pipeline.plan import ask_apart, assume, check_plan, learn
