@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -13,9 +13,11 @@ from pipeline.analysis.options import Options
 from pipeline.diagnosis import RunDiagnosis, diagnose_runs
 from pipeline.diagnosis.plausibility import find_implausible
 from pipeline.diagnosis.recording import load_recording
-from pipeline.identification import Comparison, Errors, Input
+from pipeline.identification import Comparison, Errors, Input, Problem, fit_model
 from pipeline.identification.scoring import measure_errors
-from pipeline.models import Timing, find_effect
+from pipeline.models import Model, Timing, find_effect
+from pipeline.runs import MotionRun
+from pipeline.vehicles import Vehicle
 
 _LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"
 
@@ -91,11 +93,21 @@ class Asked:
             (self.known[name, source],) = diagnose_runs([recording], vehicle, inputs=inputs).runs
         return self.known[name, source]
 
-    def measure_as_recorded(self, name: str) -> Errors:
-        """Errors of the ideal model on measured wheels, on the clocks as they were recorded."""
+    def fit(self, name: str, source: str, ids: Sequence[str]) -> Model:
+        vehicle, run = self._load(name)
+        problem = Problem([run], vehicle, Input(source))
+        return fit_model(
+            problem, Model(vehicle, tuple(find_effect(each)() for each in ids)), exact=True
+        ).model
+
+    def _load(self, name: str) -> tuple[Vehicle, MotionRun]:
         options = Options(out=self.results, report=False, diagnosis=False)
         vehicle, recording = read_recording(analyze_log(_LOGS / f"{name}.mcap", options).manifest)
-        run = load_recording(recording, vehicle)
+        return vehicle, load_recording(recording, vehicle)
+
+    def measure_as_recorded(self, name: str) -> Errors:
+        """Errors of the ideal model on measured wheels, on the clocks as they were recorded."""
+        vehicle, run = self._load(name)
         comparison = Comparison(run, vehicle, Input.MEASURED)
         timing, late = Timing(-run.alignment.wheel_delay_s), -run.alignment.heading_delay_s
         reached = comparison.find_horizon_errors((), timing, late)
@@ -152,12 +164,11 @@ def test_the_error_falls_as_far_as_it_can(asked: Asked, name: str) -> None:
 @pytest.mark.parametrize("names", [_ASPHALT, _GRASS, _GRAVEL])
 @pytest.mark.parametrize("source", ["command", "measured"])
 def test_runs_of_one_vehicle_on_one_ground_agree(asked: Asked, names: tuple[str, ...], source: str) -> None:
-    tracks = []
-    for name in names:
-        named = {effect.id: effect for effect in asked.diagnose(name, source).effects}
-        tracks.append(named["effective_track"].parameters["k"].value)
-    # On one asphalt a formula of a track that depends on speed is found beside it.
-    assert max(tracks) - min(tracks) <= 0.065
+    # A track beside one that depends on speed is another number: the same model is fitted to each run.
+    common = set.intersection(*({e.id for e in asked.diagnose(name, source).effects} for name in names))
+    tracks = [asked.fit(name, source, sorted(common)).effect("effective_track").values["k"] for name in names]
+    # Two drives on gravel, a day apart, differ by 3.9 %; all others by less.
+    assert max(tracks) <= 1.04 * min(tracks)
 
 
 @pytest.mark.parametrize("source", ["command", "measured"])
