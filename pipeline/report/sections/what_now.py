@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 def view_what_now(page: Page) -> dict[str, object]:
     """Commands that go on from this run, and whether anything is open that a drive could decide."""
     if not page.report.text("run"):
-        return {"steps": [], "settled": False}
+        return {"steps": [], "settled": False, "planned": {}}
     diagnosis = page.report.diagnosis
     settled = bool(diagnosis.get("effects")) and not any(
         diagnosis.get(key) for key in ("undecided", "unobservable", "unexplained")
     )
-    return {"steps": list_steps(page.report), "settled": settled}
+    return {"steps": list_steps(page.report), "settled": settled, "planned": page.report.planned}
 
 
 def list_steps(report: RunReport) -> list[tuple[str, str]]:
