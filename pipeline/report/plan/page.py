@@ -44,7 +44,6 @@ def preview_plan(plan: Plan) -> dict[str, object]:
         "drives": bool(plan.manoeuvres),
         "area": f"{plan.area.length_m:g} x {plan.area.width_m:g} m",
         "duration_s": plan.commands.duration_s,
-        "sketch": _sketch(plan),
         **_say(plan),
     }
 
@@ -58,16 +57,6 @@ def show_planned(page: str, planned: Mapping[str, object]) -> str:
     """
     shown = render_template("report/templates/sections/planned.html", planned=planned)
     return _PLACE.sub(lambda _: shown, page, count=1)
-
-
-def _sketch(plan: Plan) -> dict[str, object]:
-    """The expected way as points of a drawing of so many metres, y downwards, and the area about it."""
-    way = plan.ways[0][:: 2 * _EVERY]
-    return {
-        "length_m": plan.area.length_m,
-        "width_m": plan.area.width_m,
-        "way": " ".join(f"{x:.2f},{-y:.2f}" for x, y in zip(way.real, way.imag, strict=True)),
-    }
 
 
 def render_plan(plan: Plan, catalogue: str = "") -> str:

@@ -52,11 +52,10 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
     if diagnosis.get("effects"):
         steps.append(("Keep the model that was named", f"slip diagnose {name} --apply model.toml"))
         steps.append(("Give it to the robot's controller", "slip model export model.toml --to ros2_control"))
-    asked = "undecided" if diagnosis.get("undecided") else "all"
     if diagnosis.get("undecided") or diagnosis.get("unobservable"):
-        what = "is undecided" if asked == "undecided" else "this log cannot tell"
+        what = "is undecided" if diagnosis.get("undecided") else "this log cannot tell"
         steps += [
-            (f"Plan the drive that decides what {what}", f"slip plan {name} --for {asked} --out plan"),
+            (f"Plan the drive that decides what {what}", f"slip plan {name} --out plan"),
             ("Look at plan/plan.html, lift the wheels, and play it", "ros2 bag play plan/plan.mcap"),
             ("See whether it kept what it promised", "slip plan --check plan NEW.mcap"),
         ]
