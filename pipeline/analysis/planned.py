@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-from pipeline.core.paths import resolve_inside
+import msgspec
+
+from pipeline.core.paths import PathError, resolve_inside
 from pipeline.report.pages import PLANS, lead_to, lead_up
 from pipeline.store.files import make_folder, replace_file
 from pipeline.store.names import encode_run
@@ -28,8 +30,20 @@ def place_plan(results: Path, run: str, name: str) -> Path:
     return resolve_inside(results, f"{PLANS}/{encode_run(run)}/{name}")
 
 
+class _Preview(msgspec.Struct):
+    """What a report shows of a plan: the results that it was made for, and as of `preview_plan`."""
+
+    key: str
+    drives: bool
+    area: str
+    duration_s: float
+    promises: list[str]
+
+
 def read_preview(results: Path, run: str, key: str) -> dict[str, object]:
-    """The plan of a run in short; empty where there is none of these results.
+    """The plan of a run in short, with the ``address`` of its page seen from the report.
+
+    Empty where there is none of these results, or none that can be read: others may have written it.
 
     Args:
         results: the results folder.
@@ -37,10 +51,11 @@ def read_preview(results: Path, run: str, key: str) -> dict[str, object]:
         key: of its generation.
     """
     try:
-        found = json.loads(place_plan(results, run, PREVIEW).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        found = msgspec.json.decode(place_plan(results, run, PREVIEW).read_bytes(), type=_Preview)
+    except (OSError, PathError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
         return {}
-    return found if isinstance(found, dict) and found.get("key") == key else {}
+    address = lead_up(run, f"{PLANS}/{encode_run(run).as_posix()}/plan.html")
+    return {**msgspec.structs.asdict(found), "address": address} if found.key == key else {}
 
 
 def write_drive(plan: Plan, folder: Path, results: Path) -> tuple[Path, ...]:
@@ -84,9 +99,8 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
     preview = place_plan(results, run, PREVIEW)
     make_folder(preview.parent)
     write_drive(plan, preview.parent, results)
-    address = lead_up(run, f"{PLANS}/{encode_run(run).as_posix()}/plan.html")
-    planned = {"key": manifest.key, "address": address, **preview_plan(plan)}
-    replace_file(preview, json.dumps(planned, allow_nan=False).encode())
+    told = {"key": manifest.key, **preview_plan(plan)}
+    replace_file(preview, json.dumps(told, allow_nan=False).encode())
     with store.open_generation(run, manifest.key) as generation:
         current = generation.previous
         if current is None or current.key != manifest.key or REPORT not in current.files:
@@ -94,10 +108,8 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
         page = current.path(REPORT).read_text(encoding="utf-8")
         for table in current.tables:
             generation.reuse_table(table)
-        for name in current.files.keys() - {
-            REPORT,
-            *(f"{QUARANTINE}{table}.parquet" for table in current.tables),
-        }:
+        new = {REPORT, *(f"{QUARANTINE}{table}.parquet" for table in current.tables)}
+        for name in [name for name in current.files if name not in new]:
             generation.reuse_file(name)
-        generation.write_text(REPORT, show_planned(page, planned))
+        generation.write_text(REPORT, show_planned(page, read_preview(results, run, manifest.key)))
         return generation.commit(current.details).path(REPORT)

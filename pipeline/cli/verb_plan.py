@@ -153,13 +153,13 @@ def plan(  # noqa: D417 - the runs document themselves
 def _show_in_report(results: Path, manifests: Sequence[Manifest], made: Plan) -> list[str]:
     """Leave the plan beside the one stored run it is for, and say which report shows it."""
     from pipeline.analysis.planned import leave_plan  # noqa: PLC0415 - heavy
-    from pipeline.store import Store, StoreError  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     if len(manifests) != 1:
         return []
     try:
         shown = leave_plan(Store(results), manifests[0], made)
-    except StoreError as error:
+    except (SlipError, OSError) as error:
         say(f"slip: the report of the run does not show the plan: {error}")
         return []
     return [f"report       {shown} shows it"] if shown is not None else []

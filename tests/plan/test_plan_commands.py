@@ -348,6 +348,10 @@ def test_a_plan_stands_in_the_report_of_its_run(plan: Plan, tmp_path: Path) -> N
     assert address in again.path("report.html").read_text(encoding="utf-8")
     # Other results of the run are not what it was planned for.
     assert read_preview(store.root, manifest.run, "0" * 16) == {}
+    preview = place_plan(store.root, manifest.run, "plan.json")
+    for spoiled in ("", "[]", '{"key": 3}', preview.read_text(encoding="utf-8").replace('"promises"', '"x"')):
+        preview.write_text(spoiled, encoding="utf-8")
+        assert read_preview(store.root, manifest.run, manifest.key) == {}
 
 
 def test_time_that_is_left_answers_later_questions_or_is_said_to_be_of_no_use(plan: Plan) -> None:

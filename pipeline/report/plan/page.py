@@ -53,7 +53,7 @@ def show_planned(page: str, planned: Mapping[str, object]) -> str:
 
     Args:
         page: the report.
-        planned: the preview of the plan, with the ``address`` of its page seen from the report.
+        planned: the preview of the plan, with the ``address`` of its page seen from the report; may be empty.
     """
     shown = render_template("report/templates/sections/planned.html", planned=planned)
     return _PLACE.sub(lambda _: shown, page, count=1)
