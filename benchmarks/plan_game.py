@@ -24,19 +24,10 @@ from json_lines import add_row, read_rows
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.diagnosis import read_recording
 from pipeline.analysis.options import Options
-from pipeline.analysis.plan import ALL, ask, study
+from pipeline.analysis.plan import ALL, Wish, plan_drive, study
 from pipeline.core.errors import SlipError
 from pipeline.diagnosis import Named, Recording, diagnose_runs
-from pipeline.plan import (
-    Plan,
-    Request,
-    check_plan,
-    choose_limits,
-    make_plan,
-    parse_area,
-    read_promises,
-    write_plan,
-)
+from pipeline.plan import Plan, check_plan, parse_area, read_promises, write_plan
 from pipeline.simulate import (
     Disturbance,
     PoseSensor,
@@ -128,19 +119,14 @@ def play(seed: int, folder: Path) -> Score:
         score.first = [effect.id for effect in studied.diagnosis.effects]
         score.undecided = [list(group.candidates) for group in studied.diagnosis.undecided]
         begun = time.perf_counter()
-        problem = studied.knowledge.problem
-        limits = choose_limits(
-            vehicle,
-            None if problem is None else problem.largest,
+        wish = Wish(
+            parse_area(_AREAS.get(name, "20x10m"), vehicle),
+            _SECONDS,
+            (ALL,),
             speed_mps=4.0 if name == "car" else None,
+            seed=seed,
         )
-        questions = ask(studied.knowledge, [ALL], limits, _SECONDS, studied.diagnosis)
-        area = parse_area(_AREAS.get(name, "20x10m"), vehicle)
-        type_name = (
-            "ackermann_msgs/msg/AckermannDriveStamped" if name == "car" else "geometry_msgs/msg/TwistStamped"
-        )
-        request = Request(limits, area, _SECONDS, (before.name,), "/cmd", type_name, seed)
-        plan = make_plan(studied.knowledge, questions, request)
+        plan = plan_drive(vehicle, studied, wish, [before]).plan
         score.plan_s = round(time.perf_counter() - begun, 1)
         score.duration_s = plan.commands.duration_s
         if plan.manoeuvres:

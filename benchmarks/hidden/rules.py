@@ -192,7 +192,7 @@ RULES: tuple[Rule, ...] = (
     Rule("price", "some effects must gain more than others", search, "price_of", _give(verdict.LEAST_GAIN)),
     Rule("price_of_number", "a number more must buy something", selection.Selection, "_present",
          _set(selection, _PRICE_OF_A_NUMBER=0.0), costly=True),
-    Rule("simplify", "an effect that became another one is that one", selection.Selection, "_simplify",
+    Rule("simplify", "what a new effect leaves at nothing goes", selection.Selection, "_simplify",
          _second, _same_ids),
     Rule("disguise", "no effect at values where it is another one", selection, "is_nameable",
          _nameable_in_disguise),

@@ -183,6 +183,7 @@ def _write_outputs(
     generation = work.generation
     if options.report or options.figures:
         # Drawing is most of the start-up time; who wants neither does not pay for it.
+        from pipeline.analysis.planned import read_preview  # noqa: PLC0415
         from pipeline.report import RunReport, render_report, view_diagnosis  # noqa: PLC0415
         from pipeline.report.pages import lead_up  # noqa: PLC0415
 
@@ -190,7 +191,8 @@ def _write_outputs(
         tables = {name: generation.read_table(name) for name in generation.table_names}
         motion = view_diagnosis(tables, work.vehicle, diagnosis or {})
         peers = find_peers(Store(options.out), summary)
-        report = RunReport(summary, tables, diagnosis or {}, motion, peers, lead_up(work.run))
+        planned = read_preview(options.out, work.run, generation.key)
+        report = RunReport(summary, tables, diagnosis or {}, motion, peers, lead_up(work.run), planned)
         if options.report:
             generation.write_text(REPORT, render_report(report))
         if options.figures:

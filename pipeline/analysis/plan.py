@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
     from pipeline.diagnosis import Recording, RunDiagnosis
     from pipeline.fleet.forecast import Forecast
-    from pipeline.plan import Knowledge, Limits
+    from pipeline.plan import Knowledge, Limits, Plan
+    from pipeline.plan.limits import Area
     from pipeline.plan.questions import Question
     from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
@@ -29,14 +30,98 @@ class Studied:
     """Runs of one vehicle with what is known of them.
 
     Attributes:
-        diagnosis: of all of them together.
+        diagnosis: of all of them together; None where there are none.
         knowledge: of the same model.
         forecast: of the fleet, which the knowledge holds; None where it was not asked.
     """
 
-    diagnosis: RunDiagnosis
+    diagnosis: RunDiagnosis | None
     knowledge: Knowledge
     forecast: Forecast | None = None
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a user asks of a plan.
+
+    Attributes:
+        area: free ground.
+        time_s: longest duration.
+        wanted: `UNDECIDED`, `ALL`, or ids of effects; empty for what is undecided and then, in the time that
+            is left, for all that is open.
+        speed_mps, yaw_rate_radps, acceleration_mps2: limits; None for the vehicle's own.
+        topic, type_name: on which it will be played; None as the run recorded its command.
+        seed: of the draws from what is known.
+    """
+
+    area: Area
+    time_s: float
+    wanted: tuple[str, ...] = ()
+    speed_mps: float | None = None
+    yaw_rate_radps: float | None = None
+    acceleration_mps2: float | None = None
+    topic: str | None = None
+    type_name: str | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A plan with the questions that it was asked, and the limits that it obeys."""
+
+    plan: Plan
+    questions: tuple[Question, ...]
+    limits: Limits
+
+
+def plan_drive(
+    vehicle: Vehicle,
+    studied: Studied,
+    wish: Wish,
+    recordings: Sequence[Recording] = (),
+    command: Mapping[str, object] | None = None,
+) -> Planned:
+    """Ask what is open, and plan the drive that answers it.
+
+    Args:
+        vehicle: to drive.
+        studied: what is known of it.
+        wish: what is asked of the plan.
+        recordings: the runs that the knowledge comes from.
+        command: how the first one's command was chosen, as of `read_command`.
+
+    Raises:
+        SlipError: an effect is unknown, nobody knows how fast the vehicle may drive, or no drive fits.
+    """
+    from pipeline.plan import Request, choose_limits, make_plan  # noqa: PLC0415 - heavy
+
+    knowledge, diagnosis = studied.knowledge, studied.diagnosis
+    limits = choose_limits(
+        vehicle,
+        None if knowledge.problem is None else knowledge.problem.largest,
+        speed_mps=wish.speed_mps,
+        yaw_rate_radps=wish.yaw_rate_radps,
+        acceleration_mps2=wish.acceleration_mps2,
+    )
+    undecided = diagnosis is not None and bool(diagnosis.undecided)
+    wanted = wish.wanted or (UNDECIDED if undecided else ALL,)
+    questions = tuple(ask(knowledge, wanted, limits, wish.time_s, diagnosis))
+    later: list[Question] = []
+    if undecided and not wish.wanted:
+        texts = {question.text for question in questions}
+        everything = ask(knowledge, [ALL], limits, wish.time_s, diagnosis)
+        later = [question for question in everything if question.text not in texts]
+    topic, type_name = choose_topic(vehicle, command or {}, recordings[0].path if recordings else "")
+    request = Request(
+        limits,
+        wish.area,
+        wish.time_s,
+        tuple(recording.name for recording in recordings),
+        wish.topic or topic,
+        wish.type_name or type_name,
+        wish.seed,
+    )
+    return Planned(make_plan(knowledge, questions, request, later), questions, limits)
 
 
 def study(
@@ -83,7 +168,7 @@ def study(
     return Studied(diagnosis, learn(runs, vehicle, [*named, *rest], forecast.prior), forecast)
 
 
-def expect(vehicle: Vehicle, terrain: str | None, known: Path) -> tuple[Knowledge, Forecast | None]:
+def expect(vehicle: Vehicle, terrain: str | None, known: Path) -> Studied:
     """What is known of a vehicle without a log: the fleet's forecast on a terrain, or the ideal model.
 
     Raises:
@@ -92,9 +177,9 @@ def expect(vehicle: Vehicle, terrain: str | None, known: Path) -> tuple[Knowledg
     from pipeline.plan import assume  # noqa: PLC0415 - heavy
 
     if terrain is None:
-        return assume(vehicle), None
+        return Studied(None, assume(vehicle))
     forecast = _forecast(known, vehicle, terrain)
-    return assume(vehicle, forecast.effects, forecast.prior), forecast
+    return Studied(None, assume(vehicle, forecast.effects, forecast.prior), forecast)
 
 
 def _forecast(known: Path, vehicle: Vehicle, terrain: str, without: Sequence[str] = ()) -> Forecast:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from cyclopts import App, Parameter
 from cyclopts.types import PositiveFloat
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis import Recording, RunDiagnosis
     from pipeline.fleet.forecast import Forecast
     from pipeline.plan import Needed, Plan
+    from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
 
 
@@ -72,7 +73,7 @@ def plan(  # noqa: D417 - the runs document themselves
         vehicle: vehicle preset; without any log the plan looks for all of its effects.
         terrain: to drive on; the plan starts from what the runs of --known let expect there.
         known: results folder with diagnosed runs of the vehicle (default: --results).
-        wanted: what to decide; by default what is undecided in the runs.
+        wanted: what to decide; by default what is undecided, and in the time left all that is open.
         time: longest duration, for example 60s or 2min.
         area: free ground: length along the heading at the start, and width; the start is its middle.
         max_speed: [m/s].
@@ -96,61 +97,41 @@ def plan(  # noqa: D417 - the runs document themselves
         names = list(runs or [])
         if check is not None:
             return _check(check, names, options, json=json, quiet=quiet)
-        from pipeline.analysis.plan import UNDECIDED, ask, choose_topic, expect, study  # noqa: PLC0415 - heavy
-        from pipeline.plan import (  # noqa: PLC0415 - heavy
-            Request,
-            choose_limits,
-            compare_protocols,
-            make_plan,
-            parse_area,
-            parse_protocols,
-            write_plan,
-        )
+        from pipeline.analysis.plan import Wish, expect, plan_drive, study  # noqa: PLC0415 - heavy
+        from pipeline.analysis.planned import write_drive  # noqa: PLC0415 - heavy
+        from pipeline.plan import compare_protocols, parse_area, parse_protocols  # noqa: PLC0415 - heavy
         from pipeline.plan.limits import parse_time  # noqa: PLC0415 - heavy
 
         seconds = parse_time(time)
         protocols = () if compare is None else parse_protocols(compare)
-        diagnosis, lossy = None, False
-        if names:
-            found, recordings, chosen, lossy = _gather(names, options, quiet=quiet or json)
-            # Before a diagnosis that takes its time.
-            place = parse_area(area, found)
+        gathered = _gather(names, options, quiet=quiet or json) if names else None
+        found = _find_vehicle(vehicle) if gathered is None else gathered.vehicle
+        recordings = [] if gathered is None else gathered.recordings
+        # Before a diagnosis that takes its time.
+        wish = Wish(
+            parse_area(area, found),
+            seconds,
+            tuple(wanted or ()),
+            max_speed,
+            max_yaw_rate,
+            max_acceleration,
+            topic,
+            type_name,
+            seed,
+        )
+        if gathered is None:
+            studied = expect(found, terrain, known or results)
+        else:
             with show_progress(names[0], quiet=quiet or json) as progress:
                 progress("diagnosis")
                 studied = study(recordings, found, terrain, known or results)
-            diagnosis, knowledge, forecast = studied.diagnosis, studied.knowledge, studied.forecast
-            usual = choose_topic(found, chosen, recordings[0].path)
-        else:
-            found = _find_vehicle(vehicle)
-            knowledge, forecast = expect(found, terrain, known or results)
-            recordings, place = [], parse_area(area, found)
-            usual = choose_topic(found, {}, "")
-        limits = choose_limits(
-            found,
-            None if knowledge.problem is None else knowledge.problem.largest,
-            speed_mps=max_speed,
-            yaw_rate_radps=max_yaw_rate,
-            acceleration_mps2=max_acceleration,
-        )
-        questions = ask(knowledge, wanted or [UNDECIDED], limits, seconds, diagnosis)
-        request = Request(
-            limits,
-            place,
-            seconds,
-            tuple(recording.name for recording in recordings),
-            topic or usual[0],
-            type_name or usual[1],
-            seed,
-        )
-        made = make_plan(knowledge, questions, request)
-        others = compare_protocols(knowledge, questions, limits, protocols, seed)
-        asked = [question.text for question in questions]
-        files: tuple[Path, ...] = ()
-        if made.manoeuvres:
-            from pipeline.report.pages import lead_to  # noqa: PLC0415 - heavy
-            from pipeline.report.plan import render_plan  # noqa: PLC0415 - heavy
-
-            files = write_plan(made, out, render_plan(made, lead_to(results, out)))
+        command = {} if gathered is None else gathered.command
+        planned = plan_drive(found, studied, wish, recordings, command)
+        made, forecast = planned.plan, studied.forecast
+        others = compare_protocols(studied.knowledge, planned.questions, planned.limits, protocols, seed)
+        asked = [question.text for question in planned.questions]
+        files = write_drive(made, out, results)
+        shown = _show_in_report(results, gathered.manifests, made) if gathered is not None else []
     except SlipError as error:
         print_error(error)
         if json:
@@ -164,10 +145,24 @@ def plan(  # noqa: D417 - the runs document themselves
         written = {**_known_as_json(forecast), "files": [str(file) for file in files], "errors": []}
         print_json({**made.to_json(), **({"compare": told} if others else {}), **written})
     elif not quiet:
-        print_lines(
-            [*_tell_known(forecast), *_describe(made, diagnosis, files), *_list_others(made, asked, others)]
-        )
-    return LOSSY if lossy else CLEAN
+        lines = [*_tell_known(forecast), *_describe(made, studied.diagnosis, files), *shown]
+        print_lines([*lines, *_list_others(made, asked, others)])
+    return LOSSY if gathered is not None and gathered.lossy else CLEAN
+
+
+def _show_in_report(results: Path, manifests: Sequence[Manifest], made: Plan) -> list[str]:
+    """Leave the plan beside the one stored run it is for, and say which report shows it."""
+    from pipeline.analysis.planned import leave_plan  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    if len(manifests) != 1:
+        return []
+    try:
+        shown = leave_plan(Store(results), manifests[0], made)
+    except (SlipError, OSError) as error:
+        say(f"slip: the report of the run does not show the plan: {error}")
+        return []
+    return [f"report       {shown} shows it"] if shown is not None else []
 
 
 def _known_as_json(forecast: Forecast | None) -> dict[str, object]:
@@ -201,16 +196,25 @@ def _list_others(made: Plan, asked: Sequence[str], others: Sequence[Needed]) -> 
     return rows
 
 
-def _gather(
-    names: Sequence[str], options: Options, *, quiet: bool
-) -> tuple[Vehicle, list[Recording], dict[str, object], bool]:
-    """Recordings of one vehicle, and what was chosen in the first of them."""
+class _Gathered(NamedTuple):
+    """Runs of one vehicle, how the command of the first of them was chosen, and whether one had losses."""
+
+    vehicle: Vehicle
+    recordings: list[Recording]
+    manifests: list[Manifest]
+    command: dict[str, object]
+    lossy: bool
+
+
+def _gather(names: Sequence[str], options: Options, *, quiet: bool) -> _Gathered:
+    """Runs of one vehicle, each once."""
     from pipeline.analysis.diagnosis import read_recording  # noqa: PLC0415 - heavy
     from pipeline.analysis.plan import read_command  # noqa: PLC0415 - heavy
     from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
 
     vehicles: list[Vehicle] = []
     recordings: list[Recording] = []
+    manifests: list[Manifest] = []
     chosen: dict[str, object] = {}
     lossy = False
     for name in names:
@@ -227,6 +231,7 @@ def _gather(
             continue
         vehicles.append(vehicle)
         recordings.append(recording)
+        manifests.append(opened.manifest)
     if any(vehicle != vehicles[0] for vehicle in vehicles):
         raise SlipError(
             "several_vehicles",
@@ -234,7 +239,7 @@ def _gather(
             where=", ".join(recording.name for recording in recordings),
             hint="Give runs of one vehicle.",
         )
-    return vehicles[0], recordings, chosen, lossy
+    return _Gathered(vehicles[0], recordings, manifests, chosen, lossy)
 
 
 def _find_vehicle(name: str | None) -> Vehicle:
@@ -264,7 +269,7 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
             "no_log", "a check needs the log that was driven", where=str(path), hint="Give it as well."
         )
     before = [name for name in promised.runs if name not in names]
-    vehicle, recordings, _, lossy = _gather([*before, *names], options, quiet=quiet)
+    vehicle, recordings, _, _, lossy = _gather([*before, *names], options, quiet=quiet)
     with show_progress(names[0], quiet=quiet or json) as progress:
         progress("diagnosis")
         driven = [load_recording(recording, vehicle) for recording in recordings[len(before) :]]
@@ -299,6 +304,8 @@ def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path])
     for one in made.promises:
         how = f"t = {one.expected:.1f}" if one.kind == "separation" else f"+- {one.expected:.2g}"
         lines.append(f"after {one.decided_after_s:3.0f} s  {one.question} ({how})")
+    if rest := made.say_rest():
+        lines.append(f"then         {rest}")
     lines += [f"cannot       {one.question}: {one.because}" for one in made.impossible]
     if not made.manoeuvres:
         return [*lines, "no drive on level ground within these limits answers it: no file is written"]

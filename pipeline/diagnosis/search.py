@@ -18,7 +18,6 @@ _BETTER = 0.005
 _TIE = 0.03
 # Recordings with much structure offer ever another exchange by a hair.
 _MOST_WORK = 16
-_MOST_SPLIT = 3
 
 
 def search_effects(selection: Selection, start: CandidateModel) -> CandidateModel:
@@ -32,13 +31,17 @@ def search_effects(selection: Selection, start: CandidateModel) -> CandidateMode
         The model that no move improves.
     """
     current = grow(selection, start)
+    seen = {current.ids}
+    moves = iter((_swap, _join, _split))
     for _ in range(_ROUNDS):
-        if selection.is_done(_MOST_WORK):
-            return current
-        moved = _swap(selection, current) or _join(selection, current) or _split(selection, current)
+        moved = next((found for move in moves if (found := move(selection, current)) is not None), None)
         if moved is None:
             return current
         current = grow(selection, prune(selection, selection.adapt(moved)))
+        if current.ids not in seen:
+            # An exchange that ends where it began is not tried again; the others are.
+            seen.add(current.ids)
+            moves = iter((_swap, _join, _split))
     return current
 
 
@@ -122,12 +125,13 @@ def _join(selection: Selection, current: CandidateModel) -> CandidateModel | Non
 
 def _split(selection: Selection, current: CandidateModel) -> CandidateModel | None:
     """Two effects in the place of one, where the model leaves room for them."""
-    if not selection.has_room(current) or len(current.ids) > _MOST_SPLIT or selection.is_done(_MOST_WORK):
+    if not selection.has_room(current):
         return None
     for name in _free(selection, current):
+        if selection.budget.is_spent():
+            return None
         without = selection.drop(current, [name])
-        for half in selection.suggest(without, 2, without=[name]):
-            for rival in selection.suggest(half, 2, without=[name]):
-                if rival.score < current.score and selection.prefers(current, rival):
-                    return rival
+        for rival in selection.suggest(without, _SWAPPED, without=[name], pairs=True):
+            if rival.score < current.score and selection.prefers(current, rival):
+                return rival
     return None

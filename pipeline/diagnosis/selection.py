@@ -13,7 +13,7 @@ from pipeline.diagnosis.plausibility import is_nameable
 from pipeline.diagnosis.verdict import LEAST_GAIN, Verdict, compare
 from pipeline.identification.fit import PartFit, fit_part
 from pipeline.identification.folds import hold_out_part, make_folds
-from pipeline.identification.proposals import propose
+from pipeline.identification.proposals import propose, propose_pairs
 from pipeline.identification.weights import Weights, make_weights, measure_spread
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ Floats = NDArray[np.float64]
 # A number more must buy something: between models that predict alike the simpler one is named.
 _PRICE_OF_A_NUMBER = 0.004
 _FIRST_STEPS = 4
+_PAIRED = 5
 _WORTH = 1.15
 _FLOOR = 1.1
 
@@ -142,14 +143,16 @@ class Selection:
         self.budget.report(self.part.way, tested.ids)
         return self.enter(tested.state)
 
-    def suggest(self, base: CandidateModel, count: int, without: Iterable[str] = ()) -> list[CandidateModel]:
-        """The best few models with one effect more, fitted, by score."""
+    def suggest(
+        self, base: CandidateModel, count: int, without: Iterable[str] = (), *, pairs: bool = False
+    ) -> list[CandidateModel]:
+        """The best few models with one effect more, or with two, fitted, by score."""
         barred = frozenset(without)
-        key = (base.ids, count, barred)
+        key = (base.ids, count, barred, pairs)
         if key in self._suggested:
             return self._suggested[key]
-        self.work += 1
-        proposals = self._propose(base, barred)[:count]
+        proposals = self._propose(base, barred)
+        proposals = (propose_pairs(base.fit, proposals[:_PAIRED]) if pairs else proposals)[:count]
         # A few steps tell which of them are worth fitting to the end.
         tried = [self._try(base.ids, proposal.state) for proposal in proposals]
         best = min((fit.loss for fit in tried), default=0.0)
@@ -165,6 +168,7 @@ class Selection:
         """Effects beside a model by what they promise; asked again and again for another count of them."""
         key = (base.ids, barred)
         if key not in self._proposed:
+            self.work += 1
             candidates = [c for c in self.candidates if c.id not in barred]
             self._proposed[key] = propose(self.part, base.fit, candidates, self.largest, self._columns)
         return self._proposed[key]
@@ -182,14 +186,22 @@ class Selection:
         return self._finished[key]
 
     def _simplify(self, tested: CandidateModel) -> CandidateModel:
-        """The model with a simpler effect for one that has become it beside a new effect."""
+        """The model without what a new effect has taken the place of, or with what is left of it.
+
+        Lags together imitate a delay, a slow steering a limit: put in beside their imitation they leave it
+        at nothing, and the model with both says less than the one without it.
+        """
         known = {candidate.id for candidate in self.candidates} - set(tested.ids)
-        for effect in tested.state.effects:
-            simpler = None if effect.id in self.kept else effect.collapse()
-            if simpler is None or simpler.id not in known or is_nameable(effect, self.evidence):
-                continue
-            return self.enter(tested.state.drop([effect.id]).add(simpler))
-        return tested
+        gone = [
+            effect
+            for effect in tested.state.effects
+            if effect.id not in self.kept and not is_nameable(effect, self.evidence)
+        ]
+        if not gone or len(gone) == len(tested.ids):
+            return tested
+        simpler = [one for one in (effect.collapse() for effect in gone) if one is not None]
+        left = tested.state.drop([effect.id for effect in gone])
+        return self.enter(left.add(*(one for one in simpler if one.id in known)))
 
     def has_room(self, tested: CandidateModel) -> bool:
         """Whether a model leaves more than a saturated fit does in any channel."""

@@ -81,8 +81,9 @@ class Problem:
                     hint="Drive longer, or check the intervals and the pose topic with `slip inspect`.",
                 )
         self.largest = measure_largest(self.runs, self.vehicle)
-        gyro = all(comparison.has_gyro for comparison in self.comparisons)
-        # The gyro dates the poses; what is left between them and the wheels is the encoders' delay.
+        # A gyro dates the poses, of one run for all; what is left between them and the wheels is the
+        # encoders' delay.
+        gyro = any(comparison.has_gyro for comparison in self.comparisons)
         delays: tuple[DelayName, ...] = ("wheel_delay_s",) if gyro else ()
         if source is Input.MEASURED:
             self.whole = BodyPart(self.comparisons, delays, whole=False)

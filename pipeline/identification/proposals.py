@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -63,10 +64,16 @@ class Trial:
 
 @dataclass(frozen=True)
 class Proposal:
-    """An effect with values worth polishing, and the loss that one step promises."""
+    """Effects with values worth polishing.
+
+    Attributes:
+        state: the model with them.
+        trials: their starts.
+        loss: promised by one step.
+    """
 
     state: State
-    effect: str
+    trials: tuple[Trial, ...]
     loss: float
 
 
@@ -98,7 +105,7 @@ def propose(
             if candidate.id.startswith(TERM):
                 known[candidate.id] = trials
         for trial in trials:
-            proposal = _promise(fit, trial)
+            proposal = _promise(fit, (trial,))
             if proposal is not None and (best is None or proposal.loss < best.loss):
                 best = proposal
         if best is not None:
@@ -168,37 +175,60 @@ def _find_traced(trial: Trial, size: Floats) -> NDArray[np.bool_]:
     return traced if traced.any() else size > _NO_TRACE
 
 
-def _promise(fit: PartFit, trial: Trial) -> Proposal | None:
-    """Loss after one joint step of the model's numbers and the effect's."""
-    base = fit.residual - trial.shift
-    joint = np.concatenate((fit.jacobian, trial.columns), axis=2)
-    own = fit.jacobian.shape[2]
+def propose_pairs(fit: PartFit, singles: Sequence[Proposal]) -> list[Proposal]:
+    """Proposals two at a time, by what both promise together beside the model.
+
+    Args:
+        fit: of the model to add to.
+        singles: what to pair, of `propose` on the same model.
+    """
+    pairs = (_promise(fit, one.trials + other.trials) for one, other in combinations(singles, 2))
+    return sorted((pair for pair in pairs if pair is not None), key=lambda pair: pair.loss)
+
+
+def _promise(fit: PartFit, trials: tuple[Trial, ...]) -> Proposal | None:
+    """Loss after one joint step of the model's numbers and those of effects beside it."""
     factor = fit.weights.factors(fit.residual)
+    trials = tuple(
+        trial for trial in (_leave_out_silent(trial, factor) for trial in trials) if trial is not None
+    )
+    if not trials:
+        return None
+    base = fit.residual - sum(trial.shift for trial in trials)
+    joint = np.concatenate((fit.jacobian, *(trial.columns for trial in trials)), axis=2)
     rows = (joint * factor[:, :, None]).reshape(-1, joint.shape[2])
     size = np.sqrt(np.einsum("ij,ij->j", rows, rows)) + 1e-12
-    if not (size[own:] > _NO_TRACE).any():
-        return None
-    traced = _find_traced(trial, size[own:])
-    if not traced.all():
-        # Driven straight only, a change of ground shows in one gain: the other is left as it is.
-        silent = [n for n, seen in zip(trial.names, traced.tolist(), strict=True) if not seen]
-        kept = np.concatenate((np.ones(own, dtype=bool), traced))
-        loud = tuple(name for name in trial.names if name not in silent)
-        trial = Trial(trial.effect.fix(*silent), loud, trial.columns[:, :, traced], trial.shift)
-        joint, rows, size = joint[:, :, kept], rows[:, kept], size[kept]
     rows /= size
     normal = rows.T @ rows + 1e-7 * np.eye(rows.shape[1])
     step = np.linalg.solve(normal, rows.T @ (base * factor).reshape(-1)) / size
     after = base - joint @ step
     state = fit.state
+    own = len(fit.free)
     for number, change in zip(fit.free, step[:own].tolist(), strict=True):
         if number.is_smooth:
             state = state.set(number, state.get(number) + change)
-    effect = trial.effect
-    if trial.names:
-        for name, change in zip(trial.names, step[own:].tolist(), strict=True):
+    for trial in trials:
+        mine, own = step[own : own + trial.columns.shape[2]], own + trial.columns.shape[2]
+        effect = trial.effect
+        if not trial.names and mine[0] < _LEAST_SHARE:
+            return None
+        for name, change in zip(trial.names, mine.tolist(), strict=False):
             low, high = effect.parameter(name).bounds
             effect = effect.change(**{name: min(max(effect.values[name] + change, low), high)})
-    elif step[own] < _LEAST_SHARE:
+        state = state.add(effect)
+    return Proposal(state, trials, fit.weights.loss(after))
+
+
+def _leave_out_silent(trial: Trial, factor: Floats) -> Trial | None:
+    """The trial without numbers that leave no trace; None where none leaves any."""
+    rows = trial.columns * factor[:, :, None]
+    size = np.sqrt(np.einsum("ijk,ijk->k", rows, rows))
+    if not (size > _NO_TRACE).any():
         return None
-    return Proposal(state.add(effect), effect.id, fit.weights.loss(after))
+    traced = _find_traced(trial, size)
+    if traced.all():
+        return trial
+    # Driven straight only, a change of ground shows in one gain: the other is left as it is.
+    silent = [n for n, seen in zip(trial.names, traced.tolist(), strict=True) if not seen]
+    loud = tuple(name for name in trial.names if name not in silent)
+    return Trial(trial.effect.fix(*silent), loud, trial.columns[:, :, traced], trial.shift)

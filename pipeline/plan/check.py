@@ -45,8 +45,8 @@ class Check:
 def check_plan(promised: Promised, diagnosis: RunDiagnosis) -> Check:
     """Compare promises with the joint diagnosis of the logs before and of that of the plan.
 
-    A separation is kept where its effects stand together in no undecided group any more and the logs can tell
-    of them; an interval where it is as narrow as was promised.
+    A separation is kept where its effects stand together in no undecided group any more and one of them is
+    named, or the logs can tell of all and show none; an interval where it is as narrow as was promised.
     """
     kept = tuple(
         _check_interval(one, diagnosis) if one.kind == "interval" else _check_separation(one, diagnosis)
@@ -62,10 +62,11 @@ def _check_separation(promise: Promise, diagnosis: RunDiagnosis) -> Kept:
     named = [effect.id for effect in diagnosis.effects if effect.id in promise.effects]
     asked = set(promise.effects)
     undecided = any(asked <= set(group.candidates) for group in diagnosis.undecided)
+    if named and not undecided:
+        # What explains the drive leaves a rival nothing to be seen by: it is decided against.
+        return Kept(promise.question, text, " and ".join(named), kept=True)
     if undecided or asked & {one.id for one in diagnosis.unobservable}:
         return Kept(promise.question, text, "still open", kept=False)
-    if named:
-        return Kept(promise.question, text, " and ".join(named), kept=True)
     # With more data what two effects shared may prove to be nothing: that decides, too.
     return Kept(promise.question, text, "decided: none of it acts", kept=True)
 

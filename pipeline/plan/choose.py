@@ -70,18 +70,25 @@ class Chooser:
             reserve: factor by which more is asked: manoeuvres do not quite add up, and stretches of driving
                 do not begin where manoeuvres do.
         """
-        self.reserve = reserve
-        self._answers.clear()
-        chosen: list[int] = []
-        while True:
-            best = self._find_next(chosen)
-            if best is None:
-                break
-            chosen.append(best)
+        chosen = self.extend([], reserve)
         for _ in range(_ROUNDS):
             if not self._exchange(chosen):
                 break
         return chosen
+
+    def extend(self, chosen: Sequence[int], reserve: float) -> list[int]:
+        """Manoeuvres with more behind them, as long as these answer anything and there is time.
+
+        Args:
+            chosen: what stays at the beginning.
+            reserve: as of `choose`.
+        """
+        self.reserve = reserve
+        self._answers.clear()
+        longer = list(chosen)
+        while (best := self._find_next(longer)) is not None:
+            longer.append(best)
+        return longer
 
     def add_up(self, trials: Sequence[Sequence[int]]) -> list[float]:
         """Of each trial, the sum of the shares of all questions that its manoeuvres answer."""

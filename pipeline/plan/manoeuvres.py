@@ -82,28 +82,34 @@ def list_manoeuvres(vehicle: Vehicle, limits: Limits) -> tuple[Manoeuvre, ...]:
     steered = is_steered(vehicle)
     found: list[Manoeuvre] = []
 
-    def add(name: str, *stages: tuple[float, float, float]) -> None:
-        found.append(Manoeuvre(name, _go_and_return(hold_within(stages, vehicle, limits), steered=steered)))
+    def add(name: str, *stages: tuple[float, float, float], end: str = "") -> None:
+        there = hold_within(stages, vehicle, limits)
+        # What is reached: short stages and narrow limits leave some targets far away.
+        fast, turning = (
+            float(v[np.abs(v).argmax()]) for v in (there.speed, np.copysign(there.turn, stages[0][1]))
+        )
+        reached = [f"{fast:.2g} m/s"] if fast else []
+        reached += [f"{turning:.2g} {unit}"] if turning else []
+        found.append(Manoeuvre(f"{name} {', '.join(reached)}{end}", _go_and_return(there, steered=steered)))
 
     speed, turn = limits.speed_mps, limits.turn
+    unit = "rad" if steered else "rad/s"
     for share in (_SMALL, *_SHARES):
         for hold in _HOLDS_S:
-            add(f"straight at {share * speed:.2g} m/s, {hold:g} s", (share * speed, 0.0, hold))
+            add("straight at", (share * speed, 0.0, hold), end=f", {hold:g} s")
             if not steered:
-                add(f"spin at {share * turn:.2g} rad/s, {hold:g} s", (0.0, share * turn, hold))
-                add(f"spin at {-share * turn:.2g} rad/s, {hold:g} s", (0.0, -share * turn, hold))
-    unit = "rad" if steered else "rad/s"
+                add("spin at", (0.0, share * turn, hold), end=f", {hold:g} s")
+                add("spin at", (0.0, -share * turn, hold), end=f", {hold:g} s")
     for fast in _SHARES:
         for round_ in (_SMALL, *_SHARES):
             for side in (1.0, -1.0):
                 at = (fast * speed, side * round_ * turn)
-                name = f"{at[0]:.2g} m/s, {at[1]:.2g} {unit}"
                 for hold in _HOLDS_S:
-                    add(f"arc at {name}, {hold:g} s", (*at, hold))
-                add(f"S at {name}", (*at, 2.0), (at[0], -at[1], 2.0))
+                    add("arc at", (*at, hold), end=f", {hold:g} s")
+                add("S at", (*at, 2.0), (at[0], -at[1], 2.0))
     for share in _SHARES:
         add(
-            f"steps of speed to {share * speed:.2g} m/s",
+            "steps of speed to",
             (0.3 * share * speed, 0.0, 1.5),
             (share * speed, 0.0, 1.5),
             (0.0, 0.0, 1.0),
@@ -113,7 +119,9 @@ def list_manoeuvres(vehicle: Vehicle, limits: Limits) -> tuple[Manoeuvre, ...]:
         found.append(
             Manoeuvre(f"sine sweep at {share * speed:.2g} m/s", _go_and_return(there, steered=steered))
         )
-    return tuple(found)
+    # Targets that are not reached make the same drive several times.
+    different = {(one.commands.speed.tobytes(), one.commands.turn.tobytes()): one for one in found}
+    return tuple(different.values())
 
 
 def hold_within(stages: Sequence[tuple[float, float, float]], vehicle: Vehicle, limits: Limits) -> Commands:

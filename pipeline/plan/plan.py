@@ -40,6 +40,11 @@ _STEP_S = 1.0
 _TAIL_S = 1.0
 # By which more is asked of single manoeuvres until the whole keeps what is asked of it.
 _RESERVES = (1.1, 1.4, 1.8)
+# Of what is asked: beyond it more driving is of no use. Time left is driven where an interval gains a tenth.
+_AMPLE = 2.0
+_WORTH_DRIVING = 0.1
+# Less is not worth a word.
+_LEAST_REST_S = 5.0
 # Of the answer, in driving time: below it more of the same would take ten times as long.
 _HOPELESS = 0.1
 
@@ -96,6 +101,8 @@ class Plan:
         topic, type_name: on which the commands are played.
         steered: whether a turn is a steering angle.
         home_m: largest distance of any model's end from the start.
+        spare_s: of the time that was offered and is not driven [s].
+        spare_gain: share by which driving it would narrow the interval that gains most.
         wheels: speeds of the left and the right wheels [rad/s] as commands, shape (n,) each; None where these
             are not all that is commanded.
         ways: of the models, base first, positions x + iy [m] 20 times a second, shape (models, n).
@@ -113,8 +120,23 @@ class Plan:
     type_name: str
     steered: bool
     home_m: float
+    spare_s: float
+    spare_gain: float
     wheels: tuple[Floats, Floats] | None = field(repr=False)
     ways: Complex = field(repr=False)
+
+    def say_rest(self) -> str:
+        """What the time is for after all is decided, or why it is not driven; empty without a drive."""
+        duration = self.commands.duration_s
+        last = max((one.decided_after_s for one in self.promises), default=duration)
+        told = []
+        if self.promises and duration - last >= _LEAST_REST_S:
+            told.append(f"all of it is decided after {last:.0f} s, and surer after {duration:.0f} s")
+        if self.promises and self.spare_s >= _LEAST_REST_S:
+            gain = f"narrow no interval by more than {max(self.spare_gain, 0.01):.0%}"
+            intervals = any(one.kind == "interval" for one in self.promises)
+            told.append(f"{self.spare_s:.0f} s more would {gain if intervals else 'decide nothing else'}")
+        return "; ".join(told)
 
     def to_json(self) -> dict[str, object]:
         """The promised keys of `slip plan --json`, and more."""
@@ -123,6 +145,8 @@ class Plan:
             "vehicle": self.vehicle,
             "runs": list(self.runs),
             "home_m": self.home_m,
+            "spare_s": self.spare_s,
+            "spare_gain": self.spare_gain,
             "limits": asdict(self.limits) | {"yaw_rate_radps": _finite(self.limits.yaw_rate_radps)},
             "area": asdict(self.area),
             "safety": list(SAFETY),
@@ -170,29 +194,44 @@ class Request:
     seed: int = 0
 
 
-def make_plan(knowledge: Knowledge, questions: Sequence[Question], request: Request) -> Plan:
+def make_plan(
+    knowledge: Knowledge, questions: Sequence[Question], request: Request, later: Sequence[Question] = ()
+) -> Plan:
     """Choose manoeuvres that answer questions, and say what the whole of them promises.
 
     Args:
         knowledge: where the plan starts from.
         questions: to answer.
         request: time, area and limits.
+        later: questions for the time that is left once the others are answered.
 
     Raises:
         PlanError: ``no_room``, no manoeuvre fits into the area and the time.
     """
     largest = find_largest(knowledge, request.limits, request.time_s)
-    models = _list_models(knowledge, questions, largest, request.seed)
+    models = _list_models(knowledge, [*questions, *later], largest, request.seed)
     library = list_manoeuvres(knowledge.vehicle, request.limits)
     chooser = _make_chooser(knowledge, questions, request, library, models) if questions else None
-    best = _rehearse(knowledge, questions, request.area, [], models)
+    best, order, gain = _rehearse(knowledge, questions, request.area, [], models), [], 0.0
     for reserve in _RESERVES if chooser is not None else ():
-        chosen = [library[number] for number in chooser.choose(reserve)] if chooser is not None else []
-        trial = _rehearse(knowledge, questions, request.area, chosen, models)
+        chosen = chooser.choose(reserve) if chooser is not None else []
+        trial = _rehearse(knowledge, questions, request.area, [library[number] for number in chosen], models)
         if (len(trial.promises), trial.answered) > (len(best.promises), best.answered):
-            best = trial
+            best, order = trial, chosen[: len(trial.manoeuvres)]
         if not best.impossible:
             break
+    if chooser is not None and best.promises:
+        asked = [*questions, *(later if not best.impossible else ())]
+        if len(asked) > len(questions):
+            chooser = _make_chooser(knowledge, asked, request, library, models)
+        longer = [library[number] for number in chooser.extend(order, _AMPLE)]
+        fuller = _rehearse(knowledge, asked, request.area, longer, models)
+        # What is asked only where time is left may stay open without a word.
+        told = {one.text for one in questions}
+        missed = tuple(one for one in fuller.impossible if one.question in told)
+        fuller, gain = replace(fuller, impossible=missed), _find_gain(best, fuller)
+        if gain >= _WORTH_DRIVING or len(fuller.promises) > len(best.promises):
+            best, gain = fuller, 0.0
     if not best.promises:
         # Nobody sends a robot out for nothing.
         best = replace(best, manoeuvres=(), starts=())
@@ -210,6 +249,8 @@ def make_plan(knowledge: Knowledge, questions: Sequence[Question], request: Requ
         type_name=request.type_name,
         steered=is_steered(knowledge.vehicle),
         home_m=float(np.abs(ways[:, -1]).max()),
+        spare_s=round(request.time_s - commands.duration_s, 3),
+        spare_gain=round(gain, 4),
         wheels=_turn_wheels(commands, knowledge),
         ways=ways,
     )
@@ -262,6 +303,17 @@ def _rehearse(
         return _Trial((), starts, commands, ways, (), nothing, 0.0)
     promised = _promise(knowledge, questions, rehearsal, commands.duration_s)
     return _Trial(tuple(chosen), starts, commands, ways, *promised)
+
+
+def _find_gain(best: _Trial, fuller: _Trial) -> float:
+    """Share by which a longer drive narrows the promised interval that gains most."""
+    after = {one.question: one.expected for one in fuller.promises}
+    gains = [
+        1.0 - after[one.question] / one.expected
+        for one in best.promises
+        if one.kind == "interval" and one.question in after
+    ]
+    return max([0.0, *gains])
 
 
 def find_largest(knowledge: Knowledge, limits: Limits, time_s: float) -> Largest:

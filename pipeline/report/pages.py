@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from pipeline.store import Store
 
 CATALOGUE = "index.html"
+PLANS = "workbench/plans"
+"""Folder of drives that were planned, by run."""
 PAGES = {
     CATALOGUE: "All runs",
     "comparison.html": "Compare",
@@ -41,12 +43,13 @@ def write_page(store: Store, name: str, page: str) -> Path:
 
 def is_page(place: str) -> bool:
     """Whether a place in a results folder, as `runs/a/b/report.html`, is that of a page."""
-    return place in PAGES or (place.startswith("runs/") and place.endswith("/report.html"))
+    kinds = (("runs/", "/report.html"), (f"{PLANS}/", "/plan.html"))
+    return place in PAGES or any(place.startswith(top) and place.endswith(name) for top, name in kinds)
 
 
-def lead_up(run: str) -> str:
-    """The address of the catalogue seen from the report of a run."""
-    return "../" * (run.count("/") + 3) + CATALOGUE
+def lead_up(run: str, page: str = CATALOGUE) -> str:
+    """The address of a page of the results, the catalogue if none is said, seen from the report of a run."""
+    return "../" * (run.count("/") + 3) + quote(page)
 
 
 def lead_to(results: Path, folder: Path) -> str:

@@ -28,6 +28,7 @@ class RunReport:
         motion: a model of the run; None where there is none.
         peers: median slip moduli [m/s] of comparable runs by input; empty where there are none.
         catalogue: address of the page over all runs, seen from the report; empty where there is none.
+        planned: preview of the drive that was planned after it; empty where none was.
     """
 
     summary: Mapping[str, object]
@@ -36,6 +37,7 @@ class RunReport:
     motion: MotionView | None = None
     peers: Mapping[str, Sequence[float]] = field(default_factory=dict)
     catalogue: str = ""
+    planned: Mapping[str, object] = field(default_factory=dict)
 
     def table(self, name: str) -> pl.DataFrame | None:
         """A table that has rows, or None."""

@@ -15,15 +15,16 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from pipeline.analysis.analyze import REPORT
+from pipeline.analysis.planned import PREVIEW
 from pipeline.report.bundle import load_bundle
-from pipeline.report.pages import PAGES, is_page
+from pipeline.report.pages import PAGES, PLANS, is_page
 from pipeline.vehicles import list_presets
 from pipeline.web.answers import answer, make_handlers
 from pipeline.web.errors import WorkbenchError
 from pipeline.web.guard import LOOPBACK, Guard
 from pipeline.web.limits import Limits
 from pipeline.web.places import Places
-from pipeline.web.plans import KINDS, PREVIEW, find_file
+from pipeline.web.plans import KINDS, find_file
 from pipeline.web.requests import read_ask
 from pipeline.web.runs import find_run, list_runs
 from pipeline.web.sessions import Sessions
@@ -79,7 +80,7 @@ class Web:
             Route("/model.toml", self.download),
             Route("/report", self.report),
             *(Route(f"/{name}", self.page) for name in PAGES),
-            Route("/runs/{place:path}", self.page),
+            *(Route(f"/{top}/{{place:path}}", self.page) for top in ("runs", PLANS)),
             Route("/api/runs", self.runs),
             Route("/api/jobs", self.jobs),
             Route("/api/session", self.session, methods=["POST"]),

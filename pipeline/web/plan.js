@@ -48,7 +48,7 @@ const fill = async (planned, run) => {
   node.replaceChildren(...[
     place,
     h("p", { class: "quiet" }, `${Math.round(plan.duration_s)} s on ${plan.area}: `, h("a", { href: link("plan.html"), target: "_blank", rel: "noopener" }, "the whole plan")),
-    list(plan.promises), left,
+    list(plan.promises), plan.rest && h("p", { class: "quiet" }, plan.rest), left,
     h("p", {}, h("a", { class: "download button", href: link("plan.mcap") }, "Download plan.mcap"), " ", h("code", {}, plan.play)),
     h("div", { class: "doubts" }, list(plan.safety))].filter(Boolean));
   const plots = slipPlots(plan, { strict: true });

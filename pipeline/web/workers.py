@@ -132,7 +132,7 @@ def work_on_errand(task: Task) -> Report:
             return Report(entry=replace(entry, state="done"))
         if isinstance(task, Errand) and task.basis == PLAN:
             store = Store(task.options.out)
-            write_run_plan(task.options.out, find_run(store, entry.run), task.area)
+            write_run_plan(store, find_run(store, entry.run), task.area)
             return Report(entry=replace(entry, state="done"))
         return Report(entry=_analyze(task, entry))
     except SlipError as error:

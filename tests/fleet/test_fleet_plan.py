@@ -48,7 +48,8 @@ def test_what_is_known_is_the_forecast_with_its_spread(results: Path) -> None:
     vehicle = _find()
     spread = {}
     for terrain in ("ice", "gravel", "mud"):
-        knowledge, forecast = expect(vehicle, terrain, results)
+        studied = expect(vehicle, terrain, results)
+        knowledge, forecast = studied.knowledge, studied.forecast
         assert forecast is not None
         (mean, deviation) = forecast.prior["effective_track.k"]
         assert knowledge.base.names == {"effective_track"}
@@ -61,7 +62,7 @@ def test_what_is_known_is_the_forecast_with_its_spread(results: Path) -> None:
     # Whether an effect acts that the fleet names is no question any more.
     questions = ask(knowledge, [UNDECIDED], choose_limits(vehicle), 60.0, None)
     assert "whether effective_track acts" not in {one.text for one in questions}
-    assert expect(vehicle, None, results)[0].base.names == set()
+    assert expect(vehicle, None, results).knowledge.base.names == set()
 
 
 def test_a_plan_for_a_terrain_needs_no_run(

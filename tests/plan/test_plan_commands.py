@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.options import Options
 from pipeline.analysis.plan import choose_topic
+from pipeline.analysis.planned import leave_plan, place_plan, read_preview
 from pipeline.cli import main
 from pipeline.cli.output import FAILED
 from pipeline.models import find_effect
@@ -36,8 +40,9 @@ from pipeline.plan.plan import Plan, find_largest
 from pipeline.plan.protocols import LONGEST_S, drive_protocol
 from pipeline.plan.rehearsal import Rehearsal
 from pipeline.report.plan import preview_plan
-from pipeline.simulate import find_vehicle
+from pipeline.simulate import find_vehicle, simulate_case
 from pipeline.simulate.played import read_played
+from pipeline.store import Store
 from pipeline.vehicles import Vehicle, find_preset, list_presets
 
 if TYPE_CHECKING:
@@ -321,3 +326,44 @@ def test_limits_asked_for_never_raise_those_of_the_vehicle() -> None:
     limits = choose_limits(_find("husky_a200"), speed_mps=50.0, yaw_rate_radps=50.0)
     assert (limits.speed_mps, limits.turn) == (1.0, 1.0)
     assert math.isinf(limits.yaw_rate_radps)
+
+
+def test_a_plan_stands_in_the_report_of_its_run(plan: Plan, tmp_path: Path) -> None:
+    log = simulate_case(None, {}, out=tmp_path / "run.mcap", seed=1, duration_s=20.0, vehicle="husky")
+    options = Options(out=tmp_path / "results", diagnosis=False)
+    manifest = analyze_log(log, options).manifest
+    store = Store(options.out)
+    assert "planned:" not in manifest.path("report.html").read_text(encoding="utf-8")
+    report = leave_plan(store, manifest, plan)
+    assert report is not None
+    page = report.read_text(encoding="utf-8")
+    assert plan.promises[0].question in page
+    (address,) = re.findall(r'href="([^"]+plan\.html)"', page)
+    assert (report.parent / address).resolve() == place_plan(store.root, manifest.run, "plan.html").resolve()
+    assert (report.parent / address).is_file()
+    # What was stored is there still, and as it was; a report that is written anew shows the plan too.
+    assert store.verify() == ()
+    assert analyze_log(log, options).computed == ()
+    again = analyze_log(log, replace(options, force=True)).manifest
+    assert address in again.path("report.html").read_text(encoding="utf-8")
+    # Other results of the run are not what it was planned for.
+    assert read_preview(store.root, manifest.run, "0" * 16) == {}
+    preview = place_plan(store.root, manifest.run, "plan.json")
+    for spoiled in ("", "[]", '{"key": 3}', preview.read_text(encoding="utf-8").replace('"promises"', '"x"')):
+        preview.write_text(spoiled, encoding="utf-8")
+        assert read_preview(store.root, manifest.run, manifest.key) == {}
+
+
+def test_time_that_is_left_answers_later_questions_or_is_said_to_be_of_no_use(plan: Plan) -> None:
+    vehicle = _find("husky_a200")
+    knowledge = assume(vehicle)
+    largest = find_largest(knowledge, plan.limits, 60.0)
+    questions, later = (ask_presence(knowledge, names, largest) for names in (TURNING, ["deadband"]))
+    both = make_plan(knowledge, questions, Request(plan.limits, plan.area, 90.0), later)
+    new = {one.question for one in both.promises} - {one.question for one in plan.promises}
+    assert new == {"whether deadband acts"}
+    assert plan.spare_s == pytest.approx(60.0 - plan.commands.duration_s)
+    assert replace(plan, spare_s=20.0).say_rest().endswith("20 s more would decide nothing else")
+    interval = replace(plan.promises[0], kind="interval")
+    narrow = replace(plan, promises=(interval,), spare_s=20.0, spare_gain=0.07)
+    assert narrow.say_rest().endswith("20 s more would narrow no interval by more than 7%")

@@ -14,6 +14,7 @@ from plan_game import draw_scenario, record
 from scipy.special import stdtrit
 
 from pipeline.diagnosis import Named, RunDiagnosis, Value
+from pipeline.diagnosis.excitation import Unobservable
 from pipeline.diagnosis.recording import load_recording
 from pipeline.diagnosis.undecided import Undecided
 from pipeline.models import find_effect
@@ -157,6 +158,11 @@ def test_promises_are_checked_against_what_came_out() -> None:
     still = check_plan(promised, _diagnose((), (("a", "b"),)))
     assert [one.kept for one in still.kept] == [False, False, False]
     assert still.open == ("a or b: turn",)
+    # Beside what is named a rival may not be seen: that decides; with nothing named it does not.
+    hidden = (Unobservable("b", "collinear with what was named", "turn"),)
+    told = check_plan(promised, replace(_diagnose(("a",)), unobservable=hidden)).kept[0]
+    assert (told.kept, told.measured) == (True, "a")
+    assert not check_plan(promised, replace(_diagnose(), unobservable=hidden)).kept[0].kept
 
 
 def _run(*arguments: str | Path, code: int = 0) -> str:

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from pipeline.report.plan.page import preview_plan, render_plan
+from pipeline.report.plan.page import preview_plan, render_plan, show_planned
 
-__all__ = ["preview_plan", "render_plan"]
+__all__ = ["preview_plan", "render_plan", "show_planned"]

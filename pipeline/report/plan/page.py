@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 import altair as alt
@@ -14,8 +15,11 @@ from pipeline.report.elements import Picture
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.specs import build_spec, share_rows
+from pipeline.report.templating import render_template
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from pipeline.plan import Plan
 
 # One pose in so many, and so many ways beside the base's.
@@ -25,6 +29,7 @@ _WIDTH = 640
 # The part of the area that is drawn: times as far as the drive leads, and at least.
 _ROOM = 1.2
 _LEAST = 0.1
+_PLACE = re.compile(r'<div id="planned">.*?</div>', re.DOTALL)
 
 
 def preview_plan(plan: Plan) -> dict[str, object]:
@@ -36,8 +41,22 @@ def preview_plan(plan: Plan) -> dict[str, object]:
         "dark": dict(theme.DARK_TWINS),
         "words": picture.words,
         "safety": SAFETY,
+        "drives": bool(plan.manoeuvres),
+        "area": f"{plan.area.length_m:g} x {plan.area.width_m:g} m",
+        "duration_s": plan.commands.duration_s,
         **_say(plan),
     }
+
+
+def show_planned(page: str, planned: Mapping[str, object]) -> str:
+    """The report of a run with what was planned after it.
+
+    Args:
+        page: the report.
+        planned: the preview of the plan, with the ``address`` of its page seen from the report; may be empty.
+    """
+    shown = render_template("report/templates/sections/planned.html", planned=planned)
+    return _PLACE.sub(lambda _: shown, page, count=1)
 
 
 def render_plan(plan: Plan, catalogue: str = "") -> str:
@@ -75,6 +94,7 @@ def _say(plan: Plan) -> dict[str, object]:
             + (f"(t = {one.expected:.1f})" if one.kind == "separation" else f"(+- {one.expected:.2g})")
             for one in plan.promises
         ],
+        "rest": plan.say_rest(),
         "impossible": [f"{one.question}: {one.because}" for one in plan.impossible],
     }
 

@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 def view_what_now(page: Page) -> dict[str, object]:
     """Commands that go on from this run, and whether anything is open that a drive could decide."""
     if not page.report.text("run"):
-        return {"steps": [], "settled": False}
+        return {"steps": [], "settled": False, "planned": {}}
     diagnosis = page.report.diagnosis
     settled = bool(diagnosis.get("effects")) and not any(
         diagnosis.get(key) for key in ("undecided", "unobservable", "unexplained")
     )
-    return {"steps": list_steps(page.report), "settled": settled}
+    return {"steps": list_steps(page.report), "settled": settled, "planned": page.report.planned}
 
 
 def list_steps(report: RunReport) -> list[tuple[str, str]]:
@@ -52,11 +52,10 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
     if diagnosis.get("effects"):
         steps.append(("Keep the model that was named", f"slip diagnose {name} --apply model.toml"))
         steps.append(("Give it to the robot's controller", "slip model export model.toml --to ros2_control"))
-    asked = "undecided" if diagnosis.get("undecided") else "all"
     if diagnosis.get("undecided") or diagnosis.get("unobservable"):
-        what = "is undecided" if asked == "undecided" else "this log cannot tell"
+        what = "is undecided" if diagnosis.get("undecided") else "this log cannot tell"
         steps += [
-            (f"Plan the drive that decides what {what}", f"slip plan {name} --for {asked} --out plan"),
+            (f"Plan the drive that decides what {what}", f"slip plan {name} --out plan"),
             ("Look at plan/plan.html, lift the wheels, and play it", "ros2 bag play plan/plan.mcap"),
             ("See whether it kept what it promised", "slip plan --check plan NEW.mcap"),
         ]

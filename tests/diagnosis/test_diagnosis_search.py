@@ -1,0 +1,90 @@
+"""What the search owes a user: wrong names that were taken first are given back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.diagnosis import read_recording
+from pipeline.analysis.options import Options
+from pipeline.diagnosis.budget import Budget
+from pipeline.diagnosis.context import prepare
+from pipeline.diagnosis.search import search_effects
+from pipeline.diagnosis.selection import open_selection
+from pipeline.diagnosis.subject import load_recording
+from pipeline.identification import Input, Problem, fit_model
+from pipeline.models import Model, find_effect
+from pipeline.simulate import (
+    VEHICLES,
+    Disturbance,
+    Imu,
+    PoseSensor,
+    Program,
+    Scenario,
+    simulate_run,
+    write_log,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pipeline.runs.recording import MotionRun
+    from pipeline.vehicles import Vehicle
+
+_LAGS = {"drive_lag": 0.45, "steering_lag": 0.38}
+_CAR = Scenario(
+    vehicle=VEHICLES["car"],
+    effects=_LAGS,
+    program=Program("circle", speed_scale=0.4, turn_scale=0.4),
+    duration_s=40.0,
+    seed=5,
+    disturbance=Disturbance(0.01, 0.005),
+    pose=PoseSensor(),
+    imu=Imu(),
+)
+
+
+def _load(scenario: Scenario, folder: Path) -> tuple[MotionRun, Vehicle]:
+    folder.mkdir()
+    write_log(simulate_run(scenario), folder / "run.mcap")
+    options = Options(out=folder / "out", report=False, diagnosis=False)
+    vehicle, recording = read_recording(analyze_log(folder / "run.mcap", options).manifest)
+    return load_recording(recording, vehicle), vehicle
+
+
+def test_two_lags_take_the_place_of_the_delay_and_the_limits_that_imitate_them(tmp_path: Path) -> None:
+    """Neither lag helps beside the delay alone, and beside both lags the limits are never reached."""
+    wrong = ("body_speed_limit", "body_turn_limit", "transport_delay", "steering_gain")
+    run, vehicle = _load(_CAR, tmp_path / "car")
+    context = prepare([run], vehicle, Input.COMMAND)
+    part = context.problem.parts[1]
+    begin = context.problem.start_state()
+    selection, current = open_selection(part, begin, context.list_drivetrain(), context.evidence, Budget())
+    for name in wrong:
+        effect = find_effect(name)().make_usual(context.largest)
+        current = selection.enter(current.state.add(effect))
+    found = search_effects(selection, selection.adapt(current)).state
+    assert {effect.id: effect.values["tau"] for effect in found.effects} == pytest.approx(_LAGS, abs=0.01)
+
+
+def test_a_run_without_a_usable_gyro_leaves_the_clock_of_another_run_free(tmp_path: Path) -> None:
+    """A straight drive dates nothing by its gyro; the encoders' delay of the turning run went into a lag."""
+    runs = []
+    for name, seed in (("straight", 3), ("smooth", 4)):
+        scenario = replace(
+            _CAR,
+            vehicle=VEHICLES["jackal"],
+            effects={"body_inertia": 0.52},
+            program=Program(name),  # type: ignore[arg-type]
+            seed=seed,
+        )
+        run, vehicle = _load(scenario, tmp_path / name)
+        runs.append(run)
+    problem = Problem(runs, vehicle, Input.MEASURED)
+    assert [comparison.has_gyro for comparison in problem.comparisons] == [False, True]
+    fitted = fit_model(problem, Model(vehicle, (find_effect("body_inertia")(),)))
+    (effect,) = fitted.state.effects
+    assert effect.values["tau"] == pytest.approx(0.52, abs=0.004)
