@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -16,8 +17,10 @@ from pipeline.diagnosis.recording import load_recording
 from pipeline.identification import Comparison, Errors, Input, Problem, fit_model
 from pipeline.identification.scoring import measure_errors
 from pipeline.models import Model, Timing, find_effect
-from pipeline.runs import MotionRun
-from pipeline.vehicles import Vehicle
+
+if TYPE_CHECKING:
+    from pipeline.runs import MotionRun
+    from pipeline.vehicles import Vehicle
 
 _LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"
 

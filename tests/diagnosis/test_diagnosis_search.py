@@ -12,9 +12,9 @@ from pipeline.analysis.diagnosis import read_recording
 from pipeline.analysis.options import Options
 from pipeline.diagnosis.budget import Budget
 from pipeline.diagnosis.context import prepare
+from pipeline.diagnosis.recording import load_recording
 from pipeline.diagnosis.search import search_effects
 from pipeline.diagnosis.selection import open_selection
-from pipeline.diagnosis.subject import load_recording
 from pipeline.identification import Input, Problem, fit_model
 from pipeline.models import Model, find_effect
 from pipeline.simulate import (
