@@ -13,6 +13,7 @@ from pipeline.report.bundle import load_bundle
 from pipeline.report.elements import Picture
 from pipeline.report.figures import list_figures
 from pipeline.report.figures.figure import Section
+from pipeline.report.pages import list_ways
 from pipeline.report.scene import Scene
 from pipeline.report.sections import SECTIONS, Page
 from pipeline.report.sections.health import summarise_health
@@ -42,7 +43,7 @@ def render_report(report: RunReport) -> str:
         "report/templates/run.html",
         [picture for pictures in drawn.values() for picture in pictures],
         title=report.text("run") or "run",
-        catalogue=report.catalogue,
+        ways=list_ways(report.catalogue),
         facts=_list_facts(page),
         strip=summarise_health(report),
         sections=[(section, section.view(page)) for section in SECTIONS],
