@@ -129,14 +129,14 @@ def correlations_as_json(estimates: Estimates) -> list[dict[str, object]]:
 
 def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
     """The ladder as a table for people."""
-    lines = [f"{describe_errors('held-out error of', None)}{'gone':>7}"]
+    lines = [f"{describe_errors('held-out error of', None)}{'gone':>5}"]
     for number, (rung, share) in enumerate(zip(ladder.rungs, ladder.explained_shares(floor), strict=True)):
         name = "ideal" if number == 0 else f"+ {_added(ladder.rungs[number - 1], rung)}"
-        gone = "" if share is None else f"{share:7.0%}"
-        lines.append(f"{name:<28}{_columns(rung.errors)}{gone}")
+        gone = "" if share is None else f"{share:5.0%}"
+        lines.append(f"{name:<30}{_columns(rung.errors)}{gone}")
         lines += _describe_rises(ladder.rungs[max(number - 1, 0)].errors, rung.errors, "within chance")
     if floor is not None:
-        lines.append(f"{'noise floor (estimated)':<28}{_columns(floor)}")
+        lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
     if ladder.idle:
         lines.append(f"no rung, no help on unseen data:  {', '.join(ladder.idle)}")
     return lines
@@ -148,7 +148,7 @@ def describe_step(before: Rung, after: Rung) -> list[str]:
     position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
     heading = f"{old.r_mrmse_rad:.4f} -> {new.r_mrmse_rad:.4f} rad"
     word = "taken" if set(after.effects) > set(before.effects) else "done"
-    line = f"{'all effects, before -> after':<28}{position}   {heading}"
+    line = f"{'all effects, before -> after':<30}{position}   {heading}"
     return [line, *_describe_rises(old, new, f"{word} because asked for")]
 
 
@@ -182,8 +182,8 @@ def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:
 def describe_errors(name: str, errors: Errors | None) -> str:
     """One row of errors, or the heads of the columns."""
     if errors is not None:
-        return f"{name:<28}{_columns(errors)}"
-    return f"{name:<28}{''.join(f'{head:>9}' for head in _HEADS)}"
+        return f"{name:<30}{_columns(errors)}"
+    return f"{name:<30}{''.join(f'{head:>9}' for head in _HEADS)}"
 
 
 def _added(before: Rung, rung: Rung) -> str:

@@ -183,9 +183,15 @@ def test_the_signature_of_an_effect_comes_goes_and_follows_its_value(
         f"{gone}; watch.disconnect(); }}).observe(document.querySelector('.number.r .value'),"
         " { childList: true, characterData: true, subtree: true })"
     )
+    # No other figure is drawn anew: what a person looks at does not flicker.
+    chrome.run(
+        "window.still = document.querySelector('.plot[data-figure=trajectory] svg'),"
+        " window.whole = document.querySelector('figure[data-id=trajectory]')"
+    )
     chrome.click(".proposals li[data-effect=effective_track] .add")
     chrome.wait(drawn)
     assert chrome.run("window.first") is True
+    assert chrome.run("window.still.isConnected && window.whole.isConnected") is True
     chrome.wait(f"{ERROR} < {0.1 * before}")
     chrome.picture(pictures / "workbench_signature.png", whole=True)
     assert cast("float", chrome.run(outside)) < 1.0
@@ -201,7 +207,10 @@ def test_the_signature_of_an_effect_comes_goes_and_follows_its_value(
     chrome.run(slide.format("input.min", "['input']"))
     chrome.wait(f"{drawn} && {shape} + {ticks} !== {fitted}")
     assert cast("float", chrome.run(outside)) < 1.0
-    chrome.run(slide.format("1", "['input', 'change']"))
+    chrome.run(slide.format("1", "['input']"))
+    chrome.wait(f"{drawn}.getBBox().height === 0")
+    look_for_trouble(chrome)
+    chrome.run(slide.format("1", "['change']"))
     chrome.wait(gone)
     chrome.click(".undo")
     chrome.wait(drawn)

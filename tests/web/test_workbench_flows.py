@@ -132,6 +132,14 @@ def test_two_models_and_their_difference(
     assert float(apart) == pytest.approx(float(second) - float(first), rel=0.01)
     assert "effective_track.k" in rows[2]
     assert "not in it" in rows[2]
+    # When they are apart: two lines over time, which follow both models, of one run only.
+    lines = "[...document.querySelectorAll('#apart .mark-line path')].map((line) => line.getAttribute('d'))"
+    chrome.wait(f"{lines}.length === 2 && {lines}[0] !== {lines}[1]")
+    before = cast("list[str]", chrome.run(lines))
+    chrome.click("[data-slot=b] .proposals li[data-effect=effective_track] .add")
+    chrome.wait(f"{lines}[1] !== {json.dumps(before[1])}")
+    chrome.wait(SETTLED)
+    assert chrome.run(f"{lines}[0]") == before[0]
     look(chrome, pictures / f"flow_compared_{width}.png")
     assert find_barriers(chrome) == []
 
