@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import cast
 
 from pipeline.cli.output import tidy_line
+from pipeline.core.durations import say_recorded
 
 Summary = Mapping[str, object]
 
@@ -55,7 +56,11 @@ def _describe_head(summary: Summary) -> list[str]:
     log = _part(summary, "log")
     seconds = float(cast("float", log.get("duration_s") or 0.0))
     distance = summary.get("distance_m")
-    facts = [str(summary["vehicle"]), str(summary["terrain"]), format_duration(seconds)]
+    facts = [
+        str(summary["vehicle"]),
+        str(summary["terrain"]),
+        say_recorded(seconds, summary.get("duration_s")),
+    ]
     if isinstance(distance, (int, float)):
         facts.append(format_distance(float(distance)))
     head = [_row("run", f"{summary['run']}    {' · '.join(facts)}")]
@@ -181,16 +186,6 @@ def _relative(path: str) -> str:
         return str(Path(path).resolve().relative_to(Path.cwd()))
     except ValueError:
         return path
-
-
-def format_duration(seconds: float) -> str:
-    """Seconds in words: `10 min 48 s`."""
-    whole = round(seconds)
-    hours, rest = divmod(whole, 3600)
-    minutes, left = divmod(rest, 60)
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {left} s" if minutes else f"{left} s"
 
 
 def format_distance(metres: float) -> str:

@@ -9,7 +9,7 @@ from cyclopts import App, Parameter
 
 from pipeline.cli.choices import Choices, build_options
 from pipeline.cli.output import CLEAN, LOSSY, print_json, print_lines
-from pipeline.cli.screen import format_duration
+from pipeline.core.durations import say_duration
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -101,7 +101,7 @@ def _describe(seen: Inspection) -> list[str]:
     packing = "compression " + (", ".join(name or "none" for name in index.compressions) or "none")
     lines = [
         f"log       {index.path}",
-        f"          {index.size_bytes / 1e6:.1f} MB, {format_duration(index.duration_s)}, {packing}",
+        f"          {index.size_bytes / 1e6:.1f} MB, {say_duration(index.duration_s)}, {packing}",
         f"          {index.message_count} messages in {index.chunk_count} chunks",
         f"          profile {index.profile or '-'}, written by {index.library or '-'}",
         f"health    {'complete' if not seen.losses else 'with losses'}"
