@@ -118,4 +118,6 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
     ]
     if own:
         fit["own"] = own
+    if undecided := [group for group in file.undecided if set(group) & set(model.ids)]:
+        fit["undecided"] = undecided
     return replace(file, model=model, intervals=intervals, fit=fit)
