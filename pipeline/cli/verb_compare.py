@@ -105,7 +105,7 @@ def _compare_causes(
                 f"{budget.dataset}: {budget.total**0.5:.3g} m/s, {budget.runs} run{'s' * (budget.runs != 1)}",
                 f"  {parts}",
             ]
-        lines.append("")
+        lines += [""] * bool(content["differences"])
         for one in cast("Sequence[Mapping[str, object]]", content["differences"]):
             lines += [str(one["sentence"]), *([f"  {one['note']}"] if one["note"] else [])]
         print_lines([*lines, "", *(f"! {note}" for note in found.notes), f"page    {written['causes.html']}"])

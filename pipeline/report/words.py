@@ -42,7 +42,7 @@ def say_split(drivetrain: float, ground: float, cross: float) -> str:
     """
     if max(drivetrain, ground) <= 1.0:
         shares = zip(("drivetrain", "ground", "cross"), (drivetrain, ground, cross), strict=True)
-        return "   ".join(f"{name} {share:z.0%}" for name, share in shares)
+        return ", ".join(f"{name} {share:z.0%}" for name, share in shares)
     one, two = (say_number(math.sqrt(share), digits=2) for share in (drivetrain, ground))
     return (
         f"drivetrain and ground cancel in part: {one} and {two} times the slip that is left (rms), "

@@ -272,11 +272,12 @@ export class Pane {
     }
   }
 
+  // The card has the focus at once: a moment later a person may be at its slider.
   async add(effect) {
-    await this.act("add", { effect });
-    const card = this.model.querySelector(`.card[data-effect="${CSS.escape(effect)}"]`);
-    if (!card) return;
-    card.focus({ preventScroll: true });
+    await this.settle();
+    if (!(await this.ask("add", { effect }))) return;
+    this.model.querySelector(`.card[data-effect="${CSS.escape(effect)}"]`)?.focus({ preventScroll: true });
+    await this.redraw();
     this.tryAll();
   }
 
@@ -401,6 +402,7 @@ export class Pane {
       return;
     }
     const turn = (this.turn += 1);
+    delete this.root.dataset.drawn;
     try {
       const answer = await post("/api/rows", this.request);
       if (turn !== this.turn) return;

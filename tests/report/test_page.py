@@ -149,7 +149,7 @@ def test_every_row_block_that_a_figure_names_is_there_once(outline: Outline) -> 
 
 
 def test_shares_that_cancel_are_put_into_words() -> None:
-    assert say_split(0.35, 0.63, 0.02) == "drivetrain 35%   ground 63%   cross 2%"
+    assert say_split(0.35, 0.63, 0.02) == "drivetrain 35%, ground 63%, cross 2%"
     told = say_split(6.96, 5.92, -11.88)
     assert "%" not in told
     assert "2.6 and 2.4 times the slip that is left" in told

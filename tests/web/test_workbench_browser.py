@@ -14,6 +14,7 @@ import pytest
 from workbench_server import RUN, TOKEN, TRACK, Workbench
 
 from pipeline.analysis.analyze import analyze_log, update_datasets
+from pipeline.analysis.map import draw_up_map, write_map
 from pipeline.analysis.options import Options
 from pipeline.analysis.peers import find_peers
 from pipeline.cli.verb_serve import _open_browser
@@ -456,6 +457,16 @@ def test_a_report_leads_to_all_runs_and_they_lead_back(
         chrome.wait("document.querySelector('#shown')?.textContent === '1 of 1 runs'")
         chrome.click("tbody th a")
     chrome.wait(f"document.querySelector('h1')?.textContent === {json.dumps(RUN)}")
+
+    # A page that is not there yet is told how to be made; once it is, the report made before it leads there.
+    report = str(chrome.run("location.href"))
+    chrome.click("#pages a[href$='#map']")
+    chrome.wait("document.querySelector('#map:target code')?.textContent === 'slip map'")
+    write_map(Store(results), draw_up_map(Store(results)))
+    chrome.open(report)
+    chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
+    chrome.click("#pages a[href$='#map']")
+    chrome.wait("document.querySelector('h1')?.textContent === 'Deployment map'")
     assert chrome.errors == []
 
 
