@@ -41,9 +41,10 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.budget import Budget
     from pipeline.diagnosis.context import Context
     from pipeline.diagnosis.diagnose import Explored
-    from pipeline.diagnosis.diagnosis import Json, Undecided, Value
+    from pipeline.diagnosis.diagnosis import Json, Value
     from pipeline.diagnosis.naming_rules import Clocks
     from pipeline.diagnosis.subject import Recording
+    from pipeline.diagnosis.undecided import Undecided
     from pipeline.identification.judgement import Judgement
     from pipeline.identification.parts import Part
     from pipeline.identification.state import State

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from workbench_server import RUN, TOKEN, TRACK, Workbench
 
-from pipeline.analysis.analyze import analyze_log, update_datasets
-from pipeline.analysis.map import draw_up_map, write_map
+from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.options import Options
 from pipeline.analysis.peers import find_peers
 from pipeline.cli.verb_serve import _open_browser
@@ -438,36 +437,6 @@ def test_an_empty_folder_asks_for_a_log(chrome: Chrome, tmp_path: Path, pictures
     finally:
         server.close()
     assert not (tmp_path / "nothing yet").exists()
-
-
-@pytest.mark.parametrize("served", [True, False], ids=["served", "from_files"])
-def test_a_report_leads_to_all_runs_and_they_lead_back(
-    chrome: Chrome, workbench: Workbench, results: Path, *, served: bool
-) -> None:
-    update_datasets(Store(results))
-    if served:
-        chrome.open(workbench.address)
-        chrome.wait("document.querySelector('main')")
-        chrome.open(f"{workbench.origin}/report?run={RUN}")
-    else:
-        chrome.open(next(results.glob("runs/**/report.html")).as_uri())
-    for _ in range(2):
-        chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
-        chrome.click("#pages a")
-        chrome.wait("document.querySelector('#shown')?.textContent === '1 of 1 runs'")
-        chrome.click("tbody th a")
-    chrome.wait(f"document.querySelector('h1')?.textContent === {json.dumps(RUN)}")
-
-    # A page that is not there yet is told how to be made; once it is, the report made before it leads there.
-    report = str(chrome.run("location.href"))
-    chrome.click("#pages a[href$='#map']")
-    chrome.wait("document.querySelector('#map:target code')?.textContent === 'slip map'")
-    write_map(Store(results), draw_up_map(Store(results)))
-    chrome.open(report)
-    chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
-    chrome.click("#pages a[href$='#map']")
-    chrome.wait("document.querySelector('h1')?.textContent === 'Deployment map'")
-    assert chrome.errors == []
 
 
 @pytest.mark.long
