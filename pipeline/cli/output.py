@@ -80,8 +80,7 @@ def fold_line(line: str, width: int) -> list[str]:
     starts = [found.start() for found in _FIELD.finditer(line)]
     begun = [start for start in starts if start <= min(width // 2, _DEEPEST)] or starts[:1] or [0]
     later = [start for start in starts if begun[-1] < start <= width]
-    fits = [start for start in later if begun[-1] + len(line) - start <= width] or later[-1:]
-    hang, cut = begun[-1], fits[0] if fits else line.rfind(" ", begun[-1], width + 1)
+    hang, cut = begun[-1], later[-1] if later else line.rfind(" ", begun[-1], width + 1)
     if cut <= hang:
         cut = line.find(" ", width)
         if cut < 0:

@@ -169,9 +169,7 @@ def _describe_diagnosis(summary: Summary) -> list[str]:
 def _describe_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
     lines = []
     if unchanged:
-        lines.append(
-            _row("unchanged", "log and configuration are as before: nothing was computed (--force does)")
-        )
+        lines.append(_row("same", "nothing was computed: log and configuration are as before (--force does)"))
     if _part(summary, "diagnosis").get("effects"):
         name = shlex.quote(str(summary["run"]))
         lines.append(_row("next", f"slip diagnose {name}{said} --apply model.toml"))

@@ -163,7 +163,7 @@ def _list_falls(diagnosis: RunDiagnosis) -> dict[str, str]:
     for before, after in zip(diagnosis.ladder[:-1], diagnosis.ladder[1:], strict=True):
         old = set(cast("Sequence[str]", before["effects"]))
         text = (
-            f"{_number(before, 't_mrmse_m')} -> {_number(after, 't_mrmse_m')} m   "
+            f"{_number(before, 't_mrmse_m')} -> {_number(after, 't_mrmse_m')} m, "
             f"{_number(before, 'r_mrmse_rad')} -> {_number(after, 'r_mrmse_rad')} rad"
         )
         for name in cast("Sequence[str]", after["effects"]):

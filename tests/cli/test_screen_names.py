@@ -70,10 +70,10 @@ def test_a_summary_keeps_to_its_lines() -> None:
     assert "\x1b" not in text
 
 
-ROW = "missing   drive_lag           tau = 0.304 s [0.274, 0.333]  0.187 -> 0.133 m   0.355 -> 0.304 rad"
+ROW = "missing   drive_lag           tau = 0.304 s [0.274, 0.333]  0.187 -> 0.133 m, 0.355 -> 0.304 rad"
 FOLDED = """\
 missing   drive_lag           tau = 0.304 s [0.274, 0.333]
-                              0.187 -> 0.133 m   0.355 -> 0.304 rad"""
+                              0.187 -> 0.133 m, 0.355 -> 0.304 rad"""
 TEXT = f"          {'':<20}turns as if its wheels stood 0.99 m apart instead of 0.55: a wrong track width"
 
 
