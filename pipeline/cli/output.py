@@ -80,13 +80,21 @@ def fold_line(line: str, width: int) -> list[str]:
     starts = [found.start() for found in _FIELD.finditer(line)]
     begun = [start for start in starts if start <= min(width // 2, _DEEPEST)] or starts[:1] or [0]
     later = [start for start in starts if begun[-1] < start <= width]
-    hang, cut = begun[-1], later[-1] if later else line.rfind(" ", begun[-1], width + 1)
+    hang, cut = begun[-1], later[-1] if later else _find_break(line, begun[-1], width)
     if cut <= hang:
         cut = line.find(" ", width)
         if cut < 0:
             return [line]
     rest = line[cut:].strip()
     return [line[:cut].rstrip(), *fold_line(" " * hang + rest, width)] if rest else [line[:cut].rstrip()]
+
+
+def _find_break(line: str, hang: int, width: int) -> int:
+    """The last space that a line has room for; a number stays with its unit."""
+    last = cut = line.rfind(" ", hang, width + 1)
+    while cut > hang and line[cut - 1].isdigit():
+        cut = line.rfind(" ", hang, cut)
+    return cut if cut > hang else last
 
 
 def print_json(content: Mapping[str, object]) -> None:
