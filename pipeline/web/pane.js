@@ -127,6 +127,7 @@ export class Pane {
     this.state = null;
     this.album = null;
     this.plots = null;
+    this.signatures = [];
     for (const part of [this.glance, this.model, this.figures]) part.replaceChildren();
     this.hero.replaceChildren(h("h2", {}, run), h("p", { class: "lead waiting", role: "status" }, "making the run ready …"), working());
   }
