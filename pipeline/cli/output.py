@@ -41,6 +41,8 @@ _UNPRINTABLE = re.compile(
 _FIELD = re.compile(r"(?:^|(?<=  ))\S")
 _NARROWEST = 40
 _DEEPEST = 38
+# Commands and places, which are copied from the screen, stay in one line.
+_COPIED = ("next ", "play ", "page ", "report ")
 
 
 def tidy_line(text: str) -> str:
@@ -75,7 +77,7 @@ def fold_line(line: str, width: int) -> list[str]:
     Fields stand two spaces or more apart. What begins in the right half goes to the next line as a whole; a
     longer text is broken between its words. A single word that is too long stays as it is.
     """
-    if width < _NARROWEST or len(line) <= width:
+    if width < _NARROWEST or len(line) <= width or line.startswith(_COPIED):
         return [line]
     starts = [found.start() for found in _FIELD.finditer(line)]
     begun = [start for start in starts if start <= min(width // 2, _DEEPEST)] or starts[:1] or [0]

@@ -80,6 +80,8 @@ TEXT = f"          {'':<20}turns as if its wheels stood 0.99 m apart instead of 
 def test_a_line_is_folded_below_the_field_that_it_goes_on_with() -> None:
     assert fold_line(ROW, 200) == fold_line(ROW, 0) == [ROW]
     assert "\n".join(fold_line(ROW, 80)) == FOLDED
+    command = f"next      slip diagnose {'season/run ' * 10}--apply model.toml"
+    assert fold_line(command, 80) == [command]
     assert fold_line("only within 0.029 s, or less", 40) == ["only within 0.029 s, or less"]
     assert fold_line(f"{'x' * 30} within 0.029 s, or less", 42) == [f"{'x' * 30} within", "0.029 s, or less"]
     parts = fold_line(TEXT, 80)
