@@ -116,6 +116,13 @@ class Plan:
     wheels: tuple[Floats, Floats] | None = field(repr=False)
     ways: Complex = field(repr=False)
 
+    def list_impossible(self) -> list[str]:
+        """What stays open, a text for each reason."""
+        questions: dict[str, list[str]] = {}
+        for one in self.impossible:
+            questions.setdefault(one.because, []).append(one.question)
+        return [f"{'; '.join(asked)}: {because}" for because, asked in questions.items()]
+
     def to_json(self) -> dict[str, object]:
         """The promised keys of `slip plan --json`, and more."""
         return {

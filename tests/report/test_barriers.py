@@ -58,7 +58,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         with pytest.raises(SystemExit) as ended:
             main([verb, str(results), "--quiet"])
         assert ended.value.code == 0
-    plan = ["plan", "--vehicle", "husky_a200", "--time", "30s", "--out", str(folder / "plan"), "--quiet"]
+    plan = ["plan", "--vehicle", "husky_a200", "--time", "120s", "--out", str(folder / "plan"), "--quiet"]
     with pytest.raises(SystemExit) as ended:
         main(plan)
     assert ended.value.code == 0

@@ -76,7 +76,7 @@ def _say(plan: Plan) -> dict[str, object]:
             + (f"(t = {one.expected:.1f})" if one.kind == "separation" else f"(+- {one.expected:.2g})")
             for one in plan.promises
         ],
-        "impossible": [f"{one.question}: {one.because}" for one in plan.impossible],
+        "impossible": plan.list_impossible(),
     }
 
 
