@@ -96,7 +96,10 @@ def _find_names(store: Store) -> dict[str, str]:
     found: dict[str, set[str]] = {}
     for number in fit_results(store)[0].numbers:
         found.setdefault(number.effect, set()).add(number.name)
-    return {effect: name for effect, names in found.items() for name in names if names == {name} != {effect}}
+    called = {
+        effect: name for effect, names in found.items() for name in names if names == {name} != {effect}
+    }
+    return called | {"localization_noise": "localization noise"}
 
 
 def describe_causes(causes: Causes) -> dict[str, object]:

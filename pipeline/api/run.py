@@ -15,12 +15,13 @@ from pipeline.analysis.options import INPUTS, Options
 from pipeline.analysis.peers import find_peers
 from pipeline.api.model import Model
 from pipeline.api.shown import tabulate_ladder, tabulate_parameters, write_html
+from pipeline.core.durations import say_recorded
 from pipeline.diagnosis.budget import parse_budget
 from pipeline.report import RunReport, make_charts, view_diagnosis
 from pipeline.report.diagnosed import read_model_text
 from pipeline.report.motion_run import load_vehicle
 from pipeline.report.run import mapping_in, number_in, objects_in
-from pipeline.report.words import say_distance, say_duration
+from pipeline.report.words import say_distance
 from pipeline.store import Store
 
 if TYPE_CHECKING:
@@ -144,7 +145,7 @@ class Run:
         log = mapping_in(self.summary, "log")
         facts = [self.name, self.vehicle.name, str(self.summary["terrain"])]
         duration, distance = number_in(log, "duration_s"), number_in(self.summary, "distance_m")
-        facts += [] if duration is None else [say_duration(duration)]
+        facts += [] if duration is None else [say_recorded(duration, number_in(self.summary, "duration_s"))]
         facts += [] if distance is None else [say_distance(distance)]
         return ", ".join(facts if log.get("complete") else [*facts, "the log has losses"])
 

@@ -6,7 +6,7 @@ import importlib
 import os
 import pkgutil
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args, get_origin
 
 from cyclopts import App, CycloptsError, CycloptsPanel, MissingArgumentError
 
@@ -52,8 +52,10 @@ def _describe_usage(error: CycloptsError) -> object:
     lacking = error.argument
     if not isinstance(error, MissingArgumentError) or lacking is None or lacking.tokens or error.keyword:
         return CycloptsPanel(error)
-    about = f": {lacking.parameter.help}" if lacking.parameter.help else ""
-    return CycloptsPanel(f"slip {' '.join(error.command_chain or ())} needs {lacking.name}{about}.")
+    choices = get_args(lacking.hint) if get_origin(lacking.hint) is Literal else ()
+    about = lacking.parameter.help or " or ".join(map(str, choices))
+    verb = f"slip {' '.join(error.command_chain or ())}"
+    return CycloptsPanel(f"{verb} needs {lacking.name}{f': {about}' if about else ''}.")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -7,7 +7,7 @@ import time
 from typing import TYPE_CHECKING
 
 from pipeline.cli.output import say, tidy_line
-from pipeline.cli.screen import format_duration
+from pipeline.core.durations import say_duration
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -56,7 +56,7 @@ class LineWatch(SilentWatch):
         what = f"{line.state}: {line.reason}" if line.reason else line.state
         left = ""
         if self._done < self._todo:
-            left = f", about {format_duration(self.estimate_rest())} left"
+            left = f", about {say_duration(self.estimate_rest())} left"
         self._write(
             f"[{self._done}/{self._todo}] {line.run or line.path} {what} ({line.seconds:.1f} s){left}"
         )
@@ -102,7 +102,7 @@ class BarWatch(LineWatch):
             text = tidy_line(f"{line.run or line.path} {line.state}: {line.reason}")
             self._bar.console.print(text, markup=False, highlight=False)
         if self._task is not None:
-            left = f"about {format_duration(self.estimate_rest())} left" if self._done < self._todo else ""
+            left = f"about {say_duration(self.estimate_rest())} left" if self._done < self._todo else ""
             self._bar.update(self._task, advance=1, left=left)
 
     def __exit__(

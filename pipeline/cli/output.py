@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import shutil
 import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -35,6 +37,13 @@ _UNPRINTABLE = re.compile(
     r"[\x00-\x1f\x7f-\x9f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
 )
 
+# Where fields begin; the narrowest screen that has room for them; the column that none hangs beyond.
+_FIELD = re.compile(r"(?:^|(?<=  ))\S")
+_NARROWEST = 40
+_DEEPEST = 38
+# Commands and places, which are copied from the screen, stay in one line.
+_COPIED = ("next ", "play ", "page ", "report ")
+
 
 def tidy_line(text: str) -> str:
     """A line as it may reach a screen: names in it must neither move the cursor nor begin a line."""
@@ -50,8 +59,44 @@ def _spell_out(character: str) -> str:
 
 
 def print_lines(lines: Iterable[str]) -> None:
-    """Lines on stdout, each of them one line whatever names stand in it."""
-    sys.stdout.write("".join(f"{tidy_line(line)}\n" for line in lines))
+    """Lines on stdout, each one line whatever names stand in it, folded where a screen is narrower."""
+    width = _measure_screen()
+    sys.stdout.write("".join(f"{part}\n" for line in lines for part in fold_line(tidy_line(line), width)))
+
+
+def _measure_screen() -> int:
+    """Columns that are there, or said by COLUMNS; 0 where nobody looks: what a file takes in stays whole."""
+    told = os.environ.get("COLUMNS", "")
+    seen = int(told) if told.isdecimal() else 0
+    return seen or (shutil.get_terminal_size().columns if sys.stdout.isatty() else 0)
+
+
+def fold_line(line: str, width: int) -> list[str]:
+    """A line in parts of at most `width` columns, each below the field that it goes on with.
+
+    Fields stand two spaces or more apart. What begins in the right half goes to the next line as a whole; a
+    longer text is broken between its words. A single word that is too long stays as it is.
+    """
+    if width < _NARROWEST or len(line) <= width or line.startswith(_COPIED):
+        return [line]
+    starts = [found.start() for found in _FIELD.finditer(line)]
+    begun = [start for start in starts if start <= min(width // 2, _DEEPEST)] or starts[:1] or [0]
+    later = [start for start in starts if begun[-1] < start <= width]
+    hang, cut = begun[-1], later[-1] if later else _find_break(line, begun[-1], width)
+    if cut <= hang:
+        cut = line.find(" ", width)
+        if cut < 0:
+            return [line]
+    rest = line[cut:].strip()
+    return [line[:cut].rstrip(), *fold_line(" " * hang + rest, width)] if rest else [line[:cut].rstrip()]
+
+
+def _find_break(line: str, hang: int, width: int) -> int:
+    """The last space that a line has room for; a number stays with its unit."""
+    last = cut = line.rfind(" ", hang, width + 1)
+    while cut > hang and line[cut - 1].isdigit():
+        cut = line.rfind(" ", hang, cut)
+    return cut if cut > hang else last
 
 
 def print_json(content: Mapping[str, object]) -> None:

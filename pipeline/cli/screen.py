@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import cast
 
 from pipeline.cli.output import tidy_line
+from pipeline.core.durations import say_recorded
 
 Summary = Mapping[str, object]
 
-_LABEL = 26
+_LABEL = 10
 _READ_FROM_LOG = ("robot_description", "namespace", "message_types", "fitted")
 _SHOWN = 6
 
@@ -31,7 +32,7 @@ def describe_run(summary: Summary, *, unchanged: bool, twin: str = "", said: str
         *_describe_topics(summary),
         *_describe_findings(summary),
         *_describe_diagnosis(summary),
-        *([_row("same content", f"as {twin}: counted once, under the name it has")] if twin else []),
+        *([_row("same", f"content as {twin}: counted once, under the name it has")] if twin else []),
         *_describe_end(summary, said, unchanged=unchanged),
     ]
     return "\n".join(tidy_line(line.rstrip()) for line in lines) + "\n"
@@ -55,7 +56,11 @@ def _describe_head(summary: Summary) -> list[str]:
     log = _part(summary, "log")
     seconds = float(cast("float", log.get("duration_s") or 0.0))
     distance = summary.get("distance_m")
-    facts = [str(summary["vehicle"]), str(summary["terrain"]), format_duration(seconds)]
+    facts = [
+        str(summary["vehicle"]),
+        str(summary["terrain"]),
+        say_recorded(seconds, summary.get("duration_s")),
+    ]
     if isinstance(distance, (int, float)):
         facts.append(format_distance(float(distance)))
     head = [_row("run", f"{summary['run']}    {' · '.join(facts)}")]
@@ -91,24 +96,26 @@ def _describe_slip(summary: Summary) -> list[str]:
         f"{_number(_part(by_input, name), 'median_modulus')} m/s {words[name]}" for name in shown
     )
     norms = " | ".join(_number(_part(by_input, name), "median_window_norm") for name in shown)
-    scale = _number(summary, "length_scale_m")
-    lines = [_row(f"slip modulus (L = {scale} m)", f"median {medians}    (2 s window norm {norms})")]
+    lines = [
+        _row("slip", f"median modulus {medians}"),
+        _row("", f"with L = {_number(summary, 'length_scale_m')} m; 2 s window norm {norms} m/s"),
+    ]
     split = _part(summary, "split")
     detail = []
     if split:
         detail.append(say_split(**{name: float(cast("float", value)) for name, value in split.items()}))
     lead = _part(by_input, str(summary.get("leading_input")))
     detail.append(
-        f"transitory {_number(lead, 'transitory_median_modulus')} | "
+        f"transitory {_number(lead, 'transitory_median_modulus')} m/s | "
         f"steady {_number(lead, 'steady_median_modulus')} m/s"
     )
-    lines.append(_row("", "      ".join(detail)))
+    lines.append(_row("", "    ".join(detail)))
     left = [name for name in shown if _part(by_input, name).get("median_residual_modulus") is not None]
     if left:
         medians = "    ".join(
             f"{_number(_part(by_input, name), 'median_residual_modulus')} m/s {words[name]}" for name in left
         )
-        lines.append(_row("relative to the model", f"median {medians}"))
+        lines.append(_row("", f"relative to the model: {medians}"))
     return lines
 
 
@@ -119,11 +126,9 @@ def _describe_topics(summary: Summary) -> list[str]:
         told = str(summary["vehicle_source"]).replace("_", " ")
         lines.append(_row("vehicle", f"{summary['vehicle_name']}    told by: {told}"))
     roles = [role for role in ("command", "wheels", "pose", "imu", "interval") if _part(topics, role)]
-    first = next(iter(roles), "")
-    for role in roles:
-        source = _part(topics, role)
-        label = "topics" if role == first else ""
-        lines.append(_row(label, f"{role:<9}{source['topic']}    {source['reason']}"))
+    if roles:
+        chosen = ", ".join(f"{role} {_part(topics, role)['topic']}" for role in roles)
+        lines.append(_row("topics", f"{chosen} (why: slip inspect)"))
     others = _part(_part(summary, "choices"), "pose").get("others")
     rejected = others if isinstance(others, list) else []
     lines.extend(_row("", f"{'not':<9}{other['topic']}    {other['reason']}") for other in rejected)
@@ -164,9 +169,7 @@ def _describe_diagnosis(summary: Summary) -> list[str]:
 def _describe_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
     lines = []
     if unchanged:
-        lines.append(
-            _row("unchanged", "log and configuration are as before: nothing was computed (--force does)")
-        )
+        lines.append(_row("same", "nothing was computed: log and configuration are as before (--force does)"))
     if _part(summary, "diagnosis").get("effects"):
         name = shlex.quote(str(summary["run"]))
         lines.append(_row("next", f"slip diagnose {name}{said} --apply model.toml"))
@@ -181,16 +184,6 @@ def _relative(path: str) -> str:
         return str(Path(path).resolve().relative_to(Path.cwd()))
     except ValueError:
         return path
-
-
-def format_duration(seconds: float) -> str:
-    """Seconds in words: `10 min 48 s`."""
-    whole = round(seconds)
-    hours, rest = divmod(whole, 3600)
-    minutes, left = divmod(rest, 60)
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {left} s" if minutes else f"{left} s"
 
 
 def format_distance(metres: float) -> str:

@@ -122,4 +122,4 @@ def _print_outcomes(outcomes: list[Outcome], said: str) -> None:
 
     for outcome in outcomes:
         text = describe_run(outcome.summary, unchanged=not outcome.computed, twin=outcome.twin, said=said)
-        print_lines(text.split("\n"))
+        print_lines(text.splitlines())

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from pipeline.analysis.compare import Answer
     from pipeline.store import Store
 
-_NAME = 34
-
 
 def register(app: App) -> None:
     """Add the verb."""
@@ -107,7 +105,7 @@ def _compare_causes(
                 f"{budget.dataset}: {budget.total**0.5:.3g} m/s, {budget.runs} run{'s' * (budget.runs != 1)}",
                 f"  {parts}",
             ]
-        lines.append("")
+        lines += [""] * bool(content["differences"])
         for one in cast("Sequence[Mapping[str, object]]", content["differences"]):
             lines += [str(one["sentence"]), *([f"  {one['note']}"] if one["note"] else [])]
         print_lines([*lines, "", *(f"! {note}" for note in found.notes), f"page    {written['causes.html']}"])
@@ -121,12 +119,13 @@ def _describe(answer: Answer, written: Mapping[str, Path]) -> str:
     )
     rated = answer.intervals.join(datasets, on="dataset").sort("value")
     label = "as published" if answer.quantity == "published_norm" else "median modulus"
+    width = max([len(name) for name in rated["dataset"]] + [7]) + 1
     lines = [
         f"slip on {answer.input.replace('measured', 'measured wheels')}, {label} [m/s]",
         "",
-        f"{'dataset':<{_NAME}}{'runs':>5}{'median':>9}   {'95 % interval':<16}{'window norm':>12}",
+        f"{'dataset':<{width}}{'runs':>5}{'median':>9}   {'95 % interval':<16}{'window norm':>12}",
     ]
-    lines += [_describe_dataset(row) for row in rated.iter_rows(named=True)]
+    lines += [_describe_dataset(row, width) for row in rated.iter_rows(named=True)]
     lines += ["", *_describe_pairs(list(answer.comparisons.sort("p_adjusted", "p").iter_rows(named=True)))]
     orders = compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
     told = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
@@ -135,12 +134,12 @@ def _describe(answer: Answer, written: Mapping[str, Path]) -> str:
     return "\n".join(lines)
 
 
-def _describe_dataset(row: Mapping[str, object]) -> str:
+def _describe_dataset(row: Mapping[str, object], width: int) -> str:
     low, high = row["low"], row["high"]
     ends = f"{low:.3g} to {high:.3g}" if isinstance(low, float) and isinstance(high, float) else "-"
     only = " (this run)" if row["interval"] == "this run only" and ends != "-" else ""
     return (
-        f"{str(row['dataset'])[: _NAME - 1]:<{_NAME}}{row['runs']:>5}{_number(row['value']):>9}   "
+        f"{row['dataset']:<{width}}{row['runs']:>5}{_number(row['value']):>9}   "
         f"{ends:<16}{_number(row['median_window_norm']):>12}{only}"
     )
 

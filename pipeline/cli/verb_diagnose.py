@@ -106,7 +106,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
                 if apply is None
                 else f"slip model export {shlex.quote(str(apply))} --to ros2_control"
             )
-            print_lines(describe(diagnosis, following).split("\n"))
+            print_lines(describe(diagnosis, following).splitlines())
     return exit_code(errors, lossy=lossy)
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.output import CLEAN, print_json
+from pipeline.cli.output import CLEAN, print_json, print_lines
 
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
@@ -39,7 +38,7 @@ def effects(  # noqa: D417 - the arguments document themselves
         print_json({"effects": [_as_json(item) for item in chosen]})
     elif not quiet:
         lines = list_pages(chosen) if effect is None else [describe_effect(chosen[0])]
-        sys.stdout.write("\n".join(lines) + "\n")
+        print_lines("\n".join(lines).split("\n"))
     return CLEAN
 
 

@@ -100,7 +100,8 @@ def _describe_alignment(manifest: Manifest) -> list[str]:
     lines = ["put right      (table alignments; latency, outlier and *_aligned stand in poses and commands)"]
     for name, value in row.items():
         if isinstance(value, float) and not name.startswith("recorded_modulus"):
-            lines.append(f"  {name:<20}{value:.6g}")
+            unit = _describe_column(f"alignments.{name}").get("unit", "1").removesuffix("1")
+            lines.append(f"  {name:<20}{value:.6g} {unit}".rstrip())
     aggregates = manifest.read("aggregates")
     for name in ("command", "measured"):
         before = row[f"recorded_modulus_{name}"]

@@ -9,7 +9,7 @@ from cyclopts import App, Parameter
 
 from pipeline.cli.choices import Choices, build_options
 from pipeline.cli.output import CLEAN, LOSSY, print_json, print_lines
-from pipeline.cli.screen import format_duration
+from pipeline.core.durations import say_duration
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -101,7 +101,7 @@ def _describe(seen: Inspection) -> list[str]:
     packing = "compression " + (", ".join(name or "none" for name in index.compressions) or "none")
     lines = [
         f"log       {index.path}",
-        f"          {index.size_bytes / 1e6:.1f} MB, {format_duration(index.duration_s)}, {packing}",
+        f"          {index.size_bytes / 1e6:.1f} MB, {say_duration(index.duration_s)}, {packing}",
         f"          {index.message_count} messages in {index.chunk_count} chunks",
         f"          profile {index.profile or '-'}, written by {index.library or '-'}",
         f"health    {'complete' if not seen.losses else 'with losses'}"
@@ -153,19 +153,18 @@ def _describe_ratings(ratings: Sequence[PoseRating]) -> list[str]:
 
 def _describe_topics(topics: Sequence[TopicHealth]) -> list[str]:
     width = max([len(topic.topic) for topic in topics] + [5])
-    kind = max([len(topic.type_name) for topic in topics] + [4])
     numbers = f"{'messages':>8}  {'Hz':>7}  {'gaps':>5}  {'longest':>8}  {'late':>11}"
-    head = f"{'topic':<{width}}  {'type':<{kind}}  {numbers}"
-    return [head, *(_describe_topic(topic, width, kind) for topic in topics)]
+    head = f"{'topic':<{width}}  {numbers}  type"
+    return [head, *(_describe_topic(topic, width) for topic in topics)]
 
 
-def _describe_topic(topic: TopicHealth, width: int, kind: int) -> str:
+def _describe_topic(topic: TopicHealth, width: int) -> str:
     rate = "-" if topic.rate_hz is None else f"{topic.rate_hz:.4g}"
     gap = "-" if topic.largest_gap_s is None else f"{topic.largest_gap_s:.3g} s"
     late = "-" if topic.latency_s is None else f"{topic.latency_s * 1e3:.0f} ms"
     if topic.latency_s is not None and abs(topic.latency_s) > _OTHER_CLOCK_S:
         late = "other clock"
     return (
-        f"{topic.topic:<{width}}  {topic.type_name:<{kind}}  {topic.messages:>8}  {rate:>7}  "
-        f"{topic.gaps:>5}  {gap:>8}  {late:>11}"
+        f"{topic.topic:<{width}}  {topic.messages:>8}  {rate:>7}  "
+        f"{topic.gaps:>5}  {gap:>8}  {late:>11}  {topic.type_name}"
     )

@@ -81,7 +81,7 @@ def draw(  # noqa: D417 - arguments document themselves
         )
     elif not quiet:
         print_lines(
-            f"{row['dataset']:<34}{row['energy']:>10.3g} J   complexity {row['complexity']:.1f}   "
+            f"{row['dataset']:<26}{row['energy']:>9.3g} J   complexity {row['complexity']:.1f}   "
             f"{drawn.measure.name} {_say(row['value'], drawn.measure.unit)}   {row['zone']} risk"
             for row in drawn.own.sort("energy", descending=True).iter_rows(named=True)
         )

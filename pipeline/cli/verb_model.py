@@ -119,6 +119,7 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
     runs = file.fit.get("runs")
     if isinstance(runs, list):
         lines.append(f"fitted on {file.fit.get('input')}: {', '.join(str(run['run']) for run in runs)}")
+    lines += [f"undecided: {' or '.join(group)}" for group in file.undecided]
     print_lines(lines)
     return CLEAN
 

@@ -306,7 +306,7 @@ def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path])
         lines.append(f"after {one.decided_after_s:3.0f} s  {one.question} ({how})")
     if rest := made.say_rest():
         lines.append(f"then         {rest}")
-    lines += [f"cannot       {one.question}: {one.because}" for one in made.impossible]
+    lines += [f"cannot       {text}" for text in made.list_impossible()]
     if not made.manoeuvres:
         return [*lines, "no drive on level ground within these limits answers it: no file is written"]
     limits, turn = made.limits, "rad steering" if made.steered else "rad/s"

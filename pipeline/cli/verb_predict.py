@@ -27,8 +27,8 @@ def register(app: App) -> None:
 
 def predict(
     *,
-    vehicle: str,
-    terrain: str,
+    vehicle: Annotated[str, Parameter(help="vehicle preset, for example warthog")],
+    terrain: Annotated[str, Parameter(help="terrain to drive on, for example ice")],
     known: Path = Path("results"),
     input: Literal["command", "measured"] = "command",  # noqa: A002 - the word of the other verbs
     model: Path | None = None,
@@ -43,7 +43,7 @@ def predict(
 
     Args:
         vehicle: vehicle preset, for example warthog.
-        terrain: terrain to drive on.
+        terrain: terrain to drive on, for example ice.
         known: results folder with diagnosed runs of the vehicle.
         input: what the model is fed with.
         model: model file to write.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.output import CLEAN, print_lines
+from pipeline.cli.output import CLEAN, tidy_line
 from pipeline.cli.results_place import open_results
 from pipeline.core.errors import SlipError
 
@@ -79,7 +79,7 @@ def _print(answer: pl.DataFrame, form: Literal["table", "csv", "json"]) -> None:
         sys.stdout.write(f'{{"columns": {names}, "rows": {_spell_bytes(answer).write_json()}}}\n')
     else:
         with pl.Config(tbl_rows=-1, tbl_cols=-1, fmt_str_lengths=_WIDE, tbl_width_chars=_WIDE):
-            print_lines(str(answer).split("\n"))
+            sys.stdout.write("".join(f"{tidy_line(line)}\n" for line in str(answer).split("\n")))
 
 
 def _spell_bytes(answer: pl.DataFrame) -> pl.DataFrame:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import textwrap
 from pathlib import Path
 from typing import Annotated
 
@@ -114,16 +112,6 @@ def _print_catalogue(
         print_json({"cases": dict(cases), "effects": dict(effects), "platforms": dict(platforms)})
         return
     for title, rows in (("cases", cases), ("effects", effects), ("platforms", platforms)):
-        print(title)
+        print_lines([title])
         width = max(len(name) for name, _ in rows)
-        room = max(shutil.get_terminal_size().columns, width + 44)
-        for name, text in rows:
-            begin = f"  {name:<{width}}  "
-            aside = textwrap.TextWrapper(
-                room,
-                initial_indent=begin,
-                subsequent_indent=" " * len(begin),
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
-            print(aside.fill(text))
+        print_lines(f"  {name:<{width}}  {text}" for name, text in rows)

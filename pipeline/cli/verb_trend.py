@@ -92,13 +92,13 @@ def _describe(found: Trend, page: Path) -> str:
         label = f"{one.vehicle} {one.label}"
         runs = one.points.height
         lines.append(
-            f"{label:<44}{runs:>4} run{'s' * (runs != 1):<2} latest {one.latest:.3g}{unit}, {say_power(one)}"
+            f"{label:<34}{runs:>4} run{'s' * (runs != 1):<2} latest {one.latest:.3g}{unit}, {say_power(one)}"
         )
     for group in dict.fromkeys(one.group for one in found.series):
         own = [one for one in found.series if one.group == group]
         slip = next((one for one in own if one.quantity.startswith("median_modulus")), own[0])
         runs = slip.points.height
         latest = f"{slip.quantity} latest {slip.latest:.3g} {slip.unit}"
-        lines.append(f"{group:<44}{runs:>4} run{'s' * (runs != 1):<2} {latest}")
+        lines.append(f"{group:<34}{runs:>4} run{'s' * (runs != 1):<2} {latest}")
     lines += [*(f"! {note}" for note in found.notes), f"page    {page}"]
     return "\n".join(lines)

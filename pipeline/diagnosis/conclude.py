@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.diagnosis import Json, Value
     from pipeline.diagnosis.naming_rules import Clocks
     from pipeline.diagnosis.recording import Recording
+    from pipeline.diagnosis.undecided import Undecided
     from pipeline.identification.judgement import Judgement
     from pipeline.identification.parts import Part
     from pipeline.identification.state import State
@@ -135,7 +136,7 @@ def summarize(
         timing={"runs": cast("Json", list(clocks.timing))},
         by_way=_describe_ways(ways, source, judgements.get("measured")),
         disturbance=residual_structure.describe_disturbance(body, unexplained),
-        proposal=None if judgement is None else note_fit(ModelFile(judgement.fitted.model), judgement),
+        proposal=None if judgement is None else note_fit(_begin(judgement, undecided), judgement),
         budgets=tuple(
             budget for one in judgements.values() for budget in apportion(one, length_scale_m=length_scale_m)
         ),
@@ -143,6 +144,11 @@ def summarize(
             number for one in judgements.values() for number in list_estimates(context, one, named)
         ),
     )
+
+
+def _begin(judgement: Judgement, undecided: Sequence[Undecided]) -> ModelFile:
+    groups = [list(item.candidates) for item in undecided]
+    return ModelFile(judgement.fitted.model, fit={"undecided": groups})
 
 
 def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Context) -> RunDiagnosis:

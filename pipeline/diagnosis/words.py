@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from textwrap import wrap
 from typing import TYPE_CHECKING, cast
 
 from pipeline.diagnosis.enough import describe_enough
@@ -17,8 +16,6 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.diagnosis import Diagnosis, Json, Named, RunDiagnosis, Value
 
 _LABEL = 10
-_LINE = 88
-_SENTENCE = 68
 _WHERE_SHOWN = 3
 _UNOBSERVABLE_SHOWN = 8
 _DETECTABLE_SHOWN = 5
@@ -83,15 +80,15 @@ def _list_shared(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
         share = max(min(diagnosis.explained_share, 1.0), 0.0)
         now, floor = _number(last, "t_mrmse_m"), _number(diagnosis.noise_floor, "t_mrmse_m")
         lines.append(("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m"))
-    lines += _label("budget", wrap(_describe_budget(diagnosis), _LINE))
-    lines += _label("enough", wrap(describe_enough(diagnosis.effects), _LINE))
+    lines += _label("budget", [_describe_budget(diagnosis)])
+    lines += _label("enough", [describe_enough(diagnosis.effects)])
     lines += _label("below", _describe_immaterial(diagnosis))
     lines += _label("cannot", _describe_unobservable(diagnosis))
-    return [*lines, *_label("excluded", wrap(_describe_detectable(diagnosis), _LINE))]
+    return [*lines, *_label("excluded", [_describe_detectable(diagnosis)])]
 
 
 def _label(label: str, texts: Sequence[str]) -> list[tuple[str, str]]:
-    return [("" if number else label, text) for number, text in enumerate(texts)]
+    return [("" if number else label, text) for number, text in enumerate(filter(None, texts))]
 
 
 def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
@@ -108,13 +105,13 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
             notes.append("tentative")
         note = f"  ({'; '.join(notes)})" if notes else ""
         rows.append(f"{effect.id:<20}{_values(effect):<{width}}{falls.get(effect.id, '')}{note}")
-        rows += [f"{'':<20}{line}" for line in wrap(effect.sentence, _SENTENCE)]
+        rows += [f"{'':<20}{effect.sentence}"] if effect.sentence else []
     for item in diagnosis.undecided:
         held = diagnosis.find_held(item)
         fall = f"  {falls[held]}" if held in falls else ""
         rows.append(f"{'undecided':<20}{' or '.join(item.candidates)}{fall}")
         text = f"{held} stands for them in the model; {item.separate_by}" if held else item.separate_by
-        rows += [f"{'':<20}{line}" for line in wrap(text, _SENTENCE)]
+        rows.append(f"{'':<20}{text}")
     if diagnosis.unexplained is not None:
         left = diagnosis.unexplained
         rows.append(f"{'unexplained':<20}{left.share:.0%} of what is left: {left.where}")
@@ -166,7 +163,7 @@ def _list_falls(diagnosis: RunDiagnosis) -> dict[str, str]:
     for before, after in zip(diagnosis.ladder[:-1], diagnosis.ladder[1:], strict=True):
         old = set(cast("Sequence[str]", before["effects"]))
         text = (
-            f"{_number(before, 't_mrmse_m')} -> {_number(after, 't_mrmse_m')} m   "
+            f"{_number(before, 't_mrmse_m')} -> {_number(after, 't_mrmse_m')} m, "
             f"{_number(before, 'r_mrmse_rad')} -> {_number(after, 'r_mrmse_rad')} rad"
         )
         for name in cast("Sequence[str]", after["effects"]):
@@ -187,8 +184,8 @@ def _describe_unobservable(diagnosis: RunDiagnosis) -> list[str]:
             if part not in manoeuvres:
                 manoeuvres.append(part)
     return [
-        *wrap(f"tell of {shown}{more} from this log", _LINE),
-        *wrap(f"to see them: {'; '.join(manoeuvres[:3])}", _LINE),
+        f"tell of {shown}{more} from this log",
+        f"to see them: {'; '.join(manoeuvres[:3])}",
     ]
 
 
@@ -199,7 +196,7 @@ def _describe_detectable(diagnosis: RunDiagnosis) -> str:
         diagnosis.detectable, key=lambda one: one.size / abs(usual[one.id].typical - usual[one.id].neutral)
     )
     shown = [
-        f"{one.id} {100.0 * one.size:.2g} %" if one.unit == "1" else f"{one.id} {one.size:.2g} {one.unit}"
+        f"{one.id} {100.0 * one.size:.2g}%" if one.unit == "1" else f"{one.id} {one.size:.2g} {one.unit}"
         for one in sharpest[:_DETECTABLE_SHOWN]
     ]
     return f"what is larger than {', '.join(shown)}" if shown else ""

@@ -101,15 +101,15 @@ class Difference:
         if largest > self.total:
             # What one side has more of outweighs what it has more in all: shares would say nothing.
             words = ", ".join(
-                f"{part.difference:+.2g} {_say(names, part)}"
+                f"{part.difference:+.2g} {names[part.name]}"
                 for part in self.parts
                 if abs(part.difference) >= _WORTH_SAYING * largest
             )
             return f"{self.b} against {self.a}, {self.total:.2g} m/s of slip more: in m/s {words}"
         told = [part for part in self.parts if abs(part.difference) >= _WORTH_SAYING * self.total]
         none = [part for part in self.parts if abs(part.difference) < _NO_PART * self.total]
-        words = ", ".join(f"{part.difference / self.total:.0%} {_say(names, part)}" for part in told)
-        rest = f"; {', '.join(_say(names, part) for part in none)} no part" if none else ""
+        words = ", ".join(f"{part.difference / self.total:.0%} {names[part.name]}" for part in told)
+        rest = f"; {', '.join(names[part.name] for part in none)} no part" if none else ""
         return f"{self.b} against {self.a}, {self.total:.2g} m/s of slip more: {words}{rest}"
 
 
@@ -205,7 +205,3 @@ def _compare(a: _Group, b: _Group) -> Difference:
             f"{runs_needed(len(causes))} a side would do"
         )
     return Difference(a.name, b.name, roots[1] - roots[0], tuple(parts), BLOCKS if single else RUNS, note)
-
-
-def _say(names: Mapping[str, str], part: CauseDifference) -> str:
-    return names[part.name].replace("localization_noise", "localization noise")

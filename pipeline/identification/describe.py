@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import re
 from typing import TYPE_CHECKING
 
 from pipeline.identification.intervals import NOTHING as NOT_FITTED
@@ -128,14 +129,14 @@ def correlations_as_json(estimates: Estimates) -> list[dict[str, object]]:
 
 def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
     """The ladder as a table for people."""
-    lines = [f"{describe_errors('held-out error of', None)}{'gone':>7}"]
+    lines = [f"{describe_errors('held-out error of', None)}{'gone':>5}"]
     for number, (rung, share) in enumerate(zip(ladder.rungs, ladder.explained_shares(floor), strict=True)):
         name = "ideal" if number == 0 else f"+ {_added(ladder.rungs[number - 1], rung)}"
-        gone = "" if share is None else f"{share:7.0%}"
-        lines.append(f"{name:<34}{_columns(rung.errors)}{gone}")
+        gone = "" if share is None else f"{share:5.0%}"
+        lines.append(f"{name:<30}{_columns(rung.errors)}{gone}")
         lines += _describe_rises(ladder.rungs[max(number - 1, 0)].errors, rung.errors, "within chance")
     if floor is not None:
-        lines.append(f"{'noise floor (estimated)':<34}{_columns(floor)}")
+        lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
     if ladder.idle:
         lines.append(f"no rung, no help on unseen data:  {', '.join(ladder.idle)}")
     return lines
@@ -147,7 +148,7 @@ def describe_step(before: Rung, after: Rung) -> list[str]:
     position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
     heading = f"{old.r_mrmse_rad:.4f} -> {new.r_mrmse_rad:.4f} rad"
     word = "taken" if set(after.effects) > set(before.effects) else "done"
-    line = f"{'all effects, before -> after':<34}{position}   {heading}"
+    line = f"{'all effects, before -> after':<30}{position}   {heading}"
     return [line, *_describe_rises(old, new, f"{word} because asked for")]
 
 
@@ -181,8 +182,8 @@ def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:
 def describe_errors(name: str, errors: Errors | None) -> str:
     """One row of errors, or the heads of the columns."""
     if errors is not None:
-        return f"{name:<34}{_columns(errors)}"
-    return f"{name:<34}{''.join(f'{head:>9}' for head in _HEADS)}"
+        return f"{name:<30}{_columns(errors)}"
+    return f"{name:<30}{''.join(f'{head:>9}' for head in _HEADS)}"
 
 
 def _added(before: Rung, rung: Rung) -> str:
@@ -200,7 +201,8 @@ def describe_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[
     for label, entry in parameters.items():
         rows = entry.get("runs")
         for row in rows if isinstance(rows, list) else [entry]:
-            text = f"  {label:<32}{_show(row.get('value')):>12} {entry['unit']:<8}"
+            unit = "" if entry["unit"] == "1" else entry["unit"]
+            text = f"  {label:<32}{_show(row.get('value')):>12} {unit:<8}"
             if row.get("low") is not None:
                 text += f"95 %: {_show(row['low'])} to {_show(row['high'])}"
             if row.get("at_bound"):
@@ -220,6 +222,8 @@ def describe_effect(effect: type[Effect] | Effect) -> str:
     else:
         module = inspect.getmodule(effect if inspect.isclass(effect) else type(effect))
         page = inspect.cleandoc((module.__doc__ if module else None) or effect.__doc__ or "")
+        # A paragraph is one line, as wide as who reads it has room for.
+        page = re.sub(r"(?m)^(\S.*)\n(?=\S)", r"\1 ", page)
     lines = [page, "", f"id            {effect.id}", f"acts on       {effect.place.name.lower()}"]
     lines.append(f"vehicles      {', '.join(effect.kinds)}")
     for parameter in effect.parameters:
@@ -269,7 +273,7 @@ def list_pages(effects: Sequence[type[Effect]]) -> list[str]:
     for effect in effects:
         module = inspect.getmodule(effect)
         title = ((module.__doc__ if module else None) or "").strip().splitlines()[0]
-        lines.append(f"{effect.id:<20}{effect.place.name.lower():<14}{title.split(': ', 1)[-1]}")
+        lines.append(f"{effect.id:<24}{effect.place.name.lower():<13}{title.split(': ', 1)[-1]}")
     return lines
 
 

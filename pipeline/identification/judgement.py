@@ -118,4 +118,10 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
     ]
     if own:
         fit["own"] = own
+    # Other runs may tell apart what those of the diagnosis could not.
+    before = file.fit.get("runs")
+    names = [run["run"] for run in before if isinstance(run, dict)] if isinstance(before, list) else []
+    undecided = [group for group in file.undecided if set(group) & set(model.ids)]
+    if undecided and names in ([], list(problem.names)):
+        fit["undecided"] = undecided
     return replace(file, model=model, intervals=intervals, fit=fit)

@@ -71,6 +71,17 @@ class ModelFile:
         found = self.fit.get("input")
         return found if isinstance(found, str) else None
 
+    @property
+    def undecided(self) -> list[list[str]]:
+        """Groups of effects that explained the fitted runs as well as each other; one of each is here."""
+        groups = self.fit.get("undecided")
+        found = [group for group in groups if isinstance(group, list)] if isinstance(groups, list) else []
+        return [[str(name) for name in group] for group in found]
+
+    def list_rivals(self, effect: str) -> list[str]:
+        """What explained the runs of the fit as well as an effect of the model did."""
+        return [name for group in self.undecided if effect in group for name in group if name != effect]
+
     def find_wheel_delay(self, run: str) -> float:
         """How late the encoders of a run were in the last fit [s]; zero where it was not fitted on it."""
         runs = self.fit.get("runs")

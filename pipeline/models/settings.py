@@ -187,6 +187,8 @@ class Facts:
         if label in self.file.intervals:
             low, high = self.file.intervals[label]
             text += f" (95 %: {low:.5g} to {high:.5g})"
+        if rivals := self.file.list_rivals(effect.id):
+            text += f", undecided: {' or '.join(rivals)} would explain as much"
         if value != parameter.neutral and stands_at_bound(value, parameter.bounds):
             text += ", at its bound: a limit of the search, no measurement"
         return text

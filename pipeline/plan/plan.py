@@ -138,6 +138,13 @@ class Plan:
             told.append(f"{self.spare_s:.0f} s more would {gain if intervals else 'decide nothing else'}")
         return "; ".join(told)
 
+    def list_impossible(self) -> list[str]:
+        """What stays open, a text for each reason."""
+        questions: dict[str, list[str]] = {}
+        for one in self.impossible:
+            questions.setdefault(one.because, []).append(one.question)
+        return [f"{'; '.join(asked)}: {because}" for because, asked in questions.items()]
+
     def to_json(self) -> dict[str, object]:
         """The promised keys of `slip plan --json`, and more."""
         return {

@@ -8,17 +8,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pipeline.core.durations import say_recorded
 from pipeline.report import theme
 from pipeline.report.bundle import load_bundle
 from pipeline.report.elements import Picture
 from pipeline.report.figures import list_figures
 from pipeline.report.figures.figure import Section
+from pipeline.report.pages import list_ways
 from pipeline.report.scene import Scene
 from pipeline.report.sections import SECTIONS, Page
 from pipeline.report.sections.health import summarise_health
 from pipeline.report.specs import build_spec, share_rows
 from pipeline.report.templating import read_own, render_template
-from pipeline.report.words import say_date, say_distance, say_duration
+from pipeline.report.words import say_date, say_distance
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,7 +44,7 @@ def render_report(report: RunReport) -> str:
         "report/templates/run.html",
         [picture for pictures in drawn.values() for picture in pictures],
         title=report.text("run") or "run",
-        catalogue=report.catalogue,
+        ways=list_ways(report.catalogue),
         facts=_list_facts(page),
         strip=summarise_health(report),
         sections=[(section, section.view(page)) for section in SECTIONS],
@@ -91,7 +93,7 @@ def _list_facts(page: Page) -> list[str]:
         report.text("vehicle_name") or report.text("vehicle"),
         report.text("terrain"),
         say_date(_first_stamp(page)),
-        say_duration(float(duration)) if isinstance(duration, int | float) else "",
+        say_recorded(duration, report.number("duration_s")) if isinstance(duration, int | float) else "",
         say_distance(distance) if distance is not None else "",
     ]
     return [fact for fact in line if fact]

@@ -1,4 +1,8 @@
-"""The pages over all runs of a results folder, and their links: only to those that are there."""
+"""The pages over all runs of a results folder, and their links.
+
+Every page names all of them. One that was not there when a page was made is looked for by way of the
+catalogue, which is made anew with every page: it leads on to what came since, and says how to make the rest.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +28,12 @@ PAGES = {
     "trend.html": "Trends",
     "map.html": "Map",
 }
+_MADE_BY = {"comparison.html": "slip compare", "causes.html": "slip compare --causes"}
 _PLACE = re.compile(r'(<nav id="pages"[^>]*>).*?(</nav>)', re.DOTALL)
 
 
 def write_page(store: Store, name: str, page: str) -> Path:
-    """Write one of `PAGES` with links to those that are there, and the catalogue anew, which so knows it.
+    """Write one of `PAGES` with links to the others, and the catalogue anew, which so knows it.
 
     Other pages are left as they are: what stands in them was made by others, or is damaged.
 
@@ -60,10 +65,20 @@ def lead_to(results: Path, folder: Path) -> str:
     return quote(Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix())
 
 
+def list_ways(catalogue: str) -> dict[str, str]:
+    """Titles of `PAGES` and the ways to them through the catalogue; none where it has no address."""
+    ways = {title: f"{catalogue}#{Path(name).stem}" for name, title in PAGES.items()}
+    return ways | {PAGES[CATALOGUE]: catalogue} if catalogue else {}
+
+
 def _link(store: Store, name: str, page: str) -> str:
-    links = "".join(
-        f"<b>{title}</b>" if other == name else f'<a href="{html.escape(other)}">{title}</a>'
-        for other, title in PAGES.items()
-        if other in {name, CATALOGUE} or (store.root / other).is_file()
-    )
+    links = ""
+    for (title, way), other in zip(list_ways(CATALOGUE).items(), PAGES, strict=True):
+        stem, is_there = Path(other).stem, other == CATALOGUE or (store.root / other).is_file()
+        if other == name:
+            links += f"<b>{title}</b>"
+        elif is_there or name != CATALOGUE:
+            links += f'<a href="{html.escape(other if is_there else way)}" data-page="{stem}">{title}</a>'
+        else:
+            links += f'<span id="{stem}">{title}: <code>{_MADE_BY.get(other, f"slip {stem}")}</code></span>'
     return _PLACE.sub(lambda found: found[1] + links + found[2], page, count=1)

@@ -104,6 +104,11 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false
     return result.view;
   };
 
+  const forget = (id) => {
+    views.get(id)?.finalize();
+    views.delete(id);
+  };
+
   const draw = async (place) => {
     const room = place.clientWidth;
     let width = room - (page.figures[place.dataset.figure].usermeta?.gutter ?? 50) - RIGHT;
@@ -137,5 +142,5 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false
     }
   };
 
-  return { dark, draw, feed, rowsOf, unpack, views };
+  return { dark, draw, feed, forget, rowsOf, unpack, views };
 };

@@ -54,7 +54,6 @@ def _environment() -> Environment:
         "bytes": words.say_bytes,
         "capital": words.begin_large,
         "distance": words.say_distance,
-        "duration": words.say_duration,
         "number": words.say_number,
         "sha256": lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode(),
         "share": words.say_share,

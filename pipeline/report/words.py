@@ -6,7 +6,6 @@ import math
 from datetime import UTC, datetime
 
 MISSING = "\u2013"
-_MINUTE, _HOUR = 60.0, 3600.0
 _KILOMETRE = 1000.0
 _MOST_PLACES = 3
 _EARLIEST_YEAR = 2000
@@ -43,24 +42,12 @@ def say_split(drivetrain: float, ground: float, cross: float) -> str:
     """
     if max(drivetrain, ground) <= 1.0:
         shares = zip(("drivetrain", "ground", "cross"), (drivetrain, ground, cross), strict=True)
-        return "   ".join(f"{name} {share:z.0%}" for name, share in shares)
+        return ", ".join(f"{name} {share:z.0%}" for name, share in shares)
     one, two = (say_number(math.sqrt(share), digits=2) for share in (drivetrain, ground))
     return (
         f"drivetrain and ground cancel in part: {one} and {two} times the slip that is left (rms), "
         "so shares would mean nothing"
     )
-
-
-def say_duration(seconds: float | None) -> str:
-    """A duration in the two units that matter."""
-    if seconds is None:
-        return MISSING
-    if seconds < _MINUTE:
-        return f"{seconds:.1f} s"
-    whole = round(seconds)
-    if whole < _HOUR:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
 def say_distance(metres: float | None) -> str:

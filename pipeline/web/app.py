@@ -17,7 +17,7 @@ from starlette.routing import Route
 from pipeline.analysis.analyze import REPORT
 from pipeline.analysis.planned import PREVIEW
 from pipeline.report.bundle import load_bundle
-from pipeline.report.pages import PAGES, PLANS, is_page
+from pipeline.report.pages import CATALOGUE, PAGES, PLANS, is_page
 from pipeline.vehicles import list_presets
 from pipeline.web.answers import answer, make_handlers
 from pipeline.web.errors import WorkbenchError
@@ -102,6 +102,7 @@ class Web:
         listed = await run_in_threadpool(list_runs, sessions.store)
         presets = [{"id": preset.id, "name": preset.name} for preset in list_presets()]
         more = {"jobs": sessions.jobs.show(), "vehicles": presets, "results": str(sessions.results)}
+        more["catalogue"] = (sessions.results / CATALOGUE).is_file()
         return answer({**listed, **more})
 
     async def jobs(self, _: Request) -> Response:

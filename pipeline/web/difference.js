@@ -1,5 +1,8 @@
-// Two models beside each other: how far their errors are apart, and which numbers differ.
+// Two models beside each other: how far their errors are apart, when, and which numbers differ.
 import { h, say, sayShare } from "./parts.js";
+
+const LINES = "reach";
+let apart = null;
 
 const ERRORS = [["t", "position error after 2 s", "m"], ["r", "heading error after 2 s", "rad"]];
 
@@ -31,3 +34,34 @@ const listNumbers = (a, b) => {
   const [first, second] = [numbers(a), numbers(b)];
   return [...new Set([...first.keys(), ...second.keys()])].map((name) => [name, first.get(name) ?? null, second.get(name) ?? null]);
 };
+
+// The errors of both over time, in the figure that each has of its own; of one run only.
+export const drawDifference = async (place, one, other) => {
+  const sessions = [one, other].map((pane) => pane?.state?.session);
+  const there = [one, other].every((pane) => pane?.plots && pane.album?.figures[LINES]);
+  place.hidden = !there || sessions[0].run !== sessions[1].run;
+  if (place.hidden) {
+    apart = null;
+    return;
+  }
+  const rows = [one, other].flatMap((pane, slot) =>
+    pane.plots.rowsOf(LINES).filter((row) => row.series === "model").map((row) => ({ ...row, series: "AB"[slot] })));
+  const columns = Object.fromEntries(["t", "value", "series"].map((name) => [name, rows.map((row) => row[name])]));
+  const drawn = sessions.map((session) => `${session.run} ${session.input}`).join();
+  if (apart?.drawn === drawn) {
+    await apart.ready;
+    return apart.plots.feed({ [LINES]: columns });
+  }
+  const figures = { [LINES]: structuredClone(one.album.figures[LINES]) };
+  const { color } = figures[LINES].layer.find((layer) => layer.encoding?.color).encoding;
+  color.scale.domain = ["A", "B"];
+  delete color.legend.labelExpr;
+  const plots = slipPlots({ figures, rows: { ...one.album.rows, [LINES]: columns }, dark: one.album.dark }, { strict: true, own: one.marks.own });
+  place.replaceChildren(h("h3", {}, "Errors of A and B over the run"),
+    h("div", { class: "plot", role: "img", "aria-label": "Error of two-second predictions of model A and of model B over time", data: { figure: LINES } }));
+  apart = { drawn, plots, ready: plots.draw(place.lastElementChild) };
+  return apart.ready;
+};
+
+// The room or the colours changed.
+export const repaintDifference = (place) => !place.hidden && apart?.plots.draw(place.lastElementChild);

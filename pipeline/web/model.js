@@ -126,8 +126,8 @@ const buildRow = (pane, row, first) => {
     row.twins.length > 0 && h("i", { class: "mark twin", title: "they take the same off the error of this run: take one of them" }, `twin: ${row.twins.join(", ")}`)].filter(Boolean);
   return h("li", { class: first ? "first" : "", data: { effect: row.id }, bar: row.tried ? Math.min(Math.max(1 - row.to.t / row.from.t, 0), 1) : 0 },
     h("div", {},
-      h("b", {}, row.id), h("span", {}, row.sentence || row.about),
-      h("span", { class: "quiet falls" }, row.tried ? `position ${say(row.from.t)} → ${say(row.to.t)} m, ${share("t")}; heading ${share("r")}` : "not tried yet"),
+      h("b", {}, row.id), h("span", { title: row.sentence || row.about }, (row.sentence || row.about).split(": ")[0]),
+      h("span", { class: "quiet falls" }, row.tried ? `position to ${say(row.to.t)} m, ${share("t")}; heading ${share("r")}` : "not tried yet"),
       marks.length > 0 && h("span", { class: "marks" }, marks)),
     h("button", { type: "button", class: "add", "aria-label": `add ${row.id}`, title: row.about, data: { keep: `add ${row.id}` }, onclick: () => pane.add(row.id) }, "Add"));
 };

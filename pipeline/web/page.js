@@ -1,5 +1,5 @@
 // Runs, dropped logs, one pane or two; what is open stands in the address, so that a reload brings it back.
-import { showDifference } from "./difference.js";
+import { drawDifference, repaintDifference, showDifference } from "./difference.js";
 import { Pane } from "./pane.js";
 import { get, h, post, say, sayDuration, toast, upload } from "./parts.js";
 
@@ -79,6 +79,7 @@ const findPeers = (run) => {
 const load = async () => {
   listed = await get("/api/runs");
   find("results").textContent = listed.results;
+  find("catalogue").hidden = !listed.catalogue;
   showRuns();
   showJobs(listed.jobs);
 };
@@ -94,9 +95,11 @@ const arrange = (two) => {
     if (!pane) continue;
     pane.findPeers = findPeers;
     pane.shown = () => showDifference(find("difference"), panes.a, panes.b);
+    pane.moved = () => drawDifference(find("apart"), panes.a, panes.b);
     pane.place(two || narrow.matches ? null : find("side"));
   }
   showDifference(find("difference"), panes.a, panes.b);
+  drawDifference(find("apart"), panes.a, panes.b);
   // What is marked in one is marked in the other, as long as both show the same run.
   const other = { a: "b", b: "a" };
   for (const pane of Object.values(panes))
@@ -228,6 +231,7 @@ const again = () => {
   timer = setTimeout(() => Object.values(panes).forEach((pane) => {
     pane?.planned?.paint?.();
     if (pane?.plots) pane.paint();
+    repaintDifference(find("apart"));
   }), 200);
 };
 addEventListener("resize", () => {

@@ -4,9 +4,23 @@ import { h, post, runTo, say, sayDuration, sayShare, toast } from "./parts.js";
 
 const WAIT_MS = 60;
 const HEADROOM = 1.05;
+const SIGNATURE = "signature";
 
 // The effects whose signatures can be drawn: not those that are off, or neutral.
 const listSignatures = (rows) => Object.keys(rows).filter((name) => name.startsWith("signature_"));
+
+// The signature of an effect at its neutral value: it does nothing, and leaves what stood there without it.
+const flatten = (rows) => {
+  const without = rows.filter((row) => row.series === "before");
+  const there = [...without.map((row) => ({ ...row, series: "curve", mean: 0, low: null, high: null })), ...without, ...without.map((row) => ({ ...row, series: "after" }))];
+  return Object.fromEntries(["value", "mean", "low", "high", "series"].map((name) => [name, there.map((row) => row[name])]));
+};
+
+const buildFigure = (figure) =>
+  h("figure", { class: figure.width, data: { id: figure.id } },
+    h("figcaption", {}, h("h3", {}, figure.title)),
+    h("div", { class: "plot", role: "img", "aria-label": figure.words, data: { figure: figure.id } }),
+    figure.note && h("p", { class: "note" }, figure.note));
 
 // Seen only where an answer takes longer than a moment.
 const working = () => h("i", { class: "working", role: "progressbar", "aria-label": "working" });
@@ -113,6 +127,7 @@ export class Pane {
     this.state = null;
     this.album = null;
     this.plots = null;
+    this.signatures = [];
     for (const part of [this.glance, this.model, this.figures]) part.replaceChildren();
     this.hero.replaceChildren(h("h2", {}, run), h("p", { class: "lead waiting", role: "status" }, "making the run ready …"), working());
   }
@@ -258,11 +273,12 @@ export class Pane {
     }
   }
 
+  // The card has the focus at once: a moment later a person may be at its slider.
   async add(effect) {
-    await this.act("add", { effect });
-    const card = this.model.querySelector(`.card[data-effect="${CSS.escape(effect)}"]`);
-    if (!card) return;
-    card.focus({ preventScroll: true });
+    await this.settle();
+    if (!(await this.ask("add", { effect }))) return;
+    this.model.querySelector(`.card[data-effect="${CSS.escape(effect)}"]`)?.focus({ preventScroll: true });
+    await this.redraw();
     this.tryAll();
   }
 
@@ -327,16 +343,31 @@ export class Pane {
     this.album = album;
     this.signatures = listSignatures(album.rows);
     this.tellWhere(album.where);
-    this.figures.replaceChildren(this.marking, ...album.shown.map((figure) =>
-      h("figure", { class: figure.width, data: { id: figure.id } },
-        h("figcaption", {}, h("h3", {}, figure.title)),
-        h("div", { class: "plot", role: "img", "aria-label": figure.words, data: { figure: figure.id } }),
-        figure.note && h("p", { class: "note" }, figure.note))));
+    this.figures.replaceChildren(this.marking, ...album.shown.map(buildFigure));
     if (this.drawnRun !== this.run) this.marks.reset();
     this.drawnRun = this.run;
     this.plots = slipPlots(album, { strict: true, own: this.marks.own, zoomOf: this.marks.zoomOf });
     this.marks.join(album, this.plots, () => this.paint(), this.figures.querySelectorAll(".plot[data-figure]"));
     await this.paint(turn);
+    this.moved?.();
+  }
+
+  // Panels came or went with their effects: that figure alone is put in, out, or in the place of the old one.
+  async renewSignatures(turn) {
+    const album = await post("/api/figures", this.request);
+    if (turn !== this.turn) return;
+    const find = (id) => this.figures.querySelector(`figure[data-id="${id}"]`);
+    const at = album.shown.findIndex(({ id }) => id === SIGNATURE);
+    find(SIGNATURE)?.remove();
+    this.plots.forget(SIGNATURE);
+    Object.assign(this.album.figures, album.figures);
+    Object.assign(this.album.rows, album.rows);
+    this.signatures = listSignatures(album.rows);
+    if (at >= 0) {
+      const node = buildFigure(album.shown[at]);
+      find(album.shown[at - 1].id).after(node);
+      await this.plots.draw(node.querySelector(".plot"));
+    }
   }
 
   tellWhere(regions) {
@@ -351,7 +382,9 @@ export class Pane {
     for (const [id, text] of Object.entries(words)) this.figures.querySelector(`[data-figure=${id}]`)?.setAttribute("aria-label", text);
     // Words are seen before the figures are drawn.
     await new Promise((done) => setTimeout(done));
-    await this.plots?.feed(rows);
+    const idle = this.signatures.filter((name) => !(name in rows)).map((name) => [name, flatten(this.plots.rowsOf(name))]);
+    await this.plots?.feed({ ...rows, ...Object.fromEntries(idle) });
+    this.moved?.();
   }
 
   async paint(turn = this.turn) {
@@ -362,14 +395,15 @@ export class Pane {
     this.root.dataset.drawn = String(turn);
   }
 
-  // Where effects came or went their signatures do: all figures anew. Else only their rows; steps of the staircase
-  // come and go as well, so that figure changes its height and is drawn whole.
+  // Only rows, but steps of the staircase come and go, so that figure changes its height and is drawn whole; and
+  // where effects came or went their signatures do.
   async redraw() {
     if (!this.plots) {
       await this.draw();
       return;
     }
     const turn = (this.turn += 1);
+    delete this.root.dataset.drawn;
     try {
       const answer = await post("/api/rows", this.request);
       if (turn !== this.turn) return;
@@ -378,9 +412,9 @@ export class Pane {
       if (ladder) await this.plots.draw(ladder);
       await fed;
       if (turn !== this.turn) return;
-      // What is there has moved already; panels of effects that came or went take a new page of figures.
-      if (listSignatures(answer.rows).join() === this.signatures.join()) this.root.dataset.drawn = String(turn);
-      else await this.draw();
+      if (listSignatures(answer.rows).join() !== this.signatures.join()) await this.renewSignatures(turn);
+      if (turn !== this.turn) return;
+      this.root.dataset.drawn = String(turn);
       if (this.state.trial) this.follow();
     } catch (error) {
       toast(error.message);

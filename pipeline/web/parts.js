@@ -61,7 +61,10 @@ export const say = (value, digits = 3) => {
   return value.toFixed(Math.min(places, 4)).replace("-", "−");
 };
 
-export const sayShare = (value) => `${value < 0 ? "−" : value > 0 ? "+" : ""}${Math.abs(value * 100).toFixed(0)}\u00a0%`;
+export const sayShare = (value) => {
+  const whole = Math.round(value * 100);
+  return `${whole < 0 ? "−" : whole > 0 ? "+" : ""}${Math.abs(whole)}\u00a0%`;
+};
 
 export const sayDuration = (seconds) => {
   if (!Number.isFinite(seconds)) return "";

@@ -39,7 +39,7 @@ const fill = async (planned, run) => {
   const link = (file) => `/plan?${new URLSearchParams({ run, file })}`;
   const plan = await get(link("plan.json"));
   const list = (texts) => h("ul", {}, texts.map((text) => h("li", {}, text)));
-  const left = plan.impossible.length > 0 && h("details", { class: "left-open" }, h("summary", {}, `${plan.impossible.length} questions stay open`), list(plan.impossible));
+  const left = plan.impossible.length > 0 && h("details", { class: "left-open" }, h("summary", {}, "What stays open"), list(plan.impossible));
   if (!plan.drives) {
     node.replaceChildren(...[h("p", { class: "quiet" }, plan.impossible.length ? "No drive on level ground answers it." : "Nothing is open."), left].filter(Boolean));
     return;

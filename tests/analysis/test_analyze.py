@@ -273,7 +273,7 @@ def test_a_copy_says_whose_results_it_shares(log: Path, out: Path, tmp_path: Pat
     assert (second.computed, second.twin) == ((), str(copy))
     assert second.manifest.run == first.manifest.run
     text = describe_run(second.summary, unchanged=True, twin=second.twin)
-    assert f"same content              as {copy}" in text
+    assert f"same      content as {copy}" in text
 
 
 def test_a_log_that_was_moved_is_no_copy(log: Path, out: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.cli import main
-from pipeline.cli.output import print_error, print_lines, tidy_line
+from pipeline.cli.output import fold_line, print_error, print_lines, tidy_line
 from pipeline.cli.screen import describe_run
 from pipeline.core.errors import SlipError
 
@@ -66,5 +66,45 @@ def test_a_summary_keeps_to_its_lines() -> None:
     log = {"losses": [], "duration_s": 1.0}
     summary = {"run": "a\nb", "vehicle": "v\x1b", "terrain": "t", "log": log, "segments": 1}
     text = describe_run(summary, unchanged=False)
-    assert "run                       a\\nb" in text
+    assert "run       a\\nb" in text
     assert "\x1b" not in text
+
+
+ROW = "missing   drive_lag           tau = 0.304 s [0.274, 0.333]  0.187 -> 0.133 m, 0.355 -> 0.304 rad"
+FOLDED = """\
+missing   drive_lag           tau = 0.304 s [0.274, 0.333]
+                              0.187 -> 0.133 m, 0.355 -> 0.304 rad"""
+TEXT = f"          {'':<20}turns as if its wheels stood 0.99 m apart instead of 0.55: a wrong track width"
+
+
+def test_a_line_is_folded_below_the_field_that_it_goes_on_with() -> None:
+    assert fold_line(ROW, 200) == fold_line(ROW, 0) == [ROW]
+    assert "\n".join(fold_line(ROW, 80)) == FOLDED
+    command = f"next      slip diagnose {'season/run ' * 10}--apply model.toml"
+    assert fold_line(command, 80) == [command]
+    assert fold_line("only within 0.029 s, or less", 40) == ["only within 0.029 s, or less"]
+    assert fold_line(f"{'x' * 30} within 0.029 s, or less", 42) == [f"{'x' * 30} within", "0.029 s, or less"]
+    parts = fold_line(TEXT, 80)
+    assert all(len(part) <= 80 and part[:30].isspace() and part[30] != " " for part in parts)
+    assert " ".join(part.strip() for part in parts) == TEXT.strip()
+
+
+@pytest.mark.parametrize(
+    "line", ["", " " * 200, "x" * 200, "report    " + "/x" * 100, "a  " * 60, "  b c" * 40]
+)
+@pytest.mark.parametrize("width", [40, 80])
+def test_folding_loses_nothing_and_ends(line: str, width: int) -> None:
+    parts = fold_line(line, width)
+    assert "".join(parts).replace(" ", "") == line.replace(" ", "")
+    assert all(len(part) <= width or " " not in part.strip() or "/" in part for part in parts)
+
+
+def test_a_screen_of_80_columns_is_kept_to_and_a_file_takes_in_whole_lines(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    print_lines([ROW])
+    assert capsys.readouterr().out == f"{ROW}\n"
+    monkeypatch.setenv("COLUMNS", "80")
+    print_lines([ROW])
+    assert capsys.readouterr().out == f"{FOLDED}\n"

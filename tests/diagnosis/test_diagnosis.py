@@ -16,7 +16,7 @@ from pipeline.analysis.options import Options
 from pipeline.diagnosis import Diagnosis, Recording, diagnose_runs
 from pipeline.diagnosis.plausibility import find_exceeded, find_implausible, is_nameable
 from pipeline.diagnosis.words import describe, list_lines
-from pipeline.models import Model, find_effect, read_model
+from pipeline.models import Model, find_effect, read_model, write_model
 from pipeline.models.evidence import Evidence, Largest
 from pipeline.runs.errors import MotionError
 from pipeline.simulate import (
@@ -248,6 +248,8 @@ def test_one_circle_leaves_it_undecided_with_a_manoeuvre(tmp_path: Path) -> None
     assert run.undecided[0].separate_by
     held = run.find_held(run.undecided[0])
     assert run.proposal is not None
+    write_model(run.proposal, tmp_path / "model.toml")
+    assert read_model(tmp_path / "model.toml").undecided == [list(run.undecided[0].candidates)]
     assert held in run.proposal.model.ids
     assert f"{held} stands for them in the model" in " ".join(text for _, text in list_lines(run))
 

@@ -30,22 +30,31 @@ def make_results(folder: Path) -> Store:
 
 
 def links_of(path: Path) -> list[str]:
+    return re.findall(r'href="([^"]+)"', nav_of(path))
+
+
+def nav_of(path: Path) -> str:
     nav = re.search(r'<nav id="pages"[^>]*>(.*?)</nav>', path.read_text(encoding="utf-8"))
     assert nav is not None
-    return re.findall(r'href="([^"]+)"', nav[1])
+    return nav[1]
 
 
-def test_a_page_leads_to_those_that_are_there_and_the_catalogue_to_all(tmp_path: Path) -> None:
+def test_a_page_leads_to_all_others_and_to_those_made_later_by_way_of_the_catalogue(tmp_path: Path) -> None:
     store = make_results(tmp_path)
     assert links_of(tmp_path / "index.html") == []
+    for verb in ("compare", "compare --causes", "trend", "map"):
+        assert f"<code>slip {verb}</code>" in nav_of(tmp_path / "index.html")
     write_map(store, draw_up_map(store))
     assert links_of(tmp_path / "index.html") == ["map.html"]
-    assert links_of(tmp_path / "map.html") == ["index.html"]
+    ways = ["index.html", "index.html#comparison", "index.html#causes", "index.html#trend"]
+    assert links_of(tmp_path / "map.html") == ways
+    # What such a link leads to is there, whether the page it asks for is or not.
+    nav = nav_of(tmp_path / "index.html")
+    assert all(f'id="{way.partition("#")[2]}"' in nav for way in ways[1:])
     write_trend(store, follow_trend(store, by=("dataset",), threshold=0.1, limits={}))
     assert links_of(tmp_path / "index.html") == ["trend.html", "map.html"]
-    assert links_of(tmp_path / "trend.html") == ["index.html", "map.html"]
-    write_map(store, draw_up_map(store))
-    assert links_of(tmp_path / "map.html") == ["index.html", "trend.html"]
+    assert 'data-page="trend"' in nav_of(tmp_path / "index.html")
+    assert links_of(tmp_path / "trend.html")[-1] == "map.html"
     update_datasets(store)
     assert links_of(tmp_path / "index.html") == ["trend.html", "map.html"]
 

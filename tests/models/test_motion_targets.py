@@ -169,10 +169,13 @@ def test_every_effect_stands_at_a_line_or_among_those_without_one(name: str, veh
 def test_a_line_says_its_effect_value_interval_and_bound() -> None:
     effects = (find_effect("effective_track")(k=1.8), find_effect("transport_delay")(d=1.0))
     intervals = {"effective_track.k": (1.7, 1.9)}
-    lines = export_model(make(*effects, intervals=intervals, fit=FIT), "ros2_control").splitlines()
+    fit = FIT | {"undecided": [["transport_delay", "drive_lag"]]}
+    lines = export_model(make(*effects, intervals=intervals, fit=fit), "ros2_control").splitlines()
     at = next(i for i, line in enumerate(lines) if "wheel_separation_multiplier: 1.8" in line)
     assert "effective_track.k = 1.8 (95 %: 1.7 to 1.9)" in "".join(lines[at - 2 : at])
-    assert "#   transport_delay.d = 1 s, at its bound: a limit of the search, no measurement" in lines
+    rivals = "undecided: drive_lag would explain as much"
+    at_bound = "at its bound: a limit of the search, no measurement"
+    assert f"#   transport_delay.d = 1 s, {rivals}, {at_bound}" in lines
     assert "# Fitted on the measured input of yard/monday." in lines
 
 

@@ -14,6 +14,7 @@ from pipeline.analysis.options import Options
 from pipeline.cli import main
 from pipeline.report import theme
 from pipeline.report.catalogue import render_catalogue
+from pipeline.report.pages import CATALOGUE, write_page
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 
@@ -57,11 +58,11 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         with pytest.raises(SystemExit) as ended:
             main([verb, str(results), "--quiet"])
         assert ended.value.code == 0
-    plan = ["plan", "--vehicle", "husky_a200", "--time", "30s", "--out", str(folder / "plan"), "--quiet"]
+    plan = ["plan", "--vehicle", "husky_a200", "--time", "120s", "--out", str(folder / "plan"), "--quiet"]
     with pytest.raises(SystemExit) as ended:
         main(plan)
     assert ended.value.code == 0
-    (results / "index.html").write_text(render_catalogue(Store(results)))
+    write_page(Store(results), CATALOGUE, render_catalogue(Store(results)))
     return {
         "report": next(results.glob("runs/*/tile_0/*/report.html")),
         "compare": results / "comparison.html",

@@ -14,10 +14,11 @@ import polars as pl
 import pytest
 from report_synthesis import list_places, make_report
 
+from pipeline.core.durations import say_duration, say_recorded
 from pipeline.report import RunReport, render_report, templating
 from pipeline.report.sections.glance import say_standing
 from pipeline.report.templating import render_template, show_text
-from pipeline.report.words import begin_large, say_date, say_duration, say_number, say_share, say_split
+from pipeline.report.words import begin_large, say_date, say_number, say_share, say_split
 
 TEMPLATES = Path(templating.__file__).parents[1]
 HOSTILE = "</script><script>alert(1)</script><!-- <img src=x onerror=alert(2)> \u2028 \" ' & \u202e"
@@ -148,7 +149,7 @@ def test_every_row_block_that_a_figure_names_is_there_once(outline: Outline) -> 
 
 
 def test_shares_that_cancel_are_put_into_words() -> None:
-    assert say_split(0.35, 0.63, 0.02) == "drivetrain 35%   ground 63%   cross 2%"
+    assert say_split(0.35, 0.63, 0.02) == "drivetrain 35%, ground 63%, cross 2%"
     told = say_split(6.96, 5.92, -11.88)
     assert "%" not in told
     assert "2.6 and 2.4 times the slip that is left" in told
@@ -388,6 +389,8 @@ def test_durations_shares_and_dates_are_said_in_words() -> None:
     assert say_duration(648.2) == "10 min 48 s"
     assert say_duration(3.25) == "3.2 s"
     assert say_duration(7380.0) == "2 h 03 min"
+    assert say_recorded(646.0, 629.0) == "10 min 46 s"
+    assert say_recorded(646.0, 230.0) == "10 min 46 s, 3 min 50 s of it compared"
     assert say_share(0.385) == "38\u202f%"
     assert say_share(-0.004) == "0\u202f%"
     assert say_date(0) == ""

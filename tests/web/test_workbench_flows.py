@@ -10,7 +10,10 @@ import pytest
 from barriers import find_barriers
 from workbench_server import RUN, Workbench
 
+from pipeline.analysis.analyze import update_datasets
+from pipeline.analysis.map import draw_up_map, write_map
 from pipeline.simulate import simulate_case
+from pipeline.store import Store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -132,6 +135,14 @@ def test_two_models_and_their_difference(
     assert float(apart) == pytest.approx(float(second) - float(first), rel=0.01)
     assert "effective_track.k" in rows[2]
     assert "not in it" in rows[2]
+    # When they are apart: two lines over time, which follow both models, of one run only.
+    lines = "[...document.querySelectorAll('#apart .mark-line path')].map((line) => line.getAttribute('d'))"
+    chrome.wait(f"{lines}.length === 2 && {lines}[0] !== {lines}[1]")
+    before = cast("list[str]", chrome.run(lines))
+    chrome.click("[data-slot=b] .proposals li[data-effect=effective_track] .add")
+    chrome.wait(f"{lines}[1] !== {json.dumps(before[1])}")
+    chrome.wait(SETTLED)
+    assert chrome.run(f"{lines}[0]") == before[0]
     look(chrome, pictures / f"flow_compared_{width}.png")
     assert find_barriers(chrome) == []
 
@@ -190,4 +201,34 @@ def test_no_barrier_on_the_page(chrome: Chrome, workbench: Workbench, width: int
     chrome.wait("!document.querySelector('.marked').hidden")
     assert find_barriers(chrome) == []
     assert chrome.run(REACHED) == []
+    assert chrome.errors == []
+
+
+@pytest.mark.parametrize("served", [True, False], ids=["served", "from_files"])
+def test_a_report_leads_to_all_runs_and_they_lead_back(
+    chrome: Chrome, workbench: Workbench, results: Path, *, served: bool
+) -> None:
+    update_datasets(Store(results))
+    if served:
+        chrome.open(workbench.address)
+        chrome.wait("document.querySelector('main')")
+        chrome.open(f"{workbench.origin}/report?run={RUN}")
+    else:
+        chrome.open(next(results.glob("runs/**/report.html")).as_uri())
+    for _ in range(2):
+        chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
+        chrome.click("#pages a")
+        chrome.wait("document.querySelector('#shown')?.textContent === '1 of 1 runs'")
+        chrome.click("tbody th a")
+    chrome.wait(f"document.querySelector('h1')?.textContent === {json.dumps(RUN)}")
+
+    # A page that is not there yet is told how to be made; once it is, the report made before it leads there.
+    report = str(chrome.run("location.href"))
+    chrome.click("#pages a[href$='#map']")
+    chrome.wait("document.querySelector('#map:target code')?.textContent === 'slip map'")
+    write_map(Store(results), draw_up_map(Store(results)))
+    chrome.open(report)
+    chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
+    chrome.click("#pages a[href$='#map']")
+    chrome.wait("document.querySelector('h1')?.textContent === 'Deployment map'")
     assert chrome.errors == []

@@ -53,7 +53,11 @@ def render_causes(
         "report/templates/causes.html",
         [draw_causes(budgets, names)],
         title="Deployments compared by cause",
-        facts=[f"{len(budgets)} datasets", f"{len(keys)} runs", f"slip {INPUT_WORDS[input_name]}"],
+        facts=[
+            f"{len(budgets)} dataset{'s' * (len(budgets) != 1)}",
+            f"{len(keys)} run{'s' * (len(keys) != 1)}",
+            f"slip {INPUT_WORDS[input_name]}",
+        ],
         sentences_told=sentences,
         budgets=_tabulate_budgets(budgets, names),
         differences=_tabulate_differences(differences, names),

@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
+from pipeline.core.durations import say_duration
 from pipeline.fleet.measures import MEASURES, compare_orders
 from pipeline.report.comparison.difficulty import list_contradictions, tabulate_difficulty
 from pipeline.report.comparison.figures import draw_boxes, draw_runs
 from pipeline.report.elements import Cell, Column, Picture, Table
 from pipeline.report.page import render_figures
 from pipeline.report.run import INPUT_WORDS
-from pipeline.report.words import MISSING, say_distance, say_duration, say_number
+from pipeline.report.words import MISSING, say_distance, say_number
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -30,7 +31,7 @@ _SHOWN = (
 
 _DATASETS = (
     Column("dataset"), Column("runs", number=True), Column("samples", number=True),
-    Column("distance", number=True), Column("duration", number=True),
+    Column("distance", number=True), Column("time compared", number=True),
     Column("median modulus", "m/s", number=True), Column("95 % interval", number=True),
     Column("transitory", number=True), Column("steady", number=True),
     Column("window norm", "m/s", number=True), Column("as published", number=True),
@@ -151,7 +152,7 @@ def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
             str(row["runs"]),
             f"{row['samples']:,}",
             say_distance(row["distance"]).replace(" ", "\u00a0"),
-            say_duration(row["duration"]).replace(" ", "\u00a0"),
+            MISSING if row["duration"] is None else say_duration(row["duration"]).replace(" ", "\u00a0"),
             say_number(row["median_modulus"]),
             Cell(_say_ends(row), small="this run" if row["interval"] == "this run only" else ""),
             *(say_number(row[name]) for name in _SHOWN),

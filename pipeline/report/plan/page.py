@@ -14,6 +14,7 @@ from pipeline.report import theme
 from pipeline.report.elements import Picture
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
+from pipeline.report.pages import list_ways
 from pipeline.report.specs import build_spec, share_rows
 from pipeline.report.templating import render_template
 
@@ -72,7 +73,7 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
         "report/templates/plan.html",
         [_draw_ways(plan), _draw_commands(plan)],
         title="What to drive next",
-        catalogue=catalogue,
+        ways=list_ways(catalogue),
         facts=[
             plan.vehicle,
             f"{plan.commands.duration_s:.0f} s",
@@ -95,7 +96,7 @@ def _say(plan: Plan) -> dict[str, object]:
             for one in plan.promises
         ],
         "rest": plan.say_rest(),
-        "impossible": [f"{one.question}: {one.because}" for one in plan.impossible],
+        "impossible": plan.list_impossible(),
     }
 
 
