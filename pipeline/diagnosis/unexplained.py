@@ -177,12 +177,13 @@ def _describe(comparison: Comparison) -> tuple[Floats, tuple[str, ...]]:
         columns[f"v_w {late:g} s ago"] = np.interp(at - late, around.times, velocity.w)
         if vehicle.kinematics.has_inputs("sideways"):
             columns[f"v_y {late:g} s ago"] = np.interp(at - late, around.times, velocity.y)
-    yaw = np.interp(at, around.times, around.attitude[:, 2])
-    columns |= {"sin yaw": np.sin(yaw), "cos yaw": np.cos(yaw)}
-    columns |= {"sin 2 yaw": np.sin(2.0 * yaw), "cos 2 yaw": np.cos(2.0 * yaw)}
+    x, y, yaw = (np.interp(at, around.times, column) for column in around.from_start.T)
+    for times, name in ((1.0, "yaw"), (2.0, "2 yaw")):
+        columns[f"sin {name} since the start"] = np.sin(times * yaw)
+        columns[f"cos {name} since the start"] = np.cos(times * yaw)
     for place, name in enumerate(("roll", "pitch")):
         columns[name] = np.interp(at, around.times, around.attitude[:, place])
-    columns |= {"x": find_places(comparison)[:, 0], "y": find_places(comparison)[:, 1]}
+    columns |= {"x ahead of the start": x, "y left of the start": y}
     half = 0.5 * around.track_m * velocity.w if vehicle.kind == "differential" else 0.0 * velocity.w
     for name, rim in (("left", velocity.x - half), ("right", velocity.x + half)):
         angle = np.cumsum(rim) * cells.step_s / vehicle.wheel_radius_m

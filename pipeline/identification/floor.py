@@ -135,11 +135,11 @@ def describe_inputs(comparison: Comparison) -> Floats:
     for late in _LAGS_S:
         one, two = look(along, late), look(around_w, late)
         columns += [one, two, one * two, np.abs(one) * two, one * np.abs(two)]
-    yaw = look(around.attitude[:, 2], 0.0)
+    yaw = look(around.from_start[:, 2], 0.0)
     moving = np.clip(np.abs(v) + np.abs(w), 0.0, 0.1) * 10.0
     columns += [moving, np.sin(yaw) * moving, np.cos(yaw) * moving]
     columns += [np.sin(look(around.attitude[:, i], 0.0)) * moving for i in (0, 1)]
-    since = middle / max(around.duration_s, 1e-9)
+    since = (middle - around.start_s) / max(around.duration_s, 1e-9)
     columns += [since * v, since * w]
     if around.vehicle.kinematics.has_inputs("sideways"):
         aside = _average(velocity.y, around.step_s)

@@ -34,6 +34,7 @@ Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 UNIT_S = 10.0
+_ROUNDING_S = 1e-6
 IDEAL_CHANNELS = (0, 2, 1)
 """Which of x, y, w the columns of `Part.find_ideal` are."""
 _NO_DELAY = Timing()
@@ -75,10 +76,16 @@ class Part(ABC):
         windows = [c.windows for c in self.comparisons]
         self.run = np.repeat(np.arange(len(windows)), [w.start.size for w in windows]).astype(np.int64)
         self.times: Floats = np.concatenate([w.times for w in windows])
-        self.unit = number_units(self.run, self.times)
+        begin = np.array([comparison.run.start_s for comparison in self.comparisons])
+        self._since: Floats = self.times.mean(axis=1) - begin[self.run]
+        self.unit = self.number_stretches(UNIT_S)
         shift = np.concatenate(([0], np.cumsum([int(w.block.max(initial=-1)) + 1 for w in windows])))
         self.block: Integers = np.concatenate([w.block + shift[i] for i, w in enumerate(windows)])
         self.live = find_live(self.find_ideal())
+
+    def number_stretches(self, length: float) -> Integers:
+        """Stretches of a length [s] since each run's start, numbered through all runs, shape (n,)."""
+        return number_stretches(self.run, self._since, length)
 
     @abstractmethod
     def owns(self, effect: Effect) -> bool:
@@ -227,9 +234,16 @@ class WheelPart(Part):
         return self.find_run_residuals(replace(state, timing=tuple(timing)), run)
 
 
-def number_units(run: Integers, times: Floats, length: float = UNIT_S) -> Integers:
-    """Stretches of ten seconds, or of another length, numbered through all runs."""
-    label = run * 1_000_000 + (times.mean(axis=1) // length).astype(np.int64)
+def number_stretches(run: Integers, since: Floats, length: float = UNIT_S) -> Integers:
+    """Stretches of ten seconds, or of another length, numbered through all runs.
+
+    Args:
+        run: number of the run of each window, shape (n,).
+        since: middle of each window since its run's start [s], shape (n,): when the recorder was started
+            must not say which windows belong together.
+        length: [s].
+    """
+    label = run * 1_000_000 + ((since + _ROUNDING_S) // length).astype(np.int64)
     return np.unique(label, return_inverse=True)[1].astype(np.int64)
 
 

@@ -185,10 +185,5 @@ def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
         wheel = max(wheel, float(find_fastest_wheel(series).max()))
         difference = max(difference, float(np.abs(series.right - series.left).max()))
     moments = np.concatenate([run.track.times[run.track.active] for run in runs])
-    places = np.concatenate([run.track.place[run.track.active, 0] for run in runs])
-    shares = np.linspace(0.0, 1.0, 11)
-    if places.size == 0:
-        tenths = np.zeros(11), np.zeros(11)
-    else:
-        tenths = np.quantile(moments, shares), np.quantile(places, shares)
-    return Largest(speed, turn, wheel, max(difference, 1e-6), *tenths, sideways=aside)
+    tenths = np.quantile(moments, np.linspace(0.0, 1.0, 11)) if moments.size else np.zeros(11)
+    return Largest(speed, turn, wheel, max(difference, 1e-6), tenths, sideways=aside)

@@ -31,6 +31,7 @@ Integers = NDArray[np.int64]
 _DEAD = 1e-9
 _LONGEST_WAIT = 1.5
 _REPEATED_SHARE = 0.2
+_ROUNDING_S = 1e-6
 _ROLLS = 0.3
 _NUMBERS = (
     "hold_time",
@@ -170,6 +171,11 @@ class MotionRun:
     repeats_s: float = 0.0
 
     @property
+    def start_s(self) -> float:
+        """When its first stream begins [s]."""
+        return float(self.streams[0])
+
+    @property
     def gyro_fit(self) -> GyroFit | None:
         """How the gyro fits the poses; None without a good one."""
         return self.alignment.gyro
@@ -245,7 +251,7 @@ def make_run(
         streams=streams,
         step_starts=steps,
         barred=barred,
-        duration_s=float(streams[-1]),
+        duration_s=float(streams[-1] - streams[0]),
         alignment=alignment,
         repeats_s=_measure_repeats(tables["poses"]),
     )
@@ -431,8 +437,8 @@ def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Flo
     known = np.concatenate(
         ([min(float(streams[0]), times[0]) - 0.05], times, [max(streams[-1], times[-1]) + 0.05])
     )
-    holes = np.flatnonzero(np.diff(known) > 0.2)  # noqa: PLR2004 - four samples at the usual rate
+    holes = np.flatnonzero(np.diff(known) > 0.2 + _ROUNDING_S)
     for hole in holes.tolist():
-        barred.append(np.arange(known[hole] + 0.05, known[hole + 1], 0.05))  # noqa: PERF401
+        barred.append(np.arange(known[hole] + 0.05, known[hole + 1] - _ROUNDING_S, 0.05))  # noqa: PERF401
     barred.append(np.array([times[0] - 1e-3, times[-1] + 1e-3]))
     return starts, np.unique(np.concatenate(barred))

@@ -351,7 +351,7 @@ def test_a_diagnosis_is_the_same_each_time(tmp_path: Path) -> None:
     assert diagnose_runs([recording], vehicle).to_json() == first
 
 
-_EVIDENCE = Evidence(Largest(1.0, 1.0, 8.0, 3.0, np.linspace(0.0, 120.0, 11), np.zeros(11)))
+_EVIDENCE = Evidence(Largest(1.0, 1.0, 8.0, 3.0, np.linspace(0.0, 120.0, 11)))
 
 
 @pytest.mark.parametrize(
