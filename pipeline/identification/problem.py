@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.identification.comparison import Comparison, Input, choose_rate
+from pipeline.identification.floor import estimate_floor
 from pipeline.identification.folds import Fold, find_near, make_folds
 from pipeline.identification.parts import BodyPart, Part, WheelPart
 from pipeline.identification.state import State
@@ -23,6 +24,7 @@ from pipeline.runs.signals import find_fastest_wheel, name_inputs
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.identification.scoring import Errors
     from pipeline.identification.state import DelayName
     from pipeline.models.effect import Effect
     from pipeline.models.model import Model
@@ -133,6 +135,11 @@ class Problem:
     def names(self) -> tuple[str, ...]:
         """Names of the runs."""
         return tuple(run.name for run in self.runs)
+
+    @cached_property
+    def floor(self) -> Errors:
+        """The noise floor of these runs, whatever is fitted to them (see `estimate_floor`)."""
+        return estimate_floor(self)
 
     @cached_property
     def folds(self) -> tuple[Fold, ...]:
