@@ -6,7 +6,7 @@ A part of the way from command to body: the whole of it, from the wheels to the 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -212,10 +212,18 @@ class WheelPart(Part):
         return effect.place <= Place.DRIVE
 
     def find_run_residuals(self, state: State, run: int) -> Floats:
-        """See `Part`; in terms of the ideal velocity of the wheels."""
-        comparison, late = self.comparisons[run], state.timing[run].wheel_delay_s
+        """See `Part`; in terms of the ideal velocity of the wheels.
+
+        Encoders do not report what has not happened yet: where the body seems to turn after its wheels do,
+        it is the body or its gyro that is late, and no command the later for it.
+        """
+        return self._compare(state, run, max(state.timing[run].wheel_delay_s, 0.0))
+
+    def _compare(self, state: State, run: int, late: float) -> Floats:
+        """Residuals where the encoders are late by so much [s]."""
+        comparison = self.comparisons[run]
         if (run, late) not in self._seen:
-            wheels = self.measured[run].predict_velocity((), state.timing[run])
+            wheels = self.measured[run].predict_velocity((), Timing(late))
             self._seen = {key: seen for key, seen in self._seen.items() if key[0] != run}
             self._seen[run, late] = average_windows(comparison, wheels, self._spans[run])
         drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
@@ -229,9 +237,7 @@ class WheelPart(Part):
 
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
         """See `Part`: of encoders that are later by ``late_s`` than they are taken for."""
-        timing = list(state.timing)
-        timing[run] = Timing(timing[run].wheel_delay_s + late_s)
-        return self.find_run_residuals(replace(state, timing=tuple(timing)), run)
+        return self._compare(state, run, max(state.timing[run].wheel_delay_s, 0.0) + late_s)
 
 
 def number_stretches(run: Integers, since: Floats, length: float = UNIT_S) -> Integers:

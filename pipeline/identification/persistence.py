@@ -124,6 +124,29 @@ def _covary(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
     return means
 
 
+def take_own_past(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
+    """Residuals without what the two windows before each, which it does not overlap, tell of it.
+
+    Args:
+        comparisons: whose windows they are.
+        residuals: x, y, w, shape (n, 3); where nothing goes before a window it is zero.
+    """
+    past = np.full((2, *residuals.shape), np.nan)
+    shift = 0
+    for comparison in comparisons:
+        times = comparison.windows.times
+        for lag in (1, 2):
+            first, second = _pair(times, lag)
+            past[lag - 1, shift + second] = residuals[shift + first]
+        shift += times.shape[0]
+    known = np.isfinite(past).all(axis=(0, 2))
+    fresh = np.zeros(residuals.shape)
+    for channel in range(residuals.shape[1]):
+        design, target = past[:, known, channel].T, residuals[known, channel]
+        fresh[known, channel] = target - design @ np.linalg.lstsq(design, target, rcond=None)[0]
+    return fresh
+
+
 def _pair(times: Floats, lag: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Windows and those that begin where ``lag`` windows later begin."""
     first = np.arange(times.shape[0])
