@@ -26,6 +26,7 @@ Floats = NDArray[np.float64]
 CHANNELS = ("v_x", "v_y", "v_w")
 _WIDE = 50.0
 _WAVE_NUMBERS = np.geomspace(0.15, 6.0, 60)
+_ENOUGH = 400
 _DIRECTIONS = np.linspace(0.0, np.pi, 24, endpoint=False)
 
 # Formula and its unit; the catalogue has the others (gains, squares, drifts, slopes).
@@ -155,11 +156,12 @@ def list_waves(
     rest = selection.weights.weigh(final.fit.residual)
     # Directions are counted from where the run began to head: which way the map lies must not matter.
     headings = float(selection.part.comparisons[0].context.attitude[0, 2]) + _DIRECTIONS
+    # Windows overlap by half, and some hundreds of them tell a wave.
+    every = max(rest.shape[0] // _ENOUGH, 2)
     found = []
     for channel, name in enumerate(CHANNELS):
         factor, column = ("w0", 1) if name == "v_w" else ("v0", 0)
-        # Windows overlap by half.
-        wave = _best_wave(rest[::2, channel], lags[::2, column], places[::2], headings)
+        wave = _best_wave(rest[::every, channel], lags[::every, column], places[::every], headings)
         found.append(_make_wave(name, factor, mark, *wave))
     return tuple(found)
 
