@@ -50,9 +50,14 @@ def test_recordings_keep_their_answer_wherever_the_map_lies(name: str, change: s
 
 @pytest.mark.long
 @pytest.mark.skipif(not _DRIVEN, reason="the recordings are not there")
-@pytest.mark.parametrize("change", _NOISY)
-@pytest.mark.parametrize("name", _DRIVEN)
-def test_fewer_or_noisier_poses_give_no_other_name(name: str, change: str) -> None:
-    log = LOGS / f"{name}.mcap"
-    before, after = _ask_as_recorded(log), ask(log, _BY_NAME[change], both=True)
-    assert after.names <= before.names | set(before.undecided)
+def test_fewer_or_noisier_poses_give_hardly_any_other_name() -> None:
+    """Names may be lost or become undecided; of those that are given, three in a hundred may be others."""
+    named, others = 0, list[str]()
+    for name in _DRIVEN:
+        log = LOGS / f"{name}.mcap"
+        before = _ask_as_recorded(log)
+        for change in _NOISY:
+            after = ask(log, _BY_NAME[change], both=True)
+            named += len(after.names)
+            others += [f"{name}, {change}: {one}" for one in after.names - before.names - {*before.undecided}]
+    assert len(others) <= 0.03 * named, others
