@@ -153,7 +153,7 @@ def write_formula(joined: Mapping[str, object]) -> str:
     parameters = joined["parameters"]
     for name, entry in parameters.items() if isinstance(parameters, dict) else ():
         low, high = entry["bounds"]
-        neutral = f", neutral = {entry['value']:g}" if entry["fixed"] or low > 0.0 else ""
+        neutral = f", neutral = {entry['value']:g}" if entry["fixed"] or not low <= 0.0 <= high else ""
         fixed = ", fixed = true" if entry["fixed"] else ""
         lines.append(
             f'{name} = {{value = {entry["value"]:g}, unit = "{entry["unit"]}", '

@@ -324,7 +324,7 @@ def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> T
             fresh = fresh[~_waits_in_motion(times, held, wheels)[fresh]]
         fresh = fresh[np.diff(times[fresh], prepend=-np.inf) > 0.0]
         if fresh.size > 1:
-            parts.append(_unroll(piece[fresh]))
+            parts.append(_unroll(piece[fresh], parts[-1] if parts else None))
     if sum(part.times.size for part in parts) < 10:  # noqa: PLR2004 - fewer say nothing
         raise MotionError(
             "no_poses",
@@ -349,11 +349,16 @@ def _waits_in_motion(times: Floats, held: Flags, wheels: DriveSeries) -> Flags:
     return waits
 
 
-def _unroll(piece: pl.DataFrame) -> Track:
-    """One segment's poses, rolled out into the plane of motion."""
+def _unroll(piece: pl.DataFrame, before: Track | None) -> Track:
+    """One segment's poses, rolled out into the plane of motion; headings go on from the segment before.
+
+    How often a heading has gone round since the map's x axis must not matter between segments.
+    """
     position = piece.select("x", "y", "z").to_numpy()
     quaternion = piece.select("q_x", "q_y", "q_z", "q_w").to_numpy()
     roll, pitch, yaw = rigid.euler_from_quaternions(quaternion)
+    if before is not None:
+        yaw = yaw + 2.0 * np.pi * np.round((before.heading[-1] - yaw[0]) / (2.0 * np.pi))
     _, turn = segments.measure_increments(position, quaternion)
     middle = rigid.slerp(quaternion[:-1], quaternion[1:], np.full(turn.shape[0], 0.5))
     moved = rigid.rotate(rigid.invert_quaternions(middle), np.diff(position, axis=0))
