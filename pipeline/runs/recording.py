@@ -315,7 +315,7 @@ def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
 
 
 def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> Track:
-    parts = []
+    parts: list[Track] = []
     for piece in poses.sort("segment", "t").partition_by("segment", maintain_order=True):
         times = piece["t"].to_numpy()
         held = piece["held"].to_numpy()
