@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from pipeline.vehicles.sources import Sources
 
 LOGS = Path(__file__).parents[2] / "shared" / "logs"
-_STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
+STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96
 _VERDICTS = ("recovered", "told", "undecided", "cannot", "missed")
 Json = dict[str, Any]
@@ -205,7 +205,7 @@ def main() -> int:
     logs = [
         log
         for log in sorted(LOGS.glob("*.mcap"))
-        if not log.stem.startswith(_STANDING) and any(word in log.name for word in asked.logs)
+        if not log.stem.startswith(STANDING) and any(word in log.name for word in asked.logs)
     ]
     unchanged = Injection("nothing", lambda tables, _: tables)
     plain = {(log, both): ask(log, unchanged, both=both) for log in logs for both in (False, True)}

@@ -74,6 +74,7 @@ def list_injections() -> list[Injection]:
         ),
         Injection("gyro negated", _on("imu", lambda t: t.with_columns(-pl.col("rate_z"))), same=True),
         Injection("map turned and moved", _map_moved, same=True),
+        Injection("recorder started 12.8 s earlier", _all_later, same=True),
         Injection("poses at 5 Hz", _on("poses", _thin), same=True),
         Injection("1 cm of noise", _on("poses", _noisy), same=True),
         Injection(
@@ -158,6 +159,14 @@ def _scale(table: pl.DataFrame, left: float = 1.0, right: float = 1.0) -> pl.Dat
 def _later(table: pl.DataFrame, late_s: float) -> pl.DataFrame:
     nanoseconds = round(late_s * 1e9)
     return table.with_columns(pl.col("t") + late_s, pl.col("stamp") + nanoseconds)
+
+
+def _all_later(tables: Tables, _: Drive) -> Tables:
+    """All times count from an earlier start, no multiple of the stretches that anything is divided into."""
+    return {
+        name: _later(table, 12.8) if {"t", "stamp"} <= set(table.columns) else table
+        for name, table in tables.items()
+    }
 
 
 def _thin(poses: pl.DataFrame) -> pl.DataFrame:

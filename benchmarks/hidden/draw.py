@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from closed_loop import close_loop
 from odd_physics import ODD
 
 from pipeline.simulate import (
@@ -57,6 +58,8 @@ CAR = ("steering_offset", "steering_gain", "steering_lag", "understeer")
 SENSED = ("steering_sensor_offset",)
 AT_SPEED = ("speed_track",)
 EMPTY = ("plain", "jumps", "noisy", "tilted")
+# In closed loop, with random motion of its usual size and three times that; asked for by name, too.
+CLOSED = ("closed", "closed_rough")
 MACHINERY = ("track", "payload", "small_wheels", "slope", "slow_motors", "low_grip")
 _CARS = 0.1
 # On top of these two an equipped vehicle has one effect more, or nothing.
@@ -67,7 +70,7 @@ POOLS: dict[str, tuple[str, ...]] = {
     "single": DIFFERENTIAL + CAR + SENSED + AT_SPEED,
     "small": DIFFERENTIAL + CAR + SENSED + AT_SPEED,
     "equipped": (*_MORE, "nothing"),
-    "empty": EMPTY,
+    "empty": EMPTY + CLOSED,
     "poor": _POOR + CAR,
     "odd": tuple(sorted(ODD)),
     "rigid": MACHINERY,
@@ -326,6 +329,11 @@ def _draw_empty(draw: np.random.Generator, seed: int, effect: str | None) -> Rid
         scene = replace(scene, pose=replace(scene.pose, rate_hz=10.0, noise_m=0.02, noise_rad=0.01))
     elif kind == "tilted":
         scene = replace(scene, ground=Ground(math.radians(7.0), math.radians(-4.0)))
+    elif kind in CLOSED:
+        rough = 1.0 if kind == "closed" else 3.0
+        scene = _draw_scene(draw, seed)
+        scene = replace(scene, disturbance=Disturbance(0.03 * rough, 0.05 * rough))
+        scene = close_loop(replace(scene, duration_s=float(draw.uniform(60.0, 120.0))), draw)
     return Riddle(scene, Answer("empty", program=scene.program.name, note=kind))
 
 

@@ -98,8 +98,7 @@ def check_models(vehicle: Vehicle, recording: Recording, told: Json, answer: Ans
         )
     except MotionError:
         return Checked()
-    true = [_build(name, values) for name, values in answer.effects.items()]
-    true = [_place_change(effect, run.duration_s) for effect in true]
+    true = list(build_true(answer, run.duration_s))
     ideal = _judge(problem, Model(vehicle))
     best = _judge(problem, Model(vehicle, tuple(true))) if true else None
     found = _judge(problem, Model(vehicle, tuple(named))) if named else ideal
@@ -113,6 +112,11 @@ def check_models(vehicle: Vehicle, recording: Recording, told: Json, answer: Ans
     if clock is not None and run.gyro_fit is not None:
         without[clock.id] = _judge_late(problem, Model(vehicle, tuple(true)))
     return Checked(ideal, best, found, _judge_formula(problem, Model(vehicle, tuple(named)), told), without)
+
+
+def build_true(answer: Answer, duration_s: float) -> tuple[Effect, ...]:
+    """The effects that were simulated, at their values."""
+    return tuple(_place_change(_build(name, values), duration_s) for name, values in answer.effects.items())
 
 
 def _judge(problem: Problem, model: Model) -> Held:

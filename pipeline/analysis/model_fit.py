@@ -50,8 +50,8 @@ class ModelFit:
 
     @property
     def floor(self) -> Errors:
-        """One floor for both ladders: it is the runs', and the better model sees it sharper."""
-        return min(self.before.floor, self.after.floor, key=lambda errors: errors.t_mrmse_m)
+        """One floor for both ladders: it is the runs'."""
+        return self.after.floor
 
     def to_json(self) -> dict[str, object]:
         """The keys of `slip model fit --json` that are the fit's own."""

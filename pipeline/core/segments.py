@@ -19,6 +19,7 @@ _GAUSSIAN = 1.4826
 _SIDE = 4
 _PLAINLY = 3.0
 _LONGEST_WAIT = 1.0
+_ROUNDING_S = 1e-6
 
 
 def find_gaps(times: Floats, smallest: float) -> Flags:
@@ -71,8 +72,9 @@ def select_fresh_poses(times: Floats, held: Flags) -> Integers:
     following = np.searchsorted(fresh, np.arange(held.size), side="right")
     # Nobody saw the next change after the last repeat: it may have come at once.
     next_fresh = np.append(times[fresh], times[-1])[following]
-    stands = held & (next_fresh - times[previous] > longest_wait)
-    old_again = next_fresh - times < float(np.median(waits)) * 1.5
+    # Stamps on a raster meet these bounds exactly: rounding must not decide.
+    stands = held & (next_fresh - times[previous] > longest_wait + _ROUNDING_S)
+    old_again = next_fresh - times < float(np.median(waits)) * 1.5 - _ROUNDING_S
     return np.flatnonzero(~held | (stands & ~old_again)).astype(np.int64)
 
 

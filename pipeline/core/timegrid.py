@@ -93,8 +93,10 @@ def _choose_neighbours(at: Floats, times: Floats, window: float) -> tuple[Indice
             break
         before = np.where(first > 0, at - times[np.maximum(first - 1, 0)], np.inf)
         after = np.where(last < times.size, times[np.minimum(last, times.size - 1)] - at, np.inf)
-        first = np.where(short & (before <= after), first - 1, first)
-        last = np.where(short & (before > after), last + 1, last)
+        # Of two that are as near the earlier one, whatever rounding says.
+        earlier = before <= after + 1e-9
+        first = np.where(short & earlier, first - 1, first)
+        last = np.where(short & ~earlier, last + 1, last)
     return first, last
 
 

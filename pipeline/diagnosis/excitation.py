@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.diagnosis.verdict import LEAST_STRETCHES, SHORT_S
-from pipeline.identification.parts import number_units
 from pipeline.models.effect import Excitation, Search
 
 if TYPE_CHECKING:
@@ -144,7 +143,7 @@ def _evidence(selection: Selection, final: CandidateModel, shift: Floats) -> tup
 def _count_stretches(selection: Selection, shift: Floats) -> float:
     """Number of short stretches over which a shift of the prediction is spread."""
     moved = ((shift / selection.weights.scale) ** 2).sum(axis=1)
-    stretch = number_units(selection.part.run, selection.part.times, SHORT_S)
+    stretch = selection.part.number_stretches(SHORT_S)
     action = np.bincount(stretch, moved)
     power = float(np.sum(action**2))
     return float(action.sum()) ** 2 / power if power > 0.0 else 0.0

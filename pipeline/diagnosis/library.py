@@ -26,6 +26,8 @@ Floats = NDArray[np.float64]
 CHANNELS = ("v_x", "v_y", "v_w")
 _WIDE = 50.0
 _WAVE_NUMBERS = np.geomspace(0.15, 6.0, 60)
+_ENOUGH = 400
+_DIRECTIONS = np.linspace(0.0, np.pi, 24, endpoint=False)
 
 # Formula and its unit; the catalogue has the others (gains, squares, drifts, slopes).
 _SHAPES: Mapping[str, tuple[str, str]] = {
@@ -50,16 +52,12 @@ _SHAPES: Mapping[str, tuple[str, str]] = {
     "saturating_turn": ("w0 / hypot(w0, s)", "1"),
     "push_ahead": ("v0_rate", "m/s^2"),
     "push_around": ("w0_rate", "rad/s^2"),
-    "world_sin": ("sin(yaw) * tanh(abs(v0) / u)", "1"),
-    "world_cos": ("cos(yaw) * tanh(abs(v0) / u)", "1"),
-    "world_sin_still": ("sin(yaw)", "1"),
-    "world_cos_still": ("cos(yaw)", "1"),
-    "world_sin_two": ("sin(2 * yaw) * tanh(abs(v0) / u)", "1"),
-    "world_cos_two": ("cos(2 * yaw) * tanh(abs(v0) / u)", "1"),
-    "speed_world_sin": ("v0 * sin(yaw)", "m/s"),
-    "speed_world_cos": ("v0 * cos(yaw)", "m/s"),
-    "turn_world_sin": ("w0 * sin(yaw)", "rad/s"),
-    "turn_world_cos": ("w0 * cos(yaw)", "rad/s"),
+    # Sine and cosine together: which way a map lies must not matter.
+    "world": ("(a * sin(yaw) + b * cos(yaw)) * tanh(abs(v0) / u)", "1"),
+    "world_still": ("a * sin(yaw) + b * cos(yaw)", "1"),
+    "world_two": ("(a * sin(2 * yaw) + b * cos(2 * yaw)) * tanh(abs(v0) / u)", "1"),
+    "speed_world": ("v0 * (a * sin(yaw) + b * cos(yaw))", "m/s"),
+    "turn_world": ("w0 * (a * sin(yaw) + b * cos(yaw))", "rad/s"),
 }
 _SIDEWAYS_SHAPES: Mapping[str, tuple[str, str]] = {
     "sideways_gain": ("s0", "m/s"),
@@ -121,9 +119,11 @@ def list_terms(*, sideways: bool = False) -> tuple[Term, ...]:
 
 def _make_term(channel: str, name: str, text: str, unit: str) -> Term:
     ratio = _divide(_UNITS[channel], unit)
-    gain = Parameter("k", ratio, (-_WIDE, _WIDE), 0.0, "size", 0.1, step=1e-3)
+    sizes = {"a": "sine part", "b": "cosine part"} if "a * sin" in text else {"k": "size"}
+    gains = [Parameter(n, ratio, (-_WIDE, _WIDE), 0.0, about, 0.1, step=1e-3) for n, about in sizes.items()]
     shape = tuple(parameter for key, parameter in _FIXED.items() if f" {key})" in text)
-    return Term(f"{TERM}{channel[-1]}_{name}", channel, f"k * {text}", (gain, *shape))
+    whole = text if len(gains) > 1 else f"k * {text}"
+    return Term(f"{TERM}{channel[-1]}_{name}", channel, whole, (*gains, *shape))
 
 
 def _divide(one: str, other: str) -> str:
@@ -142,7 +142,7 @@ def _divide(one: str, other: str) -> str:
 def list_waves(
     selection: Selection, final: CandidateModel, places: Floats, mark: str = ""
 ) -> tuple[Term, ...]:
-    """Terms that repeat along the map's axes, with the wave numbers that fit the residuals best.
+    """Terms that repeat across the map, with the wave numbers and directions that fit the residuals best.
 
     Args:
         selection: where models are judged.
@@ -150,47 +150,52 @@ def list_waves(
         places: x, y [m] in the map at every window, shape (n, 2).
         mark: tells terms of several models apart.
     """
+    if np.ptp(places, axis=0).max() < 1.0:
+        return ()
     lags = selection.part.find_ideal()[:, 0, :]
     rest = selection.weights.weigh(final.fit.residual)
+    # Directions are counted from where the run began to head: which way the map lies must not matter.
+    headings = float(selection.part.comparisons[0].context.attitude[0, 2]) + _DIRECTIONS
+    # Windows overlap by half, and some hundreds of them tell a wave.
+    every = max(rest.shape[0] // _ENOUGH, 2)
     found = []
     for channel, name in enumerate(CHANNELS):
-        for axis, place in zip("xy", places.T, strict=True):
-            if np.ptp(place) < 1.0:
-                continue
-            for factor, values in (("v0", lags[:, 0]), ("w0", lags[:, 1])):
-                if (name == "v_w") != (factor == "w0"):
-                    continue
-                wave = _best_wave(rest[:, channel], values, place)
-                found.append(_make_wave(name, factor, axis + mark, wave))
+        factor, column = ("w0", 1) if name == "v_w" else ("v0", 0)
+        wave = _best_wave(rest[::every, channel], lags[::every, column], places[::every], headings)
+        found.append(_make_wave(name, factor, mark, *wave))
     return tuple(found)
 
 
-def _best_wave(rest: Floats, factor: Floats, place: Floats) -> float:
-    best, number = -1.0, 1.0
-    for wave in _WAVE_NUMBERS.tolist():
-        design = np.column_stack((factor * np.sin(wave * place), factor * np.cos(wave * place)))
-        taken = float(rest @ design @ np.linalg.pinv(design.T @ design) @ design.T @ rest)
-        if taken > best:
-            best, number = taken, wave
-    return number
+def _best_wave(rest: Floats, factor: Floats, places: Floats, headings: Floats) -> tuple[float, float]:
+    """Wave number [1/m] and direction [rad] whose sine and cosine, times a factor, take most of a rest."""
+    best, found = -1.0, (1.0, 0.0)
+    for heading in headings.tolist():
+        along = places @ np.array([np.cos(heading), np.sin(heading)])
+        phase = along[:, None] * _WAVE_NUMBERS
+        sine, cosine = factor[:, None] * np.sin(phase), factor[:, None] * np.cos(phase)
+        both = (sine**2).sum(axis=0), (cosine**2).sum(axis=0), (sine * cosine).sum(axis=0)
+        one, other = rest @ sine, rest @ cosine
+        taken = one**2 * both[1] - 2.0 * one * other * both[2] + other**2 * both[0]
+        taken /= np.maximum(both[0] * both[1] - both[2] ** 2, 1e-6 * both[0] * both[1] + 1e-12)
+        if taken.max() > best:
+            best, found = float(taken.max()), (float(_WAVE_NUMBERS[taken.argmax()]), heading)
+    return found
 
 
-def _make_wave(channel: str, factor: str, axis: str, wave: float) -> Term:
-    text = f"{factor} * (a * sin(q * {axis[0]}) + b * cos(q * {axis[0]}))"
+def _make_wave(channel: str, factor: str, mark: str, wave: float, heading: float) -> Term:
+    along = "q * (x * cos(h) + y * sin(h))"
     size = {"a": "sine part", "b": "cosine part"}
     parameters = [Parameter(n, "1", (-_WIDE, _WIDE), 0.0, about, 0.1, step=1e-3) for n, about in size.items()]
-    number = Parameter(
-        "q",
-        "1/m",
-        (0.5 * wave, 2.0 * wave),
-        wave,
-        "wave number",
-        wave,
-        search=Search.STARTS,
-        starts=(wave,),
-        step=1e-3,
+    shape = (
+        ("q", "1/m", (0.5 * wave, 2.0 * wave), wave, "wave number"),
+        ("h", "rad", (heading - 0.3, heading + 0.3), heading, "direction in the map"),
     )
-    return Term(f"{TERM}{channel[-1]}_{factor}_along_{axis}", channel, text, (*parameters, number))
+    parameters += [
+        Parameter(n, unit, bounds, value, about, value, search=Search.STARTS, starts=(value,), step=1e-3)
+        for n, unit, bounds, value, about in shape
+    ]
+    text = f"{factor} * (a * sin({along}) + b * cos({along}))"
+    return Term(f"{TERM}{channel[-1]}_{factor}_along{mark}", channel, text, tuple(parameters))
 
 
 def is_term(name: str) -> bool:

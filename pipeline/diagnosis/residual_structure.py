@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from pipeline.diagnosis.diagnosis import Unexplained
 from pipeline.diagnosis.error_regions import CHANNELS
 from pipeline.diagnosis.library import join_formula
+from pipeline.diagnosis.materiality import LEAST_TURN_RAD, LEAST_WAY_SHARE
 from pipeline.diagnosis.unexplained import collect_terms, describe_windows, is_explainable
 from pipeline.identification.persistence import split_residuals
+from pipeline.runs.windows import HORIZON_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -59,9 +61,22 @@ def describe(ways: Sequence[Explored]) -> Unexplained | None:
         channel = CHANNELS.index(left.channel)
         left = replace(left, share=float(explainable.shares[channel]))
         size = float(np.sqrt((signal[:, channel] ** 2).mean()))
-        found.append((size / float(_measure_asked(body)[channel]), left))
+        part = size / float(_measure_asked(body)[channel])
+        if is_felt(left.channel, size, part):
+            found.append((part, left))
     found += [one for way in ways if (one := _find_lasting(way)) is not None]
     return max(found, key=lambda item: item[0])[1] if found else None
+
+
+def is_felt(channel: str, size: float, part: float) -> bool:
+    """Whether a planner feels a push of this rms over two seconds: least sizes are those of effects.
+
+    Args:
+        channel: x, y or w.
+        size: [m/s] or [rad/s].
+        part: of the motion that was asked for in that channel.
+    """
+    return size * HORIZON_S >= LEAST_TURN_RAD if channel == "w" else part >= LEAST_WAY_SHARE
 
 
 def _describe_signal(body: Explored, signal: Floats, share: float, formula: str | None) -> Unexplained:
@@ -138,7 +153,7 @@ def write_formula(joined: Mapping[str, object]) -> str:
     parameters = joined["parameters"]
     for name, entry in parameters.items() if isinstance(parameters, dict) else ():
         low, high = entry["bounds"]
-        neutral = f", neutral = {entry['value']:g}" if entry["fixed"] or low > 0.0 else ""
+        neutral = f", neutral = {entry['value']:g}" if entry["fixed"] or not low <= 0.0 <= high else ""
         fixed = ", fixed = true" if entry["fixed"] else ""
         lines.append(
             f'{name} = {{value = {entry["value"]:g}, unit = "{entry["unit"]}", '

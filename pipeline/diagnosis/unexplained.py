@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from pipeline.diagnosis.library import is_term, list_terms, list_waves
 from pipeline.diagnosis.search import prune
 from pipeline.identification.folds import find_near
+from pipeline.identification.persistence import take_own_past
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.diagnosis.selection import CandidateModel, Selection
     from pipeline.identification.comparison import Comparison
+    from pipeline.identification.parts import Part
     from pipeline.models.formula.formula_effect import FormulaEffect
 
 Floats = NDArray[np.float64]
@@ -31,6 +33,7 @@ _LEAST_Z = 3.0
 _BETTER = 0.04
 _MOST_PAIRED = 3
 _EXPLAINABLE = 0.1
+_LEAST_FRESH = 0.02
 _LAGS_S = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
 _TREES = 60
 _FOLDS = 4
@@ -113,27 +116,47 @@ def collect_terms(tested: CandidateModel) -> list[FormulaEffect]:
 def boost_residuals(selection: Selection, final: CandidateModel, features: Floats) -> Explainable:
     """Predict a model's residuals from all that was recorded, stretch by stretch unseen.
 
+    Where somebody steers by the pose, what is recorded answers random motion, which lasts for a moment: so
+    what counts as structure must also say something of the residuals that their own past does not (the
+    prediction error; Ljung, System Identification, section 13.4).
+
     Args:
         selection: where the model was judged.
         final: the model.
         features: what was recorded, at every window, shape (n, f).
     """
+    part = selection.part
+    rest = np.clip(selection.weights.weigh(final.held), -6.0, 6.0)
+    predicted = _boost(part, rest, features, part.channels)
+    shares, sizes = _measure_shares(part, rest, predicted)
+    seen = [channel for channel in part.channels if shares[channel] > _EXPLAINABLE]
+    if seen:
+        fresh = take_own_past(part.comparisons, rest)
+        own, _ = _measure_shares(part, fresh, _boost(part, fresh, features, seen))
+        shares = np.where(own > _LEAST_FRESH, shares, np.minimum(shares, 0.0))
+    return Explainable(shares, sizes, predicted)
+
+
+def _measure_shares(part: Part, rest: Floats, predicted: Floats) -> tuple[Floats, Floats]:
+    """See `Explainable`: shares and sizes."""
+    before = (rest[part.live] ** 2).mean(axis=0)
+    after = ((rest - predicted)[part.live] ** 2).mean(axis=0)
+    return 1.0 - after / np.maximum(before, 1e-12), np.sqrt(np.maximum(before - after, 0.0))
+
+
+def _boost(part: Part, rest: Floats, features: Floats, channels: Sequence[int]) -> Floats:
+    """What trees that have not seen a stretch predict of residuals there, shape (n, 3)."""
     from sklearn.ensemble import HistGradientBoostingRegressor  # noqa: PLC0415 - heavy
     from threadpoolctl import threadpool_limits  # noqa: PLC0415 - heavy
 
-    part = selection.part
-    rest = np.clip(selection.weights.weigh(final.held), -6.0, 6.0)
-    middle = part.times.mean(axis=1)
-    stretch = np.unique(part.run * 1_000_000 + (middle // _STRETCH_S).astype(np.int64), return_inverse=True)[
-        1
-    ]
+    stretch = part.number_stretches(_STRETCH_S)
     predicted = np.zeros(rest.shape)
     for fold in range(_FOLDS):
         test = stretch % _FOLDS == fold
         train = ~test & ~find_near(part, part, test)
         if not test.any() or train.sum() < 50:  # noqa: PLR2004 - too few to learn from
             continue
-        for channel in part.channels:
+        for channel in channels:
             model = HistGradientBoostingRegressor(
                 max_iter=_TREES, learning_rate=0.1, max_leaf_nodes=10, min_samples_leaf=25,
                 l2_regularization=5.0, early_stopping=False, random_state=0,
@@ -142,11 +165,7 @@ def boost_residuals(selection: Selection, final: CandidateModel, features: Float
             with threadpool_limits(limits=1, user_api="openmp"):
                 model.fit(features[train], rest[train, channel])
                 predicted[test, channel] = model.predict(features[test])
-    live = part.live
-    before = (rest[live] ** 2).mean(axis=0)
-    after = ((rest - predicted)[live] ** 2).mean(axis=0)
-    shares = 1.0 - after / np.maximum(before, 1e-12)
-    return Explainable(shares, np.sqrt(np.maximum(before - after, 0.0)), predicted)
+    return predicted
 
 
 def is_explainable(explainable: Explainable) -> bool:
@@ -177,12 +196,13 @@ def _describe(comparison: Comparison) -> tuple[Floats, tuple[str, ...]]:
         columns[f"v_w {late:g} s ago"] = np.interp(at - late, around.times, velocity.w)
         if vehicle.kinematics.has_inputs("sideways"):
             columns[f"v_y {late:g} s ago"] = np.interp(at - late, around.times, velocity.y)
-    yaw = np.interp(at, around.times, around.attitude[:, 2])
-    columns |= {"sin yaw": np.sin(yaw), "cos yaw": np.cos(yaw)}
-    columns |= {"sin 2 yaw": np.sin(2.0 * yaw), "cos 2 yaw": np.cos(2.0 * yaw)}
+    x, y, yaw = (np.interp(at, around.times, column) for column in around.from_start.T)
+    for times, name in ((1.0, "yaw"), (2.0, "2 yaw")):
+        columns[f"sin {name} since the start"] = np.sin(times * yaw)
+        columns[f"cos {name} since the start"] = np.cos(times * yaw)
     for place, name in enumerate(("roll", "pitch")):
         columns[name] = np.interp(at, around.times, around.attitude[:, place])
-    columns |= {"x": find_places(comparison)[:, 0], "y": find_places(comparison)[:, 1]}
+    columns |= {"x ahead of the start": x, "y left of the start": y}
     half = 0.5 * around.track_m * velocity.w if vehicle.kind == "differential" else 0.0 * velocity.w
     for name, rim in (("left", velocity.x - half), ("right", velocity.x + half)):
         angle = np.cumsum(rim) * cells.step_s / vehicle.wheel_radius_m

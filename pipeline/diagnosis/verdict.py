@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.identification.parts import count_seconds, number_units
+from pipeline.identification.parts import count_seconds
 
 if TYPE_CHECKING:
     from pipeline.identification.parts import Part
@@ -66,7 +66,7 @@ def compare(part: Part, weights: Weights, before: Floats, after: Floats) -> Verd
     old, new = weights.cost(before), weights.cost(after)
     gain = 1.0 - float(new.sum()) / max(float(old.sum()), 1e-12)
     moved = (((before - after) / weights.scale) ** 2).sum(axis=1)
-    stretch = number_units(part.run, part.times, SHORT_S)
+    stretch = part.number_stretches(SHORT_S)
     z = _normal_t(part, after / weights.scale, _add_up(stretch, old - new), _add_up(stretch, moved))
     return Verdict(gain, _find_t(part.unit, stretch, old, new, moved), z)
 
@@ -79,7 +79,7 @@ def grow_t(part: Part, weights: Weights, before: Floats, after: Floats) -> tuple
     """
     old, new = weights.cost(before), weights.cost(after)
     moved = (((before - after) / weights.scale) ** 2).sum(axis=1)
-    stretch = number_units(part.run, part.times, SHORT_S)
+    stretch = part.number_stretches(SHORT_S)
     ends = np.flatnonzero(np.diff(stretch, append=-1)) + 1
     seconds = np.cumsum(count_seconds(part))[ends - 1]
     t = [_find_t(part.unit[:n], stretch[:n], old[:n], new[:n], moved[:n]) for n in ends.tolist()]

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 _LABEL = 10
 _WHERE_SHOWN = 3
+# Shares above it are said to be above the whole.
+_WHOLE = 1.005
 _UNOBSERVABLE_SHOWN = 8
 _DETECTABLE_SHOWN = 5
 _WAYS = {"command": "from the command", "measured": "from the measured wheels"}
@@ -77,9 +79,12 @@ def _list_shared(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
     lines += _label("where", [region.sentence for region in diagnosis.where[:_WHERE_SHOWN]])
     lines += _label("missing", _describe_missing(diagnosis))
     if math.isfinite(diagnosis.explained_share) and len(diagnosis.ladder) > 1:
-        share = max(min(diagnosis.explained_share, 1.0), 0.0)
+        share = max(diagnosis.explained_share, 0.0)
         now, floor = _number(last, "t_mrmse_m"), _number(diagnosis.noise_floor, "t_mrmse_m")
-        lines.append(("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m"))
+        below = ": below the floor by chance, or fitted to noise" if share > _WHOLE else ""
+        lines.append(
+            ("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m{below}")
+        )
     lines += _label("budget", [_describe_budget(diagnosis)])
     lines += _label("enough", [describe_enough(diagnosis.effects)])
     lines += _label("below", _describe_immaterial(diagnosis))

@@ -5,7 +5,6 @@
 
 from pipeline.identification.comparison import Comparison, Input
 from pipeline.identification.fit import Fitted, fit_model
-from pipeline.identification.floor import estimate_floor
 from pipeline.identification.inputs import InputChoice, choose_input
 from pipeline.identification.intervals import Estimate, Estimates, estimate_intervals
 from pipeline.identification.ladder import Ladder, Rung, climb
@@ -36,7 +35,6 @@ __all__ = [
     "carry_over",
     "choose_input",
     "climb",
-    "estimate_floor",
     "estimate_intervals",
     "fit_model",
     "hold_out",

@@ -340,6 +340,7 @@ class Comparison:
         return RunContext(
             vehicle=vehicle,
             times=at,
+            start_s=self.run.start_s,
             step_s=cells.step_s,
             duration_s=self.run.duration_s,
             spans=spans,

@@ -1,198 +1,163 @@
-"""The noise floor: the part of the error that is noise of the poses and random motion.
+"""The noise floor: how well motion repeats itself while the input does, which no model has to do with.
 
-A localization that wanders for seconds cannot be told from motion by its high frequencies, and a jittery one
-is far worse than they say. So the floor is measured the other way round. Whatever of a model's residuals can
-be predicted from commands or wheels, lagged, multiplied and turned into the map, could be removed by some
-model. Of the rest, what lasts longer than a second is motion that something must have caused, even where
-nothing that was recorded tells what; noise and random motion are what remains.
+Two displacements over half a second, a second apart, differ by what the input and the attitude did
+differently, and by noise of the poses and random motion. The former is small and locally linear, so that a
+regression of differences on differences takes it away (a difference-based estimator of variance: Rice,
+Annals of Statistics 12 (1984); with regressors Yatchew, Economics Letters 57 (1997)); half the mean square of
+the rest is the floor, whatever is true of the vehicle. What changes slowly cancels out, and what makes
+windows differ the more the further they are apart (`persistence`) is no part of it.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.identification.persistence import split_residuals
-from pipeline.identification.scoring import HeldOut, measure_errors
+from pipeline.identification.parts import average_lags, find_live
+from pipeline.identification.persistence import Makeup, split_differences
+from pipeline.identification.scoring import Errors
 from pipeline.models.forward import Timing
 
 if TYPE_CHECKING:
     from pipeline.identification.comparison import Comparison
     from pipeline.identification.problem import Problem
-    from pipeline.identification.scoring import Errors
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-_LAGS_S = (0.15, 0.3, 0.6, 1.2, 2.4)
-_RIDGES = (3e-4, 3e-3, 3e-2, 3e-1)
-_CLIP = 4.0
+# From the end of one window to the start of the other [s]: at zero they share a pose.
+_GAPS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
+_NEAR_S = 0.07
+_LATEST_S = 0.5
+# Quarters of a second before a window at which the input is looked at.
+_LAGS = (0, 1, 2, 3, 4, 6, 8)
+_QUIET_SHARE = 0.7
+_FEWEST = 20
+_CLIP = 3.0
+_SHARE_OF_RMS = 0.5
+_ROUNDS = 5
+_RIDGE = 1e-3
+# Windows overlap by half, and each stands in two differences.
+_PAIRS_EACH = 1.7
+_MOST_FREEDOM = 0.5
+_MOVING_MPS = 0.1
+_LEAST = 1e-18
 
 
-def estimate_floor(problem: Problem, held_out: HeldOut) -> Errors:
-    """The error that would stay if the cause of everything that lasts were known, as far as these runs tell.
+def estimate_floor(problem: Problem) -> Errors:
+    """The errors that a model would be left with that knew everything but noise and random motion.
 
-    A ridge regression of the held-out residuals on functions of the input, fitted with the same blocks and
-    gaps, removes what is predictable; what remains is divided by how long it lasts (see `persistence`). The
-    predictions of two seconds shrink as the same parts do when they are added up over that time.
+    Against measured wheels where all runs have them, else against the command. Zero where hardly any windows
+    of these runs can be compared.
 
     Args:
-        problem: the runs.
-        held_out: the best model's held-out errors: the better it is, the sharper the floor.
-
-    Returns:
-        Errors of which every part is at most the model's own.
+        problem: the runs; what is fitted to them does not matter.
     """
-    residuals = held_out.residuals
-    known: Flags = np.asarray(np.isfinite(residuals).all(axis=1))
-    left = _remove_predictable(problem, residuals, known)
-    makeup = split_residuals(problem.comparisons, left)
-    square = np.mean(left[known] ** 2, axis=0)
-    floor = square * [1.0 - part.lasting_share for part in makeup]
-    # Positions of predictions err by both speeds, and by a heading that errs on the way.
-    before = np.sqrt(np.mean(residuals[known] ** 2, axis=0))
-    predictable = square / np.maximum(before**2, 1e-24)
+    comparisons = problem.parts[0].comparisons
+    described = [_describe(comparison) for comparison in comparisons]
+    squares = np.array([_measure_repeats(comparisons, described, gap) for gap in _GAPS_S])
+    # What grows with the time between windows lasts: something causes it, though nobody knows what.
+    windows = sum(history.shape[0] for history, _ in described)
+    x, y, w = (split_differences(np.maximum(np.nan_to_num(row), _LEAST), windows) for row in squares.T)
     after = np.linspace(0.25, 2.0, 8)
-    whole = np.array([part.spread_after(after, lasting=True).mean() for part in makeup])
-    noise = np.array([part.spread_after(after, lasting=False).mean() for part in makeup])
-    whole /= np.maximum(predictable, 1e-12)
-    speed = np.concatenate([_measure_speed(comparison) for comparison in problem.comparisons])
-    lever = 0.3 * np.mean((speed * after.mean()) ** 2)
-    weights = np.array([1.0, 1.0, lever])
-    along = np.sqrt(min(float(weights @ noise) / max(float(weights @ whole), 1e-24), 1.0))
-    around = np.sqrt(min(float(noise[2]) / max(float(whole[2]), 1e-24), 1.0))
-    shrink = np.sqrt(floor / np.maximum(square, 1e-24))
-    position = np.concatenate(held_out.position) * along
-    yaw = np.concatenate(held_out.yaw) * around
-    return replace(measure_errors(left[known] * shrink, position, yaw), windows=int(known.sum()))
-
-
-def hold_below(floor: Errors, reached: Errors) -> Errors:
-    """A floor of which no part is above what a model has reached: by then it was no floor."""
-    names = ("t_mrmse_m", "r_mrmse_rad", "t_mean_m", "r_mean_rad", "t_median_m", "r_median_rad")
-    return replace(
-        floor,
-        velocity_rms=_take_lower(floor.velocity_rms, reached.velocity_rms),
-        velocity_spread=_take_lower(floor.velocity_spread, reached.velocity_spread),
-        **{name: min(getattr(floor, name), getattr(reached, name)) for name in names},
+    turned = w.spread_after(after, lasting=False)
+    speed = np.concatenate([np.abs(history[:, 0, 0]) for history, _ in described])
+    along = x.spread_after(after, lasting=False) + y.spread_after(after, lasting=False)
+    position = np.sqrt(along + float(np.mean(speed**2)) * after**2 * _share_lever(w, turned))
+    yaw = np.sqrt(turned)
+    rms = np.sqrt([part.jitter + part.walk + part.passing.sum() for part in (x, y, w)])
+    # Of normal errors: of two coordinates the size is Rayleigh's, of one it is half-normal.
+    return Errors(
+        velocity_rms=(float(rms[0]), float(rms[1]), float(rms[2])),
+        velocity_spread=(float(rms[0]), float(rms[1]), float(rms[2])),
+        t_mrmse_m=float(np.sqrt(np.mean(position**2))),
+        r_mrmse_rad=float(np.sqrt(np.mean(yaw**2))),
+        t_mean_m=0.5 * math.sqrt(math.pi) * float(position.mean()),
+        r_mean_rad=math.sqrt(2.0 / math.pi) * float(yaw.mean()),
+        t_median_m=math.sqrt(math.log(2.0)) * float(position.mean()),
+        r_median_rad=0.6745 * float(yaw.mean()),
+        windows=windows,
     )
 
 
-def _take_lower(
-    one: tuple[float, float, float], other: tuple[float, float, float]
-) -> tuple[float, float, float]:
-    return min(one[0], other[0]), min(one[1], other[1]), min(one[2], other[2])
+def _share_lever(w: Makeup, turned: Floats) -> Floats:
+    """Variance of the mean heading error on the way: of the pose it began with, and of a walk since then."""
+    start = np.full(turned.size, w.pose_noise**2)
+    lever: Floats = start + np.maximum(turned - 2.0 * start, 0.0) / 3.0
+    return lever
 
 
-def _remove_predictable(problem: Problem, residuals: Floats, known: Flags) -> Floats:
-    """Residuals without what a regression on the inputs predicts of them, where that makes them smaller."""
-    features = np.concatenate([describe_inputs(comparison) for comparison in problem.comparisons])
-    left = residuals.copy()
-    best = np.sqrt(np.mean(residuals[known] ** 2, axis=0))
-    for predicted in _predict_held_out(problem, features, residuals, known):
-        rest = residuals - predicted
-        size = np.sqrt(np.mean(rest[known] ** 2, axis=0))
-        better = size < best
-        left[:, better], best[better] = rest[:, better], size[better]
-    return left
+def _describe(comparison: Comparison) -> tuple[Floats, Floats]:
+    """The input before every window, shape (n, lags, 2 or 3), and all that was recorded, shape (n, p)."""
+    history = average_lags(comparison, comparison.predict_velocity((), Timing()))[:, _LAGS, :]
+    around, middle = comparison.context, comparison.windows.times.mean(axis=1)
+    roll, pitch = (np.interp(middle, around.times, column) for column in around.attitude[:, :2].T)
+    yaw = np.interp(middle, around.times, around.from_start[:, 2])
+    moves = np.clip(np.abs(history[:, 0]).sum(axis=1) / _MOVING_MPS, 0.0, 1.0)[:, None]
+    world = moves * np.column_stack((np.sin(yaw), np.cos(yaw), np.sin(roll), np.sin(pitch)))
+    curve = history[:, :, 0] * history[:, :, 1]
+    return history, np.column_stack((history.reshape(history.shape[0], -1), curve, world))
 
 
-def _measure_speed(comparison: Comparison) -> Floats:
-    """Speed of the input at the middle of every window [m/s], shape (n,)."""
-    velocity = comparison.predict_velocity((), Timing())
-    middle, times = comparison.windows.times.mean(axis=1), comparison.context.times
-    along = np.asarray(np.interp(middle, times, velocity.x), dtype=np.float64)
-    if not comparison.context.vehicle.kinematics.has_inputs("sideways"):
-        return along
-    return np.asarray(np.hypot(along, np.interp(middle, times, velocity.y)), dtype=np.float64)
+def _measure_repeats(
+    comparisons: tuple[Comparison, ...], described: list[tuple[Floats, Floats]], gap_s: float
+) -> Floats:
+    """Half the mean square of the difference of two windows under the same input, x, y, w; NaN if unknown."""
+    differences, features, moving, standing, lively = [], [], [], [], []
+    for comparison, (history, recorded) in zip(comparisons, described, strict=True):
+        first, second = _pair(comparison.windows.times, gap_s)
+        residual, live = comparison.find_residuals((), Timing()), find_live(history)
+        differences.append(residual[second] - residual[first])
+        features.append(recorded[second] - recorded[first])
+        lively.append(live)
+        moving.append(live[first] & live[second])
+        standing.append(~live[first] & ~live[second])
+    rest, change = np.concatenate(differences), np.concatenate(features)
+    moves, stands = np.concatenate(moving), np.concatenate(standing)
+    if moves.sum() < _FEWEST:
+        return np.full(3, np.nan)
+    square = _take_away_changes(rest[moves], change[moves])
+    still = 0.5 * np.mean(rest[stands] ** 2, axis=0) if stands.sum() >= _FEWEST else square
+    share = float(np.concatenate(lively).mean())
+    mixed: Floats = share * square + (1.0 - share) * still
+    return mixed
 
 
-def describe_inputs(comparison: Comparison) -> Floats:
-    """Functions of the input at the middle of every window, shape (n, features)."""
-    around = comparison.context
-    velocity = comparison.predict_velocity((), Timing())
-    middle = comparison.windows.times.mean(axis=1)
-    along, around_w = _average(velocity.x, around.step_s), _average(velocity.w, around.step_s)
-
-    def look(signal: Floats, late: float) -> Floats:
-        return np.asarray(np.interp(middle - late, around.times, signal), dtype=np.float64)
-
-    v, w = look(along, 0.0), look(around_w, 0.0)
-    columns = [
-        np.ones(v.size),
-        v,
-        w,
-        v * w,
-        v * np.abs(v),
-        v * np.abs(w),
-        w * np.abs(w),
-        np.sign(v) * np.abs(w),
-    ]
-    columns += [np.abs(v), np.abs(w), np.abs(v) * w, v**2 * w, w**3, v**3]
-    for late in _LAGS_S:
-        one, two = look(along, late), look(around_w, late)
-        columns += [one, two, one * two, np.abs(one) * two, one * np.abs(two)]
-    yaw = look(around.attitude[:, 2], 0.0)
-    moving = np.clip(np.abs(v) + np.abs(w), 0.0, 0.1) * 10.0
-    columns += [moving, np.sin(yaw) * moving, np.cos(yaw) * moving]
-    columns += [np.sin(look(around.attitude[:, i], 0.0)) * moving for i in (0, 1)]
-    since = middle / max(around.duration_s, 1e-9)
-    columns += [since * v, since * w]
-    if around.vehicle.kinematics.has_inputs("sideways"):
-        aside = _average(velocity.y, around.step_s)
-        s = look(aside, 0.0)
-        columns += [
-            s,
-            s * w,
-            s * np.abs(s),
-            s * np.abs(w),
-            s * np.abs(v),
-            v * np.abs(s),
-            np.sign(s),
-            np.abs(s),
-        ]
-        columns += [s**3, s**2 * w, since * s]
-        for late in _LAGS_S:
-            one, two = look(aside, late), look(around_w, late)
-            columns += [one, one * two]
-    return np.column_stack(columns)
+def _pair(times: Floats, gap_s: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Windows, and the first of those that begin a gap after their ends."""
+    wanted = times[:, 1] + gap_s
+    second = np.minimum(np.searchsorted(times[:, 0], wanted - _NEAR_S), times.shape[0] - 1)
+    late = times[second, 0] - wanted
+    kept = (late >= -_NEAR_S) & (late <= (_LATEST_S if gap_s > 0.0 else _NEAR_S))
+    return np.flatnonzero(kept), second[kept].astype(np.int64)
 
 
-def _average(signal: Floats, step_s: float) -> Floats:
-    """Running mean over a quarter of a second."""
-    width = max(round(0.25 / step_s), 1)
-    total = np.concatenate(([0.0], np.cumsum(signal)))
-    low = np.clip(np.arange(signal.size) - width // 2, 0, signal.size)
-    high = np.clip(np.arange(signal.size) + width // 2 + 1, 0, signal.size)
-    mean: Floats = (total[high] - total[low]) / (high - low)
-    return mean
+def _take_away_changes(rest: Floats, change: Floats) -> Floats:
+    """Half the mean square of differences (n, 3), without what they owe to changes (n, p), of quiet pairs."""
+    scaled = change / (np.sqrt((change**2).mean(axis=0)) + 1e-9)
+    size = np.abs(scaled).max(axis=1)
+    quiet = np.argsort(size, kind="stable")[: max(int(_QUIET_SHARE * size.size), min(size.size, 5 * _FEWEST))]
+    rest, scaled = rest[quiet], scaled[quiet]
+    count = rest.shape[0]
+    normal = scaled.T @ scaled / count
+    ridge = _RIDGE * float(np.trace(normal)) / normal.shape[0] + 1e-12
+    inverse = np.linalg.inv(normal + ridge * np.eye(normal.shape[0]))
+    weights, left = np.zeros((normal.shape[0], 3)), rest
+    for _ in range(_ROUNDS):
+        weights = weights + inverse @ (scaled.T @ _hold(left) / count - ridge * weights)
+        left = rest - scaled @ weights
+    seen = count / _PAIRS_EACH
+    freedom = max(1.0 - float(np.trace(inverse @ normal)) / seen, _MOST_FREEDOM)
+    square: Floats = 0.5 * np.mean(_hold(left) ** 2, axis=0) / freedom
+    return square
 
 
-def _predict_held_out(problem: Problem, features: Floats, residuals: Floats, known: Flags) -> Floats:
-    """Residuals as predicted from the inputs by regressions that had not seen their stretches.
-
-    Returns:
-        shape (ridges, n, 3).
-    """
-    predicted = np.zeros((len(_RIDGES), *residuals.shape))
-    spread = 1.4826 * np.median(np.abs(residuals[known]), axis=0) + 1e-12
-    target = np.clip(residuals, -_CLIP * 3.0 * spread, _CLIP * 3.0 * spread)
-    for fold in problem.folds:
-        tested, rows = fold.test & known, fold.train & known
-        if not tested.any() or rows.sum() < 2 * features.shape[1]:
-            continue
-        centre = features[rows].mean(axis=0)
-        scale = features[rows].std(axis=0)
-        scale[scale == 0.0] = 1.0
-        design = (features[rows] - centre) / scale
-        normal = design.T @ design / design.shape[0]
-        mean = target[rows].mean(axis=0)
-        pull = design.T @ (target[rows] - mean) / design.shape[0]
-        looked_at = (features[tested] - centre) / scale
-        for number, ridge in enumerate(_RIDGES):
-            weights = np.linalg.solve(normal + ridge * np.eye(normal.shape[0]), pull)
-            predicted[number, tested] = mean + looked_at @ weights
-    return predicted
+def _hold(values: Floats) -> Floats:
+    """Values held at three spreads: what a jump of the poses or a late transient leaves is no noise."""
+    size = np.abs(values)
+    spread = np.maximum(1.4826 * np.median(size, axis=0), _SHARE_OF_RMS * np.sqrt(np.mean(size**2, axis=0)))
+    held: Floats = np.clip(values, -_CLIP * spread, _CLIP * spread)
+    return held

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 from pipeline.identification.describe import errors_as_json
 from pipeline.identification.fit import Fitted, fit_model
-from pipeline.identification.floor import estimate_floor, hold_below
 from pipeline.identification.intervals import Estimates, estimate_intervals
-from pipeline.identification.ladder import Ladder, Rung, climb, compare_losses
+from pipeline.identification.ladder import Ladder, Rung, climb
 from pipeline.identification.scoring import hold_out
 
 if TYPE_CHECKING:
@@ -30,23 +29,26 @@ class Judgement:
         ladder: held-out errors from the ideal model up, over the effects that help.
         whole: all effects of the model, fitted together, with their held-out errors.
         estimates: its numbers with intervals.
-        floor: the noise floor, from the best of all these.
     """
 
     problem: Problem
     ladder: Ladder
     whole: Rung
     estimates: Estimates
-    floor: Errors
 
     @property
     def fitted(self) -> Fitted:
         """The fit of all effects."""
         return self.whole.fitted
 
+    @property
+    def floor(self) -> Errors:
+        """The noise floor of the runs."""
+        return self.problem.floor
+
 
 def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Judgement:
-    """Fit a model, climb its ladder and estimate the floor.
+    """Fit a model and climb its ladder.
 
     Args:
         problem: the runs.
@@ -60,9 +62,7 @@ def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) 
     if wanted != set(top.effects):
         fitted = fit_model(problem, model.keep(wanted), per_run=per_run, exact=True)
         whole = Rung(fitted, hold_out(problem, fitted))
-    best = whole if compare_losses(whole.held_out, top.held_out) < 1.0 else top
-    floor = hold_below(estimate_floor(problem, best.held_out), top.errors)
-    return Judgement(problem, ladder, whole, estimate_intervals(problem, whole.fitted), floor)
+    return Judgement(problem, ladder, whole, estimate_intervals(problem, whole.fitted))
 
 
 def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:

@@ -6,7 +6,7 @@ A part of the way from command to body: the whole of it, from the wheels to the 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -34,6 +34,7 @@ Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 UNIT_S = 10.0
+_ROUNDING_S = 1e-6
 IDEAL_CHANNELS = (0, 2, 1)
 """Which of x, y, w the columns of `Part.find_ideal` are."""
 _NO_DELAY = Timing()
@@ -75,10 +76,16 @@ class Part(ABC):
         windows = [c.windows for c in self.comparisons]
         self.run = np.repeat(np.arange(len(windows)), [w.start.size for w in windows]).astype(np.int64)
         self.times: Floats = np.concatenate([w.times for w in windows])
-        self.unit = number_units(self.run, self.times)
+        begin = np.array([comparison.run.start_s for comparison in self.comparisons])
+        self._since: Floats = self.times.mean(axis=1) - begin[self.run]
+        self.unit = self.number_stretches(UNIT_S)
         shift = np.concatenate(([0], np.cumsum([int(w.block.max(initial=-1)) + 1 for w in windows])))
         self.block: Integers = np.concatenate([w.block + shift[i] for i, w in enumerate(windows)])
         self.live = find_live(self.find_ideal())
+
+    def number_stretches(self, length: float) -> Integers:
+        """Stretches of a length [s] since each run's start, numbered through all runs, shape (n,)."""
+        return number_stretches(self.run, self._since, length)
 
     @abstractmethod
     def owns(self, effect: Effect) -> bool:
@@ -205,10 +212,18 @@ class WheelPart(Part):
         return effect.place <= Place.DRIVE
 
     def find_run_residuals(self, state: State, run: int) -> Floats:
-        """See `Part`; in terms of the ideal velocity of the wheels."""
-        comparison, late = self.comparisons[run], state.timing[run].wheel_delay_s
+        """See `Part`; in terms of the ideal velocity of the wheels.
+
+        Encoders do not report what has not happened yet: where the body seems to turn after its wheels do,
+        it is the body or its gyro that is late, and no command the later for it.
+        """
+        return self._compare(state, run, max(state.timing[run].wheel_delay_s, 0.0))
+
+    def _compare(self, state: State, run: int, late: float) -> Floats:
+        """Residuals where the encoders are late by so much [s]."""
+        comparison = self.comparisons[run]
         if (run, late) not in self._seen:
-            wheels = self.measured[run].predict_velocity((), state.timing[run])
+            wheels = self.measured[run].predict_velocity((), Timing(late))
             self._seen = {key: seen for key, seen in self._seen.items() if key[0] != run}
             self._seen[run, late] = average_windows(comparison, wheels, self._spans[run])
         drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
@@ -222,14 +237,19 @@ class WheelPart(Part):
 
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
         """See `Part`: of encoders that are later by ``late_s`` than they are taken for."""
-        timing = list(state.timing)
-        timing[run] = Timing(timing[run].wheel_delay_s + late_s)
-        return self.find_run_residuals(replace(state, timing=tuple(timing)), run)
+        return self._compare(state, run, max(state.timing[run].wheel_delay_s, 0.0) + late_s)
 
 
-def number_units(run: Integers, times: Floats, length: float = UNIT_S) -> Integers:
-    """Stretches of ten seconds, or of another length, numbered through all runs."""
-    label = run * 1_000_000 + (times.mean(axis=1) // length).astype(np.int64)
+def number_stretches(run: Integers, since: Floats, length: float = UNIT_S) -> Integers:
+    """Stretches of ten seconds, or of another length, numbered through all runs.
+
+    Args:
+        run: number of the run of each window, shape (n,).
+        since: middle of each window since its run's start [s], shape (n,): when the recorder was started
+            must not say which windows belong together.
+        length: [s].
+    """
+    label = run * 1_000_000 + ((since + _ROUNDING_S) // length).astype(np.int64)
     return np.unique(label, return_inverse=True)[1].astype(np.int64)
 
 

@@ -36,6 +36,10 @@ _FIRST = 4.0
 _RESOLVED = 0.02
 # Correlation over one to two seconds from which on something lasts: random motion comes to 0.1.
 _REPEATED = 0.18
+# Differences: windows that are forgotten after three lags, and the share of the largest that is structure.
+_FORGOTTEN = 3
+_GROWN = 0.6
+_FEWEST_LASTING = 600
 
 
 @dataclass(frozen=True)
@@ -120,6 +124,29 @@ def _covary(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
     return means
 
 
+def take_own_past(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
+    """Residuals without what the two windows before each, which it does not overlap, tell of it.
+
+    Args:
+        comparisons: whose windows they are.
+        residuals: x, y, w, shape (n, 3); where nothing goes before a window it is zero.
+    """
+    past = np.full((2, *residuals.shape), np.nan)
+    shift = 0
+    for comparison in comparisons:
+        times = comparison.windows.times
+        for lag in (1, 2):
+            first, second = _pair(times, lag)
+            past[lag - 1, shift + second] = residuals[shift + first]
+        shift += times.shape[0]
+    known = np.isfinite(past).all(axis=(0, 2))
+    fresh = np.zeros(residuals.shape)
+    for channel in range(residuals.shape[1]):
+        design, target = past[:, known, channel].T, residuals[known, channel]
+        fresh[known, channel] = target - design @ np.linalg.lstsq(design, target, rcond=None)[0]
+    return fresh
+
+
 def _pair(times: Floats, lag: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Windows and those that begin where ``lag`` windows later begin."""
     first = np.arange(times.shape[0])
@@ -132,7 +159,7 @@ def _pair(times: Floats, lag: int) -> tuple[NDArray[np.int64], NDArray[np.int64]
 
 
 def _split(covariance: Floats) -> Makeup:
-    """Non-negative least squares of the covariances on those of each origin."""
+    """Covariances with windows 0, 0.5, ... 3 s later by origin, by non-negative least squares."""
     from scipy.optimize import nnls  # noqa: PLC0415 - heavy
 
     total = float(covariance[0])
@@ -156,6 +183,34 @@ def _split(covariance: Floats) -> Makeup:
         parts[1] += _RESOLVED * total - noise
     return Makeup(
         float(parts[0]), float(parts[1]), parts[2:known], parts[known:], np.asarray(covariance[1:] / total)
+    )
+
+
+def split_differences(squares: Floats, windows: int) -> Makeup:
+    """What one channel's motion under the same input is made of.
+
+    Args:
+        squares: half the mean squares of the differences of windows 0.5, 1, ... s apart, shape (k,), k <= 6.
+        windows: how many there are: in few nobody can tell what lasts from chance.
+    """
+    from scipy.optimize import nnls  # noqa: PLC0415 - heavy
+
+    jitter = np.ones(squares.size)
+    jitter[0] = 1.5
+    passing = [
+        jitter,
+        np.ones(squares.size),
+        *(1.0 - _repeat(time)[1 : squares.size + 1] for time in _PASSING_S),
+    ]
+    lasting = [1.0 - _repeat(time)[1 : squares.size + 1] for time in _LASTING_S]
+    design, known = np.column_stack([*passing, *lasting]), len(passing)
+    parts = np.asarray(nnls(design, squares)[0])
+    grown = float((design[:, known:] @ parts[known:])[-1])
+    if grown < _GROWN * squares[-1] or windows < _FEWEST_LASTING:
+        # Differences grow a little with the time between them by chance: that is no structure.
+        parts[:known], parts[known:] = nnls(design[:_FORGOTTEN, :known], squares[:_FORGOTTEN])[0], 0.0
+    return Makeup(
+        float(parts[0]), float(parts[1]), parts[2:known], parts[known:], 1.0 - squares / squares[-1]
     )
 
 

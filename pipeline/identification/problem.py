@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.identification.comparison import Comparison, Input, choose_rate
+from pipeline.identification.floor import estimate_floor
 from pipeline.identification.folds import Fold, find_near, make_folds
 from pipeline.identification.parts import BodyPart, Part, WheelPart
 from pipeline.identification.state import State
@@ -23,6 +24,7 @@ from pipeline.runs.signals import find_fastest_wheel, name_inputs
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.identification.scoring import Errors
     from pipeline.identification.state import DelayName
     from pipeline.models.effect import Effect
     from pipeline.models.model import Model
@@ -136,6 +138,11 @@ class Problem:
         return tuple(run.name for run in self.runs)
 
     @cached_property
+    def floor(self) -> Errors:
+        """The noise floor of these runs, whatever is fitted to them (see `estimate_floor`)."""
+        return estimate_floor(self)
+
+    @cached_property
     def folds(self) -> tuple[Fold, ...]:
         """Windows of the whole way that are held out in turn."""
         return make_folds(self.whole)
@@ -186,10 +193,5 @@ def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
         wheel = max(wheel, float(find_fastest_wheel(series).max()))
         difference = max(difference, float(np.abs(series.right - series.left).max()))
     moments = np.concatenate([run.track.times[run.track.active] for run in runs])
-    places = np.concatenate([run.track.place[run.track.active, 0] for run in runs])
-    shares = np.linspace(0.0, 1.0, 11)
-    if places.size == 0:
-        tenths = np.zeros(11), np.zeros(11)
-    else:
-        tenths = np.quantile(moments, shares), np.quantile(places, shares)
-    return Largest(speed, turn, wheel, max(difference, 1e-6), *tenths, sideways=aside)
+    tenths = np.quantile(moments, np.linspace(0.0, 1.0, 11)) if moments.size else np.zeros(11)
+    return Largest(speed, turn, wheel, max(difference, 1e-6), tenths, sideways=aside)

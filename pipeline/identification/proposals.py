@@ -158,8 +158,6 @@ def list_starts(candidate: Candidate, largest: Largest) -> list[dict[str, float]
 
 
 def _list_values(parameter: Parameter, largest: Largest) -> list[float]:
-    if parameter.relative_to == "place" and not largest.travels:
-        return []
     low, high = parameter.bounds
     values = [largest.take(share, parameter.relative_to) for share in parameter.starts]
     return [value for value in values if low <= value <= high]

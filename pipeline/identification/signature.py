@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.identification.parts import average_windows, locate_windows, number_units
+from pipeline.identification.parts import average_windows, locate_windows, number_stretches
 from pipeline.models.forward import Timing
 
 if TYPE_CHECKING:
@@ -104,7 +104,8 @@ def find_signatures(problem: Problem, state: State, run: int = 0) -> list[Signat
     """
     comparison = problem.comparisons[run]
     times = comparison.windows.times
-    block = number_units(np.zeros(times.shape[0], dtype=np.int64), times)
+    since = times.mean(axis=1) - comparison.run.start_s
+    block = number_stretches(np.zeros(since.size, dtype=np.int64), since)
     shared = measure_variables(comparison) | _measure_predicted(comparison, state, run)
     bins = {name: _bin(values, block) for name, values in shared.items()}
     by_channel = [

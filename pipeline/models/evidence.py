@@ -9,27 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-Relative = Literal["", "speed", "turn", "wheel", "duration", "place"]
+Relative = Literal["", "speed", "turn", "wheel", "duration"]
 
 # Of poses, headings and encoders against each other [s]: below it they are stamped no better.
 LEAST_DELAY_S = 0.012
 
 _STANDING = 0.05
 _NEVER = 0.02
-_LEAST_WAY_M = 1.0
 # Above this share of the largest that was asked for, a limit cuts nothing off.
 _REACHED = 0.99
 
 
 @dataclass(frozen=True)
 class Largest:
-    """What relative starts are shares of: the largest that was commanded, and where and when it was.
+    """What relative starts are shares of: the largest that was commanded, and when it was.
 
     Attributes:
         speed, turn, wheel: speed [m/s], yaw rate [rad/s], wheel speed [rad/s].
         difference: of the wheel speeds [rad/s].
         moments: times [s] before which the tenths of the driving lie, shape (11,).
-        places: x [m] in the map below which the tenths of the run lie, shape (11,).
         sideways: speed to the left or right [m/s].
     """
 
@@ -38,7 +36,6 @@ class Largest:
     wheel: float
     difference: float
     moments: Floats
-    places: Floats
     sideways: float = 0.0
 
     @property
@@ -56,21 +53,13 @@ class Largest:
         """Driven straight only, or turned on the spot only."""
         return min(self.fastest, self.turn) < _NEVER * max(self.fastest, self.turn)
 
-    @property
-    def travels(self) -> bool:
-        """Whether places along x differ enough for anything to change between them."""
-        return float(self.places[-1] - self.places[0]) > _LEAST_WAY_M
-
     def take(self, share: float, of: Relative) -> float:
         """A share of what was asked for; the number itself where it is no share.
 
         Args:
-            share: of the largest; for the `duration` the part of the driving that is done by then, for a
-                `place` the part of the run that lies below it.
+            share: of the largest; for the `duration` the part of the driving that is done by then.
             of: which.
         """
-        if of == "place":
-            return float(self.places[round(share * (self.places.size - 1))])
         if of == "duration":
             return float(self.moments[round(share * (self.moments.size - 1))])
         whole = {"speed": self.speed, "turn": self.turn, "wheel": self.wheel}

@@ -83,12 +83,12 @@ class Parameter:
         search: how it is found.
         starts: values to start or to begin the grid from.
         relative_to: what the starts are shares of: the largest commanded `speed`, `turn` or `wheel` speed,
-            the run's `duration`, or its way along x (`place`); empty where they are values.
+            or the run's `duration`; empty where they are values.
         step: change used for numerical derivatives.
         least: smallest size worth a name; None where every size is, or where `Effect.is_degenerate` tells.
         plausible: what vehicles show; None for all within the bounds.
         one_sign: whether physics has positive values only: the other sign is a clock or chance.
-        instead_of: the parameter that counts no more once this one is given; this one is not searched alone.
+        instead_of: the parameter that counts no more once this one is given; this one is not searched.
         quantities: what it is to a controller; none where no controller knows of it.
     """
 

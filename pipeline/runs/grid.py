@@ -19,6 +19,8 @@ Integers = NDArray[np.int64]
 _SHORTEST_HOLE = 0.3
 _SHORTEST_SPAN = 0.5
 _BEFORE = 1.0
+# Stamps on a raster meet bounds exactly: rounding must not decide.
+_ROUNDING_S = 1e-6
 
 
 @dataclass(frozen=True)
@@ -72,10 +74,10 @@ def lay_grid(run: MotionRun, rate_hz: float) -> Grid:
     stamps = run.streams
     period = np.diff(stamps)
     hole = max(_SHORTEST_HOLE, 3.0 * float(np.median(period)))
-    edges = np.flatnonzero(period > hole)
+    edges = np.flatnonzero(period > hole + _ROUNDING_S)
     starts = np.concatenate((stamps[:1], stamps[edges + 1]))
     ends = np.concatenate((stamps[edges], stamps[-1:]))
-    long = ends - starts >= _SHORTEST_SPAN
+    long = ends - starts >= _SHORTEST_SPAN - _ROUNDING_S
     starts, ends = starts[long], ends[long]
     step = 1.0 / rate_hz
     counts = np.ceil((ends - starts) / step - 1e-6).astype(np.int64)
@@ -95,7 +97,7 @@ class MeasuredDrive:
     def __init__(self, series: DriveSeries) -> None:
         times = series.times
         period = np.diff(times)
-        hole = np.flatnonzero(period > max(_SHORTEST_HOLE, 3.0 * float(np.median(period))))
+        hole = np.flatnonzero(period > max(_SHORTEST_HOLE, 3.0 * float(np.median(period))) + _ROUNDING_S)
         middle = 0.5 * (times[hole] + times[hole + 1])
         places = np.concatenate((hole + 1, hole + 1))
         self._knots = np.insert(times, places, np.concatenate((middle - 1e-6, middle + 1e-6)))

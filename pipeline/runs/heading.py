@@ -35,6 +35,8 @@ _LEAST_TURNING = 0.02
 _GOOD = 0.35
 _ALIGN_S = 3.0
 _HOLE_S = 0.5
+# Stamps on a raster meet bounds exactly: rounding must not decide.
+_ROUNDING_S = 1e-6
 _SILENT_S = 0.25
 _LEAST_COVERED = 0.95
 
@@ -90,7 +92,7 @@ def align_heading(
         span: number of the span of each pose; by default holes in the stamps end a span.
     """
     if span is None:
-        span = np.concatenate(([0], np.cumsum(np.diff(track.times) > _HOLE_S)))
+        span = np.concatenate(([0], np.cumsum(np.diff(track.times) > _HOLE_S + _ROUNDING_S)))
     offset = np.empty(track.times.size)
     for begin, end in _find_pieces(track.segment, span):
         rows = slice(begin, end)
@@ -115,7 +117,8 @@ def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out 
     spread = float(np.median(np.abs(turned)) + np.std(turned))
     if spread < _LEAST_TURNING:
         return None
-    inside = (start - _LARGEST_DELAY > times[0]) & (end + _LARGEST_DELAY < times[-1])
+    longest = _LARGEST_DELAY + _ROUNDING_S
+    inside = (start - longest > times[0]) & (end + longest < times[-1])
     start, end, turned = start[inside], end[inside], turned[inside]
     if start.size < _FEWEST:
         return None
@@ -157,7 +160,7 @@ def _refine(
         return change
 
     error = np.inf
-    unit = np.unique((start // _UNIT_S).astype(np.int64), return_inverse=True)[1]
+    unit = np.unique(((start - times[0]) // _UNIT_S).astype(np.int64), return_inverse=True)[1]
     for _ in range(_REFINEMENTS):
         # The turning rate is the slope over the delay.
         slope = scale * (turn(delay + _DELAY_STEP) - turn(delay - _DELAY_STEP)) / (2.0 * _DELAY_STEP)
@@ -192,7 +195,9 @@ def _pair_up(track: Track, run: MotionRun) -> tuple[NDArray[np.int64], NDArray[n
     first = np.arange(track.times.size)
     kept = second < track.times.size
     first, second = first[kept], second[kept].astype(np.int64)
-    kept = (track.segment[first] == track.segment[second]) & (track.times[second] - track.times[first] < 0.8)  # noqa: PLR2004
+    kept = (track.segment[first] == track.segment[second]) & (
+        track.times[second] - track.times[first] < 0.8 - _ROUNDING_S
+    )
     kept &= ~has_barred(run.barred, track.times[first], track.times[second])
     return first[kept], second[kept]
 
@@ -237,8 +242,8 @@ def _smooth(times: Floats, values: Floats, good: NDArray[np.bool_]) -> Floats:
     """Running mean over six seconds of the good values."""
     known = times[good]
     total = np.concatenate(([0.0], np.cumsum(values[good])))
-    low = np.searchsorted(known, times - _ALIGN_S)
-    high = np.searchsorted(known, times + _ALIGN_S, side="right")
+    low = np.searchsorted(known, times - _ALIGN_S - _ROUNDING_S)
+    high = np.searchsorted(known, times + _ALIGN_S + _ROUNDING_S, side="right")
     empty = high <= low
     mean = (total[high] - total[low]) / np.maximum(high - low, 1)
     if empty.any():

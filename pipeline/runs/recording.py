@@ -31,6 +31,7 @@ Integers = NDArray[np.int64]
 _DEAD = 1e-9
 _LONGEST_WAIT = 1.5
 _REPEATED_SHARE = 0.2
+_ROUNDING_S = 1e-6
 _ROLLS = 0.3
 _NUMBERS = (
     "hold_time",
@@ -170,6 +171,11 @@ class MotionRun:
     repeats_s: float = 0.0
 
     @property
+    def start_s(self) -> float:
+        """When its first stream begins [s]."""
+        return float(self.streams[0])
+
+    @property
     def gyro_fit(self) -> GyroFit | None:
         """How the gyro fits the poses; None without a good one."""
         return self.alignment.gyro
@@ -245,7 +251,7 @@ def make_run(
         streams=streams,
         step_starts=steps,
         barred=barred,
-        duration_s=float(streams[-1]),
+        duration_s=float(streams[-1] - streams[0]),
         alignment=alignment,
         repeats_s=_measure_repeats(tables["poses"]),
     )
@@ -309,7 +315,7 @@ def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
 
 
 def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> Track:
-    parts = []
+    parts: list[Track] = []
     for piece in poses.sort("segment", "t").partition_by("segment", maintain_order=True):
         times = piece["t"].to_numpy()
         held = piece["held"].to_numpy()
@@ -318,7 +324,7 @@ def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> T
             fresh = fresh[~_waits_in_motion(times, held, wheels)[fresh]]
         fresh = fresh[np.diff(times[fresh], prepend=-np.inf) > 0.0]
         if fresh.size > 1:
-            parts.append(_unroll(piece[fresh]))
+            parts.append(_unroll(piece[fresh], parts[-1] if parts else None))
     if sum(part.times.size for part in parts) < 10:  # noqa: PLR2004 - fewer say nothing
         raise MotionError(
             "no_poses",
@@ -343,11 +349,16 @@ def _waits_in_motion(times: Floats, held: Flags, wheels: DriveSeries) -> Flags:
     return waits
 
 
-def _unroll(piece: pl.DataFrame) -> Track:
-    """One segment's poses, rolled out into the plane of motion."""
+def _unroll(piece: pl.DataFrame, before: Track | None) -> Track:
+    """One segment's poses, rolled out into the plane of motion; headings go on from the segment before.
+
+    How often a heading has gone round since the map's x axis must not matter between segments.
+    """
     position = piece.select("x", "y", "z").to_numpy()
     quaternion = piece.select("q_x", "q_y", "q_z", "q_w").to_numpy()
     roll, pitch, yaw = rigid.euler_from_quaternions(quaternion)
+    if before is not None:
+        yaw = yaw + 2.0 * np.pi * np.round((before.heading[-1] - yaw[0]) / (2.0 * np.pi))
     _, turn = segments.measure_increments(position, quaternion)
     middle = rigid.slerp(quaternion[:-1], quaternion[1:], np.full(turn.shape[0], 0.5))
     moved = rigid.rotate(rigid.invert_quaternions(middle), np.diff(position, axis=0))
@@ -431,8 +442,8 @@ def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Flo
     known = np.concatenate(
         ([min(float(streams[0]), times[0]) - 0.05], times, [max(streams[-1], times[-1]) + 0.05])
     )
-    holes = np.flatnonzero(np.diff(known) > 0.2)  # noqa: PLR2004 - four samples at the usual rate
+    holes = np.flatnonzero(np.diff(known) > 0.2 + _ROUNDING_S)
     for hole in holes.tolist():
-        barred.append(np.arange(known[hole] + 0.05, known[hole + 1], 0.05))  # noqa: PERF401
+        barred.append(np.arange(known[hole] + 0.05, known[hole + 1] - _ROUNDING_S, 0.05))  # noqa: PERF401
     barred.append(np.array([times[0] - 1e-3, times[-1] + 1e-3]))
     return starts, np.unique(np.concatenate(barred))

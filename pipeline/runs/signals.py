@@ -215,7 +215,8 @@ class RunContext:
 
     Attributes:
         vehicle: geometry.
-        times: middles of the cells [s] since the run's start, shape (n,).
+        times: middles of the cells [s], shape (n,).
+        start_s: start of the run [s].
         step_s: width of a cell [s].
         duration_s: length of the run [s].
         spans: begin where the recording begins anew; states unknown.
@@ -227,6 +228,7 @@ class RunContext:
 
     vehicle: Vehicle
     times: Floats
+    start_s: float
     step_s: float
     duration_s: float
     spans: Resets
@@ -234,6 +236,13 @@ class RunContext:
     body: Resets
     attitude: Floats
     place: Floats
+
+    @cached_property
+    def from_start(self) -> Floats:
+        """x, y [m] and yaw [rad] in the frame of the run's first pose, which no map's axes enter, (n, 3)."""
+        yaw = self.attitude[:, 2] - self.attitude[0, 2]
+        place = (self.place - self.place[0]) @ np.array([1.0, 1.0j]) * np.exp(-1j * self.attitude[0, 2])
+        return np.column_stack((place.real, place.imag, yaw))
 
     @property
     def track_m(self) -> float:

@@ -23,6 +23,7 @@ _BIAS_FORGIVEN = 0.01
 _LATE = 0.04
 _GYRO_RATE = 20.0
 _LONGEST_SILENCE = 0.25
+_ROUNDING_S = 1e-6
 
 
 def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -> Floats:
@@ -47,11 +48,12 @@ def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -
     angle = timegrid.integrate_rate(stamps, rate)[:, None]
     smooth = timegrid.differentiate_locally(grid, stamps, angle, window)[:, 0]
     corrected: Floats = fit.signed_scale * np.interp(times, grid, smooth) + fit.bias
-    following = np.searchsorted(stamps, times)
+    # A grid that meets stamps meets them up to rounding.
+    following = np.searchsorted(stamps, times - _ROUNDING_S)
     before = stamps[np.maximum(following - 1, 0)]
     after = stamps[np.minimum(following, stamps.size - 1)]
     away = np.maximum(np.abs(times - before), np.abs(after - times))
-    corrected[away > _LONGEST_SILENCE] = np.nan
+    corrected[away > _LONGEST_SILENCE + _ROUNDING_S] = np.nan
     return corrected
 
 

@@ -128,7 +128,7 @@ def _differentiate_segment(piece: pl.DataFrame, settings: VelocitySection) -> pl
         return None
     kept = aligned[fresh]
     # The grid spans the whole segment, repeats included: a vehicle may stand at its end.
-    first, last = max(float(aligned[0]), 0.0), float(aligned[-1])
+    first, last = float(aligned[0]), float(aligned[-1])
     if last - first < _SHORTEST_SPAN:
         return None
     position = piece.select("x", "y", "z").to_numpy()[fresh]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from pipeline.identification import Errors
     from pipeline.models import Effect, Model
-    from pipeline.web.run_cache import Judged, PreparedRun
+    from pipeline.web.run_cache import PreparedRun
     from pipeline.web.session import SessionFile
 
     Rungs = Mapping[tuple[str, ...], dict[str, object]]
@@ -234,7 +234,7 @@ def _fit_anew(
         ladder=ladder,
         without={name: prepared.score(fitted - name, delays).t_mrmse_m for name in shown},
     )
-    return msgspec.structs.replace(session, floor=_lower_floor(session, whole)).push(step)
+    return session.push(step)
 
 
 def _require_numbers(errors: Errors, run: str) -> None:
@@ -253,21 +253,7 @@ def _known_rungs(step: Step) -> Rungs:
     return {tuple(_effects_of(rung)): rung for rung in rungs}
 
 
-def learn_floor(session: Session, diagnosis: Mapping[str, object] | None) -> Session:
-    """The session with the floor that a diagnosis found for the same input, where it is lower."""
-    found = diagnosis.get("noise_floor") if diagnosis and diagnosis.get("input") == session.input else None
-    lower = found if isinstance(found, dict) and isinstance(found.get("t_mrmse_m"), float) else None
-    if lower is None or not _is_below(lower, session.floor):
-        return session
-    return msgspec.structs.replace(session, floor=lower)
-
-
-def _lower_floor(session: Session, judged: Judged) -> dict[str, object]:
-    """The floor can only sink: the better the model, the sharper it is."""
-    found = errors_as_json(judged.floor)
-    return found if _is_below(found, session.floor) else session.floor
-
-
-def _is_below(found: Mapping[str, object], known: Mapping[str, object]) -> bool:
-    new, old = found.get("t_mrmse_m"), known.get("t_mrmse_m")
-    return isinstance(new, float) and (not isinstance(old, float) or new < old)
+def keep_floor(session: Session, prepared: PreparedRun) -> Session:
+    """The session with the noise floor of its run."""
+    floor = errors_as_json(prepared.problem.floor)
+    return session if session.floor == floor else msgspec.structs.replace(session, floor=floor)

@@ -216,7 +216,7 @@ export class Pane {
     track.style.setProperty("--floor", floor ? floor.t / most : 0);
     track.style.setProperty("--ideal", ideal.t / most);
     track.setAttribute("aria-label", `position error ${say(errors.t)} m of ${say(ideal.t)} m for the ideal model${floor ? `, floor ${say(floor.t)} m` : ""}`);
-    this.glance.querySelector(".floor-said").textContent = floor ? `floor ≤ ${say(floor.t)} m` : "";
+    this.glance.querySelector(".floor-said").textContent = floor ? `floor ${say(floor.t)} m` : "";
     this.glance.querySelector(".ideal-said").textContent =
       `ideal model ${say(ideal.t)} m${byHand ? " · set by hand, not fitted" : ""}`;
   }

@@ -14,7 +14,6 @@ from pipeline.diagnosis.error_regions import map_errors, pick_regions
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.identification import Input, Problem, State, choose_input, fit_model, hold_out
 from pipeline.identification.describe import errors_as_json
-from pipeline.identification.floor import estimate_floor
 from pipeline.identification.intervals import estimate_intervals
 from pipeline.identification.predict import predict_at_from
 from pipeline.identification.scoring import score
@@ -41,11 +40,10 @@ _MOST_FITS = 60
 
 @dataclass(frozen=True)
 class Judged:
-    """A fitted model with its held-out errors, the floor that it shows, and the intervals of its numbers."""
+    """A fitted model with its held-out errors and the intervals of its numbers."""
 
     fitted: Fitted
     errors: Errors
-    floor: Errors
     intervals: Mapping[str, tuple[float, float]]
 
 
@@ -96,17 +94,16 @@ class PreparedRun:
             if key not in self._fits:
                 fitted = fit_model(self.problem, model, exact=True)
                 held_out = hold_out(self.problem, fitted)
-                floor = estimate_floor(self.problem, held_out)
                 items = estimate_intervals(self.problem, fitted).items if model.effects else ()
                 found = {i.free.label: (i.low, i.high) for i in items if i.free.effect and i.free.run is None}
-                self._fits[key] = Judged(fitted, held_out.pooled, floor, found)
+                self._fits[key] = Judged(fitted, held_out.pooled, found)
                 while len(self._fits) > _MOST_FITS:
                     self._fits.popitem(last=False)
             self._fits.move_to_end(key)
             return self._fits[key]
 
     def judge_quickly(self, model: Model) -> Errors:
-        """Held-out errors of a fitted model, without floor and intervals."""
+        """Held-out errors of a fitted model, without intervals."""
         with self.lock:
             return hold_out(self.problem, fit_model(self.problem, model, exact=not model.effects)).pooled
 

@@ -59,7 +59,7 @@ class Session(msgspec.Struct, frozen=True, kw_only=True):
         run: the run it is fitted to.
         key: generation of the run's results that the errors belong to.
         input: what the model is fed with.
-        floor: the lowest noise floor seen, as JSON; empty before the first fit.
+        floor: the noise floor of the run, as JSON; empty before it was first shown.
         steps: oldest first.
         at: which step counts: those after it can be redone.
     """

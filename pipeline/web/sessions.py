@@ -83,9 +83,7 @@ class Sessions:
             session = actions.open_session(file, prepared)
             if ask.action == "preview":
                 return self._preview(file, prepared, session, ask)
-            changed = actions.learn_floor(
-                self._change(file, prepared, session, ask), read_diagnosis(self.results, manifest)
-            )
+            changed = actions.keep_floor(self._change(file, prepared, session, ask), prepared)
             # A step that cannot be shown is not kept.
             shown = self._show(file, prepared, changed)
             if changed is not session:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,9 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.options import Options
 from pipeline.diagnosis import Diagnosis, Recording, diagnose_runs
 from pipeline.diagnosis.plausibility import find_exceeded, find_implausible, is_nameable
+from pipeline.diagnosis.residual_structure import is_felt
 from pipeline.diagnosis.words import describe, list_lines
+from pipeline.identification.persistence import take_own_past
 from pipeline.models import Model, find_effect, read_model, write_model
 from pipeline.models.evidence import Evidence, Largest
 from pipeline.runs.errors import MotionError
@@ -353,7 +356,7 @@ def test_a_diagnosis_is_the_same_each_time(tmp_path: Path) -> None:
     assert diagnose_runs([recording], vehicle).to_json() == first
 
 
-_EVIDENCE = Evidence(Largest(1.0, 1.0, 8.0, 3.0, np.linspace(0.0, 120.0, 11), np.zeros(11)))
+_EVIDENCE = Evidence(Largest(1.0, 1.0, 8.0, 3.0, np.linspace(0.0, 120.0, 11)))
 
 
 @pytest.mark.parametrize(
@@ -434,3 +437,21 @@ def test_two_lags_that_have_become_one_make_room_for_what_set_them_apart(tmp_pat
     found = _diagnose(replace(_SCENE, effects=hidden), tmp_path).runs[0]
     assert {effect.id for effect in found.effects} == set(hidden)
     assert not found.undecided
+
+
+def test_structure_that_no_planner_feels_is_not_said() -> None:
+    assert not is_felt("w", 0.001, part=0.5)
+    assert is_felt("w", 0.0013, part=0.001)
+    assert not is_felt("x", 1.0, part=0.004)
+    assert is_felt("y", 0.001, part=0.006)
+
+
+def test_residuals_lose_what_their_own_past_tells_of_them() -> None:
+    draw, times = np.random.default_rng(3), np.arange(0.0, 300.0, 0.5)
+    lasting, fresh = np.zeros(times.size), draw.normal(size=times.size)
+    for now in range(1, times.size):
+        lasting[now] = 0.7 * lasting[now - 1] + fresh[now]
+    windows = SimpleNamespace(times=np.column_stack((times, times + 0.5)))
+    made = take_own_past([SimpleNamespace(windows=windows)], np.column_stack([lasting] * 3))  # type: ignore[list-item]
+    assert np.corrcoef(made[2:, 0], fresh[2:])[0, 1] > 0.99
+    assert not made[:2].any()

@@ -161,7 +161,7 @@ def test_the_error_falls_as_far_as_it_can(asked: Asked, name: str) -> None:
     position, yaw = _LEFT[name]
     assert last["t_mrmse_m"] < position * recorded.t_mrmse_m  # type: ignore[operator]
     assert last["r_mrmse_rad"] < yaw * recorded.r_mrmse_rad  # type: ignore[operator]
-    assert run.noise_floor["t_mrmse_m"] <= last["t_mrmse_m"]  # type: ignore[operator]
+    assert run.noise_floor["t_mrmse_m"] < 1.2 * last["t_mrmse_m"]  # type: ignore[operator]
 
 
 @pytest.mark.parametrize("names", [_ASPHALT, _GRASS, _GRAVEL])

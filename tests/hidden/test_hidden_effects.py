@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from draw import CATEGORIES, POOLS, Answer, draw_riddle, open_seal, seal, write_riddle
 from play import list_jobs, parse_seeds, play_all
@@ -20,6 +21,8 @@ from scoreboard import (
     write_scoreboard,
 )
 from truth import Checked, Held
+
+from pipeline.simulate import State
 
 
 def test_a_seal_hides_its_answer_until_it_is_opened(tmp_path: Path) -> None:
@@ -174,6 +177,29 @@ def test_single_effects_of_several_seeds_are_named_and_as_good_as_the_true_model
 
 def test_in_an_empty_log_nothing_is_named_and_nothing_flagged(tmp_path: Path) -> None:
     assert all(is_clean(play(Job("empty", 4, kind), tmp_path)) for kind in ("plain", "noisy"))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("seed", "kind"),
+    [(98_001, "closed"), (98_009, "closed"), (98_002, "closed_rough"), (98_007, "closed_rough")],
+)
+def test_commands_that_answer_random_motion_are_no_cause_of_it(seed: int, kind: str, tmp_path: Path) -> None:
+    """Each of these had a false delay, or structure in w, when judged as if nobody steered by the pose."""
+    assert is_clean(play(Job("empty", seed, kind), tmp_path))
+
+
+def test_a_controller_s_commands_follow_the_random_motion() -> None:
+    """In closed loop the command correlates with what pushed the vehicle before, not with what does after."""
+    scene = draw_riddle("empty", 98_002, "closed_rough").scenario
+    assert scene.played is not None
+    push = scene.extra
+    assert push is not None
+    pushed = np.array([push(State(t=time, v0=1.0))[2] for time in scene.played.time_s.tolist()])
+    turn, live = scene.played.turn, slice(60, -60)
+    before, after = (np.corrcoef(np.roll(pushed, lag)[live], turn[live])[0, 1] for lag in (8, -8))
+    assert before < -0.05
+    assert abs(after) < 0.5 * abs(before)
 
 
 def test_physics_that_no_catalogue_has_is_flagged_and_its_formula_helps(tmp_path: Path) -> None:

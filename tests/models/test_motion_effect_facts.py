@@ -26,7 +26,7 @@ GENERIC = sorted(
 )
 # Parameters of other people's controllers that are called as an effect is.
 NAMESAKES = {"vehicles/parameters.py": {"'wheel_radius'"}}
-ASKED = Largest(1.5, 1.2, 9.0, 8.0, np.linspace(0.0, 300.0, 11), np.linspace(-5.0, 20.0, 11))
+ASKED = Largest(1.5, 1.2, 9.0, 8.0, np.linspace(0.0, 300.0, 11))
 
 
 def list_mentions(path: Path) -> list[str]:

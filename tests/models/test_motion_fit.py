@@ -10,7 +10,6 @@ from pipeline.identification import (
     Input,
     Problem,
     climb,
-    estimate_floor,
     estimate_intervals,
     fit_model,
     hold_out,
@@ -18,8 +17,8 @@ from pipeline.identification import (
     predict_at,
     score,
 )
-from pipeline.identification.floor import hold_below
 from pipeline.identification.folds import GAP_S
+from pipeline.identification.judgement import judge_model
 from pipeline.identification.persistence import split_residuals
 from pipeline.identification.scoring import measure_by_terrain
 from pipeline.models import Model, Timing, find_effect
@@ -175,8 +174,6 @@ def test_the_floor_is_the_true_model_s_error_under_slow_localization_noise(sourc
     truth = {"effective_track": 1.8, "drive_lag": 0.3, "icr_offset": 0.1}
     run = simulate(truth, duration_s=200.0, pose=WANDERING, disturbance=Disturbance())
     problem = Problem([run], HUSKY, source)
-    fitted = fit_model(problem, model_of(*truth))
-    floor = estimate_floor(problem, hold_out(problem, fitted))
     true_model = Model(
         HUSKY,
         (
@@ -186,20 +183,22 @@ def test_the_floor_is_the_true_model_s_error_under_slow_localization_noise(sourc
         ),
     )
     true = score(problem, problem.start_state(true_model.effects)).pooled
-    assert np.allclose(floor.ratios(true), 1.0, atol=0.15)
+    x, y, _, position, _ = problem.floor.ratios(true)
+    assert np.allclose((x, y, position), 1.0, atol=0.15)
 
 
-def test_the_floor_is_one_number_whatever_model_it_is_taken_from() -> None:
-    truth = {"effective_track": 1.8, "drive_lag": 0.3, "icr_offset": 0.1}
-    run = simulate(truth, duration_s=200.0, pose=WANDERING, disturbance=Disturbance(0.03, 0.05))
-    problem = Problem([run], HUSKY, Input.MEASURED)
-    rungs = climb(problem, model_of("effective_track", "icr_offset")).rungs
-    floors = [estimate_floor(problem, rung.held_out) for rung in rungs]
-    for floor in floors[:-1]:
-        assert np.allclose(floor.ratios(floors[-1])[:3], 1.0, atol=0.15)
-        held = hold_below(floor, rungs[-1].errors)
-        assert np.all(np.array(held.ratios(rungs[-1].errors)) <= 1.0)
-        assert np.all(np.array(held.ratios(floor)) <= 1.0)
+def test_the_floor_knows_of_no_model_and_no_model_lowers_it() -> None:
+    floors = []
+    for truth in ({}, {"effective_track": 1.8, "drive_lag": 0.3, "icr_offset": 0.1}):
+        run = simulate(truth, duration_s=200.0, pose=WANDERING, disturbance=Disturbance(0.03, 0.05))
+        floors.append(Problem([run], HUSKY, Input.MEASURED).floor)
+    assert np.allclose(floors[0].ratios(floors[1]), 1.0, atol=0.2)
+    judged = judge_model(Problem([run], HUSKY, Input.MEASURED), model_of("effective_track", "icr_offset"))
+    assert judged.floor == floors[1]
+    low = replace(judged.floor, t_mrmse_m=1.2 * judged.ladder.rungs[-1].errors.t_mrmse_m)
+    share = judged.ladder.explained_shares(low)[-1]
+    assert share is not None
+    assert share > 1.0
 
 
 def test_the_noise_of_poses_is_measured_whatever_the_model_lacks() -> None:
@@ -219,12 +218,11 @@ def test_motion_that_lasts_is_no_noise_though_nothing_recorded_tells_of_it() -> 
         run = simulate(truth, duration_s=300.0, pose=WANDERING, disturbance=unseen)
         problem = Problem([run], HUSKY, Input.MEASURED)
         held_out = hold_out(problem, fit_model(problem, model_of(*truth)))
-        floors.append((estimate_floor(problem, held_out), held_out.pooled))
+        floors.append((problem.floor, held_out.pooled))
     (quiet, _), (pushed, error) = floors
     assert np.all(np.array(error.ratios(quiet)) > 3.0)
     x, y, _, position, _ = pushed.ratios(quiet)
     assert np.allclose((x, y, position), 1.0, atol=0.3)
-    # A gyro's noise is so small that beside such motion only its bound can be given.
     assert np.all(np.array(pushed.ratios(error)) < 0.3)
 
 

@@ -219,14 +219,12 @@ def test_what_a_diagnosis_named_is_shown(workbench: Workbench) -> None:
         "input": "command",
         "effects": [{"id": "effective_track", "gain": 0.9}],
         "undecided": [],
-        "noise_floor": {"t_mrmse_m": 0.0011, "r_mrmse_rad": 0.0004},
     }
     (home / manifest["folder"] / "diagnosis.json").write_text(json.dumps(named))
     manifest["files"]["diagnosis.json"] = manifest["files"]["summary.json"]
     (home / "manifest.json").write_text(json.dumps(manifest))
     opened = workbench.session(RUN)
     assert opened["diagnosis"] == named
-    assert errors(opened, "floor") == {"t": 0.0011, "r": 0.0004}
 
 
 @pytest.mark.long

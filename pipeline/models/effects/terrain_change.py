@@ -2,8 +2,9 @@
 
     v0 = k_v * v0,  w0 = k_w * w0    where t >= at_s, or where x > at_x when at_x is given
 
-k_v, k_w are plain numbers, off one by 8 to 30 %; at_s [s] since the run's start; at_x [m]. Both grounds
-need ten command steps with turning.
+k_v, k_w are plain numbers, off one by 8 to 30 %; at_s [s] since the recording's start;
+at_x [m] along the map's x axis, which is not looked for: where the axes of a map lie says nothing of the
+ground. Both grounds need ten command steps with turning.
 
 Source: piecewise-constant slip; the deployments of Samson et al. 2024.
 """
@@ -66,8 +67,6 @@ class TerrainChange(KinematicEffect):
             NAN,
             "place of the change along the map's x axis",
             0.0,
-            starts=(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
-            relative_to="place",
             instead_of="at_s",
         ),
     )
@@ -98,7 +97,8 @@ class TerrainChange(KinematicEffect):
         if math.isfinite(at_x):
             beyond = around.place[:, 0] > at_x
         else:
-            beyond = around.times >= (0.5 * around.duration_s if math.isnan(at_s) else at_s)
+            middle = around.start_s + 0.5 * around.duration_s
+            beyond = around.times >= (middle if math.isnan(at_s) else at_s)
         return rolling.scale(
             np.where(beyond, self.values["k_v"], 1.0), np.where(beyond, self.values["k_w"], 1.0)
         )
@@ -106,11 +106,6 @@ class TerrainChange(KinematicEffect):
     def is_degenerate(self, evidence: Evidence) -> bool:
         """It does not lie within the run."""
         # Nearer to the ends of what was driven it is a wheel radius and a track under another name.
-        for at, tenths in (
-            (self.values["at_s"], evidence.largest.moments),
-            (self.values["at_x"], evidence.largest.places),
-        ):
-            low, high = 0.5 * (tenths[1] + tenths[2]), 0.5 * (tenths[-3] + tenths[-2])
-            if math.isfinite(at) and not low <= at <= high:
-                return True
-        return False
+        at, tenths = self.values["at_s"], evidence.largest.moments
+        low, high = 0.5 * (tenths[1] + tenths[2]), 0.5 * (tenths[-3] + tenths[-2])
+        return math.isfinite(at) and not bool(low <= at <= high)

@@ -50,5 +50,5 @@ class TimeDrift(KinematicEffect):
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
-        fade = 1.0 - self.values["k"] * around.times / around.duration_s
+        fade = 1.0 - self.values["k"] * (around.times - around.start_s) / around.duration_s
         return rolling.scale(fade, fade)

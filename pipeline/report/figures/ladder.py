@@ -34,8 +34,8 @@ _FAR = 0.6
 def draw_ladder(scene: Scene) -> Drawing | None:
     """A staircase: one bar a rung, the longest on top, between the ceiling and the floor as dashed lines.
 
-    The ceiling is the error of the ideal model, the floor what no model could remove: what can be explained
-    lies between them, and `explained_share` counts from the one to the other.
+    The ceiling is the error of the ideal model, the floor how well motion repeats itself: what can be
+    explained lies between them, and `explained_share` counts from the one to the other.
     """
     rows = list_rungs(scene)
     if rows["ladder"].is_empty():
@@ -61,7 +61,7 @@ def draw_ladder(scene: Scene) -> Drawing | None:
     )
     note = "Ceiling: the ideal model."
     if rows["ladder_floor"].height:
-        note += " Floor: the error that no model could remove. What can be explained lies between them."
+        note += " Floor: how well motion repeats itself. What can be explained lies between them."
     return Drawing(chart, rows, note)
 
 

@@ -90,7 +90,7 @@ def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float 
     else:
         forward = turning = None
     if samples.body_commanded and both.any():
-        blocks = _average(samples, both, (samples.times // _BLOCK_S).astype(np.int64))
+        blocks = _average(samples, both, ((samples.times - samples.times[0]) // _BLOCK_S).astype(np.int64))
         along, around = (_find_gain(asked, got) for asked, got in blocks)
         # Limits and droops lower the gain of fast turns; nothing but a multiplier raises it.
         if along is not None and around is not None and abs(np.log(along)) < _SCALED and around > along:

@@ -36,6 +36,7 @@ _LAGS_S = (-0.3, -0.1, 0.0, 0.1, 0.3, 0.6, 1.0, 1.6)
 _ROUNDS = 10
 _BINS = 6
 SAMPLE_S = 0.05
+_ROUNDING = 1e-6
 
 
 def find_outliers(run: MotionRun, vehicle: Vehicle) -> Floats:
@@ -54,19 +55,20 @@ def find_outliers(run: MotionRun, vehicle: Vehicle) -> Floats:
     live = np.diff(run.track.times)[run.track.active[1:]]
     most = _LARGEST_SHARE * float(live[live < _LONGEST_S].sum())
     faulty = off > 1.0
-    grid = _fill(begin[faulty], end[faulty])
+    grid = _fill(begin[faulty], end[faulty], run.start_s)
     # More than a twentieth is no exception: then only the worst of it counts as fault.
     while grid.size * SAMPLE_S > most:
         faulty &= off > np.quantile(off[faulty], 0.1)
-        grid = _fill(begin[faulty], end[faulty])
+        grid = _fill(begin[faulty], end[faulty], run.start_s)
     return grid
 
 
-def _fill(begin: Floats, end: Floats) -> Floats:
-    """Times all through some intervals, twenty a second."""
-    first, last = np.floor(begin / SAMPLE_S), np.ceil(end / SAMPLE_S)
+def _fill(begin: Floats, end: Floats, origin: float) -> Floats:
+    """Times all through some intervals, twenty a second since ``origin``."""
+    first = np.floor((begin - origin) / SAMPLE_S + _ROUNDING)
+    last = np.ceil((end - origin) / SAMPLE_S - _ROUNDING)
     ticks = [np.arange(a, b + 1) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
-    times: Floats = np.unique(np.concatenate(ticks)) * SAMPLE_S if ticks else np.zeros(0)
+    times: Floats = origin + np.unique(np.concatenate(ticks)) * SAMPLE_S if ticks else np.zeros(0)
     return times
 
 

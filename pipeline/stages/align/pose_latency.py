@@ -26,6 +26,7 @@ _ROUNDS = 3
 _FEWEST = 200
 _TURNING = 0.3
 _STRAIGHT = 0.05
+_ROUNDING_S = 1e-6
 _OLDEST = 0.5
 _LEAST_SPREAD = 0.015
 _NOISE = (0.002, 0.02)
@@ -125,7 +126,7 @@ def _smooth(track: Track, seen: _Seen, beside: Floats, spread: float) -> Floats:
     from scipy.linalg import solveh_banded  # noqa: PLC0415 - heavy
 
     wait = np.where(np.diff(track.segment) != 0, np.inf, np.diff(track.times))
-    both = seen.telling[1:] & seen.telling[:-1] & (wait < _LONGEST_WAIT)
+    both = seen.telling[1:] & seen.telling[:-1] & (wait < _LONGEST_WAIT - _ROUNDING_S)
     limited = np.clip(beside, -3.0 * spread, 3.0 * spread)
     alike = 0.5
     if both.sum() >= _FEWEST // 2:
@@ -152,7 +153,7 @@ def _describe_stamps(track: Track) -> Floats:
     wait = np.diff(track.times, prepend=track.times[0])
     usual = float(np.median(wait))
     first = np.concatenate(([True], np.diff(track.segment) != 0))
-    wait = np.where(first | (wait > _LONGEST_WAIT), usual, wait)
+    wait = np.where(first | (wait > _LONGEST_WAIT + _ROUNDING_S), usual, wait)
     columns = [np.ones(wait.size)]
     for ahead in (-2, -1, 0, 1, 2):
         share = np.clip(np.roll(wait, -ahead) / usual, 0.0, 4.0)

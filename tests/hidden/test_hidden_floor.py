@@ -1,0 +1,48 @@
+"""The noise floor against what the true model leaves, on drawn logs: no model is asked for the floor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from draw import draw_riddle, write_riddle
+from pipeline.diagnosis.subject import load_recording
+from truth import build_true
+
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.diagnosis import read_recording
+from pipeline.analysis.options import Options
+from pipeline.identification import Input, Problem, fit_model, hold_out
+from pipeline.models import Model
+
+# Random motion of its usual size and three times that, late and repeated poses, cars, fast vehicles.
+_CATEGORIES = ("natural", "late", "cars", "single", "empty")
+_SEEDS = (98_900, 98_901, 98_902, 98_903)
+_LONGEST_S = 110.0
+
+
+def _compare(category: str, seed: int, folder: Path) -> np.ndarray:
+    """The floor over what the true model leaves of unseen data: x, y, w, and T and R over 2 s."""
+    riddle = draw_riddle(category, seed)  # type: ignore[arg-type]
+    scenario = replace(riddle.scenario, duration_s=min(riddle.scenario.duration_s, _LONGEST_S))
+    log = folder / f"{category}_{seed}.mcap"
+    write_riddle(replace(riddle, scenario=scenario), log)
+    manifest = analyze_log(log, Options(out=folder / "out", report=False)).manifest
+    vehicle, recording = read_recording(manifest)
+    run = load_recording(recording, vehicle)
+    problem = Problem([run], vehicle, Input.COMMAND)
+    true = build_true(riddle.answer, run.duration_s)
+    left = hold_out(problem, fit_model(problem, Model(problem.vehicle, true))).pooled
+    return np.array(problem.floor.ratios(left))
+
+
+@pytest.mark.long
+def test_the_floor_is_what_the_true_model_leaves_though_no_model_is_asked(tmp_path: Path) -> None:
+    found = np.array([_compare(name, seed, tmp_path) for name in _CATEGORIES for seed in _SEEDS])
+    velocity, over_2s = found[:, :3], found[:, 3:]
+    assert np.abs(np.median(velocity, axis=0) - 1.0).max() < 0.1
+    assert np.mean(np.abs(velocity - 1.0) < 0.2) >= 0.85
+    assert np.abs(np.median(over_2s, axis=0) - 1.0).max() < 0.2
+    assert np.mean(np.abs(over_2s - 1.0) < 0.3) >= 0.85
