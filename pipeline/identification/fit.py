@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.identification.proposals import propose
+from pipeline.identification.state import State
 from pipeline.identification.weights import make_weights
 from pipeline.models.model import Model
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from pipeline.identification.parts import Part
     from pipeline.identification.problem import Problem
-    from pipeline.identification.state import Free, State
+    from pipeline.identification.state import Free
     from pipeline.identification.weights import Weights
     from pipeline.models.effect import Effect, Parameter
 
@@ -27,6 +28,7 @@ Floats = NDArray[np.float64]
 _ITERATIONS = 20
 _ENOUGH = 2e-5
 _NEWS = 0.02
+_NEWS_OF_EXACT = 1e-4
 _GRID_ROUNDS = 4
 _STIFFEST = 30.0
 _REWEIGHTED = 3
@@ -47,6 +49,8 @@ class PartFit:
         jacobian: change of the prediction with each free number, shape (n, 3, p).
         weights: what a residual costs.
         loss: mean cost under these weights, that of the prior included.
+        is_fresh: whether the derivatives are those at this very state; after a small step the last ones serve.
+        both_sides: whether they were taken from both sides.
     """
 
     state: State
@@ -55,6 +59,8 @@ class PartFit:
     jacobian: Floats
     weights: Weights
     loss: float
+    is_fresh: bool = True
+    both_sides: bool = False
 
     @property
     def smooth(self) -> list[int]:
@@ -147,7 +153,7 @@ def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]
         weights = make_weights(fit.residual, part)
         if np.allclose(weights.scale, fit.weights.scale, rtol=_SAME_SCALE):
             break
-        fit = fit_part(part, weights, fit.state, per_run=per_run)
+        fit = fit_part(part, weights, fit, per_run=per_run)
     return fit
 
 
@@ -156,7 +162,7 @@ def _settle(part: Part, fit: PartFit, per_run: Sequence[str]) -> PartFit:
     for _ in range(_SETTLED_ROUNDS):
         before = np.array([fit.state.get(number) for number in fit.free])
         weights = make_weights(fit.residual, part)
-        fit = fit_part(part, weights, fit.state, per_run=per_run, enough=_SETTLED)
+        fit = fit_part(part, weights, fit, per_run=per_run, enough=_SETTLED)
         after = np.array([fit.state.get(number) for number in fit.free])
         if np.allclose(before, after, rtol=_SAME_NUMBER, atol=1e-6):
             break
@@ -191,7 +197,7 @@ class Unset:
 def fit_part(
     part: Part,
     weights: Weights,
-    state: State,
+    start: State | PartFit,
     iterations: int = _ITERATIONS,
     *,
     per_run: Sequence[str] = (),
@@ -202,18 +208,29 @@ def fit_part(
     Args:
         part: of the way.
         weights: what a residual costs.
-        state: to start from.
+        start: state to start from, or a fit of which residuals and derivatives serve on.
         iterations: most of them.
         per_run: as in `fit_model`.
         enough: relative fall of the loss at which the fit ends.
     """
-    free = state.list_free(part.delays, per_run)
-    fit = _descend(part, weights, state, free, (iterations, enough))
-    for number in free:
+    until = (iterations, enough)
+    if isinstance(start, State):
+        start = _enter(part, weights, start, start.list_free(part.delays, per_run), until)
+    fit = _descend(part, replace(start, weights=weights), until)
+    for number in fit.free:
         moved = None if number.is_smooth else _walk_grid(part, fit, number)
         if moved is not None:
-            fit = _descend(part, weights, moved, free, (iterations, enough))
+            fit = _descend(part, _enter(part, weights, moved, fit.free, until), until)
     return fit
+
+
+def _enter(
+    part: Part, weights: Weights, state: State, free: tuple[Free, ...], until: tuple[int, float]
+) -> PartFit:
+    """A state as it is, with its residuals and derivatives."""
+    residual, both = part.find_residuals(state), until[1] < _ENOUGH
+    jacobian = part.differentiate(state, residual, free, both_sides=both)
+    return PartFit(state, free, residual, jacobian, weights, math.nan, both_sides=both)
 
 
 def measure_loss(part: Part, weights: Weights, residual: Floats, state: State, free: Sequence[Free]) -> float:
@@ -253,19 +270,19 @@ def solve_step(
     return step, normal
 
 
-def _descend(
-    part: Part, weights: Weights, state: State, free: tuple[Free, ...], until: tuple[int, float]
-) -> PartFit:
+def _descend(part: Part, start: PartFit, until: tuple[int, float]) -> PartFit:
     iterations, enough = until
     both = enough < _ENOUGH
-    residual = part.find_residuals(state)
+    news = _NEWS_OF_EXACT if both else _NEWS
+    state, free, weights, residual, jacobian = (
+        start.state, start.free, start.weights, start.residual, start.jacobian
+    )  # fmt: skip
     loss = measure_loss(part, weights, residual, state, free)
-    smooth = [place for place, number in enumerate(free) if number.is_smooth]
-    jacobian = part.differentiate(state, residual, free, both_sides=both)
-    if not smooth:
-        return PartFit(state, free, residual, jacobian, weights, loss)
-    damping, is_fresh = 1e-4, True
-    for _ in range(iterations):
+    smooth, is_fresh = start.smooth, start.is_fresh
+    if both and not start.both_sides:
+        jacobian, is_fresh = part.differentiate(state, residual, free, both_sides=True), True
+    damping = 1e-4
+    for _ in range(iterations if smooth else 0):
         pull = part.prior.pull(state, free)
         moving = [
             place
@@ -303,12 +320,12 @@ def _descend(
         state, residual, loss = trial, after, reached
         damping = max(damping / 8.0, 1e-8)
         # After a small step the derivatives still serve: new ones cost a prediction for each number.
-        is_fresh = fall > _NEWS
+        is_fresh = fall > news
         if is_fresh:
             jacobian = part.differentiate(state, residual, free, both_sides=both)
         if fall < enough:
             break
-    return PartFit(state, free, residual, jacobian, weights, loss)
+    return PartFit(state, free, residual, jacobian, weights, loss, is_fresh, both)
 
 
 def _pushes_out(state: State, number: Free, column: Floats, residual: Floats, prior: float) -> bool:
