@@ -86,7 +86,7 @@ def propose(
         largest: what relative starts are shares of.
         known: columns of formula terms: they hardly change with the rest of the model.
     """
-    found = []
+    found, base = [], _weigh(fit)
     for candidate in candidates:
         if fit.state.find(candidate.id) is not None:
             continue
@@ -98,7 +98,7 @@ def propose(
             if candidate.id.startswith(TERM):
                 known[candidate.id] = trials
         for trial in trials:
-            proposal = _promise(fit, trial)
+            proposal = _promise(base, trial)
             if proposal is not None and (best is None or proposal.loss < best.loss):
                 best = proposal
         if best is not None:
@@ -168,28 +168,58 @@ def _find_traced(trial: Trial, size: Floats) -> NDArray[np.bool_]:
     return traced if traced.any() else size > _NO_TRACE
 
 
-def _promise(fit: PartFit, trial: Trial) -> Proposal | None:
-    """Loss after one joint step of the model's numbers and the effect's."""
-    base = fit.residual - trial.shift
-    joint = np.concatenate((fit.jacobian, trial.columns), axis=2)
-    own = fit.jacobian.shape[2]
+@dataclass(frozen=True)
+class _Base:
+    """A fit with what its numbers' part of every joint step is made of.
+
+    Attributes:
+        fit: the fit.
+        factor: of its residuals, shape (n, 3).
+        size: of each weighted column of its Jacobian, shape (p,).
+        rows: these columns, each of size one, shape (3 n, p).
+        normal: of these columns, shape (p, p).
+    """
+
+    fit: PartFit
+    factor: Floats
+    size: Floats
+    rows: Floats
+    normal: Floats
+
+
+def _weigh(fit: PartFit) -> _Base:
     factor = fit.weights.factors(fit.residual)
-    rows = (joint * factor[:, :, None]).reshape(-1, joint.shape[2])
+    rows, size = _scale(fit.jacobian, factor)
+    return _Base(fit, factor, size, rows, rows.T @ rows)
+
+
+def _scale(columns: Floats, factor: Floats) -> tuple[Floats, Floats]:
+    """Weighted columns, each of size one, shape (3 n, p), and their sizes."""
+    rows = (columns * factor[:, :, None]).reshape(factor.size, columns.shape[2])
     size = np.sqrt(np.einsum("ij,ij->j", rows, rows)) + 1e-12
-    if not (size[own:] > _NO_TRACE).any():
+    return rows / size, size
+
+
+def _promise(base: _Base, trial: Trial) -> Proposal | None:
+    """Loss after one joint step of the model's numbers and the effect's."""
+    fit, own = base.fit, base.size.size
+    rows, size = _scale(trial.columns, base.factor)
+    if not (size > _NO_TRACE).any():
         return None
-    traced = _find_traced(trial, size[own:])
+    traced = _find_traced(trial, size)
     if not traced.all():
         # Driven straight only, a change of ground shows in one gain: the other is left as it is.
         silent = [n for n, seen in zip(trial.names, traced.tolist(), strict=True) if not seen]
-        kept = np.concatenate((np.ones(own, dtype=bool), traced))
         loud = tuple(name for name in trial.names if name not in silent)
         trial = Trial(trial.effect.fix(*silent), loud, trial.columns[:, :, traced], trial.shift)
-        joint, rows, size = joint[:, :, kept], rows[:, kept], size[kept]
-    rows /= size
-    normal = rows.T @ rows + 1e-7 * np.eye(rows.shape[1])
-    step = np.linalg.solve(normal, rows.T @ (base * factor).reshape(-1)) / size
-    after = base - joint @ step
+        rows, size = rows[:, traced], size[traced]
+    residual = fit.residual - trial.shift
+    target = (residual * base.factor).reshape(-1)
+    across = base.rows.T @ rows
+    normal = np.block([[base.normal, across], [across.T, rows.T @ rows]]) + 1e-7 * np.eye(own + size.size)
+    moved = np.linalg.solve(normal, np.concatenate((base.rows.T @ target, rows.T @ target)))
+    step = moved / np.concatenate((base.size, size))
+    after = residual - fit.jacobian @ step[:own] - trial.columns @ step[own:]
     state = fit.state
     for number, change in zip(fit.free, step[:own].tolist(), strict=True):
         if number.is_smooth:
