@@ -22,10 +22,11 @@ from pipeline.identification.proposals import TERM
 from pipeline.identification.scoring import HeldOut, refit_folds, score_models
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from pipeline.identification.judgement import Judgement
     from pipeline.identification.problem import Problem
+    from pipeline.identification.state import State
 
 Floats = NDArray[np.float64]
 Kind = Literal["effect", "disturbance", "localization_noise"]
@@ -106,7 +107,8 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
     def leave(state: State, present: Subset) -> State:
         return state.drop([name for player in players if player not in present for name in players[player]])
 
-    known = {frozenset(players): judgement.whole.held_out, frozenset[str](): judgement.ladder.rungs[0].held_out}
+    known = {frozenset(players): judgement.whole.held_out}
+    known[frozenset()] = judgement.ladder.rungs[0].held_out
     # Models that begin alike follow each other: what they have in common is predicted once.
     asked = sorted(list_subsets(tuple(players)) - known.keys(), key=lambda one: [p in one for p in players])
     models = [[leave(state, present) for present in asked] for state in states]

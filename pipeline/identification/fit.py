@@ -49,7 +49,7 @@ class PartFit:
         jacobian: change of the prediction with each free number, shape (n, 3, p).
         weights: what a residual costs.
         loss: mean cost under these weights, that of the prior included.
-        is_fresh: whether the derivatives are those at this very state; after a small step the last ones serve.
+        is_fresh: whether the derivatives are those at this state: after a small step the last ones serve.
         both_sides: whether they were taken from both sides.
     """
 
