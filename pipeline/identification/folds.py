@@ -25,6 +25,7 @@ Flags = NDArray[np.bool_]
 FOLDS = 5
 GAP_S = 1.5
 _CHORD_STEPS = 3
+_NOTHING = 1e-6
 _LEAST_SHARE = 0.01
 
 
@@ -110,6 +111,9 @@ def refit(part: Part, fit: PartFit, train: Flags) -> State:
         held = hold + part.prior.weigh(state, free)
         step, _ = solve_step(jacobian, residual[train], weights, hold=held, pull=pull)
         moved = state.move(free, step.tolist())
+        promised = measure_loss(part, weights, residual[train] - jacobian @ step, moved, free)
+        if loss - promised < _NOTHING * loss:
+            break
         trial = part.find_residuals(moved)
         new = measure_loss(part, weights, trial[train], moved, free)
         if new >= loss:
