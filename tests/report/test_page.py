@@ -14,7 +14,9 @@ import polars as pl
 import pytest
 from report_synthesis import list_places, make_report
 
-from pipeline.report import RunReport, render_report, templating
+from pipeline.report import templating
+from pipeline.report.page import render_report
+from pipeline.report.run import RunReport
 from pipeline.report.sections.glance import say_standing
 from pipeline.report.templating import render_template, show_text
 from pipeline.report.words import begin_large, say_date, say_duration, say_number, say_share, say_split
