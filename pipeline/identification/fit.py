@@ -28,7 +28,6 @@ Floats = NDArray[np.float64]
 _ITERATIONS = 20
 _ENOUGH = 2e-5
 _NEWS = 0.02
-_NEWS_OF_EXACT = 1e-4
 _GRID_ROUNDS = 4
 _STIFFEST = 30.0
 _REWEIGHTED = 3
@@ -208,7 +207,7 @@ def fit_part(
     Args:
         part: of the way.
         weights: what a residual costs.
-        start: state to start from, or a fit of which residuals and derivatives serve on.
+        start: state to start from, or a fit, of which residuals and derivatives need not be found again.
         iterations: most of them.
         per_run: as in `fit_model`.
         enough: relative fall of the loss at which the fit ends.
@@ -273,15 +272,13 @@ def solve_step(
 def _descend(part: Part, start: PartFit, until: tuple[int, float]) -> PartFit:
     iterations, enough = until
     both = enough < _ENOUGH
-    news = _NEWS_OF_EXACT if both else _NEWS
     state, free, weights, residual, jacobian = (
         start.state, start.free, start.weights, start.residual, start.jacobian
     )  # fmt: skip
     loss = measure_loss(part, weights, residual, state, free)
-    smooth, is_fresh = start.smooth, start.is_fresh
-    if both and not start.both_sides:
-        jacobian, is_fresh = part.differentiate(state, residual, free, both_sides=True), True
-    damping = 1e-4
+    smooth, damping, is_fresh = start.smooth, 1e-4, True
+    if not start.is_fresh or both != start.both_sides:
+        jacobian = part.differentiate(state, residual, free, both_sides=both)
     for _ in range(iterations if smooth else 0):
         pull = part.prior.pull(state, free)
         moving = [
@@ -320,7 +317,7 @@ def _descend(part: Part, start: PartFit, until: tuple[int, float]) -> PartFit:
         state, residual, loss = trial, after, reached
         damping = max(damping / 8.0, 1e-8)
         # After a small step the derivatives still serve: new ones cost a prediction for each number.
-        is_fresh = fall > news
+        is_fresh = fall > _NEWS
         if is_fresh:
             jacobian = part.differentiate(state, residual, free, both_sides=both)
         if fall < enough:
