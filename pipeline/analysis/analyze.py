@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from pipeline.analysis.options import FigureFormat, Options
     from pipeline.logs import LogData
-    from pipeline.report import RunReport
+    from pipeline.report.run import RunReport
     from pipeline.store import Generation
 
 SUMMARY = "summary.json"
@@ -184,8 +184,10 @@ def _write_outputs(
     if options.report or options.figures:
         # Drawing is most of the start-up time; who wants neither does not pay for it.
         from pipeline.analysis.planned import read_preview  # noqa: PLC0415
-        from pipeline.report import RunReport, render_report, view_diagnosis  # noqa: PLC0415
+        from pipeline.report.diagnosed import view_diagnosis  # noqa: PLC0415
+        from pipeline.report.page import render_report  # noqa: PLC0415
         from pipeline.report.pages import lead_up  # noqa: PLC0415
+        from pipeline.report.run import RunReport  # noqa: PLC0415
 
         progress("report")
         tables = {name: generation.read_table(name) for name in generation.table_names}
@@ -203,7 +205,7 @@ def _write_outputs(
 def _write_figures(report: RunReport, kind: FigureFormat, generation: Generation) -> None:
     import tempfile  # noqa: PLC0415 - only where figures are asked for
 
-    from pipeline.report import write_figures  # noqa: PLC0415 - heavy
+    from pipeline.report.export import write_figures  # noqa: PLC0415 - heavy
 
     with tempfile.TemporaryDirectory() as folder:
         for path in write_figures(report, Path(folder), kind):

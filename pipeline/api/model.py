@@ -25,7 +25,8 @@ from pipeline.models import Effect, ModelFile, find_effect, read_model, write_mo
 from pipeline.models import Model as MotionModel
 from pipeline.models.export import export_model, read_current
 from pipeline.models.formula.formula_effect import CHANNELS, FormulaEffect, make_parameter
-from pipeline.report import RunReport, make_charts
+from pipeline.report.export import make_charts
+from pipeline.report.run import RunReport
 from pipeline.runs import MotionError
 from pipeline.vehicles import Vehicle, resolve_vehicle
 from pipeline.vehicles.configuration import VehicleSection

@@ -17,10 +17,10 @@ from pipeline.api.model import Model
 from pipeline.api.shown import tabulate_ladder, tabulate_parameters, write_html
 from pipeline.core.durations import say_recorded
 from pipeline.diagnosis.budget import parse_budget
-from pipeline.report import RunReport, make_charts, view_diagnosis
-from pipeline.report.diagnosed import read_model_text
+from pipeline.report.diagnosed import read_model_text, view_diagnosis
+from pipeline.report.export import make_charts
 from pipeline.report.motion_run import load_vehicle
-from pipeline.report.run import mapping_in, number_in, objects_in
+from pipeline.report.run import RunReport, mapping_in, number_in, objects_in
 from pipeline.report.words import say_distance
 from pipeline.store import Store
 

@@ -19,6 +19,7 @@ from pipeline.diagnosis.undecided import find_undecided
 from pipeline.diagnosis.unexplained import (
     Explainable,
     boost_residuals,
+    collect_terms,
     describe_windows,
     find_places,
     search_formula,
@@ -116,8 +117,9 @@ def _explore_body(context: Context, source: Input, known: Sequence[Effect], budg
     comparisons = found.selection.part.comparisons
     places = np.concatenate([find_places(comparison) for comparison in comparisons])
     final = search_formula(found.selection, found.start, found.final, places)
-    features, _ = describe_windows(comparisons)
-    explainable = boost_residuals(found.selection, final, features)
+    # Where a formula says what is left, nobody asks what else could.
+    features = None if collect_terms(final) else describe_windows(comparisons)[0]
+    explainable = None if features is None else boost_residuals(found.selection, final, features)
     found = replace(found, final=final)
     return _gather(found, explainable)
 

@@ -105,9 +105,9 @@ class Selection:
         """What was asked for."""
         return self.evidence.largest
 
-    def enter(self, state: State) -> CandidateModel:
-        """Fit a state and hold it out."""
-        return self._present(fit_part(self.part, self.weights, state))
+    def enter(self, start: State | PartFit) -> CandidateModel:
+        """Fit a state, or a fit further, and hold it out."""
+        return self._present(fit_part(self.part, self.weights, start))
 
     def drop(self, current: CandidateModel, names: Iterable[str]) -> CandidateModel:
         """A model without some of its effects, fitted anew."""
@@ -141,7 +141,7 @@ class Selection:
         self._tried.clear()
         self._finished.clear()
         self.budget.report(self.part.way, tested.ids)
-        return self.enter(tested.state)
+        return self.enter(tested.fit)
 
     def suggest(
         self, base: CandidateModel, count: int, without: Iterable[str] = (), *, pairs: bool = False
@@ -182,7 +182,7 @@ class Selection:
     def _finish(self, base: tuple[str, ...], fit: PartFit) -> CandidateModel:
         key = (base, fit.state.ids)
         if key not in self._finished:
-            self._finished[key] = self.enter(fit.state)
+            self._finished[key] = self.enter(fit)
         return self._finished[key]
 
     def _simplify(self, tested: CandidateModel) -> CandidateModel:

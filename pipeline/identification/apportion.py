@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 
 from pipeline.core.timegrid import nearest_indices
 from pipeline.identification.proposals import TERM
-from pipeline.identification.scoring import HeldOut, refit_folds, score_folds
+from pipeline.identification.scoring import HeldOut, refit_folds, score_models
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from pipeline.identification.judgement import Judgement
     from pipeline.identification.problem import Problem
+    from pipeline.identification.state import State
 
 Floats = NDArray[np.float64]
 Kind = Literal["effect", "disturbance", "localization_noise"]
@@ -103,14 +104,16 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
     def sum_stretches(held: HeldOut) -> Floats:
         return _sum_stretches(problem, held, length_scale_m)
 
-    def look(present: Subset) -> Floats:
-        gone = [name for player, names in players.items() if player not in present for name in names]
-        return sum_stretches(score_folds(problem, [state.drop(gone) for state in states]))
+    def leave(state: State, present: Subset) -> State:
+        return state.drop([name for player in players if player not in present for name in players[player]])
 
-    ideal = sum_stretches(judgement.ladder.rungs[0].held_out)
-    rest = sum_stretches(judgement.whole.held_out)
-    seen = {frozenset[str](): ideal, frozenset(players): rest} if players else {frozenset[str](): ideal}
-    split = share_out(tuple(players), look, seen)
+    known = {frozenset(players): judgement.whole.held_out}
+    known[frozenset()] = judgement.ladder.rungs[0].held_out
+    # Models that begin alike follow each other: what they have in common is predicted once.
+    asked = sorted(list_subsets(tuple(players)) - known.keys(), key=lambda one: [p in one for p in players])
+    models = [[leave(state, present) for present in asked] for state in states]
+    known |= dict(zip(asked, score_models(problem, models), strict=True))
+    split = share_out(tuple(players), {one: sum_stretches(held) for one, held in known.items()})
     floor = judgement.floor
     x, y, w = floor.velocity_rms
     floors = (x**2 + y**2 + (length_scale_m * w) ** 2, floor.t_mrmse_m**2, floor.r_mrmse_rad**2)
@@ -139,37 +142,34 @@ class Split:
     last: Mapping[str, Floats]
 
 
-def share_out(
-    players: Sequence[str], look: Callable[[Subset], Floats], seen: Mapping[Subset, Floats] | None = None
-) -> Split:
+def list_subsets(players: Sequence[str]) -> set[Subset]:
+    """Sets of players of which `share_out` must know the loss."""
+    orders = (order[:size] for order in _list_orders(players) for size in range(len(players) + 1))
+    others = (set(players) - {name} for name in players)
+    return {frozenset(one) for one in (*orders, *others, *((name,) for name in players))}
+
+
+def share_out(players: Sequence[str], losses: Mapping[Subset, Floats]) -> Split:
     """Shapley values of players that take parts of a loss away.
 
     Args:
         players: names.
-        look: loss with these players present, any shape; asked once a subset.
-        seen: subsets whose loss is known.
+        losses: loss with these players present, any shape, of all sets in `list_subsets`.
     """
-    known = dict(seen or {})
-
-    def ask(present: Subset) -> Floats:
-        if present not in known:
-            known[present] = look(present)
-        return known[present]
-
     nobody, everybody = frozenset[str](), frozenset(players)
-    parts = {name: np.zeros_like(ask(nobody)) for name in players}
+    parts = {name: np.zeros_like(losses[nobody]) for name in players}
     count = 0
     for order in _list_orders(players):
         count += 1
         steps = [frozenset(order[:size]) for size in range(len(order) + 1)]
         for name, (before, after) in zip(order, pairwise(steps), strict=True):
-            parts[name] += ask(before) - ask(after)
+            parts[name] += losses[before] - losses[after]
     return Split(
-        whole=ask(nobody),
-        rest=ask(everybody),
+        whole=losses[nobody],
+        rest=losses[everybody],
         parts={name: part / count for name, part in parts.items()},
-        alone={name: ask(nobody) - ask(frozenset({name})) for name in players},
-        last={name: ask(everybody - {name}) - ask(everybody) for name in players},
+        alone={name: losses[nobody] - losses[frozenset({name})] for name in players},
+        last={name: losses[everybody - {name}] - losses[everybody] for name in players},
     )
 
 

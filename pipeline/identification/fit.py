@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.identification.proposals import propose
+from pipeline.identification.state import State
 from pipeline.identification.weights import make_weights
 from pipeline.models.model import Model
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from pipeline.identification.parts import Part
     from pipeline.identification.problem import Problem
-    from pipeline.identification.state import Free, State
+    from pipeline.identification.state import Free
     from pipeline.identification.weights import Weights
     from pipeline.models.effect import Effect, Parameter
 
@@ -47,6 +48,8 @@ class PartFit:
         jacobian: change of the prediction with each free number, shape (n, 3, p).
         weights: what a residual costs.
         loss: mean cost under these weights, that of the prior included.
+        is_fresh: whether the derivatives are those at this state: after a small step the last ones serve.
+        both_sides: whether they were taken from both sides.
     """
 
     state: State
@@ -55,6 +58,8 @@ class PartFit:
     jacobian: Floats
     weights: Weights
     loss: float
+    is_fresh: bool = True
+    both_sides: bool = False
 
     @property
     def smooth(self) -> list[int]:
@@ -147,7 +152,7 @@ def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]
         weights = make_weights(fit.residual, part)
         if np.allclose(weights.scale, fit.weights.scale, rtol=_SAME_SCALE):
             break
-        fit = fit_part(part, weights, fit.state, per_run=per_run)
+        fit = fit_part(part, weights, fit, per_run=per_run)
     return fit
 
 
@@ -156,7 +161,7 @@ def _settle(part: Part, fit: PartFit, per_run: Sequence[str]) -> PartFit:
     for _ in range(_SETTLED_ROUNDS):
         before = np.array([fit.state.get(number) for number in fit.free])
         weights = make_weights(fit.residual, part)
-        fit = fit_part(part, weights, fit.state, per_run=per_run, enough=_SETTLED)
+        fit = fit_part(part, weights, fit, per_run=per_run, enough=_SETTLED)
         after = np.array([fit.state.get(number) for number in fit.free])
         if np.allclose(before, after, rtol=_SAME_NUMBER, atol=1e-6):
             break
@@ -191,7 +196,7 @@ class Unset:
 def fit_part(
     part: Part,
     weights: Weights,
-    state: State,
+    start: State | PartFit,
     iterations: int = _ITERATIONS,
     *,
     per_run: Sequence[str] = (),
@@ -202,18 +207,29 @@ def fit_part(
     Args:
         part: of the way.
         weights: what a residual costs.
-        state: to start from.
+        start: state to start from, or a fit, of which residuals and derivatives need not be found again.
         iterations: most of them.
         per_run: as in `fit_model`.
         enough: relative fall of the loss at which the fit ends.
     """
-    free = state.list_free(part.delays, per_run)
-    fit = _descend(part, weights, state, free, (iterations, enough))
-    for number in free:
+    until = (iterations, enough)
+    if isinstance(start, State):
+        start = _enter(part, weights, start, start.list_free(part.delays, per_run), until)
+    fit = _descend(part, replace(start, weights=weights), until)
+    for number in fit.free:
         moved = None if number.is_smooth else _walk_grid(part, fit, number)
         if moved is not None:
-            fit = _descend(part, weights, moved, free, (iterations, enough))
+            fit = _descend(part, _enter(part, weights, moved, fit.free, until), until)
     return fit
+
+
+def _enter(
+    part: Part, weights: Weights, state: State, free: tuple[Free, ...], until: tuple[int, float]
+) -> PartFit:
+    """A state as it is, with its residuals and derivatives."""
+    residual, both = part.find_residuals(state), until[1] < _ENOUGH
+    jacobian = part.differentiate(state, residual, free, both_sides=both)
+    return PartFit(state, free, residual, jacobian, weights, math.nan, both_sides=both)
 
 
 def measure_loss(part: Part, weights: Weights, residual: Floats, state: State, free: Sequence[Free]) -> float:
@@ -253,19 +269,17 @@ def solve_step(
     return step, normal
 
 
-def _descend(
-    part: Part, weights: Weights, state: State, free: tuple[Free, ...], until: tuple[int, float]
-) -> PartFit:
+def _descend(part: Part, start: PartFit, until: tuple[int, float]) -> PartFit:
     iterations, enough = until
     both = enough < _ENOUGH
-    residual = part.find_residuals(state)
+    state, free, weights, residual, jacobian = (
+        start.state, start.free, start.weights, start.residual, start.jacobian
+    )  # fmt: skip
     loss = measure_loss(part, weights, residual, state, free)
-    smooth = [place for place, number in enumerate(free) if number.is_smooth]
-    jacobian = part.differentiate(state, residual, free, both_sides=both)
-    if not smooth:
-        return PartFit(state, free, residual, jacobian, weights, loss)
-    damping, is_fresh = 1e-4, True
-    for _ in range(iterations):
+    smooth, damping, is_fresh = start.smooth, 1e-4, True
+    if not start.is_fresh or both != start.both_sides:
+        jacobian = part.differentiate(state, residual, free, both_sides=both)
+    for _ in range(iterations if smooth else 0):
         pull = part.prior.pull(state, free)
         moving = [
             place
@@ -308,7 +322,7 @@ def _descend(
             jacobian = part.differentiate(state, residual, free, both_sides=both)
         if fall < enough:
             break
-    return PartFit(state, free, residual, jacobian, weights, loss)
+    return PartFit(state, free, residual, jacobian, weights, loss, is_fresh, both)
 
 
 def _pushes_out(state: State, number: Free, column: Floats, residual: Floats, prior: float) -> bool:

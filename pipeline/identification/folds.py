@@ -25,6 +25,7 @@ Flags = NDArray[np.bool_]
 FOLDS = 5
 GAP_S = 1.5
 _CHORD_STEPS = 3
+_NOTHING = 1e-6
 _LEAST_SHARE = 0.01
 
 
@@ -70,15 +71,25 @@ def hold_out_part(fit: PartFit, folds: tuple[Fold, ...]) -> Floats:
     held = np.array(fit.residual)
     if not smooth:
         return held
-    jacobian, hold = fit.jacobian[:, :, smooth], _hold(fit)
+    jacobian, factor = fit.jacobian[:, :, smooth], fit.weights.factors(fit.residual)
+    rows, target = jacobian * factor[:, :, None], fit.residual * factor
+    hold = _LEAST_SHARE * (rows**2).sum(axis=(0, 1))
+    whole = _sum_normals(rows, target)
     for fold in folds:
         if not fold.test.any() or not fold.train.any():
             continue
-        step, _ = solve_step(
-            jacobian[fold.train], fit.residual[fold.train], _take(fit.weights, fold.train), hold=hold
-        )
-        held[fold.test] = fit.residual[fold.test] - jacobian[fold.test] @ step
+        # What is fitted is nearly everything: all of it less what is left out.
+        out = _sum_normals(rows[~fold.train], target[~fold.train])
+        normal, gradient = whole[0] - out[0], whole[1] - out[1]
+        step = np.linalg.solve(normal + np.diag((np.diag(normal) + 1e-12) * 1e-9 + hold), gradient)
+        held[fold.test] -= jacobian[fold.test] @ step
     return held
+
+
+def _sum_normals(rows: Floats, target: Floats) -> tuple[Floats, Floats]:
+    """Normal matrix (p, p) and gradient (p,) of weighted columns (n, 3, p) and residuals (n, 3)."""
+    flat = rows.reshape(-1, rows.shape[2])
+    return flat.T @ flat, flat.T @ target.reshape(-1)
 
 
 def refit(part: Part, fit: PartFit, train: Flags) -> State:
@@ -100,6 +111,9 @@ def refit(part: Part, fit: PartFit, train: Flags) -> State:
         held = hold + part.prior.weigh(state, free)
         step, _ = solve_step(jacobian, residual[train], weights, hold=held, pull=pull)
         moved = state.move(free, step.tolist())
+        promised = measure_loss(part, weights, residual[train] - jacobian @ step, moved, free)
+        if loss - promised < _NOTHING * loss:
+            break
         trial = part.find_residuals(moved)
         new = measure_loss(part, weights, trial[train], moved, free)
         if new >= loss:

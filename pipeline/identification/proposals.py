@@ -93,7 +93,7 @@ def propose(
         largest: what relative starts are shares of.
         known: columns of formula terms: they hardly change with the rest of the model.
     """
-    found = []
+    found, base = [], _weigh(fit)
     for candidate in candidates:
         if fit.state.find(candidate.id) is not None:
             continue
@@ -105,7 +105,7 @@ def propose(
             if candidate.id.startswith(TERM):
                 known[candidate.id] = trials
         for trial in trials:
-            proposal = _promise(fit, (trial,))
+            proposal = _promise(base, (trial,))
             if proposal is not None and (best is None or proposal.loss < best.loss):
                 best = proposal
         if best is not None:
@@ -180,26 +180,60 @@ def propose_pairs(fit: PartFit, singles: Sequence[Proposal]) -> list[Proposal]:
         fit: of the model to add to.
         singles: what to pair, of `propose` on the same model.
     """
-    pairs = (_promise(fit, one.trials + other.trials) for one, other in combinations(singles, 2))
+    base = _weigh(fit)
+    pairs = (_promise(base, one.trials + other.trials) for one, other in combinations(singles, 2))
     return sorted((pair for pair in pairs if pair is not None), key=lambda pair: pair.loss)
 
 
-def _promise(fit: PartFit, trials: tuple[Trial, ...]) -> Proposal | None:
-    """Loss after one joint step of the model's numbers and those of effects beside it."""
+@dataclass(frozen=True)
+class _Base:
+    """A fit with what its numbers' part of every joint step is made of.
+
+    Attributes:
+        fit: the fit.
+        factor: of its residuals, shape (n, 3).
+        size: of each weighted column of its Jacobian, shape (p,).
+        rows: these columns, each of size one, shape (3 n, p).
+        normal: of these columns, shape (p, p).
+    """
+
+    fit: PartFit
+    factor: Floats
+    size: Floats
+    rows: Floats
+    normal: Floats
+
+
+def _weigh(fit: PartFit) -> _Base:
     factor = fit.weights.factors(fit.residual)
+    rows, size = _scale(fit.jacobian, factor)
+    return _Base(fit, factor, size, rows, rows.T @ rows)
+
+
+def _scale(columns: Floats, factor: Floats) -> tuple[Floats, Floats]:
+    """Weighted columns, each of size one, shape (3 n, p), and their sizes."""
+    rows = (columns * factor[:, :, None]).reshape(factor.size, columns.shape[2])
+    size = np.sqrt(np.einsum("ij,ij->j", rows, rows)) + 1e-12
+    return rows / size, size
+
+
+def _promise(base: _Base, trials: tuple[Trial, ...]) -> Proposal | None:
+    """Loss after one joint step of the model's numbers and those of effects beside it."""
     trials = tuple(
-        trial for trial in (_leave_out_silent(trial, factor) for trial in trials) if trial is not None
+        trial for trial in (_leave_out_silent(trial, base.factor) for trial in trials) if trial is not None
     )
     if not trials:
         return None
-    base = fit.residual - sum(trial.shift for trial in trials)
-    joint = np.concatenate((fit.jacobian, *(trial.columns for trial in trials)), axis=2)
-    rows = (joint * factor[:, :, None]).reshape(-1, joint.shape[2])
-    size = np.sqrt(np.einsum("ij,ij->j", rows, rows)) + 1e-12
-    rows /= size
-    normal = rows.T @ rows + 1e-7 * np.eye(rows.shape[1])
-    step = np.linalg.solve(normal, rows.T @ (base * factor).reshape(-1)) / size
-    after = base - joint @ step
+    fit, own = base.fit, base.size.size
+    columns = np.concatenate([trial.columns for trial in trials], axis=2)
+    rows, size = _scale(columns, base.factor)
+    residual = fit.residual - sum(trial.shift for trial in trials)
+    target = (residual * base.factor).reshape(-1)
+    across = base.rows.T @ rows
+    normal = np.block([[base.normal, across], [across.T, rows.T @ rows]]) + 1e-7 * np.eye(own + size.size)
+    moved = np.linalg.solve(normal, np.concatenate((base.rows.T @ target, rows.T @ target)))
+    step = moved / np.concatenate((base.size, size))
+    after = residual - fit.jacobian @ step[:own] - columns @ step[own:]
     state = fit.state
     own = len(fit.free)
     for number, change in zip(fit.free, step[:own].tolist(), strict=True):

@@ -12,7 +12,7 @@ from pipeline.core.timegrid import nearest_indices
 from pipeline.identification.folds import refit
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from pipeline.identification.comparison import Comparison
     from pipeline.identification.fit import Fitted
@@ -100,20 +100,36 @@ def score_folds(problem: Problem, states: Sequence[State]) -> HeldOut:
         problem: the runs.
         states: one a fold of the problem, made without its tested stretches.
     """
-    whole = problem.whole
-    residuals = np.full((whole.run.size, 3), np.nan)
-    position = [np.full(c.horizons.number.size, np.nan) for c in problem.comparisons]
-    yaw = [np.full(c.horizons.number.size, np.nan) for c in problem.comparisons]
-    for fold, state in zip(problem.folds, states, strict=True):
+    return next(score_models(problem, [[state] for state in states]))
+
+
+def score_models(problem: Problem, states: Sequence[Sequence[State]]) -> Iterator[HeldOut]:
+    """Score several models at once, as `score_folds` does each.
+
+    A fold's models follow each other, so that what one has in common with the one before is kept.
+
+    Args:
+        problem: the runs.
+        states: of each fold of the problem those of all models, in one order.
+    """
+    whole, count = problem.whole, len(states[0])
+    residuals = np.full((count, whole.run.size, 3), np.nan)
+    position = [np.full((count, c.horizons.number.size), np.nan) for c in problem.comparisons]
+    yaw = [np.full((count, c.horizons.number.size), np.nan) for c in problem.comparisons]
+    for fold, models in zip(problem.folds, states, strict=True):
         for run, comparison in enumerate(problem.comparisons):
             rows = whole.run == run
-            if fold.test[rows].any():
-                residuals[rows & fold.test] = whole.find_run_residuals(state, run)[fold.test[rows]]
-            told = _find_tested(comparison, whole.times[rows], fold.test[rows])
-            if told.any():
-                reach = comparison.find_horizon_errors(state.effects_of(run), state.timing[run])
-                position[run][told], yaw[run][told] = reach.position[told], reach.yaw[told]
-    return summarize(problem, residuals, position, yaw)
+            tested = fold.test[rows]
+            told = _find_tested(comparison, whole.times[rows], tested)
+            for model, state in enumerate(models):
+                if tested.any():
+                    residuals[model, rows & fold.test] = whole.find_run_residuals(state, run)[tested]
+                if told.any():
+                    reach = comparison.find_horizon_errors(state.effects_of(run), state.timing[run])
+                    position[run][model, told] = reach.position[told]
+                    yaw[run][model, told] = reach.yaw[told]
+    for model in range(count):
+        yield summarize(problem, residuals[model], [p[model] for p in position], [y[model] for y in yaw])
 
 
 def _find_tested(comparison: Comparison, times: Floats, test: Flags) -> Flags:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +12,8 @@ if TYPE_CHECKING:
 
 _FORGOTTEN = 40.0
 """Time constants after which a state is forgotten to the last bit."""
+_ROUND = 100
+"""Plateaus that are followed one by one in the time that a step of all at once takes."""
 
 
 def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start: Signal) -> Signal:
@@ -83,37 +86,42 @@ def _find_gaps(signal: Floats, start: Floats, begins: Integers, reach: Floats, r
     """How far the limited signal is from its input where each plateau of the input begins.
 
     Nearly always it has arrived before the plateau ends, so that the next one begins at the level of the one
-    before. Only from where it has not, until it has again, must plateaus be followed one by one.
+    before. What is left where it has not is passed on to the next plateau, at all such places at once, until
+    nothing changes any more; what goes on for long is followed place by place.
     """
     level = signal[begins]
-    gap = np.diff(level, prepend=level[0])
+    alone = np.diff(level, prepend=level[0])
     fresh = np.searchsorted(begins, resets.first)
-    gap[fresh] = np.where(np.isfinite(start), level[fresh] - start, 0.0)
+    alone[fresh] = np.where(np.isfinite(start), level[fresh] - start, 0.0)
+    reach = reach.copy()
+    # Nothing is carried over a reset.
+    reach[np.append(fresh[1:], begins.size) - 1] = np.inf
+    gap = alone.copy()
     late = np.flatnonzero(np.abs(gap) > reach)
-    if not late.size:
-        return gap
-    levels, reaches = level.tolist(), reach.tolist()
-    ends = np.append(fresh, begins.size)
-    stops = ends[np.searchsorted(ends, late, side="right")]
-    changed: list[int] = []
-    values: list[float] = []
-    arrived = -1
-    for first, stop in zip(late.tolist(), stops.tolist(), strict=True):
-        if first <= arrived:
-            continue
-        value = levels[first] - float(gap[first])
-        arrived = first
-        for place in range(first, stop):
-            missing = levels[place] - value
-            most = reaches[place]
-            values.append(missing)
-            arrived = place
+    done = 0
+    while late.size and done < 2 * begins.size:
+        done += late.size + _ROUND
+        most, missing = reach[late], gap[late]
+        after = alone[late + 1] + (missing - np.minimum(np.maximum(missing, -most), most))
+        changed = after != gap[late + 1]
+        late = late[changed] + 1
+        gap[late] = after[changed]
+        late = late[np.isfinite(reach[late])]
+    return _follow(late.tolist(), gap.tolist(), alone.tolist(), reach.tolist()) if late.size else gap
+
+
+def _follow(late: list[int], gap: list[float], alone: list[float], reach: list[float]) -> Floats:
+    """Gaps of `_find_gaps` with what is left at some places passed on as far as it goes."""
+    for place in late:
+        while (most := reach[place]) < math.inf:
+            missing = gap[place]
+            place += 1  # noqa: PLW2901 - it walks on from there
+            after = alone[place]
             if missing > most:
-                value += most
+                after += missing - most
             elif missing < -most:
-                value -= most
-            else:
+                after += missing + most
+            if after == gap[place]:
                 break
-        changed.extend(range(first, arrived + 1))
-    gap[changed] = values
-    return gap
+            gap[place] = after
+    return np.array(gap)

@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.analysis.diagnosis import DIAGNOSIS
 from pipeline.analysis.relative import find_residual_modulus
-from pipeline.report import RunReport, theme
+from pipeline.report import theme
 from pipeline.report.figures import list_figures
 from pipeline.report.figures.autocorrelation import list_autocorrelations
 from pipeline.report.figures.command_space import list_cells
@@ -21,7 +21,7 @@ from pipeline.report.figures.signature import list_signatures
 from pipeline.report.figures.step_response import list_responses
 from pipeline.report.figures.trajectory import list_arcs
 from pipeline.report.figures.velocities import model_rows
-from pipeline.report.run import number_in
+from pipeline.report.run import RunReport, number_in
 from pipeline.report.scene import Scene
 from pipeline.report.specs import build_spec, pack_rows, share_rows
 from pipeline.web.runs import read_summary

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from motion_runs import simulate, vehicle_of
 
 from pipeline.identification import Fitted, Input, Problem, fit_model
-from pipeline.identification.apportion import QUANTITIES, apportion, jackknife_ratio, share_out
+from pipeline.identification.apportion import QUANTITIES, apportion, jackknife_ratio, list_subsets, share_out
 from pipeline.identification.judgement import Judgement, judge_model
 from pipeline.identification.unnamed import estimate_unnamed
 from pipeline.models import Model, find_effect
@@ -44,10 +44,10 @@ def test_shares_are_the_shapley_values_of_any_loss(count: int, seed: int) -> Non
     names = tuple("abcde"[:count])
     draw = np.random.default_rng(seed).uniform(0.0, 1.0, 2**count)
     loss = {
-        frozenset(name for bit, name in enumerate(names) if code >> bit & 1): value
+        frozenset(name for bit, name in enumerate(names) if code >> bit & 1): np.array([value])
         for code, value in enumerate(draw.tolist())
     }
-    split = share_out(names, lambda present: np.array([loss[present]]))
+    split = share_out(names, loss)
     for name in names:
         assert split.parts[name][0] == pytest.approx(shapley_by_subsets(names, loss, name), abs=1e-12)
 
@@ -61,7 +61,7 @@ def test_many_effects_that_interact_in_pairs_are_shared_out_exactly() -> None:
     def look(present: frozenset[str]) -> np.ndarray:
         return (whole - sum(pushes[name] for name in sorted(present))) ** 2
 
-    split = share_out(names, look)
+    split = share_out(names, {present: look(present) for present in list_subsets(names)})
     rest = whole - sum(pushes.values())
     for name in names:
         # Of a quadratic loss the Shapley value is the push times the sum of both ends.

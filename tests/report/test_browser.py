@@ -15,7 +15,7 @@ import pytest
 from chrome import BROWSER, FLAGS, Chrome
 from report_synthesis import list_places, make_report
 
-from pipeline.report import render_report
+from pipeline.report.page import render_report
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -23,7 +23,7 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.options import Options
 from pipeline.logs import LogWriter
 from pipeline.models import Model, find_effect
-from pipeline.report import ReportError
+from pipeline.report.errors import ReportError
 from pipeline.report.exports import (
     ExportSource,
     write_csv,

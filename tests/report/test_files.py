@@ -12,8 +12,10 @@ import polars as pl
 import pytest
 from report_synthesis import list_places, make_report
 
-from pipeline.report import FORMATS, ReportError, RunReport, theme, warm_bundle, write_figures
-from pipeline.report.bundle import cache_path, load_bundle
+from pipeline.report import theme
+from pipeline.report.bundle import cache_path, load_bundle, warm_bundle
+from pipeline.report.errors import ReportError
+from pipeline.report.export import FORMATS, write_figures
 from pipeline.report.figures import list_figures
 from pipeline.report.scales import find_range, round_up, usual_ends
 from pipeline.report.scene import Scene
@@ -21,6 +23,8 @@ from pipeline.report.specs import build_spec
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from pipeline.report.run import RunReport
 
 START = {"svg": b"<svg", "pdf": b"%PDF", "png": b"\x89PNG"}
 

@@ -15,7 +15,9 @@ import pytest
 from report_synthesis import list_places, make_report
 
 from pipeline.core.durations import say_duration, say_recorded
-from pipeline.report import RunReport, render_report, templating
+from pipeline.report import templating
+from pipeline.report.page import render_report
+from pipeline.report.run import RunReport
 from pipeline.report.sections.glance import say_standing
 from pipeline.report.templating import render_template, show_text
 from pipeline.report.words import begin_large, say_date, say_number, say_share, say_split

@@ -5,7 +5,8 @@ import polars as pl
 import pytest
 from report_synthesis import make_report
 
-from pipeline.report import RunReport, render_report
+from pipeline.report.page import render_report
+from pipeline.report.run import RunReport
 from pipeline.report.scene import Scene
 from pipeline.report.sections.where import list_regions
 
