@@ -15,6 +15,7 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.options import Options
 from pipeline.diagnosis import Diagnosis, Recording, diagnose_runs
 from pipeline.diagnosis.plausibility import find_exceeded, find_implausible, is_nameable
+from pipeline.diagnosis.values import expect_another_run
 from pipeline.diagnosis.words import describe, list_lines
 from pipeline.models import Model, find_effect, read_model
 from pipeline.models.evidence import Evidence, Largest
@@ -162,6 +163,7 @@ def test_the_regions_say_where_it_fails(skidding: Diagnosis) -> None:
 
 def test_the_screen_names_each_effect_and_the_fall(skidding: Diagnosis) -> None:
     text = describe(skidding)
+    assert "another run on this ground: " in text
     assert "effective_track" in text
     assert "drive_lag" in text
     assert "->" in text
@@ -432,3 +434,18 @@ def test_two_lags_that_have_become_one_make_room_for_what_set_them_apart(tmp_pat
     found = _diagnose(replace(_SCENE, effects=hidden), tmp_path).runs[0]
     assert {effect.id for effect in found.effects} == set(hidden)
     assert not found.undecided
+
+
+def test_another_run_is_known_less_than_this_one_and_a_moment_of_this_one_not_at_all() -> None:
+    track = find_effect("effective_track")().parameter("k")
+    low, high = expect_another_run(track, 1.8, 1.78, 1.83)
+    assert low < 1.8 - 1.95 * track.spread.size < 1.78
+    assert 1.83 < high < 1.83 + 1.97 * track.spread.size
+    lag = find_effect("drive_lag")().parameter("tau")
+    assert expect_another_run(lag, 0.1, 0.09, 0.11)[0] == lag.bounds[0]
+    moment = next(p for p in find_effect("terrain_change")().parameters if p.is_of_one_run)
+    for ends in (
+        expect_another_run(moment, 60.0, 59.0, 61.0),
+        expect_another_run(track, 1.8, math.nan, math.nan),
+    ):
+        assert not np.isfinite(ends).any()
