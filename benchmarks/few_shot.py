@@ -1,17 +1,18 @@
 """A terrain left out: what the fleet expects there, and what a few seconds of driving add.
 
 Run: python benchmarks/few_shot.py RESULTS [--input command|measured] [--leave terrain|run] [--vehicle V]
-[--jobs N]. RESULTS are analyzed and diagnosed recordings (slip batch LOGS --out RESULTS). Every terrain of a
-vehicle, or every run alone, is left out in turn. The model is that which the other runs let expect. Printed
-is its error over 2 s on all that was driven after the first minute, in metres: of the ideal model, of the
-expected numbers (prior), of fits to the first 5, 20 and 60 s with the prior and without, and of its own fit
-to that rest, on stretches held out. Then what `slip predict` expected of the run: median modulus of the slip
-and error over 2 s, and what they were.
+[--begin S] [--jobs N]. RESULTS are analyzed and diagnosed recordings (slip batch LOGS --out RESULTS). Every
+terrain of a vehicle, or every run alone, is left out in turn. The model is that which the other runs let
+expect. Printed is its error over 2 s on all that was driven after the first minute, in metres: of the ideal
+model, of the expected numbers (prior), of fits to 5, 20 and 60 s from --begin on with the prior and without,
+and of its own fit to that rest, on stretches held out. Then what `slip predict` expected of the run: median
+modulus of the slip and error over 2 s, and what they were.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import multiprocessing
 from dataclasses import dataclass
@@ -54,6 +55,7 @@ class Task:
     terrain: str
     source: Literal["command", "measured"]
     leave: Literal["terrain", "run"]
+    begin_s: float
 
 
 @dataclass(frozen=True)
@@ -92,16 +94,15 @@ def _judge(task: Task) -> Row:
     model = Model(vehicle, forecast.effects)
     fresh = model.swap(*(effect.change(**{p.name: p.neutral for p in effect.parameters}) for effect in model))
     rest = Problem([cut_run(run, find_driven(run, LEFT_S))], vehicle, source)
-    few, alone = [], []
-    for seconds in SECONDS:
-        try:
-            first = Problem([cut_run(run, end_s=find_driven(run, seconds))], vehicle, source)
-        except SlipError:
-            few.append(math.nan)
-            alone.append(math.nan)
-            continue
-        few.append(carry(rest, fit_with_prior(first, model, forecast.prior)))
-        alone.append(carry(rest, fit_model(first, fresh, exact=True)))
+    few, alone = np.full((2, len(SECONDS)), math.nan)
+    begin = find_driven(run, task.begin_s) if task.begin_s else -math.inf
+    for place, seconds in enumerate(SECONDS):
+        if task.begin_s + seconds <= LEFT_S:
+            with contextlib.suppress(SlipError):
+                end = find_driven(run, task.begin_s + seconds)
+                first = Problem([cut_run(run, begin, end)], vehicle, source)
+                few[place] = carry(rest, fit_with_prior(first, model, forecast.prior))
+                alone[place] = carry(rest, fit_model(first, fresh, exact=True))
     expected = predict_deployment(store, forecast)
     whole = Problem([run], vehicle, source)
     own = hold_out(rest, fit_model(rest, model, exact=True))
@@ -136,10 +137,11 @@ def list_tasks(
     source: Literal["command", "measured"],
     leave: Literal["terrain", "run"],
     only: str | None,
+    begin_s: float,
 ) -> list[Task]:
     runs = find_estimates(Store(results)).select("run", "vehicle", "terrain").unique().sort("run")
     return [
-        Task(results, run, vehicle, terrain, source, leave)
+        Task(results, run, vehicle, terrain, source, leave, begin_s)
         for run, vehicle, terrain in runs.iter_rows()
         if terrain != "unknown" and only in {None, vehicle}
     ]
@@ -156,15 +158,16 @@ def show(rows: list[Row]) -> None:
     prior = np.array([row.prior for row in rows])
     few, alone = np.array([row.few for row in rows]), np.array([row.alone for row in rows])
     print(f"\nover own fit, median: prior {np.median(prior / own):.2f}", end="")
-    for place, seconds in enumerate(SECONDS):
+    fitted = [place for place in range(len(SECONDS)) if np.isfinite(few[:, place]).any()]
+    for place in fitted:
         ratios = (np.nanmedian(side[:, place] / own) for side in (few, alone))
-        print("; {:g} s with prior {:.2f}, alone {:.2f}".format(seconds, *ratios), end="")
-    for place, seconds in enumerate(SECONDS):
+        print("; {:g} s with prior {:.2f}, alone {:.2f}".format(SECONDS[place], *ratios), end="")
+    for place in fitted:
         against = few[:, place] / alone[:, place]
         known = np.isfinite(against)
         worse = int((against[known] > 1.02).sum())  # two percent are chance
         print(
-            f"\n{seconds:g} s: with the prior over alone, median {np.nanmedian(against):.2f}, "
+            f"\n{SECONDS[place]:g} s: with the prior over alone, median {np.nanmedian(against):.2f}, "
             f"worst {np.nanmax(against):.2f}; worse by more than 2 % in {worse} of {int(known.sum())}",
             end="",
         )
@@ -189,11 +192,12 @@ def main() -> None:
     parser.add_argument("--input", choices=("command", "measured"), default="command")
     parser.add_argument("--leave", choices=("terrain", "run"), default="terrain")
     parser.add_argument("--vehicle")
+    parser.add_argument("--begin", type=float, default=0.0, help="seconds of driving before the few")
     parser.add_argument("--jobs", type=int, default=2)
     chosen = parser.parse_args()
     source = cast("Literal['command', 'measured']", chosen.input)
     leave = cast("Literal['terrain', 'run']", chosen.leave)
-    tasks = list_tasks(chosen.results, source, leave, chosen.vehicle)
+    tasks = list_tasks(chosen.results, source, leave, chosen.vehicle, chosen.begin)
     with multiprocessing.get_context("spawn").Pool(chosen.jobs) as pool:
         judged = pool.map(judge, tasks, chunksize=1)
     for note in judged:

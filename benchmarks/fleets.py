@@ -1,9 +1,10 @@
 """Simulated fleets: three vehicles on four terrains, three to five runs each, effects hidden at known levels.
 
-Run: python benchmarks/fleets.py [--fleets N] [--drawn N] [--seed N] [--jobs N]. Each of N fleets is driven in
-simulation, diagnosed run by run from its measured wheels, and fitted as `slip fleet fit` does; printed is
-whose each hidden number was, whose it is said to be, and how often intervals hold the truth. One run of each
-fleet is damaged: a tyre is flat. With --drawn, estimates of N fleets are drawn in place of runs, by the size
+Run: python benchmarks/fleets.py [--fleets N] [--drawn N] [--seed N] [--jobs N] [--out FILE [--resume]]. Each
+of N fleets is driven in simulation, diagnosed run by run from its measured wheels, and fitted as `slip fleet
+fit` does; printed is whose each hidden number was, whose it is said to be, and how often intervals hold the
+truth, those forecast of every run from the others among them. One run of each fleet is damaged: a tyre is
+flat. With --drawn, estimates of N fleets are drawn in place of runs, by the size
 of what is hidden in scatters of a run: the size from which levels are told.
 """
 
@@ -18,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+from json_lines import add_row, read_rows
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "models"))
 
@@ -26,6 +28,7 @@ from motion_runs import make_scenario, tables_of, vehicle_of
 from pipeline.core.errors import SlipError
 from pipeline.diagnosis import diagnose_runs
 from pipeline.diagnosis.recording import Recording
+from pipeline.fleet.forecast import RUNS_SHARE, forecast_vehicle
 from pipeline.fleet.hierarchy import decide_level, fit_fleet
 from pipeline.fleet.statistics import Interval, draw_run, split_levels
 from pipeline.simulate import find_vehicle, simulate_run
@@ -44,9 +47,14 @@ HIDDEN = (
 )
 PER_VEHICLE = 4
 FLAT_TYRE = ("wheel_asymmetry", "e", 0.1)
+FEW_RUNS = ((2,), (4,), (2, 2), (1, 1, 1), (3, 1, 1, 1, 2), (4, 4, 4, 4))
 # What is the vehicle's or the ground's varies from run to run by so much of its size.
 OWN_SPREAD = 0.05
 DURATION_S = 180.0
+
+
+Task = tuple[str, str, str, dict[str, dict[str, float]], int]
+"""Run, vehicle, terrain, hidden effects and seed."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +124,7 @@ def hide(
     return Secret(level, neutral, neutral + size * float(common.mean()), terrains, values)
 
 
-def drive(task: tuple[str, str, str, dict[str, dict[str, float]], int]) -> list[dict[str, object]]:
+def drive(task: Task) -> list[dict[str, object]]:
     """Rows of the table `estimates` of one simulated run."""
     name, vehicle, terrain, effects, seed = task
     scenario = make_scenario(effects, seed=seed, duration_s=DURATION_S, vehicle=find_vehicle(vehicle))
@@ -131,7 +139,7 @@ def drive(task: tuple[str, str, str, dict[str, dict[str, float]], int]) -> list[
     return [{**common, **row} for row in diagnosis.tabulate_estimates(name).to_dicts()]
 
 
-def list_tasks(fleet: Fleet, seed: int) -> list[tuple[str, str, str, dict[str, dict[str, float]], int]]:
+def list_tasks(fleet: Fleet, seed: int) -> list[Task]:
     tasks = []
     for vehicle, runs in fleet.runs.items():
         for name, terrain in runs:
@@ -173,10 +181,22 @@ class Score:
                 self._hold("common value", number.fit.interval, secret.centre)
                 for name, mean in number.fit.groups.items():
                     self._hold("terrain", mean.interval, secret.terrains[name])
+            self._forecast(fleet, vehicle, estimates.filter(pl.col("vehicle") == vehicle))
         for (vehicle, label), number in numbers.items():
             level = "open" if number.level is None else number.level.value
             self.invented[level] += 1
             print(f"  not hidden: {vehicle} {'.'.join(label)} {level} {number.because}", flush=True)
+
+    def _forecast(self, fleet: Fleet, vehicle: str, estimates: pl.DataFrame) -> None:
+        """Every run from the others, but the damaged one."""
+        for name, terrain in fleet.runs[vehicle]:
+            if name == fleet.damaged:
+                continue
+            others = estimates.filter(pl.col("run") != name)
+            for number in forecast_vehicle(others, vehicle, terrain, "measured").numbers:
+                secret = fleet.secrets[vehicle].get((number.effect, number.parameter))
+                if secret is not None:
+                    self._hold("another run", Interval(*number.ends, 0.95), secret.runs[name])
 
     def _hold(self, what: str, interval: Interval | None, truth: float) -> None:
         if interval is not None:
@@ -198,12 +218,18 @@ class Score:
         print(f"numbers that were not hidden: {dict(self.invented)}")
 
 
-def play_driven(fleets: int, seed: int, jobs: int) -> None:
+def play_driven(fleets: int, seed: int, jobs: int, out: Path | None, *, resume: bool) -> None:
     score = Score()
+    done = {(row["seed"], row["run"]): row["rows"] for row in (read_rows(out) if resume else ())}
     with multiprocessing.get_context("spawn").Pool(jobs) as pool:
         for number in range(seed, seed + fleets):
             fleet = draw_fleet(number)
-            rows = [row for part in pool.imap(drive, list_tasks(fleet, number)) for row in part]
+            tasks = list_tasks(fleet, number)
+            left = [task for task in tasks if (number, task[0]) not in done]
+            for task, part in zip(left, pool.imap(drive, left), strict=True):
+                done[number, task[0]] = part
+                add_row(out, {"seed": number, "run": task[0], "rows": part})
+            rows = [row for task in tasks for row in done[number, task[0]]]
             runs = sum(len(part) for part in fleet.runs.values())
             print(f"fleet {number}: {runs} runs, a flat tyre in {fleet.damaged}", flush=True)
             score.add(fleet, pl.DataFrame(rows))
@@ -244,7 +270,8 @@ def play_drawn(fleets: int, seed: int) -> None:
                 new = size * float(rng.normal()) if level == "terrain" else 0.0
                 comes = ((TERRAINS[-1], truth[TERRAINS[-1]]), ("mud", centre + new))
                 for place, (name, mean) in enumerate(comes, start=2):
-                    drawn = draw_run(values, errors, terrains.tolist(), name, size=size, count=400, rng=rng)
+                    usual = (size, RUNS_SHARE * size)
+                    drawn = draw_run(values, errors, terrains.tolist(), name, usual=usual, count=400, rng=rng)
                     low, high = np.quantile(drawn.run, (0.025, 0.975))
                     asked[place] += 1
                     held[place] += bool(low <= mean + share * float(rng.normal()) <= high)
@@ -254,17 +281,49 @@ def play_drawn(fleets: int, seed: int) -> None:
             print(f"{level:<10}{size:>6g}{shares}{holds}", flush=True)
 
 
+def play_few(fleets: int, seed: int) -> None:
+    """Forecasts from few runs: how often they hold the run that comes, and how wide they are.
+
+    Spreads, and errors of the estimates, are drawn from small to large, in usual sizes of a number: those
+    that real recordings show.
+    """
+    print(f"\n{'runs on each terrain':<22}{'there':>8}{'wide':>7}{'elsewhere':>11}{'wide':>7}")
+    for counts in FEW_RUNS:
+        terrains = [f"{number}" for number, count in enumerate(counts) for _ in range(count)]
+        held, widths = np.zeros((fleets, 2)), np.zeros((fleets, 2))
+        for number in range(fleets):
+            rng = np.random.default_rng([seed, number, *counts])
+            run, terrain = np.exp(rng.uniform(np.log(0.03), np.log((1.0, 1.4))))
+            errors = np.exp(rng.uniform(np.log(0.02), np.log(0.15), len(terrains)))
+            means = terrain * rng.normal(size=len(counts) + 1)
+            values = means[[int(name) for name in terrains]]
+            values = values + np.hypot(run, errors) * rng.normal(size=len(terrains))
+            for place, which in enumerate((0, len(counts))):
+                drawn = draw_run(
+                    values, errors, terrains, f"{which}", usual=(1.0, RUNS_SHARE), count=1000, rng=rng
+                )
+                low, high = np.quantile(drawn.run, (0.025, 0.975))
+                held[number, place] = low <= means[which] + run * rng.normal() <= high
+                widths[number, place] = high - low
+        (there, elsewhere), (wide, wider) = held.mean(axis=0), np.median(widths, axis=0)
+        label = ", ".join(map(str, counts))
+        print(f"{label:<22}{there:>8.1%}{wide:>7.2f}{elsewhere:>11.1%}{wider:>7.2f}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--fleets", type=int, default=2)
     parser.add_argument("--drawn", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--out", type=Path, help="file to add a JSON line to for each run that is driven")
+    parser.add_argument("--resume", action="store_true", help="go on where the file of --out ends")
     chosen = parser.parse_args()
     if chosen.drawn:
         play_drawn(chosen.drawn, chosen.seed)
+        play_few(chosen.drawn, chosen.seed)
     else:
-        play_driven(chosen.fleets, chosen.seed, chosen.jobs)
+        play_driven(chosen.fleets, chosen.seed, chosen.jobs, chosen.out, resume=chosen.resume)
 
 
 if __name__ == "__main__":

@@ -83,9 +83,13 @@ def _list_keys(compared: ComparedRuns) -> tuple[str, ...]:
 
 
 def write_fleet(store: Store, model: FleetModel, keys: tuple[str, ...]) -> Path:
-    """Write `fleet.json` and the table `fleet`; the path of the first."""
+    """Write `fleet.json`, the table `fleet` and the page; the path of the first."""
+    from pipeline.report.fleet import render_fleet  # noqa: PLC0415 - heavy
+    from pipeline.report.pages import write_page  # noqa: PLC0415 - heavy
+
     store.write_results_table("fleet", tabulate_fleet(model, keys))
     content = {**describe_fleet(model), "keys": list(keys)}
+    write_page(store, "fleet.html", render_fleet(content))
     return store.write_results_text(FLEET, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 

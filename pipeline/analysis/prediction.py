@@ -43,8 +43,8 @@ MOST_RUNS = 8
 _LEVEL = 0.95
 _BLOCK_S = 10.0
 _ENDS = (0.025, 0.5, 0.975)
-# Residuals of one run are half or twice those of another where they differ much.
-_USUAL_LOG_RATIO = math.log(2.0)
+# Residuals of one run are half or twice those of another where they differ much, on one ground or on two.
+_USUAL_LOG_RATIOS = (math.log(2.0), math.log(2.0))
 # How fast a run was driven is known to a part in a hundred.
 _SMALL = 0.01
 
@@ -127,12 +127,12 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
     terrains = [str(run.manifest.details.get("terrain")) for run in runs]
     sizes = draw_run(
         logs, np.sqrt(0.5 / np.array(length)), terrains, forecast.terrain,
-        size=_USUAL_LOG_RATIO, count=DRAWS, rng=rng,
+        usual=_USUAL_LOG_RATIOS, count=DRAWS, rng=rng,
     ).run  # fmt: skip
     there = np.array([name == forecast.terrain for name in terrains])
     comes = draw_run(
         paces, np.full(len(runs), _SMALL), terrains, forecast.terrain,
-        size=_USUAL_LOG_RATIO, count=DRAWS, rng=rng,
+        usual=_USUAL_LOG_RATIOS, count=DRAWS, rng=rng,
     ).run  # fmt: skip
     choices = rng.choice(len(runs), DRAWS, p=weigh_runs(there)).tolist()
     numbers: Floats = np.empty((DRAWS, 3))

@@ -37,7 +37,7 @@ def fit(
 ) -> int:
     """Fit the fleet model to all diagnosed runs: every parameter by vehicle, terrain and run.
 
-    Writes fleet.json and fleet.parquet.
+    Writes fleet.json, fleet.parquet and fleet.html.
 
     Args:
         results: results folder.

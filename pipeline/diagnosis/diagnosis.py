@@ -33,13 +33,17 @@ _DIGITS = 6
 
 @dataclass(frozen=True)
 class Value:
-    """A number with its 95 % interval, NaN where there is none, and whether it may go no further."""
+    """A number with its 95 % interval, NaN where there is none, and whether it may go no further.
+
+    `another_run` is the interval in which another run of the vehicle on this ground would show it.
+    """
 
     value: float
     low: float
     high: float
     unit: str
     at_bound: bool = False
+    another_run: tuple[float, float] = (math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,7 @@ class Named:
                     "high": _clean(v.high),
                     "unit": v.unit,
                     "at_bound": v.at_bound,
+                    "another_run": dict(zip(("low", "high"), map(_clean, v.another_run), strict=True)),
                 }
                 for name, v in self.parameters.items()
             },

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from pipeline.identification import Estimates
     from pipeline.models import Effect
+    from pipeline.models.parameter import Parameter
     from pipeline.runs import MotionRun
 
 _SURE = 1.96
@@ -34,8 +35,24 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
         if high - low > most - least:
             low = high = math.nan
         at_bound = stands_at_bound(value, parameter.bounds)
-        values[parameter.name] = Value(value, low, high, parameter.unit, at_bound)
+        another = (math.nan, math.nan) if at_bound else expect_another_run(parameter, value, low, high)
+        values[parameter.name] = Value(value, low, high, parameter.unit, at_bound, another)
     return values
+
+
+def expect_another_run(parameter: Parameter, value: float, low: float, high: float) -> tuple[float, float]:
+    """95 % interval of a number in another run on the same ground, NaN where this run has none.
+
+    The interval of this run, and the spread between runs that recordings have shown or that is usual
+    (`Parameter.spread`), independent of each other; within the bounds of the search.
+    """
+    if parameter.is_of_one_run or not math.isfinite(high - low):
+        return math.nan, math.nan
+    change = _SURE * parameter.spread.size
+    least, most = parameter.bounds
+    return max(value - math.hypot(value - low, change), least), min(
+        value + math.hypot(high - value, change), most
+    )
 
 
 def read_clock(effect: Effect, runs: Sequence[MotionRun]) -> dict[str, Value]:
@@ -55,4 +72,6 @@ def read_clock(effect: Effect, runs: Sequence[MotionRun]) -> dict[str, Value]:
             variances.append(run.gyro_fit.delay_error_s**2 + spread**2 + sampling**2)
             older = max(older, run.repeats_s)
     half = _SURE * math.sqrt(float(np.mean(variances)) / len(variances)) if variances else math.nan
-    return {parameter.name: Value(value, value - half - older, value + half, parameter.unit)}
+    low, high = value - half - older, value + half
+    another = expect_another_run(parameter, value, low, high)
+    return {parameter.name: Value(value, low, high, parameter.unit, another_run=another)}

@@ -110,7 +110,7 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
             notes.append("tentative")
         note = f"  ({'; '.join(notes)})" if notes else ""
         rows.append(f"{effect.id:<20}{_values(effect):<{width}}{falls.get(effect.id, '')}{note}")
-        rows += [f"{'':<20}{effect.sentence}"] if effect.sentence else []
+        rows += [f"{'':<20}{text}" for text in (effect.sentence, _say_another_run(effect)) if text]
     for item in diagnosis.undecided:
         held = diagnosis.find_held(item)
         fall = f"  {falls[held]}" if held in falls else ""
@@ -162,6 +162,16 @@ def _value(name: str, value: Value) -> str:
     return f"{text} (at its bound)" if value.at_bound else text
 
 
+def _say_another_run(effect: Named) -> str:
+    """Between which values another run on this ground would show the numbers; empty where nobody knows."""
+    ends = [
+        f"{name} {value.another_run[0]:.3g} to {value.another_run[1]:.3g}"
+        for name, value in effect.parameters.items()
+        if math.isfinite(value.another_run[0])
+    ]
+    return f"another run on this ground: {', '.join(ends)}" if ends else ""
+
+
 def _list_falls(diagnosis: RunDiagnosis) -> dict[str, str]:
     """How the error fell on the rung of each effect."""
     falls: dict[str, str] = {}
@@ -197,9 +207,7 @@ def _describe_unobservable(diagnosis: RunDiagnosis) -> list[str]:
 def _describe_detectable(diagnosis: RunDiagnosis) -> str:
     """What would have been seen had it been there: the effects that the log tells of most sharply."""
     usual = {one.id: find_effect(one.id)().parameter(one.parameter) for one in diagnosis.detectable}
-    sharpest = sorted(
-        diagnosis.detectable, key=lambda one: one.size / abs(usual[one.id].typical - usual[one.id].neutral)
-    )
+    sharpest = sorted(diagnosis.detectable, key=lambda one: one.size / usual[one.id].usual_size)
     shown = [
         f"{one.id} {100.0 * one.size:.2g}%" if one.unit == "1" else f"{one.id} {one.size:.2g} {one.unit}"
         for one in sharpest[:_DETECTABLE_SHOWN]

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from pipeline.fleet.statistics import LevelFit
     from pipeline.models.effect import Effect
 
-_OF_ONE_RUN = ("duration", "place")
 SURE = 0.01
 """A difference is taken for one below this chance: of ten numbers of a vehicle, nine fleets in ten show none
 that are not there."""
@@ -134,7 +133,7 @@ def list_numbers(estimates: pl.DataFrame) -> list[tuple[str, str, str, pl.DataFr
 
 def is_of_one_run(effect: Effect) -> bool:
     """Whether an effect acts at a moment or a place of one recording."""
-    return any(parameter.relative_to in _OF_ONE_RUN for parameter in effect.parameters)
+    return any(parameter.is_of_one_run for parameter in effect.parameters)
 
 
 def take_numbers(estimates: pl.DataFrame) -> pl.DataFrame:

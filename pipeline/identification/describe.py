@@ -262,6 +262,9 @@ def _describe_sizes(parameter: Parameter) -> list[str]:
     if parameter.plausible is not None:
         range_ = parameter.plausible
         lines.append(f"vehicles show {range_.low:g} to {range_.high:g}{unit}: {range_.source}")
+    if not parameter.is_of_one_run:
+        spread = parameter.spread
+        lines.append(f"from run to run of one ground {spread.size:.2g}{unit} (1 sigma): {spread.source}")
     if parameter.one_sign:
         lines.append("named where it is positive: the other sign is no physics")
     return lines

@@ -294,8 +294,8 @@ def _descend(part: Part, start: PartFit, until: tuple[int, float]) -> PartFit:
             residual,
             weights,
             damping,
-            part.prior.weigh(state, movable),
-            part.prior.pull(state, movable),
+            part.prior.weigh(state, free)[moving],
+            pull[moving],
         )
         trial = state.move(movable, step.tolist())
         # What the step promises, were the model linear: where that is nothing, the fit is done.

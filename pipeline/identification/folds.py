@@ -105,17 +105,17 @@ def refit(part: Part, fit: PartFit, train: Flags) -> State:
         return state
     weights, jacobian, hold = _take(fit.weights, train), fit.jacobian[train][:, :, smooth], _hold(fit)
     free = [fit.free[place] for place in smooth]
-    loss = measure_loss(part, weights, residual[train], state, free)
+    loss = measure_loss(part, weights, residual[train], state, fit.free)
     for _ in range(_CHORD_STEPS):
-        pull = part.prior.pull(state, free)
-        held = hold + part.prior.weigh(state, free)
+        pull = part.prior.pull(state, fit.free)[smooth]
+        held = hold + part.prior.weigh(state, fit.free)[smooth]
         step, _ = solve_step(jacobian, residual[train], weights, hold=held, pull=pull)
         moved = state.move(free, step.tolist())
         promised = measure_loss(part, weights, residual[train] - jacobian @ step, moved, free)
         if loss - promised < _NOTHING * loss:
             break
         trial = part.find_residuals(moved)
-        new = measure_loss(part, weights, trial[train], moved, free)
+        new = measure_loss(part, weights, trial[train], moved, fit.free)
         if new >= loss:
             break
         state, residual, loss = moved, trial, new

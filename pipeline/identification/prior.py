@@ -1,10 +1,11 @@
 """What is known of a model's numbers before a run is seen: observations of the numbers themselves.
 
-A number z standard deviations from its mean adds f log(1 + z^2 / f) to the cost of a fit, as one more
-observation (maximum a posteriori): z^2 where it is near, as of a normal distribution, and less where the run
-contradicts what was known, as of Student's t with few degrees of freedom f. Residuals repeat each other in
-time and are larger than noise, so that they say less than their summed cost. The prior is weighed up by that
-`excess`.
+p numbers, each z standard deviations from its mean, add (f + p) log(1 + sum z^2 / f) to the cost of a fit,
+as one more observation (maximum a posteriori): that of a multivariate t distribution with few degrees of
+freedom f (Lange, Little and Taylor, JASA 84, 1989). Where the run contradicts what was known of one number,
+all of them are held less: a run with an effect that no other run had is unlike them in several. Residuals
+repeat each other in time and are larger than noise, so that they say less than their summed cost. The prior
+is weighed up by that `excess`.
 """
 
 from __future__ import annotations
@@ -44,16 +45,18 @@ class Prior:
         if not self.numbers:
             return 0.0
         away, known = self._compare(state, free)
-        return self.excess * float(np.sum(_FREEDOM * np.log1p(known * away**2 / _FREEDOM)))
+        count = np.count_nonzero(known)
+        return self.excess * (_FREEDOM + count) * float(np.log1p(known @ away**2 / _FREEDOM))
 
     def weigh(self, state: State, free: Sequence[Free]) -> Floats:
-        """Information on each number, zero where nothing is known, shape (p,)."""
+        """Information on each of all free numbers, zero where nothing is known, shape (p,)."""
         away, known = self._compare(state, free)
-        information: Floats = self.excess * known / (1.0 + known * away**2 / _FREEDOM)
+        held = (_FREEDOM + np.count_nonzero(known)) / (_FREEDOM + known @ away**2)
+        information: Floats = self.excess * held * known
         return information
 
     def pull(self, state: State, free: Sequence[Free]) -> Floats:
-        """Half the fall of the cost with each number, shape (p,)."""
+        """Half the fall of the cost with each of all free numbers, shape (p,)."""
         pull: Floats = self.weigh(state, free) * self._compare(state, free)[0]
         return pull
 

@@ -15,12 +15,14 @@ from pipeline.models.parameter import (
     DATA_SHEET,
     MOUNTING,
     STAMPS,
+    WARTHOG_RUNS,
     Excitation,
     Least,
     Parameter,
     Part,
     Plausible,
     Search,
+    Spread,
 )
 from pipeline.runs.errors import MotionError
 from pipeline.vehicles.kinematics import list_kinds
@@ -43,6 +45,7 @@ __all__ = [  # what a file of an effect needs
     "SIDES",
     "SIDEWAYS",
     "STAMPS",
+    "WARTHOG_RUNS",
     "WHEELED",
     "AddedEffect",
     "BodyEffect",
@@ -61,6 +64,7 @@ __all__ = [  # what a file of an effect needs
     "Plausible",
     "ReportEffect",
     "Search",
+    "Spread",
     "find_late",
 ]
 

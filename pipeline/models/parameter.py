@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -50,6 +51,22 @@ class Least:
     sampled: bool = False
 
 
+@dataclass(frozen=True)
+class Spread:
+    """How much a number changes from run to run of a vehicle on one ground.
+
+    Attributes:
+        size: standard deviation, in the parameter's unit.
+        source: where it was measured.
+    """
+
+    size: float
+    source: str
+
+
+WARTHOG_RUNS = "nine runs of a Warthog on five grounds"
+_USUAL_SPREAD = 0.25
+_OF_ONE_RUN = ("duration", "place")
 STAMPS = "stamps are off by as much"
 MOUNTING = "sensors are mounted no better"
 DATA_SHEET = "a data sheet allows as much"
@@ -90,6 +107,7 @@ class Parameter:
         one_sign: whether physics has positive values only: the other sign is a clock or chance.
         instead_of: the parameter that counts no more once this one is given; this one is not searched.
         quantities: what it is to a controller; none where no controller knows of it.
+        between_runs: how much it changes from run to run; None where no recordings told.
     """
 
     name: str
@@ -107,6 +125,23 @@ class Parameter:
     one_sign: bool = False
     instead_of: str = ""
     quantities: tuple[Quantity, ...] = ()
+    between_runs: Spread | None = None
+
+    @property
+    def usual_size(self) -> float:
+        """How far from doing nothing it usually is, in its unit."""
+        return abs(self.typical - (self.neutral if math.isfinite(self.neutral) else 0.0))
+
+    @property
+    def is_of_one_run(self) -> bool:
+        """Whether it is a moment or a place of one recording, which says nothing of another."""
+        return self.relative_to in _OF_ONE_RUN
+
+    @property
+    def spread(self) -> Spread:
+        """Between runs: what is known of it, else the median of what was measured of other numbers."""
+        usual = f"a quarter of its usual size, the median over the numbers of {WARTHOG_RUNS}"
+        return self.between_runs or Spread(_USUAL_SPREAD * self.usual_size, usual)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ PAGES = {
     CATALOGUE: "All runs",
     "comparison.html": "Compare",
     "causes.html": "Causes",
+    "fleet.html": "Fleet",
     "trend.html": "Trends",
     "map.html": "Map",
 }

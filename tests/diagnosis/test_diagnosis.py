@@ -17,6 +17,7 @@ from pipeline.analysis.options import Options
 from pipeline.diagnosis import Diagnosis, Recording, diagnose_runs
 from pipeline.diagnosis.plausibility import find_exceeded, find_implausible, is_nameable
 from pipeline.diagnosis.residual_structure import is_felt
+from pipeline.diagnosis.values import expect_another_run
 from pipeline.diagnosis.words import describe, list_lines
 from pipeline.identification.persistence import take_own_past
 from pipeline.models import Model, find_effect, read_model, write_model
@@ -165,6 +166,7 @@ def test_the_regions_say_where_it_fails(skidding: Diagnosis) -> None:
 
 def test_the_screen_names_each_effect_and_the_fall(skidding: Diagnosis) -> None:
     text = describe(skidding)
+    assert "another run on this ground: " in text
     assert "effective_track" in text
     assert "drive_lag" in text
     assert "->" in text
@@ -455,3 +457,18 @@ def test_residuals_lose_what_their_own_past_tells_of_them() -> None:
     made = take_own_past([SimpleNamespace(windows=windows)], np.column_stack([lasting] * 3))  # type: ignore[list-item]
     assert np.corrcoef(made[2:, 0], fresh[2:])[0, 1] > 0.99
     assert not made[:2].any()
+
+
+def test_another_run_is_known_less_than_this_one_and_a_moment_of_this_one_not_at_all() -> None:
+    track = find_effect("effective_track")().parameter("k")
+    low, high = expect_another_run(track, 1.8, 1.78, 1.83)
+    assert low < 1.8 - 1.95 * track.spread.size < 1.78
+    assert 1.83 < high < 1.83 + 1.97 * track.spread.size
+    lag = find_effect("drive_lag")().parameter("tau")
+    assert expect_another_run(lag, 0.1, 0.09, 0.11)[0] == lag.bounds[0]
+    moment = next(p for p in find_effect("terrain_change")().parameters if p.is_of_one_run)
+    for ends in (
+        expect_another_run(moment, 60.0, 59.0, 61.0),
+        expect_another_run(track, 1.8, math.nan, math.nan),
+    ):
+        assert not np.isfinite(ends).any()

@@ -195,6 +195,10 @@ def test_what_is_fitted_is_written_and_shown_again(
     text = run_slip(capsys, "fleet", "show", str(results.root))[1]
     assert "warthog: 9 runs" in text
     assert "longitudinal_slip" in text
+    page = (results.root / "fleet.html").read_text(encoding="utf-8")
+    for word in ("longitudinal_slip", number["because"].split(" (")[0], "ice", 'href="index.html"'):
+        assert word in page
+    assert 'href="fleet.html"' in (results.root / "index.html").read_text(encoding="utf-8")
 
 
 def test_a_fleet_that_is_out_of_date_says_so(results: Store, capsys: pytest.CaptureFixture[str]) -> None:
@@ -269,14 +273,14 @@ def test_on_an_object_store_a_batch_keeps_fleet_and_trend_up_to_date_as_well(
     refresh_remote_pools(mirror)
     published = {
         name: objects.cat_file(f"/field/results/{name}").decode("utf-8")
-        for name in ("fleet.json", "trend.json", "trend.html", "index.html", "map.html")
+        for name in ("fleet.json", "fleet.html", "trend.json", "trend.html", "index.html", "map.html")
     }
     objects.store.clear()
     assert '"new/k0"' in published["fleet.json"]
     assert "in new, above the limit of 1.5" in published["trend.json"]
     assert "above the limit of 1.5" in published["trend.html"]
     linked = set(re.findall(r'href="(\w+\.html)"', published["index.html"]))
-    assert {"map.html", "trend.html"} <= linked <= set(published)
+    assert {"fleet.html", "map.html", "trend.html"} <= linked <= set(published)
 
 
 def test_without_a_fleet_or_estimates_one_line_says_what_to_do(

@@ -58,7 +58,7 @@ def test_what_is_known_is_the_forecast_with_its_spread(results: Path) -> None:
         spread[terrain] = deviation
         questions = ask(knowledge, ["effective_track"], choose_limits(vehicle), 60.0, None)
         assert [one.effects for one in questions] == [("effective_track",)]
-    assert spread["ice"] < spread["gravel"]
+    assert max(spread["ice"], spread["gravel"]) < spread["mud"]
     # Whether an effect acts that the fleet names is no question any more.
     questions = ask(knowledge, [UNDECIDED], choose_limits(vehicle), 60.0, None)
     assert "whether effective_track acts" not in {one.text for one in questions}

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from draw import draw_riddle, write_riddle
-from pipeline.diagnosis.subject import load_recording
 from truth import build_true
 
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.diagnosis import read_recording
 from pipeline.analysis.options import Options
+from pipeline.diagnosis.recording import load_recording
 from pipeline.identification import Input, Problem, fit_model, hold_out
 from pipeline.models import Model
 

@@ -12,7 +12,13 @@ GROUPS = ("asphalt", "gravel", "ice")
 
 def draw(values: list[float], groups: list[str], group: str, *, size: float = 1.0) -> tuple[float, float]:
     drawn = draw_run(
-        values, [0.05] * len(values), groups, group, size=size, count=2000, rng=np.random.default_rng(3)
+        values,
+        [0.05] * len(values),
+        groups,
+        group,
+        usual=(size, size),
+        count=2000,
+        rng=np.random.default_rng(3),
     )
     low, high = np.quantile(drawn.run, (0.025, 0.975)).tolist()
     return low, high
@@ -28,7 +34,7 @@ def test_intervals_hold_a_run_that_comes(spread: float, least: float, most: floa
         errors = rng.uniform(0.3, 0.6, len(groups))
         values = np.array([shift[name] for name in groups])
         values += np.hypot(0.5, errors) * rng.normal(size=len(groups))
-        drawn = draw_run(values, errors, groups, "ice", size=1.0, count=500, rng=rng).run
+        drawn = draw_run(values, errors, groups, "ice", usual=(1.0, 1.0), count=500, rng=rng).run
         low, high = np.quantile(drawn, (0.025, 0.975))
         held.append(low <= shift["ice"] + 0.5 * rng.normal() <= high)
     assert least <= np.mean(held) <= most
@@ -62,5 +68,5 @@ def test_one_run_tells_no_more_than_the_usual_size_of_an_effect() -> None:
 )
 def test_what_cannot_be_is_refused(errors: list[float], groups: list[str], size: float) -> None:
     with pytest.raises(StatisticsError) as told:
-        draw_run([1.0, 2.0], errors, groups, "a", size=size, count=10, rng=np.random.default_rng(1))
+        draw_run([1.0, 2.0], errors, groups, "a", usual=(size, size), count=10, rng=np.random.default_rng(1))
     assert told.value.code == "bad_errors"

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-# Spreads on a grid, as parts of the usual size: steps of a fifth, from far below any that matters.
+# Spreads on a grid, as parts of the usual ones: steps of a fifth, from far below any that matters.
 _GRID = np.geomspace(1e-3, 5.0, 48)
 
 
@@ -45,7 +45,7 @@ def draw_run(
     groups: Sequence[str],
     group: str,
     *,
-    size: float,
+    usual: tuple[float, float],
     count: int,
     rng: np.random.Generator,
 ) -> Draws:
@@ -56,37 +56,37 @@ def draw_run(
         errors: standard deviations of the numbers, shape (n,), positive.
         groups: label of each run's group, n of them.
         group: of the other run; may be one without runs.
-        size: usual size of such numbers, which spreads seldom exceed; positive.
+        usual: spreads between groups and between runs of a group that are seldom exceeded; positive.
         count: how many draws.
         rng: source of chance.
 
     Raises:
         StatisticsError: ``too_few_values``, ``not_finite``, or ``bad_errors``: shapes differ, or an error or
-            the size is not positive.
+            a usual spread is not positive.
     """
     y, s = check_values(values, what="values"), check_values(errors, what="errors")
-    if not y.size == s.size == len(groups) or min(s.min(), size) <= 0.0:
+    if not y.size == s.size == len(groups) or min(s.min(), *usual) <= 0.0:
         raise StatisticsError(
             "bad_errors",
-            f"{y.size} values have {s.size} errors and {len(groups)} groups, usual size {size:g}",
-            hint="Give every value a group and a positive error, and a positive size.",
+            f"{y.size} values have {s.size} errors and {len(groups)} groups, usual spreads {usual}",
+            hint="Give every value a group and a positive error, and positive spreads.",
         )
     names = sorted(set(groups))
     member = np.array([[name == label for label in groups] for name in names], dtype=np.float64)
-    spreads = size * _GRID
-    weight = 1.0 / (s**2 + spreads[:, None] ** 2)
+    wide, narrow = (size * _GRID for size in usual)
+    weight = 1.0 / (s**2 + narrow[:, None] ** 2)
     total = weight @ member.T
     means = (weight * y) @ member.T / total
     rest = np.sum(weight * (y - means @ member) ** 2, axis=1)
     within = -0.5 * (rest - np.log(weight).sum(axis=1) + np.log(total).sum(axis=1))
     # Axes: spread between groups, spread between runs, group.
-    outer = 1.0 / (spreads[:, None, None] ** 2 + 1.0 / total)
+    outer = 1.0 / (wide[:, None, None] ** 2 + 1.0 / total)
     mass = outer.sum(axis=2)
     centre = (outer * means).sum(axis=2) / mass
     away = np.sum(outer * (means - centre[:, :, None]) ** 2, axis=2)
     likelihood = within - 0.5 * (away - np.log(outer).sum(axis=2) + np.log(mass))
     # On a grid of equal ratios a density counts by its spread.
-    prior = np.log(spreads) - 0.5 * (spreads / size) ** 2
+    prior = np.log(_GRID) - 0.5 * _GRID**2
     score = likelihood + prior[:, None] + prior
     chance = np.exp(score - score.max()).ravel()
     picked = rng.choice(chance.size, count, p=chance / chance.sum())
@@ -98,6 +98,6 @@ def draw_run(
         place = names.index(group)
         known = total[run, place]
         pull = known * means[run, place]
-    sharp = known + 1.0 / spreads[between] ** 2
-    own = (pull + common / spreads[between] ** 2) / sharp + rng.standard_normal(count) / np.sqrt(sharp)
-    return Draws(own, own + spreads[run] * rng.standard_normal(count))
+    sharp = known + 1.0 / wide[between] ** 2
+    own = (pull + common / wide[between] ** 2) / sharp + rng.standard_normal(count) / np.sqrt(sharp)
+    return Draws(own, own + narrow[run] * rng.standard_normal(count))

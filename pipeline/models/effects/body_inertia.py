@@ -15,7 +15,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import STAMPS, BodyEffect, Excitation, Late, Least, Parameter, Plausible, Search
+from pipeline.models.effect import (
+    STAMPS,
+    WARTHOG_RUNS,
+    BodyEffect,
+    Excitation,
+    Late,
+    Least,
+    Parameter,
+    Plausible,
+    Search,
+    Spread,
+)
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Velocity
@@ -44,6 +55,7 @@ class BodyInertia(BodyEffect):
             least=Least(0.02, STAMPS),
             plausible=Plausible(0.0, 3.0, "wider than the 0.2 to 1 s of ice"),
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
+            between_runs=Spread(0.034, WARTHOG_RUNS),
         ),
     )
     needs = (Excitation.CHANGES, Excitation.TURNING)

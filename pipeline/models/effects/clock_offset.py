@@ -14,7 +14,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import STAMPS, Excitation, Late, Least, Parameter, Plausible, ReportEffect, Search
+from pipeline.models.effect import (
+    STAMPS,
+    WARTHOG_RUNS,
+    Excitation,
+    Late,
+    Least,
+    Parameter,
+    Plausible,
+    ReportEffect,
+    Search,
+    Spread,
+)
 from pipeline.models.evidence import LEAST_DELAY_S
 from pipeline.models.level import Level, Reading
 
@@ -42,6 +53,7 @@ class ClockOffset(ReportEffect):
             step=5e-3,
             least=Least(LEAST_DELAY_S, STAMPS, sampled=True),
             plausible=Plausible(-0.8, 0.8, "wider than the clocks of the DRIVE recordings"),
+            between_runs=Spread(0.14, WARTHOG_RUNS),
         ),
     )
     needs = (Excitation.CHANGES,)

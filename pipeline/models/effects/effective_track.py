@@ -15,11 +15,13 @@ from typing import TYPE_CHECKING
 from pipeline.models.effect import (
     DATA_SHEET,
     SIDES,
+    WARTHOG_RUNS,
     Excitation,
     KinematicEffect,
     Least,
     Parameter,
     Plausible,
+    Spread,
 )
 from pipeline.models.effects.wheel_radius import WheelRadius
 from pipeline.models.level import Level, Reading
@@ -48,6 +50,7 @@ class EffectiveTrack(KinematicEffect):
             least=Least(0.01, DATA_SHEET),
             plausible=Plausible(0.7, 4.0, "wider than the 1.8 and 1.9 of Warthog and Husky"),
             quantities=(Quantity.TRACK,),
+            between_runs=Spread(0.023, WARTHOG_RUNS),
         ),
     )
     needs = (Excitation.TURNING,)

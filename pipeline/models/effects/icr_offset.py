@@ -13,7 +13,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import MOUNTING, Excitation, Least, LinearEffect, Parameter, Place, Plausible
+from pipeline.models.effect import (
+    MOUNTING,
+    WARTHOG_RUNS,
+    Excitation,
+    Least,
+    LinearEffect,
+    Parameter,
+    Place,
+    Plausible,
+    Spread,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -42,6 +52,7 @@ class IcrOffset(LinearEffect):
                 0.6,
                 "wider than -0.08 to 0.24 m; the middle of a sedan is 1.35 m ahead of its rear axle",
             ),
+            between_runs=Spread(0.013, WARTHOG_RUNS),
         ),
     )
     needs = (Excitation.TURNING,)

@@ -13,7 +13,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import STAMPS, Excitation, Least, LinearEffect, Parameter, Plausible
+from pipeline.models.effect import (
+    STAMPS,
+    WARTHOG_RUNS,
+    Excitation,
+    Least,
+    LinearEffect,
+    Parameter,
+    Plausible,
+    Spread,
+)
 from pipeline.models.evidence import LEAST_DELAY_S
 
 if TYPE_CHECKING:
@@ -39,6 +48,7 @@ class LateralSkid(LinearEffect):
             least=Least(LEAST_DELAY_S, STAMPS),
             plausible=Plausible(-0.02, 0.4, "wider than 0.02 on tile and 0.15 on ice"),
             one_sign=True,
+            between_runs=Spread(0.064, WARTHOG_RUNS),
         ),
     )
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)

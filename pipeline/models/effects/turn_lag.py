@@ -15,7 +15,16 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import SIDES, DriveEffect, Excitation, Parameter, Plausible, Search
+from pipeline.models.effect import (
+    SIDES,
+    WARTHOG_RUNS,
+    DriveEffect,
+    Excitation,
+    Parameter,
+    Plausible,
+    Search,
+    Spread,
+)
 from pipeline.models.effects.drive_lag import DriveLag
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
@@ -51,6 +60,7 @@ class TurnLag(DriveEffect):
             step=5e-3,
             plausible=_PLAUSIBLE,
             quantities=(Quantity.SPEED_LAG,),
+            between_runs=Spread(0.12, WARTHOG_RUNS),
         ),
         Parameter(
             "tau_diff",
@@ -64,6 +74,7 @@ class TurnLag(DriveEffect):
             step=5e-3,
             plausible=_PLAUSIBLE,
             quantities=(Quantity.TURN_LAG,),
+            between_runs=Spread(0.24, WARTHOG_RUNS),
         ),
     )
     needs = (Excitation.CHANGES, Excitation.TURNING)

@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING
 
 from pipeline.models.effect import (
     DATA_SHEET,
+    WARTHOG_RUNS,
     Excitation,
     KinematicEffect,
     Least,
     Parameter,
     Plausible,
+    Spread,
 )
 from pipeline.models.quantity import Quantity
 from pipeline.models.wording import name_side
@@ -45,6 +47,7 @@ class WheelAsymmetry(KinematicEffect):
             least=Least(0.003, DATA_SHEET),
             plausible=Plausible(-0.2, 0.2, "wider than the 8 % of one soft side"),
             quantities=(Quantity.RADIUS_DIFFERENCE,),
+            between_runs=Spread(0.016, WARTHOG_RUNS),
         ),
     )
     needs = (Excitation.BOTH_SIGNS, Excitation.SPEED_SPREAD)

@@ -11,7 +11,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import DATA_SHEET, Excitation, KinematicEffect, Least, Parameter, Plausible
+from pipeline.models.effect import (
+    DATA_SHEET,
+    WARTHOG_RUNS,
+    Excitation,
+    KinematicEffect,
+    Least,
+    Parameter,
+    Plausible,
+    Spread,
+)
 from pipeline.models.level import Level, Reading
 from pipeline.models.quantity import Quantity
 from pipeline.models.wording import describe_share
@@ -37,6 +46,7 @@ class WheelRadius(KinematicEffect):
             least=Least(0.004, DATA_SHEET),
             plausible=Plausible(0.4, 1.3, "radii are off by 2 to 25 %, wheels slip by half on loose ground"),
             quantities=(Quantity.RADIUS,),
+            between_runs=Spread(0.019, WARTHOG_RUNS),
         ),
     )
     needs = (Excitation.SPEED_SPREAD,)

@@ -13,7 +13,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import INF, WHEELED, CommandEffect, Excitation, Parameter, Search
+from pipeline.models.effect import (
+    INF,
+    WARTHOG_RUNS,
+    WHEELED,
+    CommandEffect,
+    Excitation,
+    Parameter,
+    Search,
+    Spread,
+)
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
@@ -41,6 +50,7 @@ class WheelSpeedLimit(CommandEffect):
             relative_to="wheel",
             step=1e-2,
             quantities=(Quantity.WHEEL_SPEED_LIMIT,),
+            between_runs=Spread(0.2, WARTHOG_RUNS),
         ),
     )
     needs = (Excitation.LARGE,)

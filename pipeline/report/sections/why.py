@@ -24,6 +24,7 @@ _HEAD = (
     Column("effect"),
     Column("value", number=True),
     Column("95 %", number=True),
+    Column("95 %, another run", number=True),
     Column("squared error of unseen data without it"),
 )
 
@@ -90,16 +91,21 @@ def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
         values = mapping_in(parameters, key)
         unit = values.get("unit")
         shown = str(unit).replace("^2", "\u00b2") if unit not in (None, "1", "") else ""
-        low, high = number_in(values, "low"), number_in(values, "high")
         rows.append(
             [
                 Cell(small=key) if rows else Cell(name, small=key, notes=notes),
                 Cell(say_number(number_in(values, "value"), digits=4), small=shown),
-                "" if low is None else f"{say_number(low, digits=4)} to {say_number(high, digits=4)}",
+                _say_ends(values),
+                _say_ends(mapping_in(values, "another_run")),
                 "" if rows else gain,
             ]
         )
-    return rows or [[Cell(name, notes=notes), "", "", gain]]
+    return rows or [[Cell(name, notes=notes), "", "", "", gain]]
+
+
+def _say_ends(values: Mapping[str, object]) -> str:
+    low, high = number_in(values, "low"), number_in(values, "high")
+    return "" if low is None else f"{say_number(low, digits=4)} to {say_number(high, digits=4)}"
 
 
 def _say_gain(gain: float | None) -> str:
