@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from pipeline.analysis.log_setup import LogSetup
 
-VERSIONS: Mapping[str, int] = {"extract": 6, "align": 4, "velocity": 3, "slip": 6, "aggregate": 1}
+VERSIONS: Mapping[str, int] = {"extract": 6, "align": 5, "velocity": 4, "slip": 6, "aggregate": 1}
 EXTRACTED = ("commands", "wheels", "poses", "imu")
 TABLES: Mapping[str, tuple[str, ...]] = {
     "extract": EXTRACTED,
