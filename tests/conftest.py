@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 # A busy machine is slow, not wrong: properties are checked, not timed.
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
+# Lines are whole where nobody looks; a worker of pytest-xdist is told the width of the terminal.
+os.environ.pop("COLUMNS", None)
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared"
