@@ -29,7 +29,11 @@ PAGES = {
     "trend.html": "Trends",
     "map.html": "Map",
 }
-_MADE_BY = {"comparison.html": "slip compare", "causes.html": "slip compare --causes"}
+_MADE_BY = {
+    "comparison.html": "slip compare",
+    "causes.html": "slip compare --causes",
+    "fleet.html": "slip fleet fit",
+}
 _PLACE = re.compile(r'(<nav id="pages"[^>]*>).*?(</nav>)', re.DOTALL)
 
 
