@@ -52,10 +52,15 @@ def render_fleet(content: Mapping[str, object]) -> str:
         "report/templates/fleet.html",
         [],
         title="What is the vehicle's, what the ground's",
-        facts=[f"{len(runs)} vehicle{'s' * (len(runs) != 1)}", f"{len(keys)} runs", f"{len(rows)} numbers"],
+        facts=[
+            f"{len(found)} {word}{'s' * (len(found) != 1)}"
+            for word, found in (("vehicle", runs), ("run", keys), ("number", rows))
+        ],
         vehicles=vehicles,
-        open=[f"{why}: {', '.join(labels)}" for why, labels in reasons.items()],
-        notes=content["notes"],
+        open=[
+            *(f"{why}: {', '.join(labels)}" for why, labels in reasons.items()),
+            *cast("Sequence[str]", content["notes"]),
+        ],
         runs=keys,
     )
 
