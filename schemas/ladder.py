@@ -20,7 +20,7 @@ class Ladder(Table):
     VERSION: ClassVar[int] = 1
 
     input = dy.Enum(INPUTS, metadata={"description": "what the model was fed with"})
-    kind = dy.Enum(KINDS, metadata={"description": "a model, or the error that no model could remove"})
+    kind = dy.Enum(KINDS, metadata={"description": "a model, or how well motion repeats itself"})
     rung = dy.Int32(min=0, metadata={"description": "place on the ladder; 0 is the ideal model"})
     added = fields.text("effects that this rung adds")
     effects = fields.text("all effects of this rung, in the order of a command's way")

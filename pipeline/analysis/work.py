@@ -49,7 +49,7 @@ class Work:
 
     Attributes:
         run: name of the run.
-        subject: the log and its configuration.
+        setup: the log and its configuration.
         options: what the user asked for.
         generation: where tables go.
         keys: key of every stage.

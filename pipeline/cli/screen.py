@@ -9,6 +9,7 @@ from typing import cast
 
 from pipeline.cli.output import tidy_line
 from pipeline.core.durations import say_recorded
+from pipeline.report.words import say_distance, say_split
 
 Summary = Mapping[str, object]
 
@@ -62,7 +63,7 @@ def _describe_head(summary: Summary) -> list[str]:
         say_recorded(seconds, summary.get("duration_s")),
     ]
     if isinstance(distance, (int, float)):
-        facts.append(format_distance(float(distance)))
+        facts.append(say_distance(float(distance)))
     head = [_row("run", f"{summary['run']}    {' · '.join(facts)}")]
     losses = cast("Sequence[Mapping[str, object]]", log.get("losses") or [])
     gaps = [f for f in _findings(summary) if f["id"] == "pose_gap"]
@@ -87,8 +88,6 @@ def _describe_gaps(found: Mapping[str, object]) -> str:
 
 
 def _describe_slip(summary: Summary) -> list[str]:
-    from pipeline.report.words import say_split  # noqa: PLC0415 - heavy, by its room
-
     by_input = _part(summary, "by_input")
     words = {"command": "on command", "measured": "on measured wheels"}
     shown = [name for name in words if name in by_input]
@@ -184,8 +183,3 @@ def _relative(path: str) -> str:
         return str(Path(path).resolve().relative_to(Path.cwd()))
     except ValueError:
         return path
-
-
-def format_distance(metres: float) -> str:
-    """Metres in words: `1.42 km`."""
-    return f"{metres / 1000.0:.2f} km" if metres >= 1000.0 else f"{metres:.0f} m"  # noqa: PLR2004 - a kilometre

@@ -207,7 +207,7 @@ class RunDiagnosis:
         unexplained: structure without a name; None without.
         findings: what the stages and the diagnosis noticed.
         ladder: rungs with their held-out errors.
-        noise_floor: the errors that no model could remove.
+        noise_floor: how well motion repeats itself under the same input, as errors.
         explained_share: of the removable error; NaN without room.
         regions: every region with its part of the ideal model's error.
         where: the few that carry most of it.

@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.diagnosis.diagnosis import Value
 from pipeline.models.bounds import stands_at_bound
+from pipeline.models.parameter import is_of_one_run
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,7 +36,8 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
         if high - low > most - least:
             low = high = math.nan
         at_bound = stands_at_bound(value, parameter.bounds)
-        another = (math.nan, math.nan) if at_bound else expect_another_run(parameter, value, low, high)
+        own = at_bound or is_of_one_run(effect.parameters)
+        another = (math.nan, math.nan) if own else expect_another_run(parameter, value, low, high)
         values[parameter.name] = Value(value, low, high, parameter.unit, at_bound, another)
     return values
 
@@ -46,7 +48,7 @@ def expect_another_run(parameter: Parameter, value: float, low: float, high: flo
     The interval of this run, and the spread between runs that recordings have shown or that is usual
     (`Parameter.spread`), independent of each other; within the bounds of the search.
     """
-    if parameter.is_of_one_run or not math.isfinite(high - low):
+    if not math.isfinite(high - low):
         return math.nan, math.nan
     change = _SURE * parameter.spread.size
     least, most = parameter.bounds

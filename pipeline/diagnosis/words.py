@@ -81,7 +81,7 @@ def _list_shared(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
     if math.isfinite(diagnosis.explained_share) and len(diagnosis.ladder) > 1:
         share = max(diagnosis.explained_share, 0.0)
         now, floor = _number(last, "t_mrmse_m"), _number(diagnosis.noise_floor, "t_mrmse_m")
-        below = ": below the floor by chance, or fitted to noise" if share > _WHOLE else ""
+        below = ": below the floor, which is an estimate" if share > _WHOLE else ""
         lines.append(
             ("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m{below}")
         )

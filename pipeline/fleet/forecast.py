@@ -9,12 +9,13 @@ import numpy as np
 import polars as pl
 
 from pipeline.fleet.errors import ComparisonError
-from pipeline.fleet.hierarchy import is_of_one_run, leave_out_odd, take_numbers
+from pipeline.fleet.hierarchy import leave_out_odd, take_numbers
 from pipeline.fleet.runs import UNKNOWN
 from pipeline.fleet.statistics import draw_run
 from pipeline.models.bounds import stands_at_bound
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Place
+from pipeline.models.parameter import is_of_one_run
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -189,6 +190,6 @@ def _choose_effects(rows: pl.DataFrame, source: str) -> list[Effect]:
     chosen = [
         effect
         for effect in effects
-        if (source == "command" or effect.place > Place.DRIVE) and not is_of_one_run(effect)
+        if (source == "command" or effect.place > Place.DRIVE) and not is_of_one_run(effect.parameters)
     ]
     return [effect for effect in chosen if not any(effect.id in other.contains for other in chosen)]

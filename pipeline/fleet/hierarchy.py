@@ -17,12 +17,12 @@ from pipeline.fleet.runs import UNKNOWN
 from pipeline.fleet.statistics import find_outlier, split_levels
 from pipeline.models.catalogue import find_effect
 from pipeline.models.level import Level
+from pipeline.models.parameter import is_of_one_run
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.fleet.statistics import LevelFit
-    from pipeline.models.effect import Effect
 
 SURE = 0.01
 """A difference is taken for one below this chance: of ten numbers of a vehicle, nine fleets in ten show none
@@ -119,7 +119,7 @@ def fit_fleet(estimates: pl.DataFrame) -> FleetModel:
 def list_numbers(estimates: pl.DataFrame) -> list[tuple[str, str, str, pl.DataFrame]]:
     """Vehicle, effect, parameter and rows of every number whose effect at least one run names.
 
-    Not those of effects that act at a moment or a place of one recording, which say nothing of another.
+    Not those of effects that act from a moment of one recording on, which say nothing of another.
     """
     parts = take_numbers(estimates).partition_by(
         "vehicle", "effect", "parameter", as_dict=True, maintain_order=True
@@ -127,13 +127,8 @@ def list_numbers(estimates: pl.DataFrame) -> list[tuple[str, str, str, pl.DataFr
     return [
         (str(vehicle), str(effect), str(parameter), rows)
         for (vehicle, effect, parameter), rows in parts.items()
-        if rows["named"].any() and not is_of_one_run(find_effect(str(effect))())
+        if rows["named"].any() and not is_of_one_run(find_effect(str(effect)).parameters)
     ]
-
-
-def is_of_one_run(effect: Effect) -> bool:
-    """Whether an effect acts at a moment or a place of one recording."""
-    return any(parameter.is_of_one_run for parameter in effect.parameters)
 
 
 def take_numbers(estimates: pl.DataFrame) -> pl.DataFrame:

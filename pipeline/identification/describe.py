@@ -11,6 +11,7 @@ from pipeline.identification.intervals import NOTHING as NOT_FITTED
 from pipeline.identification.ladder import ERRORS_OVER_2S, NOTHING, list_rises
 from pipeline.models.effect import Search
 from pipeline.models.formula.formula_effect import FormulaEffect
+from pipeline.models.parameter import is_of_one_run
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -233,7 +234,11 @@ def describe_effect(effect: type[Effect] | Effect) -> str:
             f"parameter     {parameter.name} [{parameter.unit}]: {parameter.about}; {low:g} to {high:g}, "
             f"neutral {parameter.neutral:g}, usually about {parameter.typical:g}{how}"
         )
-        lines += [f"{'':<14}{text}" for text in _describe_sizes(parameter)]
+        texts = _describe_sizes(parameter)
+        if not is_of_one_run(effect.parameters):
+            spread, unit = parameter.spread, "" if parameter.unit == "1" else f" {parameter.unit}"
+            texts.append(f"from run to run of one ground {spread.size:.2g}{unit} (1 sigma): {spread.source}")
+        lines += [f"{'':<14}{text}" for text in texts]
     lines.append(f"shown by      {', '.join(need.value for need in effect.needs)}")
     if effect.equivalent_to:
         lines.append(f"same as       {', '.join(effect.equivalent_to)} ({effect.equivalent_when})")
@@ -262,9 +267,6 @@ def _describe_sizes(parameter: Parameter) -> list[str]:
     if parameter.plausible is not None:
         range_ = parameter.plausible
         lines.append(f"vehicles show {range_.low:g} to {range_.high:g}{unit}: {range_.source}")
-    if not parameter.is_of_one_run:
-        spread = parameter.spread
-        lines.append(f"from run to run of one ground {spread.size:.2g}{unit} (1 sigma): {spread.source}")
     if parameter.one_sign:
         lines.append("named where it is positive: the other sign is no physics")
     return lines

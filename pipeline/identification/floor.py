@@ -1,6 +1,6 @@
 """The noise floor: how well motion repeats itself while the input does, which no model has to do with.
 
-Two displacements over half a second, a second apart, differ by what the input and the attitude did
+Two displacements over half a second, none to two seconds apart, differ by what the input and the attitude did
 differently, and by noise of the poses and random motion. The former is small and locally linear, so that a
 regression of differences on differences takes it away (a difference-based estimator of variance: Rice,
 Annals of Statistics 12 (1984); with regressors Yatchew, Economics Letters 57 (1997)); half the mean square of

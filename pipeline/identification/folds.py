@@ -111,7 +111,7 @@ def refit(part: Part, fit: PartFit, train: Flags) -> State:
         held = hold + part.prior.weigh(state, fit.free)[smooth]
         step, _ = solve_step(jacobian, residual[train], weights, hold=held, pull=pull)
         moved = state.move(free, step.tolist())
-        promised = measure_loss(part, weights, residual[train] - jacobian @ step, moved, free)
+        promised = measure_loss(part, weights, residual[train] - jacobian @ step, moved, fit.free)
         if loss - promised < _NOTHING * loss:
             break
         trial = part.find_residuals(moved)

@@ -143,11 +143,7 @@ def list_starts(candidate: Candidate, largest: Largest) -> list[dict[str, float]
     searched = [p for p in candidate.parameters if p.search is not Search.DIRECT]
     if not searched:
         return [{}]
-    alone = [
-        {p.name: value}
-        for p in (*searched, *(p for p in candidate.parameters if p.instead_of))
-        for value in _list_values(p, largest)
-    ]
+    alone = [{p.name: value} for p in searched for value in _list_values(p, largest)]
     if len(searched) == 1:
         return alone
     together = [

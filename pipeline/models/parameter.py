@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from pipeline.models.evidence import Relative
     from pipeline.models.quantity import Quantity
 
@@ -66,7 +68,6 @@ class Spread:
 
 WARTHOG_RUNS = "nine runs of a Warthog on five grounds"
 _USUAL_SPREAD = 0.25
-_OF_ONE_RUN = ("duration", "place")
 STAMPS = "stamps are off by as much"
 MOUNTING = "sensors are mounted no better"
 DATA_SHEET = "a data sheet allows as much"
@@ -133,11 +134,6 @@ class Parameter:
         return abs(self.typical - (self.neutral if math.isfinite(self.neutral) else 0.0))
 
     @property
-    def is_of_one_run(self) -> bool:
-        """Whether it is a moment or a place of one recording, which says nothing of another."""
-        return self.relative_to in _OF_ONE_RUN
-
-    @property
     def spread(self) -> Spread:
         """Between runs: what is known of it, else the median of what was measured of other numbers."""
         usual = f"a quarter of its usual size, the median over the numbers of {WARTHOG_RUNS}"
@@ -158,3 +154,8 @@ class Part:
     effect: str
     parameter: str
     factor: float
+
+
+def is_of_one_run(parameters: Iterable[Parameter]) -> bool:
+    """Whether an effect with these acts from a moment of one recording on: another run shows none of them."""
+    return any(parameter.relative_to == "duration" for parameter in parameters)

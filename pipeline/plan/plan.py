@@ -131,7 +131,7 @@ class Plan:
         last = max((one.decided_after_s for one in self.promises), default=duration)
         told = []
         if self.promises and duration - last >= _LEAST_REST_S:
-            told.append(f"all of it is decided after {last:.0f} s, and surer after {duration:.0f} s")
+            told.append(f"every promise is kept after {last:.0f} s, and surer after {duration:.0f} s")
         if self.promises and self.spare_s >= _LEAST_REST_S:
             gain = f"narrow no interval by more than {max(self.spare_gain, 0.01):.0%}"
             intervals = any(one.kind == "interval" for one in self.promises)
@@ -237,7 +237,9 @@ def make_plan(
         told = {one.text for one in questions}
         missed = tuple(one for one in fuller.impossible if one.question in told)
         fuller, gain = replace(fuller, impossible=missed), _find_gain(best, fuller)
-        if gain >= _WORTH_DRIVING or len(fuller.promises) > len(best.promises):
+        # What comes later takes nothing from what was asked first.
+        kept = {one.question for one in best.promises} <= {one.question for one in fuller.promises}
+        if kept and (gain >= _WORTH_DRIVING or len(fuller.promises) > len(best.promises)):
             best, gain = fuller, 0.0
     if not best.promises:
         # Nobody sends a robot out for nothing.

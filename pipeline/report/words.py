@@ -1,4 +1,4 @@
-"""Text for the page: numbers with units, durations, dates."""
+"""Text for pages and screens: numbers with units, distances, dates."""
 
 from __future__ import annotations
 

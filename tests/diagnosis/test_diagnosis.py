@@ -17,7 +17,7 @@ from pipeline.analysis.options import Options
 from pipeline.diagnosis import Diagnosis, Recording, diagnose_runs
 from pipeline.diagnosis.plausibility import find_exceeded, find_implausible, is_nameable
 from pipeline.diagnosis.residual_structure import is_felt
-from pipeline.diagnosis.values import expect_another_run
+from pipeline.diagnosis.values import expect_another_run, list_values
 from pipeline.diagnosis.words import describe, list_lines
 from pipeline.identification.persistence import take_own_past
 from pipeline.models import Model, find_effect, read_model, write_model
@@ -459,16 +459,20 @@ def test_residuals_lose_what_their_own_past_tells_of_them() -> None:
     assert not made[:2].any()
 
 
-def test_another_run_is_known_less_than_this_one_and_a_moment_of_this_one_not_at_all() -> None:
+def test_another_run_is_known_less_than_this_one_and_what_begins_in_this_one_not_at_all() -> None:
     track = find_effect("effective_track")().parameter("k")
     low, high = expect_another_run(track, 1.8, 1.78, 1.83)
     assert low < 1.8 - 1.95 * track.spread.size < 1.78
     assert 1.83 < high < 1.83 + 1.97 * track.spread.size
     lag = find_effect("drive_lag")().parameter("tau")
     assert expect_another_run(lag, 0.1, 0.09, 0.11)[0] == lag.bounds[0]
-    moment = next(p for p in find_effect("terrain_change")().parameters if p.is_of_one_run)
-    for ends in (
-        expect_another_run(moment, 60.0, 59.0, 61.0),
-        expect_another_run(track, 1.8, math.nan, math.nan),
+    assert not np.isfinite(expect_another_run(track, 1.8, math.nan, math.nan)).any()
+    for effect, is_known in (
+        (find_effect("effective_track")(k=1.8), True),
+        (find_effect("terrain_change")(k_v=0.8, k_w=0.7, at_s=60.0), False),
     ):
-        assert not np.isfinite(ends).any()
+        free = [SimpleNamespace(label=f"{effect.id}.{name}") for name in effect.values]
+        items = [SimpleNamespace(free=one, low=0.6, high=0.9) for one in free]
+        values = list_values(effect, SimpleNamespace(items=items))  # type: ignore[arg-type]
+        assert all(value.high == 0.9 for value in values.values())
+        assert all(np.isfinite(value.another_run).all() == is_known for value in values.values())

@@ -138,7 +138,7 @@ def test_a_symptom_has_its_looks_a_log_an_answer_and_a_remedy() -> None:
 def test_the_readme_answers_first_and_its_links_lead_somewhere() -> None:
     text = README.read_text(encoding="utf-8")
 
-    assert not [line for line in text.splitlines() if len(line) >= 100]
+    assert not [line for line in text.splitlines() if len(line) > 100]  # as many as outputs are folded at
     answers = [
         text.index(each) for each in ("For teams", "pictures/report.png", "## Install", "## Run it on")
     ]

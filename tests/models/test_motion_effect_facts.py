@@ -14,6 +14,7 @@ from pipeline.models import Effect, list_effects
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.models.evidence import Evidence, Largest
+from pipeline.models.parameter import is_of_one_run
 
 EFFECTS = list_effects()
 BY_ID = {effect.id: effect for effect in EFFECTS}
@@ -83,8 +84,8 @@ def test_sizes_have_reasons_and_fit_each_other(effect: type[Effect]) -> None:
             assert low <= parameter.plausible.low < parameter.plausible.high <= high
             assert parameter.plausible.low <= parameter.typical <= parameter.plausible.high
             assert parameter.plausible.source in page
-        if not parameter.is_of_one_run:
-            assert 0.0 <= parameter.spread.size <= parameter.usual_size
+        if not is_of_one_run(effect.parameters):
+            assert 0.0 <= parameter.spread.size < parameter.usual_size
             assert parameter.spread.source in page
         if parameter.one_sign:
             assert parameter.typical > parameter.neutral
