@@ -20,7 +20,6 @@ from pipeline.diagnosis import (
     conclude,
     diagnose,
     excitation,
-    naming_rules,
     plausibility,
     residual_structure,
     search,
@@ -171,10 +170,6 @@ def _same_presence(one: Any, other: Any) -> bool:
     return (one is None) == (other is None)
 
 
-def _same_clocks(one: Any, other: Any) -> bool:
-    return [effect.id for effect in one.effects] == [effect.id for effect in other.effects]
-
-
 _NEVER, _ALWAYS = 1e9, -1e9
 RULES: tuple[Rule, ...] = (
     Rule("rare", "what acts in a few stretches needs less t there", verdict.Verdict, "accepts",
@@ -190,8 +185,6 @@ RULES: tuple[Rule, ...] = (
     Rule("few_moved", "what moves one short stretch stands out of nothing", selection, "compare",
          _set(verdict, LEAST_STRETCHES=0.0), _grade),
     Rule("price", "some effects must gain more than others", search, "price_of", _give(verdict.LEAST_GAIN)),
-    Rule("price_of_number", "a number more must buy something", selection.Selection, "_present",
-         _set(selection, _PRICE_OF_A_NUMBER=0.0), costly=True),
     Rule("simplify", "what a new effect leaves at nothing goes", selection.Selection, "_simplify",
          _second, _same_ids),
     Rule("disguise", "no effect at values where it is another one", selection, "is_nameable",
@@ -217,16 +210,11 @@ RULES: tuple[Rule, ...] = (
          _same_structure),
     Rule("lasting", "motion that lasts is unexplained", residual_structure, "_find_lasting", _give(None),
          _same_presence),
-    Rule("tentative", "what explains less than is left is tentative", residual_structure, "mark_tentative",
-         _first, _same_names),
     Rule("idle", "what helps the wheels and not the body is not named", conclude, "_find_idle", _give([])),
     Rule("idle_together", "unless it helps with others", conclude, "_find_idle",
          _set(conclude, _TOGETHER=0.0)),
     Rule("idle_tentative", "what lowers no error is tentative", conclude, "_mark_idle", _first, _same_names),
     Rule("doubt", "what no vehicle does is a finding", conclude, "_doubt", _give(None), _same_presence),
-    Rule("held_poses", "held poses hide small clocks", naming_rules, "_held_delay", _give(0.0)),
-    Rule("skewed_clock", "a clock beside a skew must be larger", diagnose, "read_clocks",
-         _set(naming_rules, _SKEWED_CLOCK=0.0), _same_clocks),
     Rule("shown_once", "what shows once cannot be told", diagnose, "find_unobservable",
          _set(excitation, LEAST_STRETCHES=0.0)),
 )  # fmt: skip
