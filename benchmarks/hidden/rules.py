@@ -20,6 +20,7 @@ from pipeline.diagnosis import (
     conclude,
     diagnose,
     excitation,
+    naming_rules,
     plausibility,
     residual_structure,
     search,
@@ -170,6 +171,10 @@ def _same_presence(one: Any, other: Any) -> bool:
     return (one is None) == (other is None)
 
 
+def _same_clocks(one: Any, other: Any) -> bool:
+    return [effect.id for effect in one.effects] == [effect.id for effect in other.effects]
+
+
 _NEVER, _ALWAYS = 1e9, -1e9
 RULES: tuple[Rule, ...] = (
     Rule("rare", "what acts in a few stretches needs less t there", verdict.Verdict, "accepts",
@@ -215,6 +220,9 @@ RULES: tuple[Rule, ...] = (
          _set(conclude, _TOGETHER=0.0)),
     Rule("idle_tentative", "what lowers no error is tentative", conclude, "_mark_idle", _first, _same_names),
     Rule("doubt", "what no vehicle does is a finding", conclude, "_doubt", _give(None), _same_presence),
+    Rule("held_poses", "held poses hide small clocks", naming_rules, "_held_delay", _give(0.0)),
+    Rule("skewed_clock", "a clock beside a skew must be larger", diagnose, "read_clocks",
+         _set(naming_rules, _SKEWED_CLOCK=0.0), _same_clocks),
     Rule("shown_once", "what shows once cannot be told", diagnose, "find_unobservable",
          _set(excitation, LEAST_STRETCHES=0.0)),
 )  # fmt: skip

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.naming import Search
     from pipeline.models.effect import Effect
 
+_SKEWED_CLOCK = 0.03
+_HELD_SHARE = 0.2
+
 
 @dataclass(frozen=True)
 class Clocks:
@@ -62,8 +65,9 @@ def read_clocks(context: Context, body: Search) -> Clocks:
     skewed = extra is not None and context.has_gyro and more < 0.0
     if skewed:
         found.append(find_late_effect(Late.HEADING).of_delay(-more))
+    least = max(LEAST_DELAY_S, _SKEWED_CLOCK if skewed else 0.0, _held_delay(context))
     known = extra is not None if not context.has_gyro else all(certain)
-    if known and abs(late) >= LEAST_DELAY_S:
+    if known and abs(late) >= least:
         clock = find_late_effect(Late.POSES).of_delay(late)
         if context.has_gyro and not context.largest.moves_both_ways:
             # The gyro dates the heading; only driving and turning at once tie the position's clock to it.
@@ -72,6 +76,17 @@ def read_clocks(context: Context, body: Search) -> Clocks:
             return Clocks(tuple(found), tuple(rows), (pair,))
         found.append(clock)
     return Clocks(tuple(found), tuple(rows))
+
+
+def _held_delay(context: Context) -> float:
+    """Half the time that a held pose may be old: no clock offset can be named below it."""
+    delay = 0.0
+    for run in context.runs:
+        fresh = float(np.median(np.diff(run.track.times)))
+        raw = float(np.median(np.diff(run.streams))) if run.streams.size > 1 else fresh
+        if fresh > (1.0 + _HELD_SHARE) * raw and fresh > 0.06:  # noqa: PLR2004 - slower than usual poses
+            delay = max(delay, 0.5 * fresh)
+    return delay
 
 
 def join_classes(effects: Sequence[Effect]) -> list[Effect]:
