@@ -102,7 +102,7 @@ def summarize(
     exceeded = measure_exceeded(context)
     doubts = {effect.id: _doubt(effect, exceeded) for effect in described}
     named = tuple(effect for effect in described if doubts[effect.id] is None)
-    named = residual_structure.mark_tentative(_mark_idle(named, judgements), ways, unexplained)
+    named = _mark_idle(named, judgements)
     part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
     places = np.concatenate([find_places(comparison) for comparison in part.comparisons])

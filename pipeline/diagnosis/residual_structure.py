@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis.diagnose import Explored
-    from pipeline.diagnosis.diagnosis import Json, Named
+    from pipeline.diagnosis.diagnosis import Json
     from pipeline.identification.persistence import Makeup
 
 Floats = NDArray[np.float64]
@@ -160,30 +160,6 @@ def write_formula(joined: Mapping[str, object]) -> str:
             f"bounds = [{low:g}, {high:g}]{neutral}{fixed}}}"
         )
     return "\n".join(lines) + "\n"
-
-
-def mark_tentative(
-    named: tuple[Named, ...], ways: Sequence[Explored], unexplained: Unexplained | None
-) -> tuple[Named, ...]:
-    """Names that explain far less than what stays explainable in their channel."""
-    if unexplained is None or not unexplained.partial:
-        return named
-    body = ways[0]
-    selection, final = body.search.selection, body.search.final
-    terms = [term.id for term in collect_terms(final)]
-    rest = selection.drop(final, terms) if terms else final
-    channel = CHANNELS.index(unexplained.channel)
-    stays = unexplained.share * float(((rest.held / selection.weights.scale) ** 2)[:, channel].mean())
-    marked = []
-    for effect in named:
-        tentative = False
-        if effect.id in final.ids:
-            without = selection.drop(final, [effect.id])
-            fall = ((without.held / selection.weights.scale) ** 2).mean(axis=0)
-            fall -= ((final.held / selection.weights.scale) ** 2).mean(axis=0)
-            tentative = int(np.argmax(fall)) == channel and float(fall[channel]) < 0.5 * stays
-        marked.append(replace(effect, tentative=effect.tentative or tentative))
-    return tuple(marked)
 
 
 def describe_disturbance(body: Explored, unexplained: Unexplained | None) -> dict[str, Json]:

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-# A number more must buy something: between models that predict alike the simpler one is named.
-_PRICE_OF_A_NUMBER = 0.004
 _FIRST_STEPS = 4
 _PAIRED = 5
 _WORTH = 1.15
@@ -42,7 +40,7 @@ class CandidateModel:
     Attributes:
         fit: the model.
         held: residuals under parameters fitted elsewhere, shape (n, 3).
-        score: held-out loss, a little more for every number.
+        score: held-out loss, more for effects that have a price.
     """
 
     fit: PartFit
@@ -118,10 +116,7 @@ class Selection:
 
     def _present(self, fit: PartFit) -> CandidateModel:
         held = hold_out_part(fit, self.folds)
-        price = 1.0 + sum(
-            effect.price + _PRICE_OF_A_NUMBER * sum(np.isfinite(value) for value in effect.values.values())
-            for effect in fit.state.effects
-        )
+        price = 1.0 + sum(effect.price for effect in fit.state.effects)
         return CandidateModel(fit, held, self.weights.loss(held) * price)
 
     def judge(self, before: CandidateModel, after: CandidateModel) -> Verdict:

@@ -212,12 +212,8 @@ class WheelPart(Part):
         return effect.place <= Place.DRIVE
 
     def find_run_residuals(self, state: State, run: int) -> Floats:
-        """See `Part`; in terms of the ideal velocity of the wheels.
-
-        Encoders do not report what has not happened yet: where the body seems to turn after its wheels do,
-        it is the body or its gyro that is late, and no command the later for it.
-        """
-        return self._compare(state, run, max(state.timing[run].wheel_delay_s, 0.0))
+        """See `Part`; in terms of the ideal velocity of the wheels."""
+        return self._compare(state, run, state.timing[run].wheel_delay_s)
 
     def _compare(self, state: State, run: int, late: float) -> Floats:
         """Residuals where the encoders are late by so much [s]."""
@@ -237,7 +233,7 @@ class WheelPart(Part):
 
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
         """See `Part`: of encoders that are later by ``late_s`` than they are taken for."""
-        return self._compare(state, run, max(state.timing[run].wheel_delay_s, 0.0) + late_s)
+        return self._compare(state, run, state.timing[run].wheel_delay_s + late_s)
 
 
 def number_stretches(run: Integers, since: Floats, length: float = UNIT_S) -> Integers:

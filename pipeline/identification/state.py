@@ -119,7 +119,8 @@ class State:
                     Free(effect.id, p.name, run, p.bounds, p.step, p.unit, p.search)
                     for run in (runs if alone else (None,))
                 ]
-        bounds = (-_LARGEST_DELAY, _LARGEST_DELAY)
+        # Encoders report nothing that has yet to happen: a body that moves after its wheels is itself late.
+        bounds = (0.0, _LARGEST_DELAY)
         found += [Free("", name, run, bounds, _DELAY_STEP) for run in runs for name in delays]
         return tuple(found)
 
