@@ -175,7 +175,8 @@ def _known_as_json(forecast: Forecast | None) -> dict[str, object]:
 def _tell_known(forecast: Forecast | None) -> list[str]:
     if forecast is None:
         return []
-    runs = f"{len(forecast.here)} runs there, {len(forecast.elsewhere)} elsewhere"
+    here = f"{len(forecast.here)} run{'s' * (len(forecast.here) != 1)} there"
+    runs = f"{here}, {len(forecast.elsewhere)} elsewhere"
     return [f"known        of {forecast.vehicle} on {forecast.terrain}: {runs}"]
 
 
@@ -308,7 +309,7 @@ def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path])
         lines.append(f"then         {rest}")
     lines += [f"cannot       {text}" for text in made.list_impossible()]
     if not made.manoeuvres:
-        return [*lines, "no drive on level ground within these limits answers it: no file is written"]
+        return [*lines, "no drive on level ground within these limits answers any of it: no file is written"]
     limits, turn = made.limits, "rad steering" if made.steered else "rad/s"
     lines += [
         f"drive        {made.commands.duration_s:.0f} s on {made.area.length_m:g} x {made.area.width_m:g} m",

@@ -470,4 +470,5 @@ def _explain(one: Answerable, reached: float, measured: float, bound: float) -> 
 def _advise(question: Question) -> str:
     effects = [find_effect(name)() for name in question.effects]
     advice = suggest_manoeuvre(*effects)
-    return f"on level ground, within these limits and this time, next to nothing shows it; {advice}"
+    bounds = "on level ground, within these limits and this time"
+    return f"{bounds}, next to nothing shows it; what shows it at all: {advice}"
