@@ -131,7 +131,7 @@ class Plan:
         last = max((one.decided_after_s for one in self.promises), default=duration)
         told = []
         if self.promises and duration - last >= _LEAST_REST_S:
-            told.append(f"all of it is decided after {last:.0f} s, and surer after {duration:.0f} s")
+            told.append(f"these are decided after {last:.0f} s, and surer after all {duration:.0f} s")
         if self.promises and self.spare_s >= _LEAST_REST_S:
             gain = f"narrow no interval by more than {max(self.spare_gain, 0.01):.0%}"
             intervals = any(one.kind == "interval" for one in self.promises)
@@ -470,5 +470,4 @@ def _explain(one: Answerable, reached: float, measured: float, bound: float) -> 
 def _advise(question: Question) -> str:
     effects = [find_effect(name)() for name in question.effects]
     advice = suggest_manoeuvre(*effects)
-    bounds = "on level ground, within these limits and this time"
-    return f"{bounds}, next to nothing shows it; what shows it at all: {advice}"
+    return f"next to nothing shows it within these limits and this time; to see it: {advice}"
