@@ -233,10 +233,12 @@ def _gather(names: Sequence[str], options: Options, *, quiet: bool) -> _Gathered
         vehicles.append(vehicle)
         recordings.append(recording)
         manifests.append(opened.manifest)
-    if any(vehicle != vehicles[0] for vehicle in vehicles):
+    if other := next((vehicle for vehicle in vehicles if vehicle != vehicles[0]), None):
+        fields = other.__struct_fields__
+        differing = [name for name in fields if getattr(other, name) != getattr(vehicles[0], name)]
         raise SlipError(
             "several_vehicles",
-            "the runs are of different vehicles, and a plan is for one",
+            f"the runs are of different vehicles (in {', '.join(differing)}), and a plan is for one",
             where=", ".join(recording.name for recording in recordings),
             hint="Give runs of one vehicle.",
         )

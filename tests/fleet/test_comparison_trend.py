@@ -72,7 +72,8 @@ def test_a_track_that_moved_is_said_with_its_day_and_what_is_likely(store: Store
 
 
 @pytest.mark.parametrize(
-    ("table", "what"), [("estimates", "gone"), ("findings", "gone"), ("slip", "gone"), ("estimates", "damaged")]
+    ("table", "what"),
+    [("estimates", "gone"), ("findings", "gone"), ("slip", "gone"), ("estimates", "damaged")],
 )
 def test_a_run_whose_table_is_gone_or_damaged_is_left_out_and_named(
     store: Store, table: str, what: str
