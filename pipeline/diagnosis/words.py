@@ -81,12 +81,12 @@ def _list_shared(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
     if math.isfinite(diagnosis.explained_share) and len(diagnosis.ladder) > 1:
         share = max(diagnosis.explained_share, 0.0)
         now, floor = _number(last, "t_mrmse_m"), _number(diagnosis.noise_floor, "t_mrmse_m")
-        note = ": below the floor by chance, or fitted to noise" if share > _WHOLE else ""
-        if floor == "0":
-            note = ": all that differs lasts, none of it is told as noise"
+        below = ": below the floor by chance, or fitted to noise" if share > _WHOLE else ""
         lines.append(
-            ("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m{note}")
+            ("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m{below}")
         )
+        if floor == "0":
+            lines.append(("", "floor 0: all that differs lasts for seconds, none of it is told as noise"))
     lines += _label("budget", [_describe_budget(diagnosis)])
     lines += _label("enough", [describe_enough(diagnosis.effects)])
     lines += _label("below", _describe_immaterial(diagnosis))
