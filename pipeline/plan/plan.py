@@ -131,7 +131,7 @@ class Plan:
         last = max((one.decided_after_s for one in self.promises), default=duration)
         told = []
         if self.promises and duration - last >= _LEAST_REST_S:
-            told.append(f"these are decided after {last:.0f} s, and surer after all {duration:.0f} s")
+            told.append(f"all of it is decided after {last:.0f} s, and surer after {duration:.0f} s")
         if self.promises and self.spare_s >= _LEAST_REST_S:
             gain = f"narrow no interval by more than {max(self.spare_gain, 0.01):.0%}"
             intervals = any(one.kind == "interval" for one in self.promises)

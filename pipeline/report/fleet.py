@@ -65,11 +65,12 @@ def _label(row: Mapping[str, object]) -> str:
 
 
 def _list(row: Mapping[str, object]) -> list[str | Cell]:
+    unit = "" if row["unit"] == "1" else str(row["unit"])
     spreads = [say_number(number_in(row, f"spread_{kind}")) for kind in ("terrain", "run")]
     return [
         Cell(str(row["name"]), small=_label(row), notes=[str(row["because"])] if row["level"] else ()),
         str(row["level"] or "open"),
-        _say_value(row, row),
+        Cell(say_number(number_in(row, "value")), small=unit),
         _say_ends(row),
         *spreads,
         say_number(number_in(row, "chi_square")),
@@ -84,16 +85,12 @@ def _list_terrains(row: Mapping[str, object]) -> list[list[str | Cell]]:
         [
             Cell(small=_label(row)),
             name,
-            _say_value(mean, row),
+            say_number(number_in(mean, "value")),
             _say_ends(mean),
             str(mean["runs"]),
         ]
         for name, mean in means.items()
     ]
-
-
-def _say_value(held: Mapping[str, object], row: Mapping[str, object]) -> Cell:
-    return Cell(say_number(number_in(held, "value")), small="" if row["unit"] == "1" else str(row["unit"]))
 
 
 def _say_ends(row: Mapping[str, object]) -> str:
