@@ -86,7 +86,7 @@ def find_material(
     holders: dict[str, str] = {}
     for manifest in survey.manifests:
         digest = read_digest(manifest)
-        reason = _doubt(manifest, tables) or _find_gone(manifest, optional)
+        reason = _doubt(manifest, tables) or _find_broken(manifest, optional)
         if digest in holders:
             reason = f"the same recording as {holders[digest]}"
         if reason:
@@ -147,15 +147,18 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
                 f"its table {name} has contract version {entry.contract_version} instead of "
                 f"{contract_of(name).version}; analyze its log again"
             )
-    return _find_gone(manifest, tables)
+    return _find_broken(manifest, tables)
 
 
-def _find_gone(manifest: Manifest, tables: Sequence[str]) -> str:
-    """The first of these tables whose file is gone; empty when there is none."""
+def _find_broken(manifest: Manifest, tables: Sequence[str]) -> str:
+    """The first of these tables whose file is gone or of another size; empty when there is none."""
     for name in tables:
-        entry = manifest.tables.get(name)
-        if entry is not None and not (manifest.folder / entry.file).exists():
-            return f"its table {name} is gone; slip verify --repair, then slip batch, makes it again"
+        if (entry := manifest.tables.get(name)) is None:
+            continue
+        path = manifest.folder / entry.file
+        what = "gone" if not path.exists() else "damaged" if path.stat().st_size != entry.bytes else ""
+        if what:
+            return f"its table {name} is {what}; slip verify --repair, then slip batch, makes it again"
     return ""
 
 

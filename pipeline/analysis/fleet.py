@@ -156,13 +156,13 @@ def _describe_number(number: FleetNumber) -> dict[str, object]:
         "name": number.name,
         "because": number.because,
         "value": fit.value,
-        **_bounds(fit.interval),
+        **_bounds(number, fit.interval),
         "spread_terrain": _clean(fit.spread_group),
         "spread_run": _clean(fit.spread_run),
         "chi_square": _clean(fit.chi_square),
         "p_terrain": _clean(fit.p_groups),
         "terrains": {
-            name: {"value": mean.value, **_bounds(mean.interval), "runs": mean.runs}
+            name: {"value": mean.value, **_bounds(number, mean.interval), "runs": mean.runs}
             for name, mean in fit.groups.items()
         },
         "runs": len(number.runs),
@@ -194,20 +194,30 @@ def tabulate_fleet(model: FleetModel, keys: tuple[str, ...]) -> pl.DataFrame:
             "p_terrain": _clean(fit.p_groups),
             "keys": " ".join(keys),
         }
-        rows.append({**common, "terrain": _EVERY, "value": fit.value, **_bounds(fit.interval),
+        rows.append({**common, "terrain": _EVERY, "value": fit.value, **_bounds(number, fit.interval),
                      "runs": len(number.runs), "named": number.named})  # fmt: skip
         rows += [
-            {**common, "terrain": name, "value": mean.value, **_bounds(mean.interval), "runs": mean.runs}
+            {
+                **common,
+                "terrain": name,
+                "value": mean.value,
+                **_bounds(number, mean.interval),
+                "runs": mean.runs,
+            }
             for name, mean in fit.groups.items()
         ]
     empty = contract_of("fleet").schema.create_empty()
     return pl.DataFrame(rows, schema=empty.schema, orient="row")
 
 
-def _bounds(interval: Interval | None) -> dict[str, float | None]:
+def _bounds(number: FleetNumber, interval: Interval | None) -> dict[str, float | None]:
+    """Ends of an interval, within what the number can be."""
+    from pipeline.models import find_effect  # noqa: PLC0415 - heavy
+
     if interval is None:
         return {"low": None, "high": None}
-    return {"low": interval.low, "high": interval.high}
+    least, most = find_effect(number.effect)().parameter(number.parameter).bounds
+    return {"low": max(interval.low, least), "high": min(interval.high, most)}
 
 
 def _clean(value: float) -> float | None:

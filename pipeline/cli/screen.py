@@ -147,9 +147,8 @@ def _describe_findings(summary: Summary) -> list[str]:
         lines.append(_row("" if lines else "findings", f"{mark} {found['text']}"))
     rest = len(findings) - len(serious[:_SHOWN])
     if rest:
-        lines.append(
-            _row("" if lines else "findings", f"   {rest} more in the report and in findings.parquet")
-        )
+        more = "more " if lines else ""
+        lines.append(_row("" if lines else "findings", f"   {rest} {more}in findings.parquet"))
     return lines
 
 

@@ -175,7 +175,8 @@ def _known_as_json(forecast: Forecast | None) -> dict[str, object]:
 def _tell_known(forecast: Forecast | None) -> list[str]:
     if forecast is None:
         return []
-    runs = f"{len(forecast.here)} runs there, {len(forecast.elsewhere)} elsewhere"
+    here = f"{len(forecast.here)} run{'s' * (len(forecast.here) != 1)} there"
+    runs = f"{here}, {len(forecast.elsewhere)} elsewhere"
     return [f"known        of {forecast.vehicle} on {forecast.terrain}: {runs}"]
 
 
@@ -232,10 +233,12 @@ def _gather(names: Sequence[str], options: Options, *, quiet: bool) -> _Gathered
         vehicles.append(vehicle)
         recordings.append(recording)
         manifests.append(opened.manifest)
-    if any(vehicle != vehicles[0] for vehicle in vehicles):
+    if other := next((vehicle for vehicle in vehicles if vehicle != vehicles[0]), None):
+        fields = other.__struct_fields__
+        differing = [name for name in fields if getattr(other, name) != getattr(vehicles[0], name)]
         raise SlipError(
             "several_vehicles",
-            "the runs are of different vehicles, and a plan is for one",
+            f"the runs are of different vehicles (in {', '.join(differing)}), and a plan is for one",
             where=", ".join(recording.name for recording in recordings),
             hint="Give runs of one vehicle.",
         )
@@ -308,7 +311,7 @@ def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path])
         lines.append(f"then         {rest}")
     lines += [f"cannot       {text}" for text in made.list_impossible()]
     if not made.manoeuvres:
-        return [*lines, "no drive on level ground within these limits answers it: no file is written"]
+        return [*lines, "no drive on level ground within these limits answers any of it: no file is written"]
     limits, turn = made.limits, "rad steering" if made.steered else "rad/s"
     lines += [
         f"drive        {made.commands.duration_s:.0f} s on {made.area.length_m:g} x {made.area.width_m:g} m",

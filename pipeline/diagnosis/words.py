@@ -85,6 +85,8 @@ def _list_shared(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
         lines.append(
             ("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m{below}")
         )
+        if floor == "0":
+            lines.append(("", "floor 0: all that differs lasts for seconds, none of it is told as noise"))
     lines += _label("budget", [_describe_budget(diagnosis)])
     lines += _label("enough", [describe_enough(diagnosis.effects)])
     lines += _label("below", _describe_immaterial(diagnosis))
@@ -155,17 +157,20 @@ def _values(effect: Named) -> str:
 
 
 def _value(name: str, value: Value) -> str:
-    unit = "" if value.unit == "1" else f" {value.unit}"
-    text = f"{name} = {value.value:.3g}{unit}"
+    text = f"{name} = {value.value:.3g}{_unit(value)}"
     if math.isfinite(value.low):
         text += f" [{value.low:.3g}, {value.high:.3g}]"
     return f"{text} (at its bound)" if value.at_bound else text
 
 
+def _unit(value: Value) -> str:
+    return "" if value.unit == "1" else f" {value.unit}"
+
+
 def _say_another_run(effect: Named) -> str:
     """Between which values another run on this ground would show the numbers; empty where nobody knows."""
     ends = [
-        f"{name} {value.another_run[0]:.3g} to {value.another_run[1]:.3g}"
+        f"{name} {value.another_run[0]:.3g} to {value.another_run[1]:.3g}{_unit(value)}"
         for name, value in effect.parameters.items()
         if math.isfinite(value.another_run[0])
     ]

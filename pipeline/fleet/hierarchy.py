@@ -197,7 +197,7 @@ def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:
         ends = sorted(fit.groups.items(), key=lambda one: one[1].value)
         told = ", ".join(f"{name} {mean.value:.3g}" for name, mean in ends)
         return Level.TERRAIN, f"terrains differ by more than runs do (p = {fit.p_groups:.1g}): {told}"
-    alike = f"{len(fit.groups)} terrains differ no more than runs do (p = {fit.p_groups:.2g})"
+    alike = f"{len(fit.groups)} terrains not shown to differ by more than runs do (p = {fit.p_groups:.2g})"
     inside = fit.interval
     if inside is not None and not (math.isfinite(neutral) and inside.low <= neutral <= inside.high):
         return Level.VEHICLE, f"{alike}: {fit.value:.3g} [{inside.low:.3g}, {inside.high:.3g}]"

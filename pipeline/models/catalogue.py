@@ -50,12 +50,13 @@ def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> Effe
         return known[name]
     import difflib  # noqa: PLC0415 - only for the error
 
-    near = difflib.get_close_matches(name, known, n=3) or sorted(known)
+    near = difflib.get_close_matches(name, known, n=3)
+    guess = f"Did you mean {' or '.join(near)}? " if near else ""
     raise MotionError(
         "unknown_effect",
         f"no effect is called {name!r}",
         where=name,
-        hint=f"Did you mean {' or '.join(near[:3])}? `slip effects` lists them all.",
+        hint=f"{guess}`slip effects` lists them all.",
     )
 
 

@@ -472,4 +472,4 @@ def _explain(one: Answerable, reached: float, measured: float, bound: float) -> 
 def _advise(question: Question) -> str:
     effects = [find_effect(name)() for name in question.effects]
     advice = suggest_manoeuvre(*effects)
-    return f"on level ground, within these limits and this time, next to nothing shows it; {advice}"
+    return f"next to nothing shows it within these limits and this time; to see it: {advice}"

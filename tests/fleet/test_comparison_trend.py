@@ -71,14 +71,22 @@ def test_a_track_that_moved_is_said_with_its_day_and_what_is_likely(store: Store
     assert "1.8 -&gt; 2.1 since 2026-05-03" in page
 
 
-@pytest.mark.parametrize("table", ["estimates", "findings", "slip"])
-def test_a_run_whose_table_is_gone_is_left_out_and_named(store: Store, table: str) -> None:
+@pytest.mark.parametrize(
+    ("table", "what"),
+    [("estimates", "gone"), ("findings", "gone"), ("slip", "gone"), ("estimates", "damaged")],
+)
+def test_a_run_whose_table_is_gone_or_damaged_is_left_out_and_named(
+    store: Store, table: str, what: str
+) -> None:
     drive_a_season(store, [1.8, 1.81, 1.8, 1.81, 1.8])
-    store.manifests()[0].path(table).unlink()
+    path = store.manifests()[0].path(table)
+    path.unlink()
+    if what == "damaged":
+        path.write_bytes(b"no table")
     found = follow(store)
     assert "run_00" not in " ".join(found.keys)
     (note,) = [note for note in found.notes if "run_00" in note]
-    assert note.startswith(f"left out, its table {table} is gone; slip verify --repair")
+    assert note.startswith(f"left out, its table {table} is {what}; slip verify --repair")
 
 
 def test_what_moves_with_a_parameter_is_told_with_it(store: Store) -> None:

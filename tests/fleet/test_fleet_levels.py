@@ -12,6 +12,7 @@ import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
+from pipeline.analysis.fleet import describe_fleet
 from pipeline.analysis.trend import update_trend
 from pipeline.batch.pooling import refresh_pools, refresh_remote_pools
 from pipeline.cli import main
@@ -69,7 +70,18 @@ def test_wheels_that_are_small_are_so_on_every_ground() -> None:
     assert (number.level, number.name) == (Level.VEHICLE, "wheel_radius")
     assert number.fit.interval is not None
     assert number.fit.interval.low < 0.9 < number.fit.interval.high
-    assert "3 terrains differ no more than runs do" in number.because
+    assert "3 terrains not shown to differ by more than runs do" in number.because
+
+
+def test_ends_of_an_interval_stay_within_what_the_number_can_be() -> None:
+    fleet = fit_fleet(draw({"asphalt": 0.0, "ice": 0.9}, effect="drive_lag", parameter="tau"))
+    (number,) = fleet.numbers
+    assert number.fit.interval is not None
+    assert number.fit.interval.low < 0.0
+    (row,) = json.loads(json.dumps(describe_fleet(fleet)))["parameters"]
+    assert row["low"] == 0.0
+    assert row["value"] < row["high"] <= number.fit.interval.high
+    assert all(mean["low"] >= 0.0 for mean in row["terrains"].values())
 
 
 def test_wheels_that_slip_on_ice_are_not_small() -> None:

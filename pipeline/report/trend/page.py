@@ -97,7 +97,7 @@ def _draw_parameter(trend: ParameterTrend, name: str) -> Drawing:
     base = alt.Chart(alt.NamedData(f"{name}_points")).encode(x=_along(rows))
     axis = alt.Axis(title=None, format=",.3~r", tickCount=4, minExtent=44)
     value = alt.Y("value:Q", axis=axis, scale=alt.Scale(zero=False))
-    limits = base.mark_rule(strokeWidth=9, color=theme.SHADE).encode(
+    limits = base.mark_rule(strokeWidth=9, color=theme.CROSS, opacity=0.3).encode(
         y=alt.Y("limit_low:Q"), y2="limit_high:Q"
     )
     levels = base.mark_tick(thickness=2.5, width=14, color=theme.ON_COMMAND, orient="horizontal").encode(
