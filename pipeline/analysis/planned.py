@@ -90,6 +90,7 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
         SlipError: the results cannot be written.
     """
     from pipeline.analysis.analyze import REPORT  # noqa: PLC0415 - it reads the preview
+    from pipeline.plan.files import FILES  # noqa: PLC0415 - heavy
     from pipeline.report.plan import preview_plan, show_planned  # noqa: PLC0415 - heavy
     from pipeline.store.tables import QUARANTINE  # noqa: PLC0415 - heavy
 
@@ -98,7 +99,11 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
         return None
     preview = place_plan(results, run, PREVIEW)
     make_folder(preview.parent)
-    write_drive(plan, preview.parent, results)
+    written = {path.name for path in write_drive(plan, preview.parent, results)}
+    for name in FILES:
+        if name not in written:
+            # What was planned before is not to be driven any more.
+            (preview.parent / name).unlink(missing_ok=True)
     told = {"key": manifest.key, **preview_plan(plan)}
     replace_file(preview, json.dumps(told, allow_nan=False).encode())
     with store.open_generation(run, manifest.key) as generation:

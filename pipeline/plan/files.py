@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 PAGE = "plan.html"
 _NAMES = ("plan.toml", "plan.csv", "plan.mcap")
+FILES = (*_NAMES, PAGE)
 # Fields of speed and turn by message type.
 _FIELDS: Mapping[str, tuple[str, str]] = {
     "geometry_msgs/msg/Twist": ("linear.x", "angular.z"),

@@ -17,7 +17,7 @@ from mcap_ros2.decoder import DecoderFactory
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.options import Options
 from pipeline.analysis.plan import choose_topic
-from pipeline.analysis.planned import leave_plan, place_plan, read_preview
+from pipeline.analysis.planned import PREVIEW, leave_plan, place_plan, read_preview
 from pipeline.cli import main
 from pipeline.cli.output import FAILED
 from pipeline.models import find_effect
@@ -346,6 +346,10 @@ def test_a_plan_stands_in_the_report_of_its_run(plan: Plan, tmp_path: Path) -> N
     assert analyze_log(log, options).computed == ()
     again = analyze_log(log, replace(options, force=True)).manifest
     assert address in again.path("report.html").read_text(encoding="utf-8")
+    # A plan that has nothing to drive leaves none of another one to be played.
+    assert leave_plan(store, again, replace(plan, manoeuvres=())) is not None
+    assert [path.name for path in place_plan(store.root, manifest.run, PREVIEW).parent.iterdir()] == [PREVIEW]
+    leave_plan(store, again, plan)
     # Other results of the run are not what it was planned for.
     assert read_preview(store.root, manifest.run, "0" * 16) == {}
     preview = place_plan(store.root, manifest.run, "plan.json")
