@@ -46,6 +46,7 @@ class Run:
     still: bool = False
     sized: bool = True
     moves: bool = True
+    wheels: bool = True
 
 
 def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
@@ -88,7 +89,7 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
                 }
             ).with_columns(pl.lit(name).cast(_INPUTS).alias("input"), *_WITHOUT_MODEL)
         )
-    slip = pl.concat(parts)
+    slip = pl.concat(parts if run.wheels else parts[:1])
     if not run.moves:
         slip = slip.with_columns(pl.col("^[fv]_[xyw]$") * 0.0)
     tables = {

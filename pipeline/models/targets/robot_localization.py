@@ -59,7 +59,8 @@ def write(file: ModelFile, current: Current) -> str:
         "for odometry that is corrected first: --to ros2_control",
         *_warn(file, step, known),
     )
-    x, y, w = (Amount(error * error, sources) for error in step.velocity_rms)
+    # Of an error that is known to some per cent more digits would only say from where a fit set out.
+    x, y, w = (Amount(float(f"{error * error:.3g}"), sources) for error in step.velocity_rms)
     sheet = start_sheet(facts, TARGET)
     sheet.settings.append(Setting(f"{_FILTER}.odom0_config", _FUSED, ("vx, vy and the yaw rate of odom0",)))
     acceleration, turning = find_speed_acceleration(facts), find_turn_acceleration(facts)
