@@ -89,11 +89,11 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
                 }
             ).with_columns(pl.lit(name).cast(_INPUTS).alias("input"), *_WITHOUT_MODEL)
         )
-    slip = pl.concat(parts if run.wheels else parts[:1])
+    slip = pl.concat(parts)
     if not run.moves:
         slip = slip.with_columns(pl.col("^[fv]_[xyw]$") * 0.0)
     tables = {
-        "slip": slip,
+        "slip": slip if run.wheels else slip.filter(pl.col("input") == "command"),
         "windows": _cut_windows(slip),
         "aggregates": _aggregate(slip, run),
         "findings": _list_findings(run),
