@@ -215,14 +215,13 @@ def _scale(columns: Floats, factor: Floats) -> tuple[Floats, Floats]:
 
 def _promise(base: _Base, trials: tuple[Trial, ...]) -> Proposal | None:
     """Loss after one joint step of the model's numbers and those of effects beside it."""
-    trials = tuple(
-        trial for trial in (_leave_out_silent(trial, base.factor) for trial in trials) if trial is not None
-    )
-    if not trials:
+    loud = [found for trial in trials if (found := _leave_out_silent(trial, base.factor)) is not None]
+    if not loud:
         return None
     fit, own = base.fit, base.size.size
+    trials = tuple(trial for trial, _, _ in loud)
     columns = np.concatenate([trial.columns for trial in trials], axis=2)
-    rows, size = _scale(columns, base.factor)
+    rows, size = (np.concatenate([found[place] for found in loud], axis=-1) for place in (1, 2))
     residual = fit.residual - sum(trial.shift for trial in trials)
     target = (residual * base.factor).reshape(-1)
     across = base.rows.T @ rows
@@ -231,7 +230,6 @@ def _promise(base: _Base, trials: tuple[Trial, ...]) -> Proposal | None:
     step = moved / np.concatenate((base.size, size))
     after = residual - fit.jacobian @ step[:own] - columns @ step[own:]
     state = fit.state
-    own = len(fit.free)
     for number, change in zip(fit.free, step[:own].tolist(), strict=True):
         if number.is_smooth:
             state = state.set(number, state.get(number) + change)
@@ -247,16 +245,16 @@ def _promise(base: _Base, trials: tuple[Trial, ...]) -> Proposal | None:
     return Proposal(state, trials, fit.weights.loss(after))
 
 
-def _leave_out_silent(trial: Trial, factor: Floats) -> Trial | None:
-    """The trial without numbers that leave no trace; None where none leaves any."""
-    rows = trial.columns * factor[:, :, None]
-    size = np.sqrt(np.einsum("ijk,ijk->k", rows, rows))
+def _leave_out_silent(trial: Trial, factor: Floats) -> tuple[Trial, Floats, Floats] | None:
+    """The trial without numbers that leave no trace, as of `_scale`; None where none leaves any."""
+    rows, size = _scale(trial.columns, factor)
     if not (size > _NO_TRACE).any():
         return None
     traced = _find_traced(trial, size)
     if traced.all():
-        return trial
+        return trial, rows, size
     # Driven straight only, a change of ground shows in one gain: the other is left as it is.
     silent = [n for n, seen in zip(trial.names, traced.tolist(), strict=True) if not seen]
     loud = tuple(name for name in trial.names if name not in silent)
-    return Trial(trial.effect.fix(*silent), loud, trial.columns[:, :, traced], trial.shift)
+    kept = Trial(trial.effect.fix(*silent), loud, trial.columns[:, :, traced], trial.shift)
+    return kept, rows[:, traced], size[traced]
