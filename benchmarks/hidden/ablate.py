@@ -19,10 +19,12 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from pebble import ProcessPool
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -189,8 +191,9 @@ def main() -> int:
     jobs = [j for j in list_jobs(asked.seeds, recordings=not asked.no_recordings) if j not in known]
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(asked.jobs, mp_context=spawn, max_tasks_per_child=50) as pool:
-        for count, future in enumerate(as_completed([pool.submit(ablate, *job) for job in jobs]), start=1):
+    # The pool of the standard library hangs where its only worker is replaced.
+    with ProcessPool(asked.jobs, max_tasks=50, context=spawn) as pool:
+        for count, future in enumerate(as_completed([pool.schedule(ablate, job) for job in jobs]), start=1):
             try:
                 line = future.result()
             except Exception as error:  # noqa: BLE001 - a log that fails costs itself, and is said

@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.core.toml import TomlError, parse_toml
 from pipeline.logs import LogWriter
+from pipeline.models.catalogue import find_effect
 from pipeline.models.model_text import format_value
 from pipeline.plan.errors import PlanError
 from pipeline.plan.manoeuvres import RATE_HZ
@@ -101,16 +102,21 @@ def read_promises(path: Path) -> Promised:
 
     Raises:
         PlanError: ``no_plan``, it is not there or no plan.
+        MotionError: ``unknown_effect``, it promises something of an effect that there is not.
     """
     file = path / _NAMES[0] if path.is_dir() else path
     try:
-        return msgspec.convert(parse_toml(file.read_text(encoding="utf-8")), Promised)
+        promised = msgspec.convert(parse_toml(file.read_text(encoding="utf-8")), Promised)
     except OSError as error:
         what = f"the plan cannot be read ({error.strerror})"
     except TomlError as error:
         what = f"this is no plan: {error}"
     except (UnicodeDecodeError, msgspec.ValidationError):
         what = "this is no plan.toml that `slip plan` wrote"
+    else:
+        for effect in (name for promise in promised.promises for name in promise.effects):
+            find_effect(effect)
+        return promised
     raise PlanError("no_plan", what, where=str(file), hint="Give the folder that `slip plan` wrote.")
 
 

@@ -40,6 +40,7 @@ from pipeline.plan.plan import Plan, find_largest
 from pipeline.plan.protocols import LONGEST_S, drive_protocol
 from pipeline.plan.rehearsal import Rehearsal
 from pipeline.report.plan import preview_plan
+from pipeline.runs.errors import MotionError
 from pipeline.simulate import find_vehicle, simulate_case
 from pipeline.simulate.played import read_played
 from pipeline.store import Store
@@ -278,6 +279,15 @@ def test_a_plan_is_written_only_in_a_type_that_carries_its_commands(plan: Plan, 
     with pytest.raises(PlanError, match="cannot be written as"):
         write_plan(replace(plan, type_name=list_types(steered=True)[0]), tmp_path / "plan")
     assert not (tmp_path / "plan").exists()
+
+
+def test_a_plan_that_was_edited_must_still_name_effects_that_there_are(plan: Plan, tmp_path: Path) -> None:
+    file, *_ = write_plan(plan, tmp_path)
+    effect = plan.promises[0].effects[0]
+    assert read_promises(tmp_path).promises[0].effects[0] == effect
+    file.write_text(file.read_text(encoding="utf-8").replace(f'"{effect}"', '"drive_leg"'), encoding="utf-8")
+    with pytest.raises(MotionError, match="no effect is called 'drive_leg'"):
+        read_promises(tmp_path)
 
 
 def test_a_slope_cannot_be_promised_on_level_ground() -> None:
