@@ -4,7 +4,6 @@ A job settles what a log is and which topics serve, runs the stages whose key ha
 tables, summary and report in one moment.
 """
 
-from pipeline.analysis.errors import JobError
-from pipeline.analysis.options import INPUTS, STAGES, Options
+from pipeline.analysis.options import Options
 
-__all__ = ["INPUTS", "STAGES", "JobError", "Options"]
+__all__ = ["Options"]

@@ -104,20 +104,13 @@ class Choice:
         return {"choices": choices, "vehicle_source": self.vehicle_source}
 
 
-def choose(
-    index: LogIndex,
-    configuration: Configuration,
-    overrides: Mapping[str, object],
-    *,
-    sha256: str | None = None,
-) -> Choice:
+def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str, object]) -> Choice:
     """Choose vehicle and topics of a log.
 
     Args:
         index: what the log holds.
         configuration: what the user says, the command line included.
         overrides: what of it was said on the command line.
-        sha256: hash of the log where it is known.
 
     Raises:
         ConfigurationError: the configuration cannot be followed; the vehicle is unknown and cannot be fitted;
@@ -146,8 +139,8 @@ def choose(
         if error.code != "vehicle_unknown" or configuration.vehicle.preset is not None:
             raise
         problem, vehicle, source = error, _stand_in(index, configuration), "fitted"
-    channels, sources, findings = _leave_out_silent(index, configuration, vehicle, sha256)
-    if source not in {"flag", "configuration"} and _asks_sideways(index, vehicle, sources, sha256):
+    channels, sources, findings = _leave_out_silent(index, configuration, vehicle)
+    if source not in {"flag", "configuration"} and _asks_sideways(index, vehicle, sources):
         vehicle = find_preset(vehicle.sideways_preset) or vehicle
         sources = choose_sources(channels, configuration, vehicle, where=where)
     vehicle = _apply_controller(vehicle, sources, configuration, controller)
@@ -164,7 +157,7 @@ def choose(
         problem is not None and sources.pose is not None and (sources.wheels or sources.command) is not None
     )
     if rivals or fits or _may_be_odometry(sources.pose):
-        chosen = _compare(chosen, index, configuration, rivals, sha256)
+        chosen = _compare(chosen, index, configuration, rivals)
     # What a log lacks altogether is said before what is not known of its vehicle.
     if problem is None or not fits:
         return chosen
@@ -224,21 +217,21 @@ def _recognize_geometry(
     return Recognized(vehicle, "parameters" if geometry else "transforms"), known
 
 
-def _asks_sideways(index: LogIndex, vehicle: Vehicle, sources: Sources, sha256: str | None) -> bool:
+def _asks_sideways(index: LogIndex, vehicle: Vehicle, sources: Sources) -> bool:
     """Whether a platform that has such wheels, too, is commanded to move sideways."""
     if not vehicle.sideways_preset or sources.command is None:
         return False
-    return find_sideways_share(_read_command(index, sources.command, sha256), sources.command) > 0.0
+    return find_sideways_share(_read_command(index, sources.command), sources.command) > 0.0
 
 
 def _leave_out_silent(
-    index: LogIndex, configuration: Configuration, vehicle: Vehicle, sha256: str | None
+    index: LogIndex, configuration: Configuration, vehicle: Vehicle
 ) -> tuple[Sequence[ChannelInfo], Sources, list[Finding]]:
     """Channels and topics of every role without commands of which no text can be read, and what they were."""
     channels, findings = list(index.channels), list[Finding]()
     while True:
         sources = choose_sources(channels, configuration, vehicle, where=str(index.path))
-        if sources.command is None or not _is_silent(index, sources.command, sha256):
+        if sources.command is None or not _is_silent(index, sources.command):
             return channels, sources, findings
         topic = sources.command.signals[0].topic
         text = f"no text of {topic} is a command that can be read: the topic was left out"
@@ -246,18 +239,18 @@ def _leave_out_silent(
         channels = [channel for channel in channels if channel.topic != topic]
 
 
-def _is_silent(index: LogIndex, command: DriveSource, sha256: str | None) -> bool:
+def _is_silent(index: LogIndex, command: DriveSource) -> bool:
     """Whether a command that nobody named is a topic of texts which all say something else."""
     types = {channel.topic: channel.type_name for channel in index.channels}
     if command.reason == CONFIGURED or find_type(types[command.signals[0].topic]).text is None:
         return False
-    return not any(with_texts(columns).log_time.size for columns in _read_command(index, command, sha256))
+    return not any(with_texts(columns).log_time.size for columns in _read_command(index, command))
 
 
-def _read_command(index: LogIndex, command: DriveSource, sha256: str | None) -> Sequence[TopicColumns]:
+def _read_command(index: LogIndex, command: DriveSource) -> Sequence[TopicColumns]:
     types = {channel.topic: channel.type_name for channel in index.channels}
     wanted = list_wanted(Sources(command, None, None, None, None), types)
-    return read_topics(index, wanted, sha256=sha256 or "unused").topics
+    return read_topics(index, wanted, sha256="unused").topics
 
 
 def _apply_controller(
@@ -296,14 +289,10 @@ def _check_contradiction(told: Recognized | None, vehicle: Vehicle, source: Vehi
 
 
 def _compare(
-    chosen: Choice,
-    index: LogIndex,
-    configuration: Configuration,
-    rivals: list[PoseSource],
-    sha256: str | None,
+    chosen: Choice, index: LogIndex, configuration: Configuration, rivals: list[PoseSource]
 ) -> Choice:
     types = {channel.topic: channel.type_name for channel in index.channels}
-    data = read_topics(index, list_wanted(chosen.sources, types, rivals), sha256=sha256)
+    data = read_topics(index, list_wanted(chosen.sources, types, rivals))
     ratings = rate_poses(data, chosen.sources, configuration, chosen.vehicle, where=str(index.path))
     findings = chosen.findings
     if ratings and ratings[0].from_wheels:

@@ -10,14 +10,7 @@ import numpy as np
 from pipeline.analysis.choice import UNKNOWN_VEHICLE, Choice, choose
 from pipeline.core.errors import SlipError
 from pipeline.logs import ChannelInfo, LogIndex, Loss, Wanted, open_log, read_topics
-from pipeline.vehicles import (
-    Configuration,
-    Sources,
-    Vehicle,
-    choose_sources,
-    find_preset,
-    load_configuration,
-)
+from pipeline.vehicles import Configuration, Sources, Vehicle, choose_sources, find_preset, load_configuration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -9,12 +9,7 @@ from typing import TYPE_CHECKING
 from pipeline.analysis.choice import Choice, choose
 from pipeline.analysis.errors import JobError
 from pipeline.logs import LogIndex, open_log, spell_location
-from pipeline.vehicles import (
-    Configuration,
-    Sources,
-    Vehicle,
-    load_configuration,
-)
+from pipeline.vehicles import Configuration, Sources, Vehicle, load_configuration
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,12 +13,7 @@ import polars as pl
 from pipeline.analysis.compared_runs import ComparedRuns, find_material
 from pipeline.analysis.errors import JobError
 from pipeline.fleet import ComparisonError, gather_runs
-from pipeline.fleet.parameter_trend import (
-    describe_parameter,
-    find_latest,
-    follow_parameters,
-    say_power,
-)
+from pipeline.fleet.parameter_trend import describe_parameter, find_latest, follow_parameters, say_power
 from pipeline.fleet.trend import (
     FEWEST_RUNS,
     LEVEL,

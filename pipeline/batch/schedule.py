@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from dataclasses import dataclass
+from importlib import resources
 from typing import TYPE_CHECKING, Literal
 
 from pipeline.batch.errors import BatchError
@@ -72,43 +73,11 @@ def _print_systemd(nightly: Nightly) -> str:
     # The folder ends in a slash because a backslash or a space at the end of a line would not be its own.
     words = ["/usr/bin/flock", "--nonblock", "--conflict-exit-code", "0", str(nightly.lock)]
     command = " ".join(_quote_systemd(word) for word in [*words, *_command(nightly)])
-    return f"""\
-# ~/.config/systemd/user/slip-batch.service
-[Unit]
-Description=slip: bring results up to date with the logs
-
-[Service]
-Type=oneshot
-WorkingDirectory={_escape_systemd(str(nightly.folder))}/
-ExecStart={command}
-# Exit code 3: done, but a log had losses, which the journal names.
-SuccessExitStatus=3
-Nice=10
-IOSchedulingClass=idle
-TimeoutStartSec=infinity
-TimeoutStopSec={_STOP_S}
-StandardOutput=journal
-StandardError=journal
-SyslogIdentifier=slip-batch
-
-# ~/.config/systemd/user/slip-batch.timer
-[Unit]
-Description=slip: every night
-
-[Timer]
-OnCalendar=*-*-* {nightly.hour:02d}:{nightly.minute:02d}:00
-# A night that the machine slept through is caught up when it wakes.
-Persistent=true
-RandomizedDelaySec=60
-
-[Install]
-WantedBy=timers.target
-
-# systemctl --user daemon-reload
-# systemctl --user enable --now slip-batch.timer
-# loginctl enable-linger        so that it also runs when nobody is logged in
-# journalctl --user -u slip-batch
-"""
+    units = resources.files("pipeline.batch").joinpath("slip-batch.systemd").read_text("utf-8")
+    folder = _escape_systemd(str(nightly.folder))
+    return units.format(
+        folder=folder, command=command, hour=nightly.hour, minute=nightly.minute, stop_s=_STOP_S
+    )
 
 
 def _print_cron(nightly: Nightly) -> str:

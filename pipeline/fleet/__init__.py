@@ -7,15 +7,13 @@ and drawing pages is the work of other rooms.
 from pipeline.fleet.datasets import pool_runs, read_day
 from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.pairs import Group, Pair, Samples, bound_run, compare_groups
-from pipeline.fleet.published import PublishedRun, follow_published, read_limits
-from pipeline.fleet.runs import LABELS, add_measures, gather_runs, label_runs, measure_difficulty
+from pipeline.fleet.published import follow_published, read_limits
+from pipeline.fleet.runs import add_measures, gather_runs, label_runs, measure_difficulty
 
 __all__ = [
-    "LABELS",
     "ComparisonError",
     "Group",
     "Pair",
-    "PublishedRun",
     "Samples",
     "add_measures",
     "bound_run",

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from pipeline.logs.errors import LogError
-from pipeline.logs.schema import SIZES
+from pipeline.logs.schema import NUMBER_TYPES, SIZES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,24 +22,6 @@ if TYPE_CHECKING:
     from pipeline.logs.records import Buffer
 
     Ints = NDArray[np.int64]
-
-NUMBER_TYPES: Final[dict[str, np.dtype[np.generic]]] = {
-    name: np.dtype(code)
-    for name, code in {
-        "bool": "?",
-        "int8": "i1",
-        "uint8": "u1",
-        "int16": "i2",
-        "uint16": "u2",
-        "int32": "i4",
-        "uint32": "u4",
-        "int64": "i8",
-        "uint64": "u8",
-        "float32": "f4",
-        "float64": "f8",
-    }.items()
-}
-"""Array type of every number type, in this machine's byte order."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
 
     from mcap.records import Channel, Schema
 
-    from pipeline.logs.index import ChannelInfo, Part
+    from pipeline.logs.index import ChannelInfo
     from pipeline.logs.messages import Messages
+    from pipeline.logs.scan import Catalog
     from pipeline.logs.source import ByteSource
 
 _NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be seen"
@@ -28,13 +29,13 @@ class DataSection:
 
     Args:
         source: the file.
-        part: what it holds.
+        catalog: what it holds.
         beside: computes it.
     """
 
-    def __init__(self, source: ByteSource, part: Part, beside: Executor) -> None:
+    def __init__(self, source: ByteSource, catalog: Catalog, beside: Executor) -> None:
         self._source = source
-        self._part = part
+        self._catalog = catalog
         self._beside = beside
         self._check: Future[bool] | None = None
         # All of an object is fetched for this only where nothing else covers its messages.
@@ -42,7 +43,7 @@ class DataSection:
             self._begin()
 
     def _begin(self) -> None:
-        end, crc = self._part.data_end, self._part.data_crc
+        end, crc = self._catalog.data_end, self._catalog.data_crc
         if self._check is None and end is not None and crc:
             self._check = self._beside.submit(checksum_holds, self._source, end, crc)
 
@@ -73,12 +74,12 @@ class DataSection:
                 f"{wrong}: the messages that were read are whole, as their chunks' own checksums say; "
                 "something else is damaged, such as metadata or chunks that were not read"
             )
-        times = [span.start_ns for span in self._part.spans if span.start_ns is not None]
-        ends = [span.end_ns for span in self._part.spans if span.end_ns is not None]
+        times = [span.start_ns for span in self._catalog.spans if span.start_ns is not None]
+        ends = [span.end_ns for span in self._catalog.spans if span.end_ns is not None]
         return Loss(
             "checksum_mismatch",
             text,
-            bytes=self._part.data_end or 0,
+            bytes=self._catalog.data_end or 0,
             start_ns=min(times, default=None),
             end_ns=max(ends, default=None),
         )
@@ -103,11 +104,11 @@ class Coverage:
         )
 
 
-def find_contradictions(part: Part, messages: Messages) -> list[Loss]:
+def find_contradictions(catalog: Catalog, messages: Messages) -> list[Loss]:
     """Schemas and channels that a chunk describes otherwise than the rest of the file does."""
     pairs: list[tuple[Schema | Channel, Schema | Channel]] = [
-        *((part.schemas.get(schema.id, schema), schema) for schema in messages.schemas),
-        *((part.channels.get(channel.id, channel), channel) for channel in messages.channels),
+        *((catalog.schemas.get(schema.id, schema), schema) for schema in messages.schemas),
+        *((catalog.channels.get(channel.id, channel), channel) for channel in messages.channels),
     ]
     losses = [describe_contradiction(one, other) for one, other in pairs]
     return [loss for loss in losses if loss is not None]

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from pipeline.logs.cdr import NUMBER_TYPES, Cursor, Dialect, MisfitError, Vocabulary
-from pipeline.logs.schema import SEQUENCE, SIZES, Member, Structure
+from pipeline.logs.cdr import Cursor, Dialect, MisfitError, Vocabulary
+from pipeline.logs.schema import NUMBER_TYPES, SEQUENCE, SIZES, Member, Structure
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

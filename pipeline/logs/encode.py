@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from pipeline.logs.cdr import NUMBER_TYPES
 from pipeline.logs.columns import Ragged, RaggedStrings, Strings
 from pipeline.logs.normalize import normalize_columns
-from pipeline.logs.schema import SEQUENCE, SIZES, Member, Structure
+from pipeline.logs.schema import NUMBER_TYPES, SEQUENCE, SIZES, Member, Structure
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -19,11 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from mcap.records import Channel, Schema
-
     from pipeline.logs.scan import Catalog
-    from pipeline.logs.spans import Span
-
 
 SUFFIXES: Final = (".mcap", ".db3", ".bag")
 """Of the files that recordings are made of."""
@@ -63,25 +59,17 @@ class Part:
 
     Attributes:
         path: the file.
-        spans: where its messages stand.
-        channels: channel records by the file's own number.
-        schemas: schema records by the file's own number.
-        numbers: the recording's channel number for each of the file's own.
-        data_end: where the data section ends, None when unknown.
-        data_crc: checksum of the data section, 0 when there is none.
+        size_bytes: its bytes.
+        catalog: what it holds.
         version: of an object on a store, None for a file.
-        container: what kind of file it is where it is no MCAP (see ``bags``).
+        numbers: the recording's channel number for each of the file's own, told where parts are merged.
     """
 
     path: Path
-    spans: tuple[Span, ...]
-    channels: Mapping[int, Channel]
-    schemas: Mapping[int, Schema]
-    numbers: Mapping[int, int]
-    data_end: int | None = None
-    data_crc: int = 0
-    version: str | None = None
-    container: str = ""
+    size_bytes: int
+    catalog: Catalog
+    version: str | None
+    numbers: dict[int, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +120,7 @@ class LogIndex:
     @property
     def containers(self) -> frozenset[str]:
         """What kinds of file its parts are: empty for MCAP, else the name of a kind of bag."""
-        return frozenset(part.container for part in self.parts)
+        return frozenset(part.catalog.container for part in self.parts)
 
     @property
     def complete(self) -> bool:
@@ -173,17 +161,14 @@ def open_log(path: str | os.PathLike[str]) -> LogIndex:
     """
     location = to_location(path)
     files, losses = find_parts(location)
-    catalogs: list[tuple[Path, int, Catalog]] = []
-    versions: list[str | None] = []
+    parts: list[Part] = []
     fetched = 0
     for file in files:
         with open_source(file) as source:
-            catalogs.append((file, source.size, catalog_file(source, threads=usable_threads())))
-            versions.append(version_of(source))
+            catalog = catalog_file(source, threads=usable_threads())
+            parts.append(Part(file, source.size, catalog, version_of(source)))
             fetched += count_fetched([source])
-    index = _merge(location, catalogs, losses)
-    parts = tuple(replace(part, version=each) for part, each in zip(index.parts, versions, strict=True))
-    return replace(index, parts=parts, fetched_bytes=fetched)
+    return _merge(location, parts, losses, fetched)
 
 
 def hash_log(path: str | os.PathLike[str]) -> str:
@@ -277,23 +262,15 @@ def _listed_files(text: str) -> list[str]:
     return [entry.strip("\"'") for entry in entries]
 
 
-def _merge(path: Path, catalogs: Sequence[tuple[Path, int, Catalog]], losses: Sequence[Loss]) -> LogIndex:
+def _merge(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetched: int) -> LogIndex:
     channels: dict[tuple[object, ...], ChannelInfo] = {}
-    parts: list[Part] = []
-    alone = len(catalogs) == 1
-    for file, _, catalog in catalogs:
-        numbers: dict[int, int] = {}
-        for number, channel in sorted(catalog.channels.items()):
-            schema = catalog.schemas.get(channel.schema_id)
-            key: tuple[object, ...] = (
-                (number,)
-                if alone
-                else (
-                    channel.topic,
-                    channel.message_encoding,
-                    *((schema.name, schema.data) if schema else ()),
-                )
-            )
+    alone = len(parts) == 1
+    catalogs = [part.catalog for part in parts]
+    for part in parts:
+        for number, channel in sorted(part.catalog.channels.items()):
+            schema = part.catalog.schemas.get(channel.schema_id)
+            described = (schema.name, schema.data) if schema else ()
+            key = (number,) if alone else (channel.topic, channel.message_encoding, *described)
             known = channels.get(key)
             if known is None:
                 known = ChannelInfo(
@@ -305,39 +282,25 @@ def _merge(path: Path, catalogs: Sequence[tuple[Path, int, Catalog]], losses: Se
                     0,
                     dict(channel.metadata),
                 )
-            count = known.message_count + catalog.counts.get(number, 0)
+            count = known.message_count + part.catalog.counts.get(number, 0)
             channels[key] = replace(known, message_count=count)
-            numbers[number] = known.id
-        parts.append(
-            Part(
-                file,
-                tuple(catalog.spans),
-                dict(catalog.channels),
-                dict(catalog.schemas),
-                numbers,
-                catalog.data_end,
-                catalog.data_crc,
-                container=catalog.container,
-            )
-        )
-    every = [catalog for _, _, catalog in catalogs]
-    records = tuple((n, r) for catalog in every for n, r in catalog.metadata)
-    starts = [catalog.start_ns for catalog in every if catalog.start_ns is not None]
-    ends = [catalog.end_ns for catalog in every if catalog.end_ns is not None]
+            part.numbers[number] = known.id
+    records = tuple(record for catalog in catalogs for record in catalog.metadata)
     return LogIndex(
         path=path,
-        size_bytes=sum(size for _, size, _ in catalogs),
-        profile=every[0].profile,
-        library=every[0].library,
-        compressions=tuple(sorted(set().union(*(catalog.compressions for catalog in every)))),
-        chunk_count=sum(span.kind.value != "loose" for catalog in every for span in catalog.spans),
-        start_ns=min(starts, default=0),
-        end_ns=max(ends, default=0),
+        size_bytes=sum(part.size_bytes for part in parts),
+        profile=catalogs[0].profile,
+        library=catalogs[0].library,
+        compressions=tuple(sorted(set().union(*(catalog.compressions for catalog in catalogs)))),
+        chunk_count=sum(span.kind.value != "loose" for catalog in catalogs for span in catalog.spans),
+        start_ns=min((each.start_ns for each in catalogs if each.start_ns is not None), default=0),
+        end_ns=max((each.end_ns for each in catalogs if each.end_ns is not None), default=0),
         channels=tuple(channels.values()),
         metadata=dict(records),
         metadata_records=records,
-        attachments=tuple(name for catalog in every for name in catalog.attachments),
-        losses=(*losses, *(loss for catalog in every for loss in catalog.losses)),
-        notes=tuple(note for catalog in every for note in catalog.notes),
+        attachments=tuple(name for catalog in catalogs for name in catalog.attachments),
+        losses=(*losses, *(loss for catalog in catalogs for loss in catalog.losses)),
+        notes=tuple(note for catalog in catalogs for note in catalog.notes),
         parts=tuple(parts),
+        fetched_bytes=fetched,
     )

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import threading
 import zlib
-from typing import TYPE_CHECKING, Final
+from contextlib import suppress
+from typing import IO, TYPE_CHECKING, Final
 
 import zstandard
 
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
     from pipeline.logs.records import Buffer
 
 MAX_CHUNK: Final = 1 << 30
@@ -123,14 +126,11 @@ def inflate_start(stored: Buffer, compression: str, size: int) -> Buffer:
     """As much of the first ``size`` bytes as undamaged stored bytes give; never raises for damage."""
     if compression == "":
         return stored[:size]
-    try:
-        if compression == "zstd":
-            return _inflate_zstd_start(stored, size)
-        if compression == "lz4":
-            return _inflate_lz4_start(stored, size)
-    except (zstandard.ZstdError, OSError, ValueError):
-        pass
-    return b""
+    found = bytearray()
+    with suppress(zstandard.ZstdError, OSError, ValueError), _open_damaged(stored, compression) as reader:
+        while len(found) < size and (part := reader.read(min(1 << 12, size - len(found)))):
+            found += part
+    return bytes(found)
 
 
 def inflate_prefix(stored: Buffer, compression: str, size: int, needed: int) -> Buffer:
@@ -189,19 +189,6 @@ def _inflate_zstd(stored: Buffer, size: int) -> bytes:
         raise InflateError(str(error)) from None
 
 
-def _inflate_zstd_start(stored: Buffer, size: int) -> bytes:
-    parts: list[bytes] = []
-    total = 0
-    with zstandard.ZstdDecompressor().stream_reader(stored) as reader:
-        try:
-            while total < size and (part := reader.read(min(1 << 16, size - total))):
-                parts.append(part)
-                total += len(part)
-        except zstandard.ZstdError:
-            pass
-    return b"".join(parts)
-
-
 def _inflate_lz4(stored: Buffer, size: int) -> Buffer:
     import pyarrow as pa  # noqa: PLC0415 - heavy, and few logs use lz4
 
@@ -211,16 +198,13 @@ def _inflate_lz4(stored: Buffer, size: int) -> Buffer:
         raise InflateError(str(error)) from None
 
 
-def _inflate_lz4_start(stored: Buffer, size: int) -> bytes:
+def _open_damaged(stored: Buffer, compression: str) -> AbstractContextManager[IO[bytes]]:
+    """A stream that gives what precedes damage before it raises."""
+    if compression == "zstd":
+        return zstandard.ZstdDecompressor().stream_reader(stored)
     import pyarrow as pa  # noqa: PLC0415 - heavy, and few logs use lz4
 
-    parts: list[bytes] = []
-    total = 0
-    with pa.input_stream(pa.py_buffer(stored), compression="lz4", buffer_size=0) as reader:
-        try:
-            while total < size and (part := reader.read(min(1 << 12, size - total))):
-                parts.append(part)
-                total += len(part)
-        except OSError:
-            pass
-    return b"".join(parts)
+    stream: AbstractContextManager[IO[bytes]] = pa.input_stream(
+        pa.py_buffer(stored), compression=compression, buffer_size=0
+    )
+    return stream

@@ -144,7 +144,8 @@ def read_topics(
         sources = [stack.enter_context(open_source(part.path, part.version)) for part in index.parts]
         beside = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="hash"))
         sections = [
-            DataSection(source, part, beside) for part, source in zip(index.parts, sources, strict=True)
+            DataSection(source, part.catalog, beside)
+            for part, source in zip(index.parts, sources, strict=True)
         ]
         digest = None if sha256 is not None else beside.submit(hash_sources, sources)
         for part, source, section in zip(index.parts, sources, sections, strict=True):
@@ -248,9 +249,9 @@ def _no_topic(index: LogIndex, topic: str) -> LogError:
 
 def _schema_of(index: LogIndex, number: int) -> bytes:
     for part in index.parts:
-        for own, channel in part.channels.items():
+        for own, channel in part.catalog.channels.items():
             if part.numbers[own] == number:
-                schema = part.schemas.get(channel.schema_id)
+                schema = part.catalog.schemas.get(channel.schema_id)
                 return schema.data if schema else b""
     return b""
 
@@ -259,13 +260,13 @@ def _read_part(
     source: ByteSource, part: Part, wanted: set[int], threads: int, section: DataSection
 ) -> Iterator[_Gathered]:
     own = {number for number, merged in part.numbers.items() if merged in wanted}
-    if part.container:
-        return (_gather_bag(part, messages) for messages in read_bag(part.path, part.container, own))
+    if container := part.catalog.container:
+        return (_gather_bag(part, messages) for messages in read_bag(part.path, container, own))
 
     def gather(span: Span, loaded: Loaded) -> _Gathered:
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)
         merged = {part.numbers[number]: each for number, each in payloads.items()}
-        losses = loaded.losses + find_contradictions(part, loaded.messages)
+        losses = loaded.losses + find_contradictions(part.catalog, loaded.messages)
         # The cut chunk at the end of a file is a loss already.
         spans = int(bool(merged) and span.kind is not SpanKind.CUT_CHUNK)
         return _Gathered(merged, losses, spans, spans * loaded.unchecked, loaded.index_damaged)
@@ -282,7 +283,7 @@ def _gather_bag(part: Part, messages: BagMessages) -> _Gathered:
 
 
 def _spans_with(part: Part, own: set[int]) -> list[Span]:
-    return [span for span in part.spans if span.channels is None or span.channels & own]
+    return [span for span in part.catalog.spans if span.channels is None or span.channels & own]
 
 
 def _find_repeated(

@@ -11,6 +11,7 @@ import os
 import re
 import stat
 import threading
+from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING, Final, cast
@@ -28,7 +29,6 @@ from pipeline.logs.errors import LogError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from types import TracebackType
     from typing import Self
 
     from pipeline.logs.buckets import Info
@@ -172,7 +172,7 @@ def spell_location(path: Path) -> str:
     return text
 
 
-class RemoteSource:
+class RemoteSource(AbstractContextManager["RemoteSource"]):
     """One version of an object that is read by ranges, from several threads at once.
 
     Every range is of the version that was opened: an object that is overwritten meanwhile is refused.
@@ -252,9 +252,6 @@ class RemoteSource:
             return self._tail[offset - self._tail_start : end - self._tail_start]
         return self._fetch(offset, end)
 
-    def close(self) -> None:
-        """Nothing is held."""
-
     def _fetch(self, start: int, end: int) -> bytes:
         try:
             url, look = str(self._path), self._path.look
@@ -267,13 +264,8 @@ class RemoteSource:
             self._fetched += len(found)
         return found
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+    def __exit__(self, *_exception: object) -> None:
+        """Nothing is held."""
 
 
 def _add_scheme(base: RemotePath, name: str) -> str:

@@ -57,14 +57,8 @@ def digest_messages(chunk: Buffer, messages: Messages, times: Mapping[int, Ints]
         start = messages.start[chosen] - MESSAGE_OVERHEAD
         spans = zip(start.tolist(), (messages.start + messages.size)[chosen].tolist(), strict=True)
         digests = [blake2b(view[low:high], digest_size=_DIGEST).digest() for low, high in spans]
-        found[number] = list(
-            zip(
-                messages.log_time[chosen].tolist(),
-                messages.publish_time[chosen].tolist(),
-                digests,
-                strict=True,
-            )
-        )
+        log, publish = messages.log_time[chosen].tolist(), messages.publish_time[chosen].tolist()
+        found[number] = list(zip(log, publish, digests, strict=True))
     return found
 
 

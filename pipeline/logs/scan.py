@@ -145,18 +145,7 @@ class Scanner:
             if head.body + head.compressed_size != rec.HEAD_SIZE + length:
                 return False
             if place not in self._known:
-                catalog.compressions.add(head.compression)
-                catalog.spans.append(
-                    Span(
-                        SpanKind.CHUNK,
-                        place,
-                        rec.HEAD_SIZE + length,
-                        0,
-                        head.start_ns,
-                        head.end_ns,
-                        inflated=head.uncompressed_size,
-                    )
-                )
+                self._note_chunk(SpanKind.CHUNK, place, rec.HEAD_SIZE + length, head)
         elif opcode == rec.MESSAGE_INDEX:
             self._note_index(place, rec.HEAD_SIZE + length)
         elif opcode == rec.ATTACHMENT:
@@ -168,6 +157,11 @@ class Scanner:
                 catalog.data_end = place
             self._note_small(opcode, place, self._window.view(body_at, length))
         return True
+
+    def _note_chunk(self, kind: SpanKind, place: int, length: int, head: rec.ChunkHead) -> None:
+        self._catalog.compressions.add(head.compression)
+        times = (head.start_ns, head.end_ns)
+        self._catalog.spans.append(Span(kind, place, length, 0, *times, inflated=head.uncompressed_size))
 
     def _note_small(self, opcode: int, place: int, body: memoryview) -> None:
         catalog = self._catalog
@@ -270,18 +264,7 @@ class Scanner:
             return False
         if chunk.body + chunk.compressed_size != rec.HEAD_SIZE + length:
             return False
-        self._catalog.compressions.add(chunk.compression)
-        self._catalog.spans.append(
-            Span(
-                SpanKind.CUT_CHUNK,
-                place,
-                stop - place,
-                0,
-                chunk.start_ns,
-                chunk.end_ns,
-                inflated=chunk.uncompressed_size,
-            )
-        )
+        self._note_chunk(SpanKind.CUT_CHUNK, place, stop - place, chunk)
         return True
 
     def _note_damage(self, start: int, end: int, stop: int) -> None:

@@ -6,25 +6,26 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 SEQUENCE: Final = -1
 """``Member.count`` of a sequence of varying length."""
 
-SIZES: Final[Mapping[str, int]] = {
-    "bool": 1,
-    "int8": 1,
-    "uint8": 1,
-    "int16": 2,
-    "uint16": 2,
-    "int32": 4,
-    "uint32": 4,
-    "int64": 8,
-    "uint64": 8,
-    "float32": 4,
-    "float64": 8,
+NUMBER_TYPES: Final[Mapping[str, np.dtype[np.generic]]] = {
+    name: np.dtype(name)
+    for name in (
+        "bool",
+        "float32",
+        "float64",
+        *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)),
+    )
 }
+"""Array type of every number type, in this machine's byte order."""
+
+SIZES: Final[Mapping[str, int]] = {name: kind.itemsize for name, kind in NUMBER_TYPES.items()}
 """Bytes of every number type."""
 
 MAX_FIXED: Final = 1 << 24
@@ -211,16 +212,14 @@ def _full_name(type_name: str, package: str) -> str:
 
 
 def _builtin_times(dialect: str) -> RawTypes:
-    if dialect == "ros1msg":
-        return {
-            "builtin_interfaces/Time": [RawField("sec", "uint32", None), RawField("nanosec", "uint32", None)],
-            "builtin_interfaces/Duration": [
-                RawField("sec", "int32", None),
-                RawField("nanosec", "int32", None),
-            ],
-        }
-    fields = [RawField("sec", "int32", None), RawField("nanosec", "uint32", None)]
-    return {"builtin_interfaces/Time": fields, "builtin_interfaces/Duration": fields}
+    ros1 = dialect == "ros1msg"
+    return {
+        f"builtin_interfaces/{name}": [RawField("sec", seconds, None), RawField("nanosec", rest, None)]
+        for name, seconds, rest in (
+            ("Time", "uint32" if ros1 else "int32", "uint32"),
+            ("Duration", "int32", "int32" if ros1 else "uint32"),
+        )
+    }
 
 
 def leaf_paths(structure: Structure, prefix: str = "") -> Iterator[str]:

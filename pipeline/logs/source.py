@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Final, Protocol
 
 from pipeline.logs.errors import LogError
@@ -13,8 +14,6 @@ from pipeline.logs.remote import RemotePath, RemoteSource
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
-    from types import TracebackType
-    from typing import Self
 
 _HASH_BLOCK: Final = 1 << 20
 
@@ -34,18 +33,8 @@ class ByteSource(Protocol):
         """The bytes from ``offset``; fewer than ``length`` only at the end."""
 
 
-class OpenSource(ByteSource, Protocol):
-    """Bytes that are held open for the length of a block."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
-
-
-class FileSource:
-    """A local file.
+class FileSource(AbstractContextManager["FileSource"]):
+    """A local file, held open for the length of a block.
 
     Args:
         path: the file.
@@ -122,16 +111,11 @@ class FileSource:
         """Give the file back."""
         os.close(self._descriptor)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_exception: object) -> None:
         self.close()
 
 
-def open_source(path: Path, version: str | None = None) -> OpenSource:
+def open_source(path: Path, version: str | None = None) -> AbstractContextManager[ByteSource]:
     """Open a file or an object.
 
     Args:

@@ -6,9 +6,9 @@ child; slower links above it, such as map to odom, are interpolated there.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -202,41 +202,31 @@ class TransformBuffer:
         return LogError("frame_not_found", what, hint=hint)
 
     def _collect(self, topics: list[TopicColumns]) -> None:
-        rows: dict[str, list[_Rows]] = {}
+        links: dict[str, list[Link]] = {}
+        invalid: dict[str, int] = {}
         for columns in topics:
-            for row in _split_by_child(columns, fixed=_base_name(columns.topic) == "tf_static"):
-                rows.setdefault(row.child, []).append(row)
-        for child, several in rows.items():
-            moving = [row for row in several if not row.fixed and row.time.size]
-            chosen = moving or [row for row in several if row.time.size]
+            for link, bad in _split_by_child(columns, fixed=_base_name(columns.topic) == "tf_static"):
+                links.setdefault(link.child, []).append(link)
+                invalid[link.child] = invalid.get(link.child, 0) + bad
+        for child, several in links.items():
+            moving = [link for link in several if not link.fixed and link.time.size]
+            chosen = moving or [link for link in several if link.time.size]
             if not chosen:
                 self._notes.append(f"every transform of {child} is invalid")
                 continue
-            parent = max(chosen, key=lambda row: row.time.size).parent
-            others = sorted({row.parent for row in chosen} - {parent})
+            parent = max(chosen, key=lambda link: link.time.size).parent
+            others = sorted({link.parent for link in chosen} - {parent})
             if others:
                 self._notes.append(
                     f"{child} has several parents; {parent} was taken, not {', '.join(others)}"
                 )
-            invalid = sum(row.invalid for row in several)
-            if invalid:
-                self._notes.append(f"{invalid} transforms of {child} are invalid and were left out")
-            self._links[child] = _join([row for row in chosen if row.parent == parent], fixed=not moving)
+            if invalid[child]:
+                self._notes.append(f"{invalid[child]} transforms of {child} are invalid and were left out")
+            self._links[child] = _join([link for link in chosen if link.parent == parent])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
-    parent: str
-    child: str
-    fixed: bool
-    time: Ints
-    log_time: Ints
-    position: Floats
-    quaternion: Floats
-    invalid: int
-
-
-def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[_Rows]:
+def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[tuple[Link, int]]:
+    """Links with their valid rows, and how many rows are invalid."""
     parents = columns.fields.get(f"{_TRANSFORM}header.frame_id")
     children = columns.fields.get(f"{_TRANSFORM}child_frame_id")
     numbers = [columns.fields.get(f"{_TRANSFORM}{path}") for path in _NUMBERS]
@@ -252,43 +242,36 @@ def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[_Rows]:
     with np.errstate(over="ignore", invalid="ignore"):
         norm = np.linalg.norm(quaternion, axis=1)
     valid = np.isfinite(position).all(axis=1) & np.isfinite(norm) & (norm > _LEAST_NORM)
-    found: list[_Rows] = []
+    found: list[tuple[Link, int]] = []
     pairs = np.stack((parents.codes, children.codes), axis=1)
     for parent, child in np.unique(pairs, axis=0).tolist():
         here = (pairs == (parent, child)).all(axis=1)
         chosen = here & valid
-        found.append(
-            _Rows(
-                _clean(parents.values[parent]),
-                _clean(children.values[child]),
-                fixed,
-                time[chosen],
-                log_time[chosen],
-                position[chosen],
-                quaternion[chosen] / norm[chosen, None],
-                int((here & ~valid).sum()),
-            )
+        link = Link(
+            _clean(parents.values[parent]),
+            _clean(children.values[child]),
+            fixed,
+            time[chosen],
+            log_time[chosen],
+            position[chosen],
+            quaternion[chosen] / norm[chosen, None],
         )
+        found.append((link, int((here & ~valid).sum())))
     return found
 
 
-def _join(rows: list[_Rows], *, fixed: bool) -> Link:
-    time = np.concatenate([row.time for row in rows])
-    log_time = np.concatenate([row.log_time for row in rows])
-    position = np.concatenate([row.position for row in rows])
-    quaternion = np.concatenate([row.quaternion for row in rows])
+def _join(links: list[Link]) -> Link:
+    """One link of several between the same frames; of equal stamps and of fixed links the last row counts."""
+    time = np.concatenate([link.time for link in links])
     order = np.argsort(time, kind="stable")
-    last = np.flatnonzero(np.r_[np.diff(time[order]) > 0, True])
-    chosen = order[-1:] if fixed else order[last]
-    return Link(
-        rows[0].parent,
-        rows[0].child,
-        fixed,
-        time[chosen],
-        log_time[chosen],
-        position[chosen],
-        quaternion[chosen],
-    )
+    last = order[np.r_[np.diff(time[order]) > 0, True]]
+    rows = last[-1:] if links[0].fixed else last
+
+    names = ("time", "log_time", "position", "quaternion")
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(link, name) for link in links])[rows] for name in names
+    }
+    return replace(links[0], **arrays)
 
 
 def _covers(link: Link, time: Ints) -> NDArray[np.bool_]:

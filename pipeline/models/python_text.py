@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import copy
 import math
+from importlib import resources
 from typing import TYPE_CHECKING, cast
 
 from pipeline.models.catalogue import is_own
@@ -19,71 +20,10 @@ if TYPE_CHECKING:
 
 _PLAIN_NAMES = ("abs", "min", "max", "sign")
 _PLACES = tuple(place for place in Place if place is not Place.LOCALIZATION)
-_HEAD = '''"""Motion of a vehicle from its commands. Made by `slip model export`; needs nothing but Python."""
-
-import math
-
-VEHICLE = {name}
-R = {radius}  # wheel radius [m]
-B = {track}  # width over which a difference between the sides turns it [m]
-WHEELBASE = {wheelbase}  # [m]
-MULTIPLIER = {multiplier}  # of the controller's width
-
-
-def approach(value, target, most):
-    """Move a value towards a target by at most so much."""
-    return target if abs(target - value) <= most else value + math.copysign(most, target - value)
-
-
-def sign(value):
-    """-1, 0 or 1."""
-    return (value > 0.0) - (value < 0.0)
-
-
-def split(left, right, sideways):
-    """Speeds of the wheels: front left, front right, rear left, rear right."""
-    return [left - sideways, right + sideways, left + sideways, right - sideways]
-
-
-def join(wheels):
-    """The inverse of `split`."""
-    a, b, c, d = wheels
-    return (a + c) / 2.0, (b + d) / 2.0, (b - a + c - d) / 4.0
-
-
-def predict(commands, until_s, step_s=0.005, pose=(0.0, 0.0, 0.0), roll=0.0, pitch=0.0):
-    """Predict the motion of a vehicle that stands at the start.
-
-    Args:
-        commands: (time [s], left, right) wheel speeds [rad/s] in order of time, held until the next; on a
-            car (time, axle, axle, steering [rad]); on mecanum and omni wheels (time, left, right, sideways),
-            sides' means and the speed that moves the vehicle to the left [rad/s].
-        until_s: end of the prediction [s], from zero.
-        step_s: integration step [s].
-        pose: x [m], y [m], yaw [rad] at the start.
-        roll: of the ground [rad].
-        pitch: of the ground [rad], nose down above zero.
-
-    Returns:
-        A list of (time, x, y, yaw, v_x, v_y, v_w).
-    """
-    x, y, yaw = pose
-    rows = []{state}
-    index = -1
-    for number in range(round(until_s / step_s)):
-        t = (number + 0.5) * step_s
-        while index + 1 < len(commands) and commands[index + 1][0] <= t - {delay}:
-            index += 1
-        _, left, right, aside = (*commands[index], 0.0)[:4] if index >= 0 else (0.0, 0.0, 0.0, 0.0)
-        steering, sideways = {third}'''
-_TAIL = """
-        middle = yaw + v_w * step_s / 2.0
-        x += (v_x * math.cos(middle) - v_y * math.sin(middle)) * step_s
-        y += (v_x * math.sin(middle) + v_y * math.cos(middle)) * step_s
-        yaw += v_w * step_s
-        rows.append(((number + 1) * step_s, x, y, yaw, v_x, v_y, v_w))
-    return rows
-"""
+_HEAD, _TAIL = (
+    resources.files("pipeline.models").joinpath("function.py.in").read_text("utf-8").split("{steps}")
+)
+"""What stands before and behind the effects' steps."""
 
 
 def write_function(model: Model) -> str:

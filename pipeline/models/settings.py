@@ -125,21 +125,6 @@ class Facts:
         self.file = file
         self.vehicle = file.model.vehicle
 
-    def require_kind(self, target: str, *kinds: str) -> None:
-        """Refuse a vehicle that a target has no parameters for.
-
-        Raises:
-            MotionError: ``wrong_vehicle``.
-        """
-        if self.vehicle.kind not in kinds:
-            raise MotionError(
-                "wrong_vehicle",
-                f"{target} has parameters for {' and '.join(kinds)} vehicles; {self.vehicle.id} is "
-                f"{self.vehicle.kind}",
-                where=self.vehicle.id,
-                hint="Export to another target: json and python take every vehicle.",
-            )
-
     def take(self, quantity: Quantity) -> Amount:
         """A quantity; neutral and without sources where no effect of the model is one.
 
@@ -194,14 +179,27 @@ class Facts:
         return text
 
 
-def start_sheet(facts: Facts, target: Target) -> Sheet:
-    """A sheet that says of which vehicle it is, whose parameters it holds, and what they came from."""
+def start_sheet(file: ModelFile, target: Target, *kinds: str) -> tuple[Facts, Sheet]:
+    """Facts of a model, and a sheet that says of which vehicle it is, whose parameters it holds, what from.
+
+    Raises:
+        MotionError: ``wrong_vehicle``, the target has no parameters for this kind of vehicle.
+    """
+    facts = Facts(file)
+    if facts.vehicle.kind not in kinds:
+        raise MotionError(
+            "wrong_vehicle",
+            f"{target.name} has parameters for {' and '.join(kinds)} vehicles; {facts.vehicle.id} is "
+            f"{facts.vehicle.kind}",
+            where=facts.vehicle.id,
+            hint="Export to another target: json and python take every vehicle.",
+        )
     head = [
         f"{facts.vehicle.name}: {target.about}.",
         f"Names: {target.source}.",
         facts.describe_fit(),
     ]
-    return Sheet([line for line in head if line])
+    return facts, Sheet([line for line in head if line])
 
 
 def _join(quantity: Quantity, values: list[float]) -> float:

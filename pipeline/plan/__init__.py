@@ -11,14 +11,13 @@ from pipeline.plan.check import check_plan
 from pipeline.plan.errors import PlanError
 from pipeline.plan.files import read_promises, write_plan
 from pipeline.plan.knowledge import Knowledge, assume, learn
-from pipeline.plan.limits import Area, Limits, choose_limits, parse_area
+from pipeline.plan.limits import Limits, choose_limits, parse_area
 from pipeline.plan.plan import SAFETY, Plan, Request, find_largest, make_plan
 from pipeline.plan.protocols import PROTOCOLS, Needed, compare_protocols, parse_protocols
 
 __all__ = [
     "PROTOCOLS",
     "SAFETY",
-    "Area",
     "Knowledge",
     "Limits",
     "Needed",

@@ -15,14 +15,12 @@ from pipeline.simulate.cases import (
     simulate_case,
     write_samples,
 )
-from pipeline.simulate.effects import EffectSpec, ParameterSpec
 from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.layouts import LAYOUTS, CommandTopic, Layout, PoseTopic, WheelTopic
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
-from pipeline.simulate.platform_table import PLATFORMS, find_platform
-from pipeline.simulate.platforms import Platform
+from pipeline.simulate.platforms import PLATFORMS, Platform
 from pipeline.simulate.record import write_log
-from pipeline.simulate.run import SimulatedRun, Truth, simulate_run
+from pipeline.simulate.run import SimulatedRun, simulate_run
 from pipeline.simulate.scenario import (
     Clock,
     Disturbance,
@@ -46,12 +44,10 @@ __all__ = [
     "Clock",
     "CommandTopic",
     "Disturbance",
-    "EffectSpec",
     "Encoders",
     "Ground",
     "Imu",
     "Layout",
-    "ParameterSpec",
     "Platform",
     "PoseSensor",
     "PoseTopic",
@@ -62,11 +58,9 @@ __all__ = [
     "SimulatedRun",
     "SkidSteer",
     "State",
-    "Truth",
     "Vehicle",
     "WheelTopic",
     "find_case",
-    "find_platform",
     "find_vehicle",
     "list_cases",
     "list_effects",

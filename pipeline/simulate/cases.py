@@ -11,7 +11,7 @@ from pipeline.simulate.effects import CATALOGUE, EffectSpec, resolve_effects
 from pipeline.simulate.errors import SimulateError, unknown_name
 from pipeline.simulate.layouts import find_layout
 from pipeline.simulate.mujoco_vehicle import simulate_skid_steer
-from pipeline.simulate.platform_table import find_platform
+from pipeline.simulate.platforms import find_platform
 from pipeline.simulate.played import read_played
 from pipeline.simulate.record import write_log
 from pipeline.simulate.run import simulate_run

@@ -7,9 +7,11 @@ velocity) and ``localization`` (what the pose reports). Signs follow REP-103: x 
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from importlib import resources
+from typing import TYPE_CHECKING, Any
 
 from pipeline.simulate.errors import SimulateError, unknown_name
 
@@ -17,7 +19,6 @@ if TYPE_CHECKING:
     from pipeline.simulate.vehicles import Kind
 
 _INF = math.inf
-_NAN = math.nan
 
 
 @dataclass(frozen=True)
@@ -43,97 +44,18 @@ class EffectSpec:
     kinds: tuple[Kind, ...] = ("differential", "ackermann", "mecanum", "omni")
 
 
-_SKID: tuple[Kind, ...] = ("differential", "mecanum", "omni")
-_TWO_SIDED: tuple[Kind, ...] = ("differential", "mecanum")
-_WHEELED: tuple[Kind, ...] = ("differential", "ackermann", "mecanum")
-_SIDEWAYS: tuple[Kind, ...] = ("mecanum", "omni")
-_CAR: tuple[Kind, ...] = ("ackermann",)
+def _read_effect(name: str, given: dict[str, Any]) -> EffectSpec:
+    parameters = tuple(ParameterSpec(own, **said) for own, said in given.pop("parameters").items())
+    kinds = {"kinds": tuple(given["kinds"])} if "kinds" in given else {}
+    return EffectSpec(name, given["formula"], parameters, **kinds)
 
 
-def _one(name: str, unit: str, neutral: float, typical: float) -> tuple[ParameterSpec, ...]:
-    return (ParameterSpec(name, unit, neutral, typical),)
-
-
-_SPECS: tuple[EffectSpec, ...] = (
-    EffectSpec("body_speed_limit", "commanded v_x clipped to +-limit", _one("limit", "m/s", _INF, 0.7)),
-    EffectSpec("body_turn_limit", "commanded yaw rate clipped to +-limit", _one("limit", "rad/s", _INF, 0.6)),
-    EffectSpec("deadband", "Omega = 0 where |r u| < d, else u", _one("d", "m/s", 0.0, 0.15), _WHEELED),
-    EffectSpec("transport_delay", "Omega(t) = u(t - d)", _one("d", "s", 0.0, 0.2)),
-    EffectSpec("wheel_speed_limit", "Omega clipped to +-limit", _one("limit", "rad/s", _INF, 4.5), _WHEELED),
-    EffectSpec("acceleration_limit", "|dOmega/dt| <= limit", _one("limit", "rad/s^2", _INF, 3.0), _WHEELED),
-    EffectSpec("drive_lag", "tau dOmega/dt = u - Omega, each wheel", _one("tau", "s", 0.0, 0.5)),
-    EffectSpec(
-        "turn_lag",
-        "tau_mean on the mean and tau_diff on the difference of the wheels",
-        (ParameterSpec("tau_mean", "s", 0.0, 0.3), ParameterSpec("tau_diff", "s", 0.0, 1.0)),
-        _SKID,
-    ),
-    EffectSpec(
-        "turn_droop",
-        "D = Omega_r - Omega_l; beyond +-threshold only gain times the excess is reached",
-        (ParameterSpec("threshold", "rad/s", _NAN, 1.5), ParameterSpec("gain", "1", 1.0, 0.4)),
-        _SKID,
-    ),
-    EffectSpec("steering_gain", "delta = g delta_u", _one("g", "1", 1.0, 0.85), _CAR),
-    EffectSpec("steering_offset", "delta = delta_u + o", _one("o", "rad", 0.0, 0.04), _CAR),
-    EffectSpec("steering_lag", "tau ddelta/dt = delta_u - delta", _one("tau", "s", 0.0, 0.4), _CAR),
-    EffectSpec(
-        "steering_sensor_offset",
-        "tyres steer delta + o, sensors read delta",
-        _one("o", "rad", 0.0, 0.02),
-        _CAR,
-    ),
-    EffectSpec("understeer", "v_w = v tan(delta) / (l + K v^2)", _one("K", "s^2/m", 0.0, 0.03), _CAR),
-    EffectSpec("wheel_radius", "v0 = k * v0, w0 = k * w0", _one("k", "1", 1.0, 0.92)),
-    EffectSpec(
-        "wheel_asymmetry", "left r (1 - e/2), right r (1 + e/2)", _one("e", "1", 0.0, 0.04), _TWO_SIDED
-    ),
-    EffectSpec("effective_track", "w0 = w0 / k", _one("k", "1", 1.0, 1.8), _SKID),
-    EffectSpec("lateral_scale", "s0 = k * s0", _one("k", "1", 1.0, 0.8), _SIDEWAYS),
-    EffectSpec("time_drift", "v0, w0 scaled by 1 - k t/T", _one("k", "1", 0.0, 0.1)),
-    EffectSpec(
-        "terrain_change",
-        "v0, w0 scaled by k_v, k_w after at_s, or beyond x = at_x when given; at_s defaults to half the run",
-        (
-            ParameterSpec("k_v", "1", 1.0, 0.85),
-            ParameterSpec("k_w", "1", 1.0, 0.75),
-            ParameterSpec("at_s", "s", _NAN, _NAN),
-            ParameterSpec("at_x", "m", _NAN, _NAN),
-        ),
-    ),
-    EffectSpec(
-        "body_inertia",
-        "dv_x/dt = (v0 - v_x)/tau + v_y w; dv_y/dt = -v_y/tau - v_x w; dw/dt = (w0 - w)/tau",
-        _one("tau", "s", 0.0, 0.5),
-    ),
-    EffectSpec("lateral_skid", "v_y += -c v0 w0; sideways, v_x += c s0 w0", _one("c", "s", 0.0, 0.1)),
-    EffectSpec("roller_slip", "v_y -= k s0 |s0|", _one("k", "s/m", 0.0, 0.3), _SIDEWAYS),
-    EffectSpec("speed_slip", "v_x -= k v0 |v0|", _one("k", "s/m", 0.0, 0.08)),
-    EffectSpec("turning_resistance", "v_x -= k v0 |w0|", _one("k", "s", 0.0, 0.24)),
-    EffectSpec("speed_track", "v_w += k |v0| w0", _one("k", "s/m", 0.0, 0.05), _SKID),
-    EffectSpec(
-        "slope_drift",
-        "v_x += k sin(pitch), v_y -= k cos(pitch) sin(roll), while the wheels turn",
-        _one("k", "m/s", 0.0, 0.6),
-    ),
-    EffectSpec("lateral_drift", "v_y += c while the wheels turn", _one("c", "m/s", 0.0, 0.05)),
-    EffectSpec("yaw_drift", "v_w += c while the wheels turn", _one("c", "rad/s", 0.0, 0.06)),
-    EffectSpec("icr_offset", "v_y += -x_icr w", _one("x_icr", "m", 0.0, 0.12)),
-    EffectSpec("icr_lateral", "v_x += y_icr w", _one("y_icr", "m", 0.0, 0.08)),
-    EffectSpec("heading_skew", "reported yaw is that of d ago: v_y += d v0 w0", _one("d", "s", 0.0, 0.1)),
-    EffectSpec(
-        "yaw_misalignment",
-        "reported yaw = yaw + psi: v_y = -psi v_x",
-        _one("psi", "rad", 0.0, math.radians(3.0)),
-    ),
-    EffectSpec(
-        "lever_arm",
-        "position of a point (l_x, l_y): v_x -= l_y w, v_y += l_x w",
-        (ParameterSpec("l_x", "m", 0.0, 0.2), ParameterSpec("l_y", "m", 0.0, 0.08)),
-    ),
-    EffectSpec("clock_offset", "pose stamped d late (d < 0: early)", _one("d", "s", 0.0, -0.15)),
-)
-CATALOGUE: dict[str, EffectSpec] = {spec.id: spec for spec in _SPECS}
+CATALOGUE: dict[str, EffectSpec] = {
+    name: _read_effect(name, given)
+    for name, given in tomllib.loads(
+        resources.files("pipeline.simulate").joinpath("effects.toml").read_text("utf-8")
+    ).items()
+}
 
 
 class Effects:

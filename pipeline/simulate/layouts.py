@@ -5,8 +5,12 @@ The names are those of the published recordings and of common robot configuratio
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from importlib import resources
+from typing import TYPE_CHECKING, Any, Literal
+
+import msgspec
 
 from pipeline.simulate.errors import SimulateError, unknown_name
 
@@ -68,96 +72,17 @@ class Layout:
     topics: tuple[Published, ...] = ()
 
 
-_ICP = PoseTopic("odometry", "/mapping/icp_odom")
-_JOINTS = (WheelTopic("joint_state", ("/joint_states",)),)
-_TWIST = (CommandTopic("twist", ("/cmd_vel",)),)
-_CONTROLLER = CommandTopic("twist_stamped", ("/controller/cmd_vel",))
+def _read_layout(given: dict[str, Any]) -> Layout:
+    commands = msgspec.convert(given.pop("commands"), tuple[CommandTopic, ...])
+    wheels = msgspec.convert(given.pop("wheels", []), tuple[WheelTopic, ...])
+    return Layout(given.pop("kind"), commands, wheels, PoseTopic(**given.pop("pose")), **given)
+
 
 LAYOUTS: dict[str, Layout] = {
-    "husky": Layout(
-        "differential",
-        (CommandTopic("joint_state", ("/wheel_commands",)), _CONTROLLER),
-        _JOINTS,
-        _ICP,
-        "/mti100/data",
-    ),
-    "husky_joint_commands": Layout(
-        "differential",
-        (CommandTopic("joint_state", ("/husky/joint_commands",)),),
-        _JOINTS,
-        _ICP,
-        "/mti100/data",
-        joints="{}_wheel_joint",
-    ),
-    "husky_body_command": Layout("differential", (_CONTROLLER,), _JOINTS, _ICP, "/mti100/data"),
-    "warthog": Layout(
-        "differential",
-        (CommandTopic("float_sides", ("/left_drive/velocity", "/right_drive/velocity")),),
-        (WheelTopic("float_sides", ("/left_drive/status/speed", "/right_drive/status/speed")),),
-        _ICP,
-        "/mti30/data",
-    ),
-    "warthog_platform": Layout(
-        "differential",
-        (
-            CommandTopic(
-                "float_sides",
-                (
-                    "/warthog/platform/motor/left/cmd_velocity",
-                    "/warthog/platform/motor/right/cmd_velocity",
-                ),
-            ),
-            _CONTROLLER,
-        ),
-        (
-            WheelTopic(
-                "float_sides",
-                (
-                    "/warthog/platform/motor/left/status/velocity",
-                    "/warthog/platform/motor/right/status/velocity",
-                ),
-            ),
-        ),
-        _ICP,
-        "/mti30/data",
-    ),
-    "body_command": Layout("differential", _TWIST, (), _ICP),
-    "wheel_float": Layout(
-        "differential",
-        (CommandTopic("float_sides", ("/wheel_left/cmd", "/wheel_right/cmd")),),
-        (WheelTopic("float_sides", ("/wheel_left/velocity", "/wheel_right/velocity")),),
-        PoseTopic("pose_covariance", "/localization/pose"),
-        "/imu/data",
-    ),
-    "tf": Layout(
-        "differential", _TWIST, _JOINTS, PoseTopic("tf", "/tf"), "/imu/data", joints="{}_wheel_joint"
-    ),
-    "pose_stamped": Layout(
-        "differential", _TWIST, _JOINTS, PoseTopic("pose_stamped", "/robot/pose"), "/imu/data"
-    ),
-    "pose_covariance": Layout("differential", _TWIST, (), PoseTopic("pose_covariance", "/amcl_pose")),
-    "mecanum": Layout("mecanum", _TWIST, _JOINTS, _ICP, "/imu/data", joints="{}_wheel_joint"),
-    "omni": Layout("omni", _TWIST, (), _ICP, "/imu/data"),
-    "ackermann": Layout(
-        "ackermann",
-        (CommandTopic("ackermann", ("/ackermann_cmd",)),),
-        _JOINTS,
-        _ICP,
-        "/imu/data",
-    ),
-    "ackermann_status": Layout(
-        "ackermann",
-        (CommandTopic("ackermann", ("/drive",)),),
-        (WheelTopic("ackermann", ("/drive/status",)),),
-        PoseTopic("pose_stamped", "/localization/pose"),
-    ),
-    "ackermann_floats": Layout(
-        "ackermann",
-        (CommandTopic("float_speed_steering", ("/vehicle/speed_command", "/vehicle/steering_command")),),
-        (WheelTopic("float_speed_steering", ("/vehicle/speed", "/vehicle/steering")),),
-        PoseTopic("tf", "/tf"),
-        "/imu/data",
-    ),
+    name: _read_layout(given)
+    for name, given in tomllib.loads(
+        resources.files("pipeline.simulate").joinpath("layouts.toml").read_text("utf-8")
+    ).items()
 }
 
 

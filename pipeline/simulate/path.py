@@ -9,12 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core.rigid import (
-    multiply_quaternions,
-    quaternions_from_euler,
-    quaternions_from_yaw,
-    rotate,
-)
+from pipeline.core.rigid import multiply_quaternions, quaternions_from_euler, quaternions_from_yaw, rotate
 from pipeline.simulate.scenario import ExtraPhysics, Ground, State
 from pipeline.simulate.signals import integrate_cells
 from pipeline.simulate.surface import Surface, Vector, cross, make_surface, slide_onto_plane, tilt_quaternion

@@ -212,8 +212,3 @@ _PROGRAMS: dict[str, Callable[[Floats, _Space], Drawn]] = {
     "stop_and_go": _stop_and_go,
     "teleop": _teleop,
 }
-
-
-def list_programs() -> tuple[str, ...]:
-    """Names of the command programs."""
-    return tuple(_PROGRAMS)

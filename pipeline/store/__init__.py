@@ -8,11 +8,11 @@ the new ones, never a mix, and the next writer cleans up. Rows that break a cont
 from pipeline.store.errors import StoreError
 from pipeline.store.generation import STEPS, Generation
 from pipeline.store.identities import LogIdentities, LogSighting, see_log
-from pipeline.store.manifest import JSON, FileEntry, Manifest, TableEntry, TableReport
+from pipeline.store.manifest import JSON, Manifest, TableReport
 from pipeline.store.mirror import Mirror
-from pipeline.store.notes import LOG_NOTES, Notes
+from pipeline.store.notes import LOG_NOTES
 from pipeline.store.partitions import Partition
-from pipeline.store.results import Store, Survey
+from pipeline.store.results import Store
 from pipeline.store.verification import Examination, Problem
 
 __all__ = [
@@ -20,19 +20,15 @@ __all__ = [
     "LOG_NOTES",
     "STEPS",
     "Examination",
-    "FileEntry",
     "Generation",
     "LogIdentities",
     "LogSighting",
     "Manifest",
     "Mirror",
-    "Notes",
     "Partition",
     "Problem",
     "Store",
     "StoreError",
-    "Survey",
-    "TableEntry",
     "TableReport",
     "see_log",
 ]

@@ -18,14 +18,7 @@ from pipeline.store.files import (
 )
 from pipeline.store.generation import Generation
 from pipeline.store.homes import point_latest, remove_orphans
-from pipeline.store.listing import (
-    LIST,
-    encode_entry,
-    entry_name,
-    is_run_manifest,
-    make_entry,
-    replace_listed,
-)
+from pipeline.store.listing import LIST, encode_entry, entry_name, is_run_manifest, make_entry, replace_listed
 from pipeline.store.locks import hold_lock
 from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes, hash_file
 from pipeline.store.manifest_file import encode_manifest, load_manifest

@@ -27,7 +27,6 @@ from pipeline.vehicles.sources import (
     PoseSource,
     Signal,
     Sources,
-    TopicSource,
 )
 from pipeline.vehicles.topics import DEFAULT_INTERVAL, choose_sources
 from pipeline.vehicles.units import convert_unit, list_factors
@@ -47,7 +46,6 @@ __all__ = [
     "Recognized",
     "Signal",
     "Sources",
-    "TopicSource",
     "Vehicle",
     "VehicleSource",
     "apply_parameters",

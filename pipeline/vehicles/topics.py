@@ -31,12 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from pipeline.logs import ChannelInfo
-    from pipeline.vehicles.configuration import (
-        Configuration,
-        DriveSection,
-        IntervalSection,
-        PoseSection,
-    )
+    from pipeline.vehicles.configuration import Configuration, DriveSection, IntervalSection, PoseSection
     from pipeline.vehicles.presets import Vehicle
 
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")

@@ -4,22 +4,11 @@ Slip is correlated from sample to sample, so samples are not what is counted: ru
 where there is only one. Nothing here knows of logs, tables or vehicles.
 """
 
-from pipeline.fleet.statistics.changes import Change, find_changes
-from pipeline.fleet.statistics.correlation import (
-    TIMES_PER_BLOCK,
-    count_effective,
-    integrated_time,
-    number_blocks,
-)
+from pipeline.fleet.statistics.changes import find_changes
+from pipeline.fleet.statistics.correlation import integrated_time, number_blocks
 from pipeline.fleet.statistics.effect_sizes import cliffs_delta, name_delta, shift_between
 from pipeline.fleet.statistics.errors import StatisticsError
-from pipeline.fleet.statistics.families import (
-    MOST_GROUPS,
-    adjust_holm,
-    adjust_max_t,
-    runs_needed,
-    runs_needed_against,
-)
+from pipeline.fleet.statistics.families import MOST_GROUPS, adjust_holm, adjust_max_t, runs_needed
 from pipeline.fleet.statistics.intervals import (
     Interval,
     bootstrap_median,
@@ -28,35 +17,22 @@ from pipeline.fleet.statistics.intervals import (
     bound_shift,
     bound_typical,
 )
-from pipeline.fleet.statistics.levels import GroupMean, LevelFit, find_outlier, split_levels
+from pipeline.fleet.statistics.levels import LevelFit, find_outlier, split_levels
 from pipeline.fleet.statistics.orders import kendall_p, kendall_tau, list_swaps
 from pipeline.fleet.statistics.pairs import Blocks, Comparison, compare_blocks, compare_runs, cut_blocks
-from pipeline.fleet.statistics.permutation import (
-    DRAWS,
-    PermutationTest,
-    permute_means,
-    permute_studentized,
-    smallest_p,
-)
-from pipeline.fleet.statistics.posterior import Draws, draw_run
+from pipeline.fleet.statistics.permutation import DRAWS, permute_means, permute_studentized, smallest_p
+from pipeline.fleet.statistics.posterior import draw_run
 from pipeline.fleet.statistics.ranks import mann_whitney
-from pipeline.fleet.statistics.shifts import FEWEST_FREE, Shift, ShiftSearch, find_shifts, guess_shift
+from pipeline.fleet.statistics.shifts import FEWEST_FREE, find_shifts, guess_shift
 
 __all__ = [
     "DRAWS",
     "FEWEST_FREE",
     "MOST_GROUPS",
-    "TIMES_PER_BLOCK",
     "Blocks",
-    "Change",
     "Comparison",
-    "Draws",
-    "GroupMean",
     "Interval",
     "LevelFit",
-    "PermutationTest",
-    "Shift",
-    "ShiftSearch",
     "StatisticsError",
     "adjust_holm",
     "adjust_max_t",
@@ -68,7 +44,6 @@ __all__ = [
     "cliffs_delta",
     "compare_blocks",
     "compare_runs",
-    "count_effective",
     "cut_blocks",
     "draw_run",
     "find_changes",
@@ -85,7 +60,6 @@ __all__ = [
     "permute_means",
     "permute_studentized",
     "runs_needed",
-    "runs_needed_against",
     "shift_between",
     "smallest_p",
     "split_levels",

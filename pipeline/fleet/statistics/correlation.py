@@ -52,16 +52,6 @@ def integrated_time(values: ArrayLike, ticks: ArrayLike) -> float:
     return tau
 
 
-def count_effective(values: ArrayLike, ticks: ArrayLike) -> float:
-    """How many independent samples these are worth: n / tau, at least one.
-
-    Raises:
-        StatisticsError: as `integrated_time`.
-    """
-    samples = check_values(values, what="samples", fewest=2)
-    return max(samples.size / integrated_time(samples, ticks), 1.0)
-
-
 def number_blocks(ticks: ArrayLike, pieces: ArrayLike, length: float) -> Integers:
     """Cut samples into blocks of about ``length`` grid steps; no block crosses the end of a piece.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.fleet.statistics.arrays import Floats, check_values
-from pipeline.fleet.statistics.permutation import DRAWS, LARGEST_EXACT, smallest_p
+from pipeline.fleet.statistics.permutation import DRAWS, LARGEST_EXACT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -102,14 +102,6 @@ def runs_needed(pairs: int, *, level: float = 0.05) -> int:
         if 2.0 / math.comb(2 * runs, runs) * max(pairs, 1) <= level:
             return runs
     return _MOST_RUNS
-
-
-def runs_needed_against(other: int, *, level: float = 0.05) -> int | None:
-    """Runs that a side needs against ``other`` runs to reach ``level`` in one pair; None: no number does."""
-    for runs in range(1, _MOST_RUNS):
-        if smallest_p(runs, other) <= level:
-            return runs
-    return None
 
 
 def _list_largest(groups: list[Floats], *, seed: int, draws: int) -> tuple[float, Floats]:

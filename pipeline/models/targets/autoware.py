@@ -29,9 +29,7 @@ def write(file: ModelFile, current: Current) -> str:
         MotionError: ``wrong_vehicle``.
     """
     del current
-    facts = Facts(file)
-    facts.require_kind(TARGET.name, "ackermann")
-    sheet = start_sheet(facts, TARGET)
+    facts, sheet = start_sheet(file, TARGET, "ackermann")
     sheet.add(f"{_ALL}.wheel_radius", find_radius(facts), _INFO)
     sheet.add(f"{_ALL}.wheel_base", facts.measure("wheelbase_m"), _INFO)
     sheet.add(f"{_ALL}.wheel_tread", facts.measure("track_width_m"), _INFO)

@@ -38,9 +38,7 @@ def write(file: ModelFile, current: Current) -> str:
         MotionError: ``wrong_vehicle``.
     """
     del current
-    facts = Facts(file)
-    facts.require_kind(TARGET.name, *_SYSTEMS)
-    sheet = start_sheet(facts, TARGET)
+    facts, sheet = start_sheet(file, TARGET, *_SYSTEMS)
     sheet.add("plugin.wheel_radius", find_radius(facts))
     if facts.vehicle.kind == "differential":
         note = "for a simulated ground on which the wheels skid as on the real one"

@@ -38,9 +38,7 @@ def write(file: ModelFile, current: Current) -> str:
         MotionError: ``wrong_vehicle``.
     """
     del current
-    facts = Facts(file)
-    facts.require_kind(TARGET.name, "differential", "ackermann")
-    sheet = start_sheet(facts, TARGET)
+    facts, sheet = start_sheet(file, TARGET, "differential", "ackermann")
     sheet.add(f"{_CONTROLLER}.model_delay_vx", find_speed_delay(facts), _DELAY)
     sheet.add(f"{_CONTROLLER}.model_delay_wz", find_turn_delay(facts), _DELAY)
     _add_limits(facts, sheet)

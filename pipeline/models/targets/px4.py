@@ -43,9 +43,7 @@ def write(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    facts = Facts(file)
-    facts.require_kind(TARGET.name, "differential", "ackermann")
-    sheet = start_sheet(facts, TARGET)
+    facts, sheet = start_sheet(file, TARGET, "differential", "ackermann")
     if facts.vehicle.kind == "differential":
         sheet.add("RD_WHEEL_TRACK", facts.measure("track_width_m"))
         sheet.add("RO_YAW_RATE_CORR", facts.take(Quantity.TRACK))

@@ -9,7 +9,7 @@ import msgspec
 from pipeline.models.body_limits import find_speed_acceleration, find_turn_acceleration
 from pipeline.models.effect import Place
 from pipeline.models.quantity import Quantity
-from pipeline.models.settings import Amount, Facts, Setting, start_sheet
+from pipeline.models.settings import Amount, Setting, start_sheet
 from pipeline.models.settings_text import write_yaml
 from pipeline.models.target import Target
 from pipeline.runs.errors import MotionError
@@ -50,8 +50,7 @@ def write(file: ModelFile, current: Current) -> str:
         MotionError: ``wrong_vehicle``; ``not_fitted``, the file has no ladder.
     """
     del current
-    facts = Facts(file)
-    facts.require_kind(TARGET.name, *_CONTROLLERS)
+    facts, sheet = start_sheet(file, TARGET, *_CONTROLLERS)
     controller, known = _CONTROLLERS[facts.vehicle.kind]
     step = _find_step(file, known)
     sources = (
@@ -61,7 +60,6 @@ def write(file: ModelFile, current: Current) -> str:
     )
     # Of an error that is known to some per cent more digits would only say from where a fit set out.
     x, y, w = (Amount(float(f"{error * error:.3g}"), sources) for error in step.velocity_rms)
-    sheet = start_sheet(facts, TARGET)
     sheet.settings.append(Setting(f"{_FILTER}.odom0_config", _FUSED, ("vx, vy and the yaw rate of odom0",)))
     acceleration, turning = find_speed_acceleration(facts), find_turn_acceleration(facts)
     for name in ("acceleration_limits", "deceleration_limits"):

@@ -30,9 +30,7 @@ def write(file: ModelFile, current: Current) -> str:
         MotionError: ``wrong_vehicle``.
     """
     del current
-    facts = Facts(file)
-    facts.require_kind(TARGET.name, "differential", "ackermann")
-    sheet = start_sheet(facts, TARGET)
+    facts, sheet = start_sheet(file, TARGET, "differential", "ackermann")
     if facts.vehicle.kind == "differential":
         _add_differential(facts, sheet)
     else:

@@ -37,12 +37,10 @@ def write(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``; ``gains_unknown``, neither is there.
     """
-    facts = Facts(file)
-    facts.require_kind(TARGET.name, "ackermann")
+    facts, sheet = start_sheet(file, TARGET, "ackermann")
     speed, servo, centre = (_find_current(facts, current, name) for name in TARGET.corrects)
     radius = facts.take(Quantity.RADIUS)
     gain, offset = facts.take(Quantity.STEERING_GAIN), facts.take(Quantity.STEERING_OFFSET)
-    sheet = start_sheet(facts, TARGET)
     sheet.add(f"{_ALL}.{_SPEED_GAIN}", combine(operator.truediv, speed, radius))
     sheet.add(f"{_ALL}.{_STEERING_GAIN}", combine(operator.truediv, servo, gain))
     straight = combine(lambda c, s, g, o: c - s * o / g, centre, servo, gain, offset)

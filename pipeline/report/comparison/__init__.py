@@ -4,7 +4,6 @@ The published figure (all windows of a dataset in one box) and the honest one be
 an interval over runs), the pairs with their tests, and the measures of difficulty that do not agree.
 """
 
-from pipeline.report.comparison.figures import draw_boxes, draw_runs
 from pipeline.report.comparison.page import list_pictures, render_comparison
 
-__all__ = ["draw_boxes", "draw_runs", "list_pictures", "render_comparison"]
+__all__ = ["list_pictures", "render_comparison"]

@@ -3,7 +3,6 @@
 The literature by kind of model, bounds as arrows, doubtful rows hollow; own datasets coloured by their slip.
 """
 
-from pipeline.report.deployments.figure import draw_map
 from pipeline.report.deployments.page import picture_map, render_map
 
-__all__ = ["draw_map", "picture_map", "render_map"]
+__all__ = ["picture_map", "render_map"]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from importlib import resources
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -45,28 +46,14 @@ def _build_layout(source: ExportSource) -> dict[str, object]:
     for axis, title in (("x", "v_x [m/s]"), ("y", "v_y [m/s]"), ("w", "v_w [rad/s]")):
         lines = [(line.path(axis), line.label, line.colour) for line in list_series(source)]
         panels[f"Plot!{axis}"] = _build_plot(title, lines)
-    return {
-        "configById": panels,
-        "globalVariables": {},
-        "userNodes": {},
-        "playbackConfig": {"speed": 1},
-        "layout": {
-            "direction": "row",
-            "splitPercentage": 45,
-            "first": {
-                "direction": "column",
-                "splitPercentage": 75,
-                "first": "3D!map",
-                "second": "RosOut!findings",
-            },
-            "second": {
-                "direction": "column",
-                "splitPercentage": 50,
-                "first": {"direction": "column", "first": "Plot!slip", "second": "Plot!x"},
-                "second": {"direction": "column", "first": "Plot!y", "second": "Plot!w"},
-            },
-        },
-    }
+    return {"configById": panels, **_read_constants()["layout"]}
+
+
+def _read_constants() -> dict[str, dict[str, Any]]:
+    """What is the same in every layout: of a line, a plot, the map and the whole; null is filled in."""
+    text = resources.files("pipeline.report.exports").joinpath("foxglove.json").read_text("utf-8")
+    constants: dict[str, dict[str, Any]] = json.loads(text)
+    return constants
 
 
 def _build_map(source: ExportSource) -> dict[str, object]:
@@ -78,43 +65,11 @@ def _build_map(source: ExportSource) -> dict[str, object]:
         topics.POSE: {"visible": True},
     }
     middle, extent = _find_extent(source)
-    return {
-        "followTf": source.frame_id,
-        "followMode": "follow-none",
-        "scene": {},
-        # From above, north up, the whole way in view.
-        "cameraState": {
-            "perspective": False,
-            "distance": max(_CLOSEST_M, 1.2 * extent),
-            "phi": 0,
-            "thetaOffset": 90,
-            "target": [0, 0, 0],
-            "targetOffset": [*middle, 0],
-            "targetOrientation": [0, 0, 0, 1],
-            "fovy": 45,
-            "near": 0.01,
-            "far": 5000,
-        },
-        "transforms": {},
-        "topics": lines,
-        "layers": {
-            "grid": {
-                "layerId": "foxglove.Grid",
-                "instanceId": "grid",
-                "label": "Grid",
-                "visible": True,
-                "frameLocked": True,
-                "size": 100,
-                "divisions": 20,
-                "lineWidth": 1,
-                "color": theme.GRID,
-                "position": [0, 0, 0],
-                "rotation": [0, 0, 0],
-                "order": 1,
-            }
-        },
-        "imageMode": {},
-    }
+    panel = _read_constants()["map"]
+    # From above, north up, the whole way in view.
+    panel["cameraState"] |= {"distance": max(_CLOSEST_M, 1.2 * extent), "targetOffset": [*middle, 0]}
+    panel["layers"]["grid"]["color"] = theme.GRID
+    return panel | {"followTf": source.frame_id, "topics": lines}
 
 
 def _find_extent(source: ExportSource) -> tuple[list[float], float]:
@@ -128,25 +83,9 @@ def _find_extent(source: ExportSource) -> tuple[list[float], float]:
 
 
 def _build_plot(title: str, lines: list[tuple[str, str, str]]) -> dict[str, object]:
-    return {
-        "title": title,
-        "paths": [
-            {
-                "value": value,
-                "label": label,
-                "color": colour,
-                "enabled": True,
-                "timestampMethod": "receiveTime",
-                "showLine": True,
-            }
-            for value, label, colour in lines
-        ],
-        "showLegend": True,
-        "showPlotValuesInLegend": False,
-        "legendDisplay": "floating",
-        "isSynced": True,
-        "xAxisVal": "timestamp",
-        "sidebarDimension": 240,
-        "showXAxisLabels": True,
-        "showYAxisLabels": True,
-    }
+    constants = _read_constants()
+    paths = [
+        {"value": value, "label": label, "color": colour, **constants["line"]}
+        for value, label, colour in lines
+    ]
+    return {"title": title, "paths": paths, **constants["plot"]}

@@ -1,18 +1,24 @@
-"""A platform: a vehicle and the topics it publishes, made of a few that many platforms share."""
+"""What popular platforms publish, so that logs with exactly their topics, types and frames can be made.
+
+A platform is one file here: its vehicle, and its topics. A topic is one of the few that many platforms share
+(``twist = TOPIC`` and what the function `twist` takes), or says its type, source, constants and quantities.
+"""
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from importlib import resources
+from typing import TYPE_CHECKING, Any
 
 from pipeline.simulate.description import describe_robot
+from pipeline.simulate.errors import unknown_name
 from pipeline.simulate.layouts import Layout, PoseTopic
-from pipeline.simulate.published import Published, Q, Source, Value
+from pipeline.simulate.published import Json, Published, Q, Source, Value
+from pipeline.simulate.vehicles import Vehicle, find_vehicle
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.simulate.vehicles import Vehicle
+    from collections.abc import Callable, Mapping, Sequence
 
 _XYZ, _XYZW = "xyz", "xyzw"
 
@@ -91,7 +97,7 @@ def mecanum_joints(topic: str, names: Mapping[str, str]) -> Published:
     return Published(topic, "sensor_msgs/msg/JointState", "wheels", values)
 
 
-def joints(topic: str, template: str, places: tuple[str, ...], fields: str = "both") -> Published:
+def joints(topic: str, template: str, places: Sequence[str], fields: str = "both") -> Published:
     """Joint states of the wheels; ``fields`` may be ``position`` alone."""
     names = [_name_joint(template, place) for place in places]
     turned = tuple(Q("steering") if p.startswith("steer") else Q(f"{_side(p)}_angle") for p in places)
@@ -149,7 +155,59 @@ def pose_with_covariance(topic: str, every: int) -> Published:
     return Published(topic, name, "localization", fields, every=every)
 
 
-def describe(topic: str, name: str, vehicle: Vehicle, template: str, places: tuple[str, ...]) -> Published:
+def describe(topic: str, name: str, vehicle: Vehicle, template: str, places: Sequence[str]) -> Published:
     """A robot description."""
     text = describe_robot(name, vehicle, {place: _name_joint(template, place) for place in places})
     return Published(topic, "std_msgs/msg/String", "once", {"data": text}, stamp="none")
+
+
+_SHARED: dict[str, Callable[..., Published]] = {
+    made.__name__: made
+    for made in (
+        *(twist, odometry, transform, mecanum_joints, joints),
+        *(imu, fix, ground_velocity, pose_with_covariance, describe),
+    )
+}
+
+
+def _read_value(given: Any) -> Value:  # noqa: ANN401 - as the file has it
+    """A quantity by its name, perhaps with a gain; several; or a JSON object of some."""
+    if isinstance(given, list):
+        return tuple(Q(each) if isinstance(each, str) else Q(**each) for each in given)
+    if isinstance(given, str):
+        return Q(given)
+    return Json({key: Q(name) for key, name in given["json"].items()}) if "json" in given else Q(**given)
+
+
+def _read_topic(entry: dict[str, Any], vehicle: Vehicle) -> Published:
+    for name in _SHARED.keys() & entry:
+        more = {"vehicle": vehicle} if name == "describe" else {}
+        return _SHARED[name](entry.pop(name), **entry, **more)
+    fields = entry.pop("constants", {})
+    fields |= {path: _read_value(given) for path, given in entry.pop("quantities", {}).items()}
+    return Published(entry.pop("topic"), entry.pop("type"), entry.pop("source"), fields, **entry)
+
+
+def _read_platform(text: str) -> Platform:
+    content = tomllib.loads(text)
+    given = content["vehicle"]
+    vehicle = find_vehicle(given) if isinstance(given, str) else Vehicle(**given)
+    return Platform(vehicle, tuple(_read_topic(entry, vehicle) for entry in content["topics"]))
+
+
+PLATFORMS: dict[str, Platform] = {
+    file.name.removesuffix(".toml"): _read_platform(file.read_text("utf-8"))
+    for file in sorted(resources.files(__name__).iterdir(), key=lambda file: file.name)
+    if file.name.endswith(".toml")
+}
+
+
+def find_platform(name: str) -> Platform:
+    """A platform by its name.
+
+    Raises:
+        SimulateError: ``unknown_platform``.
+    """
+    if name not in PLATFORMS:
+        raise unknown_name("platform", name, sorted(PLATFORMS))
+    return PLATFORMS[name]
