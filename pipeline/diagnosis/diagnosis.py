@@ -11,6 +11,7 @@ from pipeline.diagnosis.enough import describe_enough
 from pipeline.diagnosis.error_regions import tabulate_regions
 from pipeline.diagnosis.materiality import LEAST_TURN_RAD, LEAST_WAY_SHARE
 from pipeline.models.catalogue import find_effect
+from pipeline.models.level import Level
 from pipeline.models.model_text import format_model
 from pipeline.runs.windows import HORIZON_S
 
@@ -64,6 +65,8 @@ class Named:
             way; or its interval holds doing nothing.
         moves: how far it moves predictions over 2 s; None where the model does not hold it.
         growth: what was known of it by when; None where the model does not hold it.
+        by_run: its numbers in each of the runs that were judged together, where each has its own; those of
+            this run are `parameters`.
     """
 
     id: str
@@ -78,11 +81,18 @@ class Named:
     tentative: bool = False
     moves: Moves | None = None
     growth: Growth | None = None
+    by_run: tuple[Mapping[str, Value], ...] = ()
 
     @property
     def readings(self) -> tuple[Reading, ...]:
         """What it is if it belongs to the vehicle, the ground or the run, which one run cannot tell."""
-        return find_effect(self.id).readings
+        found = find_effect(self.id).readings
+        return tuple(one for one in found if one.level is Level.RUN) if self.by_run else found
+
+    @property
+    def tellings(self) -> tuple[Mapping[str, Value], ...]:
+        """Its numbers, once or for each run."""
+        return self.by_run or (self.parameters,)
 
     @property
     def sentence(self) -> str:
