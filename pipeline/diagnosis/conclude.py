@@ -161,9 +161,14 @@ def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Con
         tuple(_choose_run(one, number, context) for one in some)
         for some in (common.effects, common.immaterial)
     )
+    timing = dict(runs[number])
+    clock = find_late([find_effect(one.id) for one in effects], Late.POSES)
+    if clock is not None:
+        (late,) = (value for one in effects if one.id == clock.id for value in one.parameters.values())
+        timing["pose_delay_s"] = round(late.value, 4)
     return replace(
         common, run=recording.name, effects=effects, immaterial=immaterial,
-        findings=tuple(findings), timing=runs[number],
+        findings=tuple(findings), timing=timing,
     )  # fmt: skip
 
 
@@ -332,7 +337,14 @@ def _list_by_run(
     if judgement is None or effect.id not in judgement.fitted.model:
         return (list_values(effect, None),)
     acting = judgement.fitted.state.list_as_it_acts(judgement.fitted.model.effect(effect.id))
-    return tuple(list_values(one, judgement.estimates, run) for run, one in enumerate(acting))
+    found = [list_values(one, judgement.estimates, run) for run, one in enumerate(acting)]
+    if effect.late is Late.POSES:
+        # Of runs of which some have a gyro: what it had put right belongs to the clock.
+        found = [
+            {name: value.move(run.alignment.heading_delay_s) for name, value in numbers.items()}
+            for numbers, run in zip(found, context.runs, strict=True)
+        ]
+    return tuple(found)
 
 
 def _find_idle(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
 from pipeline.diagnosis.enough import describe_enough
@@ -45,6 +45,14 @@ class Value:
     unit: str
     at_bound: bool = False
     another_run: tuple[float, float] = (math.nan, math.nan)
+
+    def move(self, change: float) -> Value:
+        """The number with its intervals, larger by a change that is known."""
+        low, high = self.another_run
+        return replace(
+            self, value=self.value + change, low=self.low + change, high=self.high + change,
+            another_run=(low + change, high + change),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

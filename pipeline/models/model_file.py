@@ -91,6 +91,19 @@ class ModelFile:
                 return late
         return 0.0
 
+    def find_effects(self, run: str) -> tuple[Effect, ...]:
+        """The effects, with the numbers that belonged to a run alone in the last fit."""
+        rows = self.fit.get("own")
+        own = {
+            row.get("parameter"): row["value"]
+            for row in (rows if isinstance(rows, list) else [])
+            if isinstance(row, dict) and row.get("run") == run and isinstance(row.get("value"), float)
+        }
+        return tuple(
+            effect.change(**{n: own[label] for n in effect.values if (label := f"{effect.id}.{n}") in own})
+            for effect in self.model
+        )
+
 
 def read_model(path: Path) -> ModelFile:
     """Read a model file.
