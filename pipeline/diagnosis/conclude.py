@@ -32,6 +32,7 @@ from pipeline.identification.judgement import judge_model, note_fit
 from pipeline.identification.ladder import compare_losses
 from pipeline.identification.parts import BodyPart, count_seconds
 from pipeline.models import Model, ModelFile, find_effect
+from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late, find_late
 from pipeline.runs import MotionError
 
@@ -309,7 +310,9 @@ def _describe(
         parameters=values,
         gain=gain,
         equivalent_to=list_equivalents(effect, context),
-        confused_with=effect.confused_with,
+        confused_with=tuple(
+            dict.fromkeys((*effect.confused_with, *_list_trading(effect, context, judgement)))
+        ),
         corrected=_was_aligned(effect, context),
         way=way.search.way,
         selected=selected,
@@ -321,6 +324,23 @@ def _describe(
         ),
         by_run=by_run if len(by_run) > 1 else (),
     )
+
+
+def _list_trading(effect: Effect, context: Context, judgement: Judgement | None) -> list[str]:
+    """Effects for which a clock could be larger or smaller, and clocks for which an effect could."""
+    if judgement is None:
+        return []
+    estimates, model = judgement.estimates, judgement.fitted.model
+    clocks = {one.id for one in model if one.late in _CLOCKS}
+    pairs = [{one.effect, other.effect} for one, other, _ in estimates.list_correlated()]
+    pairs += [{one, name} for one in clocks for name in model.effect(one).confused_with if name in model]
+    if context.has_gyro:
+        # A clock that was put right beforehand is no number of the fit.
+        aligned = find_late_effect(Late.POSES).id
+        clocks.add(aligned)
+        pairs += [{aligned, item.free.effect} for item in estimates.items if item.trades_with_clock]
+    pairs = [pair for pair in pairs if effect.id in pair and pair & clocks and "" not in pair]
+    return sorted(set().union(*pairs) - {effect.id})
 
 
 def _list_by_run(

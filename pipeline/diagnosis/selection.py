@@ -188,11 +188,7 @@ class Selection:
         at nothing, and the model with both says less than the one without it.
         """
         known = {candidate.id for candidate in self.candidates} - set(tested.ids)
-        gone = [
-            effect
-            for effect in tested.state.effects
-            if not self._may_stay(effect, tested.state)
-        ]
+        gone = [effect for effect in tested.state.effects if not self._may_stay(effect, tested.state)]
         if not gone or len(gone) == len(tested.ids):
             return tested
         simpler = [one for one in (effect.collapse() for effect in gone) if one is not None]

@@ -64,11 +64,13 @@ class Part(ABC):
         least: spread below which a residual is rounding of stamps [m/s, m/s, rad/s], shape (3,).
         way: from where to where, in words.
         prior: what is known of numbers before.
+        dates_poses: whether the clocks that are no free numbers of it are those of the poses.
         clocks: ids of effects that are a clock of each run alone: several runs, of which not every one has a
             gyro that dates its poses.
     """
 
     prior: Prior = NO_PRIOR
+    dates_poses: bool = True
     channels: tuple[int, ...] = (0, 1, 2)
     way: str
 
@@ -212,6 +214,7 @@ class WheelPart(Part):
     """
 
     way = "from the command to the wheels"
+    dates_poses = False
 
     def __init__(
         self, commanded: Sequence[Comparison], measured: Sequence[Comparison], largest: Largest
