@@ -163,9 +163,8 @@ def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Con
         for some in (common.effects, common.immaterial)
     )
     timing = dict(runs[number])
-    clock = find_late([find_effect(one.id) for one in effects], Late.POSES)
-    if clock is not None:
-        (late,) = (value for one in effects if one.id == clock.id for value in one.parameters.values())
+    for clock in (one for one in effects if find_effect(one.id).late is Late.POSES):
+        (late,) = clock.parameters.values()
         timing["pose_delay_s"] = round(late.value, 4)
     return replace(
         common, run=recording.name, effects=effects, immaterial=immaterial,
@@ -362,7 +361,7 @@ def _list_by_run(
         # Of runs of which some have a gyro: what it had put right belongs to the clock.
         found = [
             {name: value.move(run.alignment.heading_delay_s) for name, value in numbers.items()}
-            for numbers, run in zip(found, context.runs, strict=True)
+            for numbers, run in zip(found, context.runs, strict=False)
         ]
     return tuple(found)
 

@@ -131,7 +131,7 @@ def fit_model(
             fit = _fit_part(problem, part, mine, per_run)
         if exact:
             fit = _settle(part, fit, per_run)
-        fit = replace(fit, state=fit.state.means)
+        fit = replace(fit, state=fit.state.centred)
         fits.append(fit)
         own = {run: {**state.own.get(run, {}), **numbers} for run, numbers in fit.state.own.items()}
         state = replace(fit.state, effects=state.effects, own={**state.own, **own}).add(*fit.state.effects)

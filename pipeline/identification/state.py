@@ -79,7 +79,7 @@ class State:
         return next((effect for effect in self.effects if effect.id == name), None)
 
     @property
-    def means(self) -> State:
+    def centred(self) -> State:
         """The state with the mean over the runs as the shared value of what belongs to each run alone."""
         labels = {label for own in self.own.values() for label in own}
         means = {

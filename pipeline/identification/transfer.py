@@ -27,8 +27,8 @@ class Transfer:
 
     Attributes:
         run: name of the run; `terrain` its terrain.
-        carried: errors with the model's values as they are; only the delays of the recording and what is each run's
-            own are fitted.
+        carried: errors with the model's values as they are; only the delays of the recording and what is each
+            run's own are fitted.
         own: held-out errors of the same effects fitted to this run.
         ideal: errors of the ideal model.
         ratio: carried over own, geometric over the channels x, y, w.
@@ -59,7 +59,7 @@ def carry_over(
         runs: to predict.
         source: what the model is fed with.
         fitted_on: terrains it was fitted on, for the warning.
-        per_run: labels of numbers that belong to each run alone, which no model carries over: they are fitted.
+        per_run: labels of numbers that belong to each run alone, which no model carries over but a fit finds.
     """
     found = []
     frozen = model.swap(

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -21,7 +22,6 @@ from pipeline.diagnosis.words import describe
 from pipeline.identification import Input, Problem, carry_over
 from pipeline.identification.judgement import judge_model
 from pipeline.models import find_effect, read_model, write_model
-from pipeline.runs import MotionRun
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,
@@ -31,7 +31,10 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
-from pipeline.vehicles import Vehicle
+
+if TYPE_CHECKING:
+    from pipeline.runs import MotionRun
+    from pipeline.vehicles import Vehicle
 
 _CLOCKS = (0.06, 0.14, 0.22)
 _SCENE = Scenario(
