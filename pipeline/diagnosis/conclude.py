@@ -356,7 +356,7 @@ def _list_by_run(
     if judgement is None or effect.id not in judgement.fitted.model:
         return (list_values(effect, None),)
     acting = judgement.fitted.state.list_as_it_acts(judgement.fitted.model.effect(effect.id))
-    found = [list_values(one, judgement.estimates, run) for run, one in enumerate(acting)]
+    found = [list_values(one, judgement.estimates.choose_run(run)) for run, one in enumerate(acting)]
     if effect.late is Late.POSES:
         # Of runs of which some have a gyro: what it had put right belongs to the clock.
         found = [

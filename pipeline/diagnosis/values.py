@@ -20,10 +20,9 @@ if TYPE_CHECKING:
 _SURE = 1.96
 
 
-def list_values(effect: Effect, estimates: Estimates | None, run: int = 0) -> dict[str, Value]:
-    """Numbers of an effect as it acts in a run, with the intervals of a fit; none where it could not tell."""
-    items = () if estimates is None else estimates.items
-    known = {item.free.label: item for item in items if item.free.run in {None, run}}
+def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]:
+    """Numbers of an effect with the intervals of a fit; none where the fit could not tell."""
+    known = {} if estimates is None else {item.free.label: item for item in estimates.items}
     values = {}
     for parameter in effect.parameters:
         value = effect.values[parameter.name]

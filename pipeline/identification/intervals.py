@@ -80,6 +80,12 @@ class Estimates:
     correlation: Floats
     blocks: int
 
+    def choose_run(self, run: int) -> Estimates:
+        """Those of the numbers that act in a run."""
+        rows = [place for place, item in enumerate(self.items) if item.free.run in {None, run}]
+        items = tuple(self.items[place] for place in rows)
+        return Estimates(items, self.correlation[np.ix_(rows, rows)], self.blocks)
+
     def list_correlated(self) -> list[tuple[Free, Free, float]]:
         """Pairs of numbers that the data hardly tell apart, with their correlation."""
         return [
