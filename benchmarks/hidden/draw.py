@@ -432,8 +432,9 @@ def _draw_joint(draw: np.random.Generator, seed: int, effect: str | None) -> Rid
         )
         for number, late in enumerate(clocks)
     ]
-    # Without encoders a clock and the drive's delay are one number.
-    alike = 0.0 if LAYOUTS[scene.recording.layout].wheels else asked.get("transport_delay", {}).get("d", 0.0)
+    # Without encoders and odometry a clock and the drive's delay are one number.
+    told = LAYOUTS[scene.recording.layout].wheels or scene.recording.decoys != "none"
+    alike = 0.0 if told else asked.get("transport_delay", {}).get("d", 0.0)
     seen = [late + alike for late in clocks]
     asked["clock_offset"] = {"d": seen[0]}
     answer = Answer("joint", asked, program=scenes[0].program.name, note=chosen, clocks=seen)
