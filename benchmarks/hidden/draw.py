@@ -39,11 +39,13 @@ from pipeline.simulate import (
 )
 
 Category = Literal[
-    "single", "small", "sets", "empty", "poor", "odd", "rigid", "equipped", "cars", "natural", "late"
-]
+    "single", "small", "sets", "empty", "poor", "odd", "rigid", "equipped", "cars", "natural", "late",
+    "joint",
+]  # fmt: skip
 # New ones go last: a category draws by its place.
 CATEGORIES: tuple[Category, ...] = (
     "single", "small", "sets", "empty", "poor", "odd", "rigid", "equipped", "cars", "natural", "late",
+    "joint",
 )  # fmt: skip
 
 DIFFERENTIAL = (
@@ -76,6 +78,11 @@ POOLS: dict[str, tuple[str, ...]] = {
     "rigid": MACHINERY,
     "natural": (*DIFFERENTIAL, "nothing"),
     "late": (*(name for name in DIFFERENTIAL if name != "clock_offset"), "nothing"),
+    # What changes within a run is no run's like another's.
+    "joint": (
+        *(name for name in DIFFERENTIAL if name not in {"clock_offset", "terrain_change", "time_drift"}),
+        "nothing",
+    ),
 }
 _CAR_SETS = (
     ("drive_lag", "steering_lag"), ("transport_delay", "icr_offset"), ("transport_delay", "understeer"),
@@ -100,6 +107,7 @@ class Answer:
         channel: channels that the odd physics acts on.
         program: what was driven.
         note: anything else.
+        clocks: how late poses are in each of several runs, against what else the run recorded [s].
     """
 
     category: str
@@ -108,15 +116,17 @@ class Answer:
     channel: str = ""
     program: str = ""
     note: str = ""
+    clocks: list[float] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class Riddle:
-    """A scenario to simulate with its answer."""
+    """A scenario to simulate with its answer; `more` are further runs of the vehicle."""
 
     scenario: Scenario
     answer: Answer
     machine: SkidSteer | None = None
+    more: tuple[Scenario, ...] = ()
 
 
 def draw_riddle(category: Category, seed: int, effect: str | None = None) -> Riddle:
@@ -140,6 +150,7 @@ def draw_riddle(category: Category, seed: int, effect: str | None = None) -> Rid
         "cars": lambda g, s, _e: _draw_cars(g, s),
         "natural": _draw_natural,
         "late": _draw_late,
+        "joint": _draw_joint,
     }
     if effect is None:
         return maker[category](np.random.default_rng([CATEGORIES.index(category), seed]), seed, None)
@@ -148,14 +159,17 @@ def draw_riddle(category: Category, seed: int, effect: str | None = None) -> Rid
     return maker[category](generator, int(generator.integers(2**31)), effect)
 
 
-def write_riddle(riddle: Riddle, path: Path) -> None:
-    """Simulate and record a riddle; its answer stands beside it, sealed."""
+def write_riddle(riddle: Riddle, path: Path) -> list[Path]:
+    """Simulate and record a riddle, its further runs beside it; its answer stands there, too, sealed."""
     if riddle.machine is None:
         run = simulate_run(riddle.scenario)
     else:
         run = simulate_skid_steer(riddle.scenario, riddle.machine)
-    write_log(run, path)
+    paths = [path, *(path.with_stem(f"{path.stem}_{n}") for n in range(1, len(riddle.more) + 1))]
+    for made, log in zip((run, *map(simulate_run, riddle.more)), paths, strict=True):
+        write_log(made, log)
     path.with_suffix(".sealed").write_text(seal(riddle.answer), encoding="ascii")
+    return paths
 
 
 def seal(answer: Answer) -> str:
@@ -400,6 +414,31 @@ def _draw_late(draw: np.random.Generator, seed: int, effect: str | None) -> Ridd
     pose = replace(scene.pose, rate_hz=20.0, update_hz=float(draw.choice([5.0, 10.0])), drift_m=0.02)
     scene = replace(scene, pose=pose, effects=asked)
     return Riddle(scene, Answer("late", asked, program=scene.program.name, note=chosen))
+
+
+def _draw_joint(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:
+    """Two to four runs of one vehicle without a gyro, the clock of each set anew."""
+    chosen = effect or _draw_one_or_none(draw, POOLS["joint"])
+    scene = replace(_excite(_draw_scene(draw, seed), chosen, draw), imu=None, duration_s=120.0)
+    asked = {} if chosen == "nothing" else {chosen: draw_size(chosen, scene, 1.0, draw)}
+    clocks = [round(float(late), 3) for late in draw.uniform(-0.05, 0.3, int(draw.integers(2, 5)))]
+    scenes = [
+        replace(
+            scene,
+            seed=seed + 1_000_000 * number,
+            program=replace(scene.program, name=str(draw.choice(["drive_steps", "smooth", "teleop"]))),  # type: ignore[arg-type]
+            start_pose=(0.0, 0.0, float(draw.uniform(-3.0, 3.0))),
+            effects={**asked, "clock_offset": {"d": late}},
+        )
+        for number, late in enumerate(clocks)
+    ]
+    # Without encoders and odometry a clock and the drive's delay are one number.
+    told = LAYOUTS[scene.recording.layout].wheels or scene.recording.decoys != "none"
+    alike = 0.0 if told else asked.get("transport_delay", {}).get("d", 0.0)
+    seen = [late + alike for late in clocks]
+    asked["clock_offset"] = {"d": seen[0]}
+    answer = Answer("joint", asked, program=scenes[0].program.name, note=chosen, clocks=seen)
+    return Riddle(scenes[0], answer, more=tuple(scenes[1:]))
 
 
 def _draw_one_or_none(draw: np.random.Generator, pool: tuple[str, ...]) -> str:

@@ -8,14 +8,14 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from draw import Answer, Riddle, draw_riddle, open_seal, write_riddle
 from records import Job, Record, describe_scene
-from score import score_run
+from score import score_runs
 from truth import Json, check_models
 
 from pipeline.analysis.analyze import analyze_log
@@ -64,22 +64,22 @@ def play(job: Job, scratch: Path) -> Record:
 def _play(job: Job, riddle: Riddle, log: Path) -> Record:
     watch = Watch()
     with watch.measure("draw"):
-        write_riddle(riddle, log)
+        logs = write_riddle(riddle, log)
     with watch.measure("ask"):
-        vehicle, recording, told = _ask_program(log) if job.by_command_line else _ask(log, watch)
+        vehicle, recording, told = _ask_program(logs) if job.by_command_line else _ask(logs, watch)
     answer: Answer = open_seal(log.with_suffix(".sealed").read_text(encoding="ascii"))
     checked, note = None, ""
     if job.category not in _UNCHECKED:
         with watch.measure("check"):
             try:
-                checked = check_models(vehicle, recording, told, answer)
+                checked = check_models(vehicle, recording, told[0], answer)
             except SlipError as error:
                 # What was said stands; that it is as good as the true model cannot be shown.
                 note = f"not checked: {error}"
     return Record(
         job,
         answer,
-        score_run(answer, told),
+        score_runs(answer, told),
         checked,
         note=note,
         scene=describe_scene(riddle),
@@ -88,22 +88,24 @@ def _play(job: Job, riddle: Riddle, log: Path) -> Record:
     )
 
 
-def _ask(log: Path, watch: Watch) -> tuple[Vehicle, Recording, Json]:
-    """What `slip diagnose LOG --json` does, in this process."""
+def _ask(logs: Sequence[Path], watch: Watch) -> tuple[Vehicle, Recording, Sequence[Json]]:
+    """What `slip diagnose LOG... --json` does, in this process."""
     with watch.measure("stages"):
-        vehicle, recording = _load(log)
+        loaded = [_load(log) for log in logs]
+    (vehicle, recording), *_ = loaded
     with watch.measure("diagnosis"):
-        told = diagnose_runs([recording], vehicle).to_json()[0]
+        told = diagnose_runs([one for _, one in loaded], vehicle).to_json()
     return vehicle, recording, told
 
 
-def _ask_program(log: Path) -> tuple[Vehicle, Recording, Json]:
+def _ask_program(logs: Sequence[Path]) -> tuple[Vehicle, Recording, Sequence[Json]]:
     """The program itself."""
-    command = [sys.executable, "-m", "pipeline", "diagnose", str(log), "--json", "--out", str(_results(log))]
+    out = str(_results(logs[0]))
+    command = [sys.executable, "-m", "pipeline", "diagnose", *map(str, logs), "--json", "--out", out]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     if done.returncode not in {0, 3}:
         raise RuntimeError(done.stderr.strip())
-    return *_load(log), dict(json.loads(done.stdout)["runs"][0])
+    return *_load(logs[0]), json.loads(done.stdout)["runs"]
 
 
 def _load(log: Path) -> tuple[Vehicle, Recording]:

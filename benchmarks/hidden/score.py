@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from draw import Answer  # noqa: TC002 - it runs as a script, too
 
@@ -93,6 +93,16 @@ def score_run(answer: Answer, run: Json) -> Score:
         tuple(false), channel, _errors(run), tuple("|".join(sorted(group)) for group in groups),
         tuple(_list_intervals(answer, entries)),
     )  # fmt: skip
+
+
+def score_runs(answer: Answer, runs: Sequence[Json]) -> Score:
+    """Compare runs that were diagnosed together with their answer: each has a clock of its own."""
+    score, intervals = score_run(answer, runs[0]), []
+    for late, run in zip(answer.clocks[1:], runs[1:], strict=True):
+        entries = [item for item in _list(run, "effects") if isinstance(item, Mapping)]
+        own = replace(answer, effects={"clock_offset": {"d": late}})
+        intervals += list(_list_intervals(own, entries))
+    return replace(score, intervals=(*score.intervals, *intervals))
 
 
 def _list_intervals(

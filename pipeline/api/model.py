@@ -159,7 +159,7 @@ class Model:
         file, read = self._read(runs, vehicle_of)
         source = choose_input(read, input, file.model, last=file.last_input).source
         with threadpool_limits(1):
-            found = carry_over(file.model, read, source)
+            found = carry_over(file.model, read, source, per_run=file.per_run)
         rows = []
         for item in found:
             judged = {"as it is": item.carried, "fitted to this run": item.own, "ideal": item.ideal}

@@ -215,7 +215,7 @@ def compare(  # noqa: D417 - the shared options document themselves
     chosen = choose_input(files[0][1], spoken.input, effects, last=last.pop() if len(last) == 1 else None)
     rows: list[tuple[str, Transfer]] = []
     for path, (file, runs) in zip((model, other), files, strict=True):
-        carried = carry_over(file.model, runs, chosen.source, fitted_on=_terrains(file))
+        carried = carry_over(file.model, runs, chosen.source, fitted_on=_terrains(file), per_run=file.per_run)
         rows += [(str(path), item) for item in carried]
     warnings = [text for text in (chosen.warning, *(item.warning for _, item in rows)) if text]
     if spoken.json:
@@ -307,7 +307,8 @@ def _change(
     if path is not None:
         write_model(written, path)
     terrains = [run.terrain for run in runs]
-    carried = carry_over(written.model, others, fit.chosen.source, fitted_on=terrains) if others else []
+    more = {"fitted_on": terrains, "per_run": written.per_run}
+    carried = carry_over(written.model, others, fit.chosen.source, **more) if others else []
     warnings = [text for text in (fit.chosen.warning, *(item.warning for item in carried)) if text]
     if spoken.json:
         print_json(

@@ -32,6 +32,7 @@ from pipeline.identification.judgement import judge_model, note_fit
 from pipeline.identification.ladder import compare_losses
 from pipeline.identification.parts import BodyPart, count_seconds
 from pipeline.models import Model, ModelFile, find_effect
+from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late, find_late
 from pipeline.runs import MotionError
 
@@ -157,14 +158,38 @@ def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Con
     findings += [cast("Mapping[str, Json]", f) for f in recording.list_findings()]
     findings += _note_brevity(context, common)
     runs = cast("Sequence[Mapping[str, Json]]", common.timing["runs"])
-    return replace(common, run=recording.name, findings=tuple(findings), timing=runs[number])
+    effects, immaterial = (
+        tuple(_choose_run(one, number, context) for one in some)
+        for some in (common.effects, common.immaterial)
+    )
+    timing = dict(runs[number])
+    for clock in (one for one in effects if find_effect(one.id).late is Late.POSES):
+        (late,) = clock.parameters.values()
+        timing["pose_delay_s"] = round(late.value, 4)
+    return replace(
+        common, run=recording.name, effects=effects, immaterial=immaterial,
+        findings=tuple(findings), timing=timing,
+    )  # fmt: skip
+
+
+def _choose_run(effect: Named, number: int, context: Context) -> Named:
+    """An effect with the numbers that it has in one of the runs."""
+    if not effect.by_run:
+        return effect
+    values = effect.by_run[number]
+    motion = _restore(effect.id, values).describe_motion(context.vehicle)
+    return replace(effect, parameters=values, motion=motion)
 
 
 def _doubt(effect: Named, exceeded: Mapping[str, float]) -> str | None:
     """Why an effect with its numbers is none of a vehicle's; None where it may well be one."""
-    restored = _restore(effect.id, effect.parameters)
-    highs = {name: value.high for name, value in effect.parameters.items()}
-    return find_implausible(restored) or find_exceeded(restored, highs, exceeded)
+    for values in effect.tellings:
+        restored = _restore(effect.id, values)
+        highs = {name: value.high for name, value in values.items()}
+        doubt = find_implausible(restored) or find_exceeded(restored, highs, exceeded)
+        if doubt is not None:
+            return doubt
+    return None
 
 
 def _restore(name: str, values: Mapping[str, Value]) -> Effect:
@@ -277,18 +302,16 @@ def _describe(
 ) -> Named:
     way = _way_of(effect, ways)
     gain, selected, evidence = _measure_gain(effect, way)
-    if _was_aligned(effect, context):
-        values = read_clock(effect, context.runs)
-    elif judgement is not None and effect.id in judgement.fitted.model:
-        values = list_values(judgement.fitted.model.effect(effect.id), judgement.estimates)
-    else:
-        values = list_values(effect, None)
+    by_run = _list_by_run(effect, context, judgement)
+    values = by_run[0]
     return Named(
         id=effect.id,
         parameters=values,
         gain=gain,
         equivalent_to=list_equivalents(effect, context),
-        confused_with=effect.confused_with,
+        confused_with=tuple(
+            dict.fromkeys((*effect.confused_with, *_list_trading(effect, context, judgement)))
+        ),
         corrected=_was_aligned(effect, context),
         way=way.search.way,
         selected=selected,
@@ -298,7 +321,49 @@ def _describe(
             evidence,
             {name: widths[label] for name in values if (label := f"{effect.id}.{name}") in widths},
         ),
+        by_run=by_run if len(by_run) > 1 else (),
     )
+
+
+def _list_trading(effect: Effect, context: Context, judgement: Judgement | None) -> list[str]:
+    """Effects for which a clock could be larger or smaller, and clocks for which an effect could."""
+    if judgement is None:
+        return []
+    estimates, model = judgement.estimates, judgement.fitted.model
+    clocks = {one.id for one in model if one.late in _CLOCKS}
+    pairs = [{one.effect, other.effect} for one, other, _ in estimates.list_correlated()]
+    pairs += [{one, name} for one in clocks for name in model.effect(one).confused_with if name in model]
+    if context.has_gyro:
+        # A clock that was put right beforehand is no number of the fit.
+        aligned = find_late_effect(Late.POSES).id
+        clocks.add(aligned)
+        pairs += [{aligned, item.free.effect} for item in estimates.items if item.trades_with_clock]
+    pairs = [pair for pair in pairs if effect.id in pair and pair & clocks and "" not in pair]
+    return sorted(set().union(*pairs) - {effect.id})
+
+
+def _list_by_run(
+    effect: Effect, context: Context, judgement: Judgement | None
+) -> tuple[Mapping[str, Value], ...]:
+    """Numbers of an effect: of each run where each has its own clock, else once."""
+    if _was_aligned(effect, context):
+        delays = [run.alignment.heading_delay_s for run in context.runs]
+        beyond = effect.delay - float(np.mean(delays))
+        return tuple(
+            read_clock(effect.of_delay(beyond + delay), run)
+            for delay, run in zip(delays, context.runs, strict=True)
+        )
+    if judgement is None or effect.id not in judgement.fitted.model:
+        return (list_values(effect, None),)
+    acting = judgement.fitted.state.list_as_it_acts(judgement.fitted.model.effect(effect.id))
+    found = [list_values(one, judgement.estimates.choose_run(run)) for run, one in enumerate(acting)]
+    if effect.late is Late.POSES:
+        # Of runs of which some have a gyro: what it had put right belongs to the clock.
+        found = [
+            {name: value.move(run.alignment.heading_delay_s) for name, value in numbers.items()}
+            for numbers, run in zip(found, context.runs, strict=False)
+        ]
+    return tuple(found)
 
 
 def _find_idle(
@@ -335,7 +400,8 @@ def _may_be_nothing(effect: Named) -> bool:
     """Whether no interval of an effect leaves out where it does nothing; a limit does nothing at infinity."""
     known = [
         (value, find_effect(effect.id)().parameter(name).neutral)
-        for name, value in effect.parameters.items()
+        for values in effect.tellings
+        for name, value in values.items()
         if math.isfinite(value.high - value.low) and value.high > value.low
     ]
     return bool(known) and all(

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
 from pipeline.diagnosis.enough import describe_enough
 from pipeline.diagnosis.error_regions import tabulate_regions
 from pipeline.diagnosis.materiality import LEAST_TURN_RAD, LEAST_WAY_SHARE
 from pipeline.models.catalogue import find_effect
+from pipeline.models.level import Level
 from pipeline.models.model_text import format_model
 from pipeline.runs.windows import HORIZON_S
 
@@ -45,6 +46,14 @@ class Value:
     at_bound: bool = False
     another_run: tuple[float, float] = (math.nan, math.nan)
 
+    def move(self, change: float) -> Value:
+        """The number with its intervals, larger by a change that is known."""
+        low, high = self.another_run
+        return replace(
+            self, value=self.value + change, low=self.low + change, high=self.high + change,
+            another_run=(low + change, high + change),
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Named:
@@ -64,6 +73,8 @@ class Named:
             way; or its interval holds doing nothing.
         moves: how far it moves predictions over 2 s; None where the model does not hold it.
         growth: what was known of it by when; None where the model does not hold it.
+        by_run: its numbers in each of the runs that were judged together, where each has its own; those of
+            this run are `parameters`.
     """
 
     id: str
@@ -78,11 +89,18 @@ class Named:
     tentative: bool = False
     moves: Moves | None = None
     growth: Growth | None = None
+    by_run: tuple[Mapping[str, Value], ...] = ()
 
     @property
     def readings(self) -> tuple[Reading, ...]:
         """What it is if it belongs to the vehicle, the ground or the run, which one run cannot tell."""
-        return find_effect(self.id).readings
+        found = find_effect(self.id).readings
+        return tuple(one for one in found if one.level is Level.RUN) if self.by_run else found
+
+    @property
+    def tellings(self) -> tuple[Mapping[str, Value], ...]:
+        """Its numbers, once or for each run."""
+        return self.by_run or (self.parameters,)
 
     @property
     def sentence(self) -> str:

@@ -44,10 +44,11 @@ def read_clocks(context: Context, body: Search) -> Clocks:
     """Name clocks: with a gyro the delays of heading and position are known apart."""
     state = body.final.state
     extra = find_late(state.effects, Late.POSES)
-    more = extra.delay if extra is not None else 0.0
     rows, positions, certain = [], [], []
-    for timing, run in zip(state.timing, context.runs, strict=True):
+    for number, (timing, run) in enumerate(zip(state.timing, context.runs, strict=True)):
         yaw = run.alignment.heading_delay_s
+        own = find_late(state.effects_of(number), Late.POSES)
+        more = own.delay if own is not None else 0.0
         late = yaw + more
         positions.append(late)
         certain.append(is_late(run))
@@ -66,8 +67,8 @@ def read_clocks(context: Context, body: Search) -> Clocks:
     if skewed:
         found.append(find_late_effect(Late.HEADING).of_delay(-more))
     least = max(LEAST_DELAY_S, _SKEWED_CLOCK if skewed else 0.0, _held_delay(context))
-    known = extra is not None if not context.has_gyro else all(certain)
-    if known and abs(late) >= least:
+    known = extra is not None if not context.has_gyro else any(certain)
+    if known and max(map(abs, positions)) >= least:
         clock = find_late_effect(Late.POSES).of_delay(late)
         if context.has_gyro and not context.largest.moves_both_ways:
             # The gyro dates the heading; only driving and turning at once tie the position's clock to it.

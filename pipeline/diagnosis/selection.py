@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pipeline.identification.parts import Part
     from pipeline.identification.proposals import Candidate, Proposal, Trial
     from pipeline.identification.state import State
+    from pipeline.models.effect import Effect
     from pipeline.models.evidence import Evidence, Largest
 
 Floats = NDArray[np.float64]
@@ -187,11 +188,7 @@ class Selection:
         at nothing, and the model with both says less than the one without it.
         """
         known = {candidate.id for candidate in self.candidates} - set(tested.ids)
-        gone = [
-            effect
-            for effect in tested.state.effects
-            if effect.id not in self.kept and not is_nameable(effect, self.evidence)
-        ]
+        gone = [effect for effect in tested.state.effects if not self._may_stay(effect, tested.state)]
         if not gone or len(gone) == len(tested.ids):
             return tested
         simpler = [one for one in (effect.collapse() for effect in gone) if one is not None]
@@ -205,9 +202,18 @@ class Selection:
 
     def is_sound(self, tested: CandidateModel) -> bool:
         """Whether every effect is large enough to be named, and no degenerate form of another."""
-        return all(
-            effect.id in self.kept or is_nameable(effect, self.evidence) for effect in tested.state.effects
-        )
+        return all(self._may_stay(effect, tested.state) for effect in tested.state.effects)
+
+    def _may_stay(self, effect: Effect, state: State) -> bool:
+        """Whether an effect is known, or may be named as it acts in one of the runs."""
+        if effect.id in self.kept:
+            return True
+        acting = state.list_as_it_acts(effect)
+        if len(acting) > 1:
+            # Of clocks that differ, the earliest is early against the latest, which no delay of a drive is.
+            delays = [one.delay for one in acting]
+            acting.append(effect.of_delay(min(delays) - max(delays)))
+        return any(is_nameable(one, self.evidence) for one in acting)
 
 
 def open_selection(

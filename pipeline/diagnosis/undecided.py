@@ -47,9 +47,10 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
             for rival in selection.suggest(without, _LOOKED_AT, without=[effect.id])
             if _is_as_good(selection, final, rival) and _does_the_same(selection, without, final, rival)
         ]
-        names = [name for rival in rivals for name in rival.ids if name not in final.ids]
         alike = _list_alike(selection, without, final, effect)
-        names += [name for name in alike if name not in names]
+        # Rivals may have become the same simpler effect.
+        names = dict.fromkeys(name for rival in rivals for name in rival.ids if name not in final.ids)
+        names |= dict.fromkeys(alike)
         simple = [name for name in names if name in alike or not _is_larger(selection, name, effect)]
         if simple:
             rest = [c() for c in selection.candidates if c.id in names]

@@ -12,8 +12,6 @@ from pipeline.models.bounds import stands_at_bound
 from pipeline.models.parameter import is_of_one_run
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from pipeline.identification import Estimates
     from pipeline.models import Effect
     from pipeline.models.parameter import Parameter
@@ -57,8 +55,8 @@ def expect_another_run(parameter: Parameter, value: float, low: float, high: flo
     )
 
 
-def read_clock(effect: Effect, runs: Sequence[MotionRun]) -> dict[str, Value]:
-    """How late poses were by the gyro's clock: no fit of the motion moves it, its error is the gyro's.
+def read_clock(effect: Effect, run: MotionRun) -> dict[str, Value]:
+    """How late poses were by a run's gyro: no fit of the motion moves it, its error is the gyro's.
 
     It is known no better than it varies in a run, nor than to half a sample of the gyro, whose stamp may be
     that of its begin or its end; and where poses are repeated until the next one is computed, that one may be
@@ -66,14 +64,11 @@ def read_clock(effect: Effect, runs: Sequence[MotionRun]) -> dict[str, Value]:
     """
     (parameter,) = effect.parameters
     value = effect.values[parameter.name]
-    variances, older = [], 0.0
-    for run in runs:
-        if run.gyro_fit is not None and run.gyro is not None:
-            sampling = 0.5 * float(np.median(np.diff(run.gyro[0]))) / _SURE
-            spread = run.alignment.latency_spread_s
-            variances.append(run.gyro_fit.delay_error_s**2 + spread**2 + sampling**2)
-            older = max(older, run.repeats_s)
-    half = _SURE * math.sqrt(float(np.mean(variances)) / len(variances)) if variances else math.nan
-    low, high = value - half - older, value + half
+    half = math.nan
+    if run.gyro_fit is not None and run.gyro is not None:
+        sampling = 0.5 * float(np.median(np.diff(run.gyro[0]))) / _SURE
+        spread = run.alignment.latency_spread_s
+        half = _SURE * math.sqrt(run.gyro_fit.delay_error_s**2 + spread**2 + sampling**2)
+    low, high = value - half - run.repeats_s, value + half
     another = expect_another_run(parameter, value, low, high)
     return {parameter.name: Value(value, low, high, parameter.unit, another_run=another)}

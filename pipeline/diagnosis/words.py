@@ -112,7 +112,10 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
             notes.append("tentative")
         note = f"  ({'; '.join(notes)})" if notes else ""
         rows.append(f"{effect.id:<20}{_values(effect):<{width}}{falls.get(effect.id, '')}{note}")
-        rows += [f"{'':<20}{text}" for text in (effect.sentence, _say_another_run(effect)) if text]
+        pairs = zip(diagnosis.joint, effect.by_run, strict=False)
+        own = [f"{_list_numbers(numbers)} in {run}" for run, numbers in pairs]
+        texts = own or (effect.sentence, _say_another_run(effect))
+        rows += [f"{'':<20}{text}" for text in texts if text]
     for item in diagnosis.undecided:
         held = diagnosis.find_held(item)
         fall = f"  {falls[held]}" if held in falls else ""
@@ -153,7 +156,11 @@ def _describe_immaterial(diagnosis: RunDiagnosis) -> list[str]:
 
 
 def _values(effect: Named) -> str:
-    return ", ".join(_value(name, value) for name, value in effect.parameters.items())
+    return "a clock of each run alone:" if effect.by_run else _list_numbers(effect.parameters)
+
+
+def _list_numbers(numbers: Mapping[str, Value]) -> str:
+    return ", ".join(_value(name, value) for name, value in numbers.items())
 
 
 def _value(name: str, value: Value) -> str:

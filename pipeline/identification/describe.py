@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from pipeline.runs.recording import MotionRun
 
 _DIGITS = 6
-_STRONG = 0.8
 _HEADS = ("x m/s", "y m/s", "w rad/s", "T 2s m", "R 2s rad")
 
 
@@ -113,19 +112,19 @@ def list_parameters(file: ModelFile) -> dict[str, dict[str, object]]:
     parameters = parameters_as_json(file.model, NOT_FITTED)
     for label, (low, high) in file.intervals.items():
         parameters[label] |= {"low": _round(low), "high": _round(high)}
+    for label in file.per_run:
+        rows = [row for row in file.own_numbers if row.get("parameter") == label]
+        if rows and label in parameters:
+            parameters[label]["runs"] = rows
     return parameters
 
 
 def correlations_as_json(estimates: Estimates) -> list[dict[str, object]]:
     """Pairs of parameters that the data hardly tell apart."""
-    found: list[dict[str, object]] = []
-    for i, one in enumerate(estimates.items):
-        for j in range(i):
-            value = float(estimates.correlation[i, j])
-            if abs(value) > _STRONG:
-                pair = [estimates.items[j].free.label, one.free.label]
-                found.append({"parameters": pair, "correlation": _round(value)})
-    return found
+    return [
+        {"parameters": [one.label, other.label], "correlation": _round(value)}
+        for one, other, value in estimates.list_correlated()
+    ]
 
 
 def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:

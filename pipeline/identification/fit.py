@@ -123,7 +123,7 @@ def fit_model(
     effects = problem.active_effects(model)
     fits: list[PartFit] = []
     for place, part in enumerate(problem.parts):
-        mine = replace(state, effects=()).add(*(effect for effect in effects if part.owns(effect)))
+        mine = state.hold([effect for effect in effects if part.owns(effect)])
         known = None if start is None else start.fits[place]
         if known is not None and (known.state.effects, known.state.timing) == (mine.effects, mine.timing):
             fit = known
@@ -131,14 +131,22 @@ def fit_model(
             fit = _fit_part(problem, part, mine, per_run)
         if exact:
             fit = _settle(part, fit, per_run)
+        fit = replace(fit, state=fit.state.centred)
         fits.append(fit)
-        state = replace(fit.state, effects=state.effects).add(*fit.state.effects)
+        own = {run: {**state.own.get(run, {}), **numbers} for run, numbers in fit.state.own.items()}
+        state = replace(fit.state, effects=state.effects, own={**state.own, **own}).add(*fit.state.effects)
     return Fitted(problem, state, tuple(fits), problem.find_residuals(state))
 
 
 def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]) -> PartFit:
     """The best values for a part of the way: effects that have none yet are put in one after the other."""
-    fresh = [effect for effect in state.effects if effect.is_neutral and effect.fixed != _names(effect)]
+    fresh = [
+        effect
+        for effect in state.effects
+        if effect.fixed != _names(effect)
+        # What all runs have in common says nothing of the clock of each.
+        and (effect.is_neutral or (effect.id in part.clocks and not state.has_own(effect.id)))
+    ]
     state = state.drop([effect.id for effect in fresh])
     fit = fit_part(part, make_weights(part.find_residuals(state), part), state, per_run=per_run)
     for effect in fresh:
@@ -214,7 +222,7 @@ def fit_part(
     """
     until = (iterations, enough)
     if isinstance(start, State):
-        start = _enter(part, weights, start, start.list_free(part.delays, per_run), until)
+        start = _enter(part, weights, start, part.list_free(start, per_run), until)
     fit = _descend(part, replace(start, weights=weights), until)
     for number in fit.free:
         moved = None if number.is_smooth else _walk_grid(part, fit, number)

@@ -31,6 +31,7 @@ SHORTEST_TIME_S = _SHORTEST_BLOCK_S / _TAUS
 _DELAY_STEP = 5e-3
 _RISEN = 1.92
 _LONGEST_S = 20.0
+_STRONG = 0.8
 # So many degrees of freedom are as good as a normal distribution.
 _NORMAL = 1e9
 
@@ -47,6 +48,7 @@ class Estimate:
         at_bound: whether it stopped at a bound, so that the interval means little.
         observable: whether the data move with it at all.
         freedom: degrees of freedom of Student's t that the interval was made with.
+        clock_error: part of the standard error that comes from not knowing when poses were taken.
     """
 
     free: Free
@@ -57,6 +59,12 @@ class Estimate:
     at_bound: bool
     observable: bool
     freedom: float = np.inf
+    clock_error: float = 0.0
+
+    @property
+    def trades_with_clock(self) -> bool:
+        """Whether most of its variance is that of the clock."""
+        return self.clock_error**2 > 0.5 * self.standard_error**2
 
     @property
     def deviation(self) -> float:
@@ -71,6 +79,21 @@ class Estimates:
     items: tuple[Estimate, ...]
     correlation: Floats
     blocks: int
+
+    def choose_run(self, run: int) -> Estimates:
+        """Those of the numbers that act in a run."""
+        rows = [place for place, item in enumerate(self.items) if item.free.run in {None, run}]
+        items = tuple(self.items[place] for place in rows)
+        return Estimates(items, self.correlation[np.ix_(rows, rows)], self.blocks)
+
+    def list_correlated(self) -> list[tuple[Free, Free, float]]:
+        """Pairs of numbers that the data hardly tell apart, with their correlation."""
+        return [
+            (self.items[j].free, one.free, value)
+            for i, one in enumerate(self.items)
+            for j in range(i)
+            if abs(value := float(self.correlation[i, j])) > _STRONG
+        ]
 
     def find(self, label: str) -> Estimate:
         """The estimate of ``effect.name``.
@@ -129,7 +152,9 @@ def estimate_part(part: Part, fit: PartFit) -> Estimates:
         deviation = np.maximum(np.outer(errors[rows], errors[rows]), 1e-300)
         correlation[np.ix_(rows, rows)] = spread / deviation
     wide = _find_quantile(freedom)
-    errors[rows] = np.hypot(errors[rows], _carry_clocks(blocks, total, rows, size))
+    carried = np.zeros(count)
+    carried[rows] = _carry_clocks(blocks, total, rows, size)
+    errors = np.hypot(errors, carried)
     items = []
     for index, number in enumerate(fit.free):
         value = fit.state.get(number)
@@ -144,6 +169,7 @@ def estimate_part(part: Part, fit: PartFit) -> Estimates:
                 at_bound=stands_at_bound(value, number.bounds),
                 observable=index in rows,
                 freedom=freedom if number.is_smooth else np.inf,
+                clock_error=float(carried[index]) if part.dates_poses else 0.0,
             )
         )
     return Estimates(tuple(items), correlation, blocks.count)

@@ -118,10 +118,12 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
     ]
     if own:
         fit["own"] = own
+    labels = (item.free.label for item in estimates.items if item.free.effect and item.free.run is not None)
+    per_run = tuple(dict.fromkeys((*file.per_run, *labels)))
     # Other runs may tell apart what those of the diagnosis could not.
     before = file.fit.get("runs")
     names = [run["run"] for run in before if isinstance(run, dict)] if isinstance(before, list) else []
     undecided = [group for group in file.undecided if set(group) & set(model.ids)]
     if undecided and names in ([], list(problem.names)):
         fit["undecided"] = undecided
-    return replace(file, model=model, intervals=intervals, fit=fit)
+    return replace(file, model=model, per_run=per_run, intervals=intervals, fit=fit)

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from pipeline.identification.prior import NO_PRIOR, Prior
 from pipeline.identification.state import State
 from pipeline.identification.weights import measure_noise
-from pipeline.models.effect import Place
+from pipeline.models.catalogue import find_late_effect
+from pipeline.models.effect import Late, Place
 from pipeline.models.forward import Timing
 from pipeline.runs.windows import WINDOW_S
 
@@ -63,15 +64,21 @@ class Part(ABC):
         least: spread below which a residual is rounding of stamps [m/s, m/s, rad/s], shape (3,).
         way: from where to where, in words.
         prior: what is known of numbers before.
+        dates_poses: whether the clocks that are no free numbers of it are those of the poses.
+        clocks: ids of effects that are a clock of each run alone: several runs, of which not every one has a
+            gyro that dates its poses.
     """
 
     prior: Prior = NO_PRIOR
+    dates_poses: bool = True
     channels: tuple[int, ...] = (0, 1, 2)
     way: str
 
     def __init__(self, comparisons: Sequence[Comparison], delays: tuple[DelayName, ...] = ()) -> None:
         self.comparisons = tuple(comparisons)
         self.delays = delays
+        is_dated = len(self.comparisons) == 1 or all(c.has_gyro for c in self.comparisons)
+        self.clocks = () if is_dated else (find_late_effect(Late.POSES).id,)
         self.least: Floats = np.full(3, _LEAST_SPREAD)
         windows = [c.windows for c in self.comparisons]
         self.run = np.repeat(np.arange(len(windows)), [w.start.size for w in windows]).astype(np.int64)
@@ -86,6 +93,17 @@ class Part(ABC):
     def number_stretches(self, length: float) -> Integers:
         """Stretches of a length [s] since each run's start, numbered through all runs, shape (n,)."""
         return number_stretches(self.run, self._since, length)
+
+    def list_free(self, state: State, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
+        """Free numbers of a state on this part: clocks belong to one run, and so does what `per_run` names.
+
+        What is late between the poses and the wheels of a run without a gyro is its clock.
+        """
+        return tuple(
+            number
+            for number in state.list_free(self.delays, (*self.clocks, *per_run))
+            if number.effect or self.comparisons[number.run or 0].has_gyro
+        )
 
     @abstractmethod
     def owns(self, effect: Effect) -> bool:
@@ -196,6 +214,7 @@ class WheelPart(Part):
     """
 
     way = "from the command to the wheels"
+    dates_poses = False
 
     def __init__(
         self, commanded: Sequence[Comparison], measured: Sequence[Comparison], largest: Largest

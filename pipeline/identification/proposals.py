@@ -54,12 +54,14 @@ class Trial:
         names: parameters that the columns are derivatives of; empty where the column is a secant.
         columns: change of the prediction, shape (n, 3, p).
         shift: change of the residual between the model and the start, shape (n, 3).
+        own: starts of a clock of each run alone, by run; its columns are secants, one a run.
     """
 
     effect: Effect
     names: tuple[str, ...]
     columns: Floats
     shift: Floats
+    own: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -115,6 +117,9 @@ def propose(
 
 def list_trials(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Iterator[Trial]:
     """Every start of an effect with its columns."""
+    if candidate.id in part.clocks:
+        yield _start_clocks(part, fit, candidate, largest)
+        return
     for values in list_starts(candidate, largest):
         start = candidate(**values)
         direct = tuple(
@@ -136,6 +141,25 @@ def list_trials(part: Part, fit: PartFit, candidate: Candidate, largest: Largest
             after = part.find_residuals(fit.state.add(changed))
             columns.append((base - after) / parameter.step)
         yield Trial(start, direct, np.stack(columns, axis=2), fit.residual - base)
+
+
+def _start_clocks(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Trial:
+    """Each run's clock at the start whose secant promises that run most."""
+    starts = [candidate(**values) for values in list_starts(candidate, largest)]
+    shifts = [fit.residual - part.find_residuals(fit.state.add(start)) for start in starts]
+    factor, best = fit.weights.factors(fit.residual), []
+    for shift in shifts:
+        rows = shift * factor
+        pull = np.bincount(part.run, (rows * fit.residual * factor).sum(axis=1))
+        size = np.bincount(part.run, (rows**2).sum(axis=1))
+        best.append(np.maximum(pull, 0.0) ** 2 / np.maximum(size, 1e-12))
+    chosen = np.argmax(best, axis=0)
+    columns = np.zeros((*fit.residual.shape, chosen.size))
+    for run, place in enumerate(chosen.tolist()):
+        rows = part.run == run
+        columns[rows, :, run] = shifts[place][rows]
+    own = tuple(starts[place].delay for place in chosen.tolist())
+    return Trial(starts[0], (), columns, np.zeros_like(fit.residual), own)
 
 
 def list_starts(candidate: Candidate, largest: Largest) -> list[dict[str, float]]:
@@ -236,6 +260,10 @@ def _promise(base: _Base, trials: tuple[Trial, ...]) -> Proposal | None:
     for trial in trials:
         mine, own = step[own : own + trial.columns.shape[2]], own + trial.columns.shape[2]
         effect = trial.effect
+        if trial.own:
+            delays = np.clip(mine, -1.0, 1.0) * trial.own
+            state = state.add(effect).set_clocks(effect, delays.tolist())
+            continue
         if not trial.names and mine[0] < _LEAST_SHARE:
             return None
         for name, change in zip(trial.names, mine.tolist(), strict=False):

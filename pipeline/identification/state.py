@@ -78,6 +78,32 @@ class State:
         """The effect of that id, None without."""
         return next((effect for effect in self.effects if effect.id == name), None)
 
+    @property
+    def centred(self) -> State:
+        """The state with the mean over the runs as the shared value of what belongs to each run alone."""
+        labels = {label for own in self.own.values() for label in own}
+        means = {
+            label: sum(self.own[run][label] for run in self.own) / len(self.own)
+            for label in labels
+            if all(label in own for own in self.own.values())
+        }
+        changed = (
+            effect.change(**{name: value for (owner, name), value in means.items() if owner == effect.id})
+            for effect in self.effects
+        )
+        return replace(self, effects=tuple(changed)) if means else self
+
+    def has_own(self, name: str) -> bool:
+        """Whether an effect has a number of each run's own."""
+        return any(owner == name for own in self.own.values() for owner, _ in own)
+
+    def list_as_it_acts(self, effect: Effect) -> list[Effect]:
+        """One of the effects, once, or as it acts in each run where it has numbers of each run's own."""
+        if not self.has_own(effect.id):
+            return [effect]
+        acting = (replace(self, effects=(effect,)).effects_of(run) for run in range(len(self.timing)))
+        return [found for (found,) in acting]
+
     def effects_of(self, run: int) -> tuple[Effect, ...]:
         """The effects as they act in one run."""
         own = self.own.get(run)
@@ -98,7 +124,16 @@ class State:
     def drop(self, names: Iterable[str]) -> State:
         """The state without some effects."""
         gone = set(names)
-        return replace(self, effects=tuple(effect for effect in self.effects if effect.id not in gone))
+        return self.hold([effect for effect in self.effects if effect.id not in gone])
+
+    def hold(self, effects: Sequence[Effect]) -> State:
+        """These effects and no others, with the numbers of each run's own that the state has of them."""
+        ids = {effect.id for effect in effects}
+        own = {
+            run: {label: value for label, value in numbers.items() if label[0] in ids}
+            for run, numbers in self.own.items()
+        }
+        return replace(self, effects=(), own=own).add(*effects)
 
     def list_free(self, delays: Sequence[DelayName], per_run: Sequence[str] = ()) -> tuple[Free, ...]:
         """Free numbers: parameters that are not fixed and say how much, then the delays of every run.
@@ -153,6 +188,12 @@ class State:
             for effect in self.effects
         )
         return replace(self, effects=tuple(changed))
+
+    def set_clocks(self, effect: Effect, delays: Sequence[float]) -> State:
+        """The state with a delay of each run's own of an effect of it that makes something late."""
+        (name,) = effect.values
+        own = {run: {**self.own.get(run, {}), (effect.id, name): late} for run, late in enumerate(delays)}
+        return replace(self, own=own)
 
     def take_over(self, other: State, free: Iterable[Free]) -> State:
         """The state with the values that another one has of some numbers."""

@@ -27,7 +27,8 @@ class Transfer:
 
     Attributes:
         run: name of the run; `terrain` its terrain.
-        carried: errors with the model's values as they are; only the delays of the recording are fitted.
+        carried: errors with the model's values as they are; only the delays of the recording and what is each
+            run's own are fitted.
         own: held-out errors of the same effects fitted to this run.
         ideal: errors of the ideal model.
         ratio: carried over own, geometric over the channels x, y, w.
@@ -44,7 +45,12 @@ class Transfer:
 
 
 def carry_over(
-    model: Model, runs: Sequence[MotionRun], source: Input, *, fitted_on: Sequence[str] = ()
+    model: Model,
+    runs: Sequence[MotionRun],
+    source: Input,
+    *,
+    fitted_on: Sequence[str] = (),
+    per_run: Sequence[str] = (),
 ) -> list[Transfer]:
     """Predict runs with a model that was fitted on others.
 
@@ -53,9 +59,12 @@ def carry_over(
         runs: to predict.
         source: what the model is fed with.
         fitted_on: terrains it was fitted on, for the warning.
+        per_run: labels of numbers that belong to each run alone, which no model carries over but a fit finds.
     """
     found = []
-    frozen = model.swap(*(effect.fix(*effect.values) for effect in model))
+    frozen = model.swap(
+        *(effect.fix(*(n for n in effect.values if f"{effect.id}.{n}" not in per_run)) for effect in model)
+    )
     for run in runs:
         problem = Problem([run], model.vehicle, source)
         carried = hold_out(problem, fit_model(problem, frozen))

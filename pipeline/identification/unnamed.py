@@ -46,7 +46,7 @@ def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Esti
 
 def _estimate_added(part: Part, fit: PartFit, effect: Effect) -> list[Estimate]:
     added = fit.state.add(effect)
-    new = tuple(n for n in added.list_free(part.delays) if n.effect == effect.id)
+    new = tuple(n for n in part.list_free(added) if n.effect == effect.id)
     if not all(number.is_smooth for number in new):
         return []
     columns = part.differentiate(added, fit.residual, new)

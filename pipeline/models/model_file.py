@@ -91,6 +91,24 @@ class ModelFile:
                 return late
         return 0.0
 
+    @property
+    def own_numbers(self) -> list[dict[str, object]]:
+        """Numbers of each run alone in the last fit: `run`, `parameter`, `value`, `low`, `high`."""
+        rows = self.fit.get("own")
+        return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+
+    def find_effects(self, run: str) -> tuple[Effect, ...]:
+        """The effects, with the numbers that belonged to a run alone in the last fit."""
+        own = {
+            row.get("parameter"): value
+            for row in self.own_numbers
+            if row.get("run") == run and isinstance(value := row.get("value"), float)
+        }
+        return tuple(
+            effect.change(**{n: own[label] for n in effect.values if (label := f"{effect.id}.{n}") in own})
+            for effect in self.model
+        )
+
 
 def read_model(path: Path) -> ModelFile:
     """Read a model file.

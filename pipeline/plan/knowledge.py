@@ -203,8 +203,8 @@ def _inform(fitted: Fitted) -> Hypothesis:
         columns = fit.jacobian[:, :, fit.smooth] * fit.weights.factors(fit.residual)[:, :, None]
         normal = np.einsum("ncp,ncq->pq", columns, columns) / _inflate(part, fit)
         numbers = [fit.free[index] for index in fit.smooth]
-        mine = [index for index, number in enumerate(numbers) if number.effect]
-        clocks = [index for index, number in enumerate(numbers) if not number.effect]
+        mine = [index for index, number in enumerate(numbers) if number.effect and number.run is None]
+        clocks = [index for index in range(len(numbers)) if index not in mine]
         known = normal[np.ix_(mine, mine)]
         if clocks:
             cross, own = normal[np.ix_(mine, clocks)], normal[np.ix_(clocks, clocks)]

@@ -48,7 +48,7 @@ def view_diagnosis(
     except MotionError:
         # A log that is too poor for a model has its slip all the same.
         return None
-    state = State(file.model.effects, (Timing(file.find_wheel_delay(run.name)),))
+    state = State(file.find_effects(run.name), (Timing(file.find_wheel_delay(run.name)),))
     places = tables["velocities"].select("t", "x", "y").sort("t") if "velocities" in tables else None
     floor = mapping_in(diagnosis, "noise_floor")
     return MotionStage(problem, places).view(state, objects_in(diagnosis, "ladder"), floor or None)

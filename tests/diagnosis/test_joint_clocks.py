@@ -1,0 +1,147 @@
+"""Runs without a gyro that are judged together: the clock of each is its own."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.diagnosis import read_recording
+from pipeline.analysis.options import Options
+from pipeline.diagnosis import Diagnosis, diagnose_runs
+from pipeline.diagnosis.recording import load_recording
+from pipeline.diagnosis.undecided import find_undecided
+from pipeline.diagnosis.words import describe
+from pipeline.identification import Input, Problem, carry_over
+from pipeline.identification.judgement import judge_model
+from pipeline.models import find_effect, read_model, write_model
+from pipeline.simulate import (
+    VEHICLES,
+    Disturbance,
+    PoseSensor,
+    Recording,
+    Scenario,
+    simulate_run,
+    write_log,
+)
+
+if TYPE_CHECKING:
+    from pipeline.runs import MotionRun
+    from pipeline.vehicles import Vehicle
+
+_CLOCKS = (0.06, 0.14, 0.22)
+_SCENE = Scenario(
+    vehicle=VEHICLES["husky"],
+    duration_s=120.0,
+    disturbance=Disturbance(0.02, 0.03),
+    pose=PoseSensor(drift_m=0.005),
+    imu=None,
+)
+
+
+def _diagnose(
+    layout: str, effects: Mapping[str, float], folder: Path
+) -> tuple[Diagnosis, list[MotionRun], Vehicle]:
+    recordings = []
+    for number, late in enumerate(_CLOCKS):
+        log = folder / f"run{number}.mcap"
+        scene = replace(_SCENE, seed=11 + number, recording=Recording(layout))
+        write_log(simulate_run(replace(scene, effects={**effects, "clock_offset": late})), log)
+        options = Options(out=folder / "out", report=False, diagnosis=False)
+        vehicle, recording = read_recording(analyze_log(log, options).manifest)
+        recordings.append(recording)
+    runs = [load_recording(recording, vehicle) for recording in recordings]
+    return diagnose_runs(recordings, vehicle), runs, vehicle
+
+
+@pytest.mark.parametrize(
+    ("layout", "effects"),
+    [("body_command", {}), ("husky", {"drive_lag": 0.4})],
+    ids=["the command alone", "encoders and a lag"],
+)
+def test_the_clock_of_each_run_is_told_and_no_effect_stands_for_it(
+    layout: str, effects: dict[str, float], tmp_path: Path
+) -> None:
+    diagnosis, runs, vehicle = _diagnose(layout, effects, tmp_path)
+    screen = describe(diagnosis)
+    for run, late in zip(diagnosis.runs, _CLOCKS, strict=True):
+        told = json.loads(json.dumps(run.to_json()))
+        named = {effect["id"]: effect["parameters"] for effect in told["effects"]}
+        assert set(named) == {*effects, "clock_offset"}
+        clock = named["clock_offset"]["d"]
+        assert clock["low"] < late < clock["high"]
+        assert clock["high"] - clock["low"] < 0.08
+        assert told["timing"]["pose_delay_s"] == pytest.approx(clock["value"], abs=1e-4)
+        assert f"d = {clock['value']:.3g} s [{clock['low']:.3g}, {clock['high']:.3g}] in {run.run}" in screen
+    for name, value in effects.items():
+        (number,) = named[name].values()
+        assert number["low"] < value < number["high"]
+        confused = {effect.id: effect.confused_with for effect in diagnosis.runs[0].effects}
+        assert name in confused["clock_offset"]
+        assert "clock_offset" in confused[name]
+
+    proposal = diagnosis.runs[0].proposal
+    assert proposal is not None
+    path = tmp_path / "model.toml"
+    write_model(proposal, path)
+    file = read_model(path)
+    assert file.per_run == ("clock_offset.d",)
+    judged = judge_model(Problem(runs, vehicle, Input.COMMAND), file.model, per_run=file.per_run)
+    own = {item.free.run: item for item in judged.estimates.items if item.free.effect == "clock_offset"}
+    for number, run in enumerate(diagnosis.runs):
+        (told_d,) = next(e.parameters.values() for e in run.effects if e.id == "clock_offset")
+        (written,) = (e.values["d"] for e in file.find_effects(run.run) if e.id == "clock_offset")
+        assert written == pytest.approx(told_d.value, abs=1e-5)
+        assert own[number].value == pytest.approx(told_d.value, abs=2e-4)
+    for item in carry_over(file.model, runs, Input.COMMAND, per_run=file.per_run):
+        assert item.ratio < 1.05
+
+
+def test_one_run_has_one_clock_and_runs_with_gyros_are_dated_by_them(tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    scene = replace(_SCENE, duration_s=60.0, imu=Scenario().imu)
+    write_log(simulate_run(scene), log)
+    options = Options(out=tmp_path / "out", report=False, diagnosis=False)
+    vehicle, recording = read_recording(analyze_log(log, options).manifest)
+    run = load_recording(recording, vehicle)
+    blind = replace(run, alignment=replace(run.alignment, gyro=None))
+    for runs, clocks in (([blind], ()), ([run, run], ()), ([run, blind], ("clock_offset",))):
+        problem = Problem(runs, vehicle, Input.COMMAND)
+        assert all(part.clocks == clocks for part in problem.parts)
+
+
+def test_undecided_repeats_no_name() -> None:
+    """Two rivals that have become the same simpler effect are one."""
+    effect, rival = find_effect("transport_delay")(d=0.2), find_effect("drive_lag")
+
+    class Selection(SimpleNamespace):
+        def drop(self, *_: object) -> object:
+            return model((), 0.0)
+
+        def suggest(self, *_: object, **__: object) -> list[object]:
+            return [model(("drive_lag",), 1.0), model(("drive_lag",), 1.0)]
+
+    def model(ids: tuple[str, ...], residual: float) -> SimpleNamespace:
+
+        rest = np.full((4, 3), residual)
+        return SimpleNamespace(ids=ids, held=rest, fit=SimpleNamespace(residual=rest))
+
+    final = model(("transport_delay",), 1.0)
+    final.state = SimpleNamespace(effects=(effect,))
+    largest = SimpleNamespace(is_one_motion=False)
+    selection = Selection(
+        kept=frozenset(),
+        budget=SimpleNamespace(is_spent=lambda: False),
+        weights=SimpleNamespace(loss=lambda held: float(abs(held).sum()), scale=1.0),
+        candidates=(rival,),
+        largest=largest,
+    )
+    (found,) = find_undecided(selection, final)  # type: ignore[arg-type]
+    assert found.candidates == ("transport_delay", "drive_lag")
