@@ -14,11 +14,10 @@ import math
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
-from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 from unittest.mock import patch
 
 from injections import Drive, Injection, list_injections
@@ -33,6 +32,7 @@ from pipeline.models import find_effect
 from pipeline.stages.extract import extract_tables
 
 if TYPE_CHECKING:
+    from pipeline.diagnosis.diagnosis import Named
     from pipeline.logs import LogData
     from pipeline.stages.extract import Extracted
     from pipeline.vehicles import Vehicle
@@ -42,27 +42,50 @@ if TYPE_CHECKING:
 LOGS = Path(__file__).parents[2] / "shared" / "logs"
 STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96
-_VERDICTS = ("recovered", "told", "undecided", "cannot", "missed")
+_OTHER = 0.02
+_VERDICTS = ("recovered", "told", "undecided", "cannot", "number", "missed")
+Number = tuple[float, float]
+_UNCHANGED = Injection("nothing", lambda tables, _: tables)
 Json = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What was said of a recording: names with numbers (value, half-width), findings, what it left open.
+    """What was said of a recording: numbers as (value, half-width) by ``effect.parameter``, and the rest.
 
-    Numbers of effects that were not named stand in `estimates`.
+    Attributes:
+        numbers: of the effects that are named.
+        findings: value by id, None where it has none.
+        undecided: ids of all groups.
+        unobservable: ids.
+        immaterial: numbers of effects that are listed as too small to be felt.
+        estimates: numbers of effects that were not named.
+        detectable: how large numbers would have had to be to be seen.
     """
 
-    numbers: Mapping[str, tuple[float, float]]
-    findings: tuple[str, ...]
-    undecided: tuple[str, ...]
-    unobservable: tuple[str, ...]
-    estimates: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    numbers: Mapping[str, Number]
+    findings: Mapping[str, float | None] = field(default_factory=dict)
+    undecided: Sequence[str] = ()
+    unobservable: Sequence[str] = ()
+    immaterial: Mapping[str, Number] = field(default_factory=dict)
+    estimates: Mapping[str, Number] = field(default_factory=dict)
+    detectable: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def names(self) -> set[str]:
         """Ids of the effects."""
         return {label.split(".")[0] for label in self.numbers}
+
+    @property
+    def mentioned(self) -> set[str]:
+        """Ids of the effects that are named, one explanation of several, or too small to be felt."""
+        return {label.split(".")[0] for label in (*self.numbers, *self.immaterial)} | {*self.undecided}
+
+    def find_number(self, label: str) -> Number:
+        """What is known of a number: as named, as estimated, or that it is less than would have been seen."""
+        effect, parameter = label.split(".")
+        neutral = (find_effect(effect)().parameter(parameter).neutral, self.detectable.get(label, 0.0))
+        return self.numbers.get(label) or self.immaterial.get(label) or self.estimates.get(label, neutral)
 
 
 def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
@@ -78,58 +101,83 @@ def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
     with tempfile.TemporaryDirectory() as folder, patch("pipeline.analysis.work.extract_tables", changed):
         manifest = analyze_log(log, Options(out=Path(folder), report=False)).manifest
         vehicle, recording = read_recording(manifest)
-        findings = tuple(str(finding["id"]) for finding in recording.list_findings())
         inputs = ("command", "measured") if both else ("measured",)
         told = diagnose_runs([recording], vehicle, inputs=inputs).runs[0]
-    numbers = {
+    findings = (*recording.list_findings(), *told.findings)
+    return Answer(
+        _list_numbers(told.effects),
+        {str(one["id"]): cast("float | None", one.get("value")) for one in findings},
+        tuple(name for item in told.undecided for name in item.candidates),
+        tuple(item.id for item in told.unobservable),
+        _list_numbers(told.immaterial),
+        {
+            f"{one.effect}.{one.parameter}": (one.value, _SURE * one.standard_error)
+            for one in sorted(told.estimates, key=lambda one: one.input)
+        },
+        {f"{one.id}.{one.parameter}": one.size for one in told.detectable},
+    )
+
+
+def _list_numbers(effects: Iterable[Named]) -> dict[str, Number]:
+    return {
         f"{effect.id}.{name}": (value.value, 0.5 * (value.high - value.low))
-        for effect in told.effects
+        for effect in effects
         for name, value in effect.parameters.items()
     }
-    undecided = tuple(name for item in told.undecided for name in item.candidates)
-    more = tuple(str(finding["id"]) for finding in told.findings)
-    unobservable = tuple(item.id for item in told.unobservable)
-    estimates = {
-        f"{one.effect}.{one.parameter}": (one.value, _SURE * one.standard_error)
-        for one in told.estimates
-        if one.input == "measured"
-    }
-    return Answer(numbers, tuple(dict.fromkeys((*findings, *more))), undecided, unobservable, estimates)
 
 
-def judge(
-    injection: Injection, before: Answer, after: Answer, usual: AbstractSet[str] = frozenset()
-) -> tuple[str, list[str]]:
-    """One of `_VERDICTS`, and names without a reason: `usual` are those of the vehicle's unchanged logs."""
-    if set(injection.findings) & set(after.findings) - set(before.findings):
+def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, list[str]]:
+    """One of `_VERDICTS`, and names that the unchanged recording neither has nor considers."""
+    told = [name for name in injection.findings if _is_news(name, before, after)]
+    if told:
         return "told", []
     effects = {label.split(".")[0] for label in injection.numbers}
-    extra = sorted(after.names - usual - effects)
+    extra = sorted(after.names - before.mentioned - effects)
     if injection.same:
         close = all(is_close(before.numbers[label], after.numbers[label]) for label in shared(before, after))
-        lost = before.names - after.names - set(after.undecided)
+        lost = before.names - after.mentioned
         return ("recovered" if close and not lost else "missed"), extra
     for effect in effects:
         labels = [label for label in injection.numbers if label.split(".")[0] == effect]
         if all(is_recovered(injection, label, before, after) for label in labels):
             return "recovered", extra
-    named = effects & after.names
-    if named:
-        return "missed", extra
-    return (
-        "undecided" if effects & set(after.undecided)
-        else "cannot" if effects & set(after.unobservable)
-        else "missed"
-    ), extra  # fmt: skip
+    unseen = {
+        label.split(".")[0]
+        for label, change in injection.numbers.items()
+        if abs(change(1.0) - 1.0) < after.detectable.get(label, 0.0)
+    }
+    for verdict, ids in (
+        ("number", after.names), ("undecided", after.undecided), ("cannot", {*after.unobservable, *unseen})
+    ):  # fmt: skip
+        if effects & {*ids}:
+            return verdict, extra
+    return "missed", extra
+
+
+def _is_news(finding: str, before: Answer, after: Answer) -> bool:
+    """Whether a finding is new, or says another number than it did of the unchanged recording."""
+    if finding not in after.findings:
+        return False
+    old, new = before.findings.get(finding), after.findings[finding]
+    return finding not in before.findings or (
+        old is not None and new is not None and abs(math.log(abs(new / old))) > _OTHER
+    )
 
 
 def is_recovered(injection: Injection, label: str, before: Answer, after: Answer) -> bool:
-    """Whether a number is what was injected on top of that of the unchanged recording."""
-    effect, parameter = label.split(".")
-    neutral = (find_effect(effect)().parameter(parameter).neutral, 0.0)
-    start = before.numbers.get(label) or before.estimates.get(label, neutral)
-    expected = (injection.numbers[label](start[0]), start[1])
-    return label in after.numbers and is_close(expected, after.numbers[label])
+    """Whether a number is what was injected on top of that of the unchanged recording.
+
+    Where the two cancel nothing is left to be named.
+    """
+    value, half = before.find_number(label)
+    expected = (injection.numbers[label](value), half)
+    found = after.numbers.get(label) or after.immaterial.get(label)
+    if found is None:
+        effect, parameter = label.split(".")
+        neutral, least = find_effect(effect)().parameter(parameter).neutral, after.detectable.get(label, 0.0)
+        cancels = abs(expected[0] - neutral) < abs(value - neutral) and is_close(expected, (neutral, least))
+        return cancels and effect not in after.names
+    return is_close(expected, found)
 
 
 def shared(before: Answer, after: Answer) -> list[str]:
@@ -147,26 +195,46 @@ def is_close(one: tuple[float, float], other: tuple[float, float]) -> bool:
     return abs(one[0] - other[0]) <= math.hypot(*halves)
 
 
+def score(rows: Iterable[Json]) -> list[Json]:
+    """A verdict, extra names and a note for every answer to a change."""
+    rows = list(rows)
+    plain = {(row["log"], row["both"]): row for row in rows if row["injection"] == _UNCHANGED.name}
+    known = {one.name: one for one in list_injections()}
+    scored = []
+    for row in rows:
+        if row["injection"] not in known:
+            continue
+        injection, before = known[row["injection"]], Answer(**plain[row["log"], row["both"]]["answer"])
+        if "answer" in row:
+            after = Answer(**row["answer"])
+            verdict, extra = judge(injection, before, after)
+            text = note(injection, before, after)
+        else:
+            verdict, extra, text = "missed", [], row["error"]
+        scored.append({**row, "verdict": verdict, "extra": extra, "note": text})
+    return scored
+
+
 def describe(rows: Iterable[Json]) -> str:
     """The table: a line an injection, and every miss."""
     by_name: dict[str, list[Json]] = defaultdict(list)
-    for row in rows:
+    for row in score(rows):
         by_name[row["injection"]].append(row)
-    lines = [f"{'injected':<32}{'logs':>5}" + "".join(f"{key:>11}" for key in (*_VERDICTS, "extra names"))]
+    lines = [f"{'injected':<32}{'logs':>5}" + "".join(f"{key:>10}" for key in (*_VERDICTS, "extra"))]
     total: dict[str, int] = defaultdict(int)
     for name, found in by_name.items():
         counts = {key: sum(row["verdict"] == key for row in found) for key in _VERDICTS}
-        extra = sum(len(row["extra"]) for row in found)
-        lines.append(
-            f"{name:<32}{len(found):>5}" + "".join(f"{count:>11}" for count in (*counts.values(), extra))
-        )
-        for key, count in (*counts.items(), ("logs", len(found)), ("extra", extra)):
+        counts["extra"] = sum(bool(row["extra"]) for row in found)
+        lines.append(f"{name:<32}{len(found):>5}" + "".join(f"{count:>10}" for count in counts.values()))
+        for key, count in (*counts.items(), ("logs", len(found))):
             total[key] += count
     right = total["recovered"] + total["told"]
-    share = right / max(total["logs"], 1)
+    logs = max(total["logs"], 1)
     lines.append(
-        f"{right} of {total['logs']} recovered or told ({share:.0%}), {total['undecided']} undecided, of "
-        f"{total['cannot']} the log is said not to tell; {total['extra']} names that no unchanged log has"
+        f"{right} of {total['logs']} recovered or told ({right / logs:.0%}), {total['undecided']} undecided "
+        f"with it among the candidates, of {total['cannot']} the log is said not to tell, {total['number']} "
+        f"named with another number, {total['missed']} missed; a name that is not of the unchanged "
+        f"recording in {total['extra']} ({total['extra'] / logs:.0%})"
     )
     for name, found in by_name.items():
         for row in found:
@@ -184,9 +252,10 @@ def note(injection: Injection, before: Answer, after: Answer) -> str:
     parts = []
     for label in labels:
         one, two = (
-            "{:.3g} +- {:.2g}".format(*answer.numbers[label]) if label in answer.numbers else "-"
+            "{:.3g} +- {:.2g}".format(*answer.numbers[label]) if label in answer.numbers
+            else "({:.3g} +- {:.2g})".format(*answer.find_number(label))
             for answer in (before, after)
-        )
+        )  # fmt: skip
         parts.append(f"{label} {one} -> {two}")
     gone = sorted(before.names - after.names)
     return ", ".join([*parts, *([f"no more {', '.join(gone)}"] if gone else [])])
@@ -200,42 +269,25 @@ def main() -> int:
     parser.add_argument("--resume", action="store_true", help="go on where the file of --out ends")
     asked = parser.parse_args()
     rows = read_rows(asked.out) if asked.resume else []
-    done = {(row["log"], row["injection"]) for row in rows}
+    done = {(row["log"], row["injection"], row["both"]) for row in rows}
     chosen = [one for one in list_injections() if any(word in one.name for word in asked.only)]
     logs = [
         log
-        for log in sorted(LOGS.glob("*.mcap"))
+        for log in sorted(LOGS.glob("*.mcap"), key=lambda log: log.stat().st_size)
         if not log.stem.startswith(STANDING) and any(word in log.name for word in asked.logs)
     ]
-    unchanged = Injection("nothing", lambda tables, _: tables)
-    plain = {(log, both): ask(log, unchanged, both=both) for log in logs for both in (False, True)}
     for log in logs:
-        vehicle = log.name.split("_")[0]
-        usual = {
-            name
-            for (other, _), answer in plain.items()
-            if other.name.startswith(vehicle)
-            for name in (*answer.names, *answer.undecided)
-        }
-        for injection in chosen:
-            if (log.stem, injection.name) in done:
+        unchanged = [(_UNCHANGED, both) for both in sorted({one.both for one in chosen})]
+        for injection, both in (*unchanged, *((one, one.both) for one in chosen)):
+            if (log.stem, injection.name, both) in done:
                 continue
-            before, extra = plain[log, injection.both], list[str]()
+            row: Json = {"log": log.stem, "injection": injection.name, "both": both}
             try:
-                after = ask(log, injection, both=injection.both)
-                verdict, extra = judge(injection, before, after, usual)
-                text = note(injection, before, after)
+                row["answer"] = asdict(ask(log, injection, both=both))
             except SlipError as error:
-                verdict, text = "missed", str(error)
-            row = {
-                "log": log.stem,
-                "injection": injection.name,
-                "verdict": verdict,
-                "extra": extra,
-                "note": text,
-            }
+                row["error"] = str(error)
             rows.append(row)
-            sys.stderr.write(f"{log.stem}: {injection.name}: {verdict} {extra or ''}\n")
+            sys.stderr.write(f"{log.stem}: {injection.name}\n")
             add_row(asked.out, row)
     sys.stdout.write(describe(rows))
     return 0

@@ -89,6 +89,10 @@ def list_injections() -> list[Injection]:
             {"icr_offset.x_icr": shift(-0.3), "lever_arm.l_x": shift(0.3)},
         ),
         Injection(
+            "turning about a point .15 m ahead", _moved(lambda m: (0.0, -0.15 * m.w, 0.0)), (),
+            {"icr_offset.x_icr": shift(0.15), "lever_arm.l_x": shift(-0.15)},
+        ),
+        Injection(
             "skid .1 s", _moved(lambda m: (0.0, -0.1 * m.v * m.w, 0.0)), (), {"lateral_skid.c": shift(0.1)}
         ),
         Injection(
