@@ -136,7 +136,7 @@ def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, lis
     if injection.same:
         close = all(is_close(before.numbers[label], after.numbers[label]) for label in shared(before, after))
         lost = before.names - after.mentioned
-        return ("recovered" if close and not lost else "missed"), extra
+        return ("recovered" if close and not lost and not extra else "missed"), extra
     for effect in effects:
         labels = [label for label in injection.numbers if label.split(".")[0] == effect]
         if all(is_recovered(injection, label, before, after) for label in labels):
@@ -144,7 +144,7 @@ def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, lis
     unseen = {
         label.split(".")[0]
         for label, change in injection.numbers.items()
-        if abs(change(1.0) - 1.0) < after.detectable.get(label, 0.0)
+        if abs(change(1.0) - 1.0) < max(after.detectable.get(label, 0.0), before.find_number(label)[1])
     }
     for verdict, ids in (
         ("number", after.names), ("undecided", after.undecided), ("cannot", {*after.unobservable, *unseen})
@@ -175,8 +175,8 @@ def is_recovered(injection: Injection, label: str, before: Answer, after: Answer
     if found is None:
         effect, parameter = label.split(".")
         neutral, least = find_effect(effect)().parameter(parameter).neutral, after.detectable.get(label, 0.0)
-        cancels = abs(expected[0] - neutral) < abs(value - neutral) and is_close(expected, (neutral, least))
-        return cancels and effect not in after.names
+        was_there = abs(value - neutral) > max(half, abs(expected[0] - neutral))
+        return was_there and is_close(expected, (neutral, least)) and effect not in after.names
     return is_close(expected, found)
 
 
@@ -245,17 +245,18 @@ def describe(rows: Iterable[Json]) -> str:
 
 
 def note(injection: Injection, before: Answer, after: Answer) -> str:
-    """The numbers that were asked for, before and after."""
-    labels = list(injection.numbers) or [
-        label for label in shared(before, after) if not is_close(before.numbers[label], after.numbers[label])
+    """The numbers that were asked for and those that changed, before and after; in brackets without a name."""
+    labels = list(injection.numbers) + [
+        label for label in after.numbers if not is_close(before.find_number(label), after.numbers[label])
     ]
     parts = []
-    for label in labels:
+    for label in dict.fromkeys(labels):
         one, two = (
-            "{:.3g} +- {:.2g}".format(*answer.numbers[label]) if label in answer.numbers
-            else "({:.3g} +- {:.2g})".format(*answer.find_number(label))
+            ("{:.3g} +- {:.2g}" if label in answer.numbers else "({:.3g} +- {:.2g})").format(
+                *answer.find_number(label)
+            )
             for answer in (before, after)
-        )  # fmt: skip
+        )
         parts.append(f"{label} {one} -> {two}")
     gone = sorted(before.names - after.names)
     return ", ".join([*parts, *([f"no more {', '.join(gone)}"] if gone else [])])

@@ -36,7 +36,7 @@ class Injection:
         change: of the extracted tables.
         findings: any of them tells of the fault; empty where none is expected.
         numbers: by ``effect.parameter`` the number that must be named, from that of the unchanged recording
-            (or from the neutral one); any of them will do.
+            (or from the neutral one); those of any of the effects will do, which are one thing to first order.
         same: the answer must stay what it was.
         both: needs the way from command to wheels.
     """
@@ -80,7 +80,10 @@ def list_injections() -> list[Injection]:
         Injection(
             "poses .15 s late", _on("poses", lambda t: _later(t, 0.15)), (), {"clock_offset.d": shift(0.15)}
         ),
-        Injection("heading .1 s late", _heading_late, (), {"heading_skew.d": shift(0.1)}),
+        Injection(
+            "heading .1 s late", _heading_late, (),
+            {"heading_skew.d": shift(0.1), "lateral_skid.c": shift(-0.1)},
+        ),
         Injection("poses from the wheels", _from_wheels(0.5), ("pose_from_wheels",)),
         Injection("poses from the wheels, Euler's", _from_wheels(1.0), ("pose_from_wheels",)),
         Injection("misalignment 3 deg", _misaligned, (), {"yaw_misalignment.psi": shift(math.radians(3.0))}),
@@ -93,7 +96,8 @@ def list_injections() -> list[Injection]:
             {"icr_offset.x_icr": shift(0.15), "lever_arm.l_x": shift(-0.15)},
         ),
         Injection(
-            "skid .1 s", _moved(lambda m: (0.0, -0.1 * m.v * m.w, 0.0)), (), {"lateral_skid.c": shift(0.1)}
+            "skid .1 s", _moved(lambda m: (0.0, -0.1 * m.v * m.w, 0.0)), (),
+            {"lateral_skid.c": shift(0.1), "heading_skew.d": shift(-0.1)},
         ),
         Injection(
             "resistance .15 s", _moved(lambda m: (-0.15 * m.v * np.abs(m.w), 0.0, 0.0)), (),
