@@ -1,9 +1,11 @@
 """Faults and effects injected into the real recordings: recovered, told as the fault it is, or missed.
 
-Run: python benchmarks/inject.py [--logs WORD ...] [--only WORD ...] [--out FILE [--resume]]. Every recording
-under ../shared/logs that moves, with every change of `injections.py`. A number is recovered where what was
-injected, put on top of what the unchanged recording says, lies within the two intervals together. An answer
-is the same where the names are, and the numbers within the same measure.
+Run: python benchmarks/inject.py [--logs WORD ...] [--only WORD ...] [--out FILE [--resume]]; --table FILE
+prints the table of what was asked. Every recording under ../shared/logs that moves, the shortest first, with
+every change of `injections.py`. A number is recovered where what was injected, put on top of what the
+unchanged recording says, lies within the two intervals together, or where both cancel and nothing is named.
+An answer is the same where the names are, and the numbers within the same measure. `cannot`: the log is said
+not to tell of it, or only of larger ones.
 Exit code 0; the table says what was missed.
 """
 
@@ -13,7 +15,6 @@ import argparse
 import math
 import sys
 import tempfile
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -201,52 +202,66 @@ def is_close(one: tuple[float, float], other: tuple[float, float]) -> bool:
 
 
 def score(rows: Iterable[Json]) -> list[Json]:
-    """A verdict, extra names and a note for every answer to a change."""
+    """For each answer a verdict, extra names, those that no recording of the vehicle has, and a note."""
     rows = list(rows)
-    plain = {(row["log"], row["both"]): row for row in rows if row["injection"] == _UNCHANGED.name}
+    plain = {
+        (row["log"], row["both"]): Answer(**row["answer"])
+        for row in rows
+        if row["injection"] == _UNCHANGED.name
+    }
     known = {one.name: one for one in list_injections()}
     scored = []
     for row in rows:
         if row["injection"] not in known:
             continue
-        injection, before = known[row["injection"]], Answer(**plain[row["log"], row["both"]]["answer"])
+        injection, before = known[row["injection"]], plain[row["log"], row["both"]]
         if "answer" in row:
             after = Answer(**row["answer"])
             verdict, extra = judge(injection, before, after)
             text = note(injection, before, after)
         else:
             verdict, extra, text = "missed", [], row["error"]
-        scored.append({**row, "verdict": verdict, "extra": extra, "note": text})
+        vehicle = row["log"].split("_")[0]
+        usual = {name for (log, _), one in plain.items() if log.startswith(vehicle) for name in one.mentioned}
+        scored.append(
+            {**row, "verdict": verdict, "extra": extra, "foreign": [*{*extra} - usual], "note": text}
+        )
     return scored
 
 
 def describe(rows: Iterable[Json]) -> str:
-    """The table: a line an injection, and every miss."""
-    by_name: dict[str, list[Json]] = defaultdict(list)
-    for row in score(rows):
-        by_name[row["injection"]].append(row)
-    lines = [f"{'injected':<32}{'logs':>5}" + "".join(f"{key:>10}" for key in (*_VERDICTS, "extra"))]
-    total: dict[str, int] = defaultdict(int)
-    for name, found in by_name.items():
-        counts = {key: sum(row["verdict"] == key for row in found) for key in _VERDICTS}
-        counts["extra"] = sum(bool(row["extra"]) for row in found)
-        lines.append(f"{name:<32}{len(found):>5}" + "".join(f"{count:>10}" for count in counts.values()))
-        for key, count in (*counts.items(), ("logs", len(found))):
-            total[key] += count
-    right = total["recovered"] + total["told"]
-    logs = max(total["logs"], 1)
-    lines.append(
-        f"{right} of {total['logs']} recovered or told ({right / logs:.0%}), {total['undecided']} undecided "
-        f"with it among the candidates, of {total['cannot']} the log is said not to tell, {total['number']} "
-        f"named with another number, {total['missed']} missed; a name that is not of the unchanged "
-        f"recording in {total['extra']} ({total['extra'] / logs:.0%})"
-    )
-    for name, found in by_name.items():
-        for row in found:
-            if row["verdict"] not in {"recovered", "told"} or row["extra"]:
-                told = f", extra {', '.join(row['extra'])}" if row["extra"] else ""
-                lines.append(f"  {name}: {row['log']} {row['verdict']}{told}; {row['note']}")
+    """The table: a line for each change and each recording, the sum, and every miss."""
+    scored = score(rows)
+    lines = []
+    for key in ("injection", "log"):
+        lines.append(f"{key:<44}{'asked':>6}" + "".join(f"{one:>10}" for one in (*_VERDICTS, "extra")))
+        lines += [
+            f"{name:<44}{len(found):>6}" + "".join(f"{count:>10}" for count in _count(found).values())
+            for name in dict.fromkeys(row[key] for row in scored)
+            if (found := [row for row in scored if row[key] == name])
+        ]
+        lines.append("")
+    total, asked = _count(scored), max(len(scored), 1)
+    right, foreign = total["recovered"] + total["told"], sum(bool(row["foreign"]) for row in scored)
+    can = max(asked - total["cannot"], 1)
+    lines += [
+        f"{right} of {asked} recovered or told ({right / asked:.0%}; {right / can:.0%} of what the log can tell);",
+        f"{total['undecided']} told less, as one of several explanations; of {total['cannot']} the log is said",
+        f"not to tell; {total['number']} named with another number; {total['missed']} missed. A name that the",
+        f"unchanged recording does not have in {total['extra']} ({total['extra'] / asked:.0%}), that no recording",
+        f"of the vehicle has in {foreign} ({foreign / asked:.0%}).",
+        "",
+    ]
+    for row in scored:
+        if row["verdict"] not in {"recovered", "told"} or row["extra"]:
+            told = f", extra {', '.join(row['extra'])}" if row["extra"] else ""
+            lines.append(f"  {row['injection']}: {row['log']} {row['verdict']}{told}; {row['note']}")
     return "\n".join(lines) + "\n"
+
+
+def _count(rows: Sequence[Json]) -> dict[str, int]:
+    counts = {key: sum(row["verdict"] == key for row in rows) for key in _VERDICTS}
+    return counts | {"extra": sum(bool(row["extra"]) for row in rows)}
 
 
 def note(injection: Injection, before: Answer, after: Answer) -> str:
@@ -273,7 +288,13 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", default=[""], help="words of the injections' names")
     parser.add_argument("--out", type=Path, help="file to add a JSON line to for each answer")
     parser.add_argument("--resume", action="store_true", help="go on where the file of --out ends")
+    parser.add_argument(
+        "--table", type=Path, help="file of --out of which the table is printed, asking nothing"
+    )
     asked = parser.parse_args()
+    if asked.table is not None:
+        sys.stdout.write(describe(read_rows(asked.table)))
+        return 0
     rows = read_rows(asked.out) if asked.resume else []
     done = {(row["log"], row["injection"], row["both"]) for row in rows}
     chosen = [one for one in list_injections() if any(word in one.name for word in asked.only)]
