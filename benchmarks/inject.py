@@ -245,11 +245,12 @@ def describe(rows: Iterable[Json]) -> str:
     right, foreign = total["recovered"] + total["told"], sum(bool(row["foreign"]) for row in scored)
     can = max(asked - total["cannot"], 1)
     lines += [
-        f"{right} of {asked} recovered or told ({right / asked:.0%}; {right / can:.0%} of what the log can tell);",
-        f"{total['undecided']} told less, as one of several explanations; of {total['cannot']} the log is said",
-        f"not to tell; {total['number']} named with another number; {total['missed']} missed. A name that the",
-        f"unchanged recording does not have in {total['extra']} ({total['extra'] / asked:.0%}), that no recording",
-        f"of the vehicle has in {foreign} ({foreign / asked:.0%}).",
+        f"{right} of {asked} recovered or told ({right / asked:.0%}),",
+        f"{right} of the {can} of which the log is not said not to tell ({right / can:.0%});",
+        f"{total['undecided']} told less, as one of several explanations;",
+        f"{total['number']} named with another number; {total['missed']} missed;",
+        f"a name that the unchanged recording does not have in {total['extra']} ({total['extra'] / asked:.0%}),",
+        f"that no recording of the vehicle has in {foreign} ({foreign / asked:.0%}).",
         "",
     ]
     for row in scored:
