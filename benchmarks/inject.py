@@ -249,7 +249,7 @@ def describe(rows: Iterable[Json]) -> str:
         f"{right} of the {can} of which the log is not said not to tell ({right / can:.0%});",
         f"{total['undecided']} told less, as one of several explanations;",
         f"{total['number']} named with another number; {total['missed']} missed;",
-        f"a name that the unchanged recording does not have in {total['extra']} ({total['extra'] / asked:.0%}),",
+        f"a name that the unchanged recording lacks in {total['extra']} ({total['extra'] / asked:.0%}),",
         f"that no recording of the vehicle has in {foreign} ({foreign / asked:.0%}).",
         "",
     ]

@@ -72,4 +72,4 @@ def test_a_break_in_a_recording_is_told_where_it_is(name: str) -> None:
     change = _BY_NAME["gains .8 and .7 half-way"]
     after = ask(log, change, both=False)
     assert judge(change, ask(log, _NOTHING, both=False), after)[0] == "recovered", after
-    assert after.numbers["terrain_change.at_s"][1] < 60.0  # noqa: PLR2004 - s
+    assert after.numbers["terrain_change.at_s"][1] < 60.0
