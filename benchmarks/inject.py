@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 LOGS = Path(__file__).parents[2] / "shared" / "logs"
 STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96
+# Relative change of a finding's number that is news.
 _OTHER = 0.02
 _VERDICTS = ("recovered", "told", "undecided", "cannot", "number", "missed")
 Number = tuple[float, float]
@@ -164,9 +165,7 @@ def _is_news(finding: str, before: Answer, after: Answer) -> bool:
     if finding not in after.findings:
         return False
     old, new = before.findings.get(finding), after.findings[finding]
-    return finding not in before.findings or (
-        old is not None and new is not None and abs(math.log(abs(new / old))) > _OTHER
-    )
+    return finding not in before.findings or bool(old and new and abs(math.log(abs(new / old))) > _OTHER)
 
 
 def is_recovered(injection: Injection, label: str, before: Answer, after: Answer) -> bool:

@@ -118,7 +118,7 @@ def _start_from_model(problem: Problem, model: Model, top: Rung, per_run: Sequen
     A moment or a limit that stood for other effects on the rungs below may have gone where no descent
     brings it back from.
     """
-    if all(number.is_smooth for number in top.fitted.free):
+    if len(top.effects) < 2 or all(number.is_smooth for number in top.fitted.free):  # noqa: PLR2004
         return top
     fitted = fit_model(problem, model.keep(top.effects), per_run=per_run, exact=True)
     return Rung(fitted, hold_out(problem, fitted)) if _scale_free(fitted) < _scale_free(top.fitted) else top
