@@ -1,9 +1,11 @@
 """Faults and effects injected into the real recordings: recovered, told as the fault it is, or missed.
 
-Run: python benchmarks/inject.py [--logs WORD ...] [--only WORD ...] [--out FILE [--resume]]. Every recording
-under ../shared/logs that moves, with every change of `injections.py`. A number is recovered where what was
-injected, put on top of what the unchanged recording says, lies within the two intervals together. An answer
-is the same where the names are, and the numbers within the same measure.
+Run: python benchmarks/inject.py [--logs WORD ...] [--only WORD ...] [--out FILE [--resume]]; --table FILE
+prints the table of what was asked. Every recording under ../shared/logs that moves, the shortest first, with
+every change of `injections.py`. A number is recovered where what was injected, put on top of what the
+unchanged recording says, lies within the two intervals together, or where both cancel and nothing is named.
+An answer is the same where the names are, and the numbers within the same measure. `cannot`: the log is said
+not to tell of it, or only of larger ones.
 Exit code 0; the table says what was missed.
 """
 
@@ -13,12 +15,10 @@ import argparse
 import math
 import sys
 import tempfile
-from collections import defaultdict
-from collections.abc import Iterable, Mapping
-from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 from unittest.mock import patch
 
 from injections import Drive, Injection, list_injections
@@ -33,6 +33,7 @@ from pipeline.models import find_effect
 from pipeline.stages.extract import extract_tables
 
 if TYPE_CHECKING:
+    from pipeline.diagnosis.diagnosis import Named
     from pipeline.logs import LogData
     from pipeline.stages.extract import Extracted
     from pipeline.vehicles import Vehicle
@@ -42,27 +43,55 @@ if TYPE_CHECKING:
 LOGS = Path(__file__).parents[2] / "shared" / "logs"
 STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96
-_VERDICTS = ("recovered", "told", "undecided", "cannot", "missed")
+# Relative change of a finding's number that is news.
+_OTHER = 0.02
+_VERDICTS = ("recovered", "told", "undecided", "cannot", "number", "missed")
+Number = tuple[float, float]
+_UNCHANGED = Injection("nothing", lambda tables, _: tables)
 Json = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What was said of a recording: names with numbers (value, half-width), findings, what it left open.
+    """What was said of a recording: numbers as (value, half-width) by ``effect.parameter``, and the rest.
 
-    Numbers of effects that were not named stand in `estimates`.
+    Attributes:
+        numbers: of the effects that are named.
+        findings: value by id, None where it has none.
+        undecided: ids of all groups.
+        unobservable: ids.
+        immaterial: numbers of effects that are listed as too small to be felt.
+        estimates: numbers of effects that were not named.
+        detectable: how large numbers would have had to be to be seen.
     """
 
-    numbers: Mapping[str, tuple[float, float]]
-    findings: tuple[str, ...]
-    undecided: tuple[str, ...]
-    unobservable: tuple[str, ...]
-    estimates: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    numbers: Mapping[str, Number]
+    findings: Mapping[str, float | None] = field(default_factory=dict)
+    undecided: Sequence[str] = ()
+    unobservable: Sequence[str] = ()
+    immaterial: Mapping[str, Number] = field(default_factory=dict)
+    estimates: Mapping[str, Number] = field(default_factory=dict)
+    detectable: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def names(self) -> set[str]:
         """Ids of the effects."""
         return {label.split(".")[0] for label in self.numbers}
+
+    def knows(self, label: str) -> bool:
+        """Whether it says anything of a number."""
+        return any(label in known for known in (self.numbers, self.immaterial, self.estimates))
+
+    @property
+    def mentioned(self) -> set[str]:
+        """Ids of the effects that are named, one explanation of several, or too small to be felt."""
+        return {label.split(".")[0] for label in (*self.numbers, *self.immaterial)} | {*self.undecided}
+
+    def find_number(self, label: str) -> Number:
+        """What is known of a number: as named, as estimated, or that it is less than would have been seen."""
+        effect, parameter = label.split(".")
+        neutral = (find_effect(effect)().parameter(parameter).neutral, self.detectable.get(label, 0.0))
+        return self.numbers.get(label) or self.immaterial.get(label) or self.estimates.get(label, neutral)
 
 
 def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
@@ -78,58 +107,82 @@ def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
     with tempfile.TemporaryDirectory() as folder, patch("pipeline.analysis.work.extract_tables", changed):
         manifest = analyze_log(log, Options(out=Path(folder), report=False)).manifest
         vehicle, recording = read_recording(manifest)
-        findings = tuple(str(finding["id"]) for finding in recording.list_findings())
         inputs = ("command", "measured") if both else ("measured",)
         told = diagnose_runs([recording], vehicle, inputs=inputs).runs[0]
-    numbers = {
+    findings = (*recording.list_findings(), *told.findings)
+    return Answer(
+        _list_numbers(told.effects),
+        {str(one["id"]): cast("float | None", one.get("value")) for one in findings},
+        tuple(name for item in told.undecided for name in item.candidates),
+        tuple(item.id for item in told.unobservable),
+        _list_numbers(told.immaterial),
+        {
+            f"{one.effect}.{one.parameter}": (one.value, _SURE * one.standard_error)
+            for one in sorted(told.estimates, key=lambda one: one.input)
+        },
+        {f"{one.id}.{one.parameter}": one.size for one in told.detectable},
+    )
+
+
+def _list_numbers(effects: Iterable[Named]) -> dict[str, Number]:
+    return {
         f"{effect.id}.{name}": (value.value, 0.5 * (value.high - value.low))
-        for effect in told.effects
+        for effect in effects
         for name, value in effect.parameters.items()
     }
-    undecided = tuple(name for item in told.undecided for name in item.candidates)
-    more = tuple(str(finding["id"]) for finding in told.findings)
-    unobservable = tuple(item.id for item in told.unobservable)
-    estimates = {
-        f"{one.effect}.{one.parameter}": (one.value, _SURE * one.standard_error)
-        for one in told.estimates
-        if one.input == "measured"
-    }
-    return Answer(numbers, tuple(dict.fromkeys((*findings, *more))), undecided, unobservable, estimates)
 
 
-def judge(
-    injection: Injection, before: Answer, after: Answer, usual: AbstractSet[str] = frozenset()
-) -> tuple[str, list[str]]:
-    """One of `_VERDICTS`, and names without a reason: `usual` are those of the vehicle's unchanged logs."""
-    if set(injection.findings) & set(after.findings) - set(before.findings):
+def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, list[str]]:
+    """One of `_VERDICTS`, and names that the unchanged recording neither has nor considers."""
+    told = [name for name in injection.findings if _is_news(name, before, after)]
+    if told:
         return "told", []
     effects = {label.split(".")[0] for label in injection.numbers}
-    extra = sorted(after.names - usual - effects)
+    extra = sorted(after.names - before.mentioned - effects)
     if injection.same:
         close = all(is_close(before.numbers[label], after.numbers[label]) for label in shared(before, after))
-        lost = before.names - after.names - set(after.undecided)
-        return ("recovered" if close and not lost else "missed"), extra
+        lost = before.names - after.mentioned
+        return ("recovered" if close and not lost and not extra else "missed"), extra
     for effect in effects:
         labels = [label for label in injection.numbers if label.split(".")[0] == effect]
         if all(is_recovered(injection, label, before, after) for label in labels):
             return "recovered", extra
-    named = effects & after.names
-    if named:
-        return "missed", extra
-    return (
-        "undecided" if effects & set(after.undecided)
-        else "cannot" if effects & set(after.unobservable)
-        else "missed"
-    ), extra  # fmt: skip
+    unseen = {
+        label.split(".")[0]
+        for label, change in injection.numbers.items()
+        if abs(change(1.0) - 1.0) < max(after.detectable.get(label, 0.0), before.find_number(label)[1])
+    }
+    for verdict, ids in (
+        ("number", after.names), ("undecided", after.undecided), ("cannot", {*after.unobservable, *unseen})
+    ):  # fmt: skip
+        if effects & {*ids}:
+            return verdict, extra
+    return "missed", extra
+
+
+def _is_news(finding: str, before: Answer, after: Answer) -> bool:
+    """Whether a finding is new, or says another number than it did of the unchanged recording."""
+    if finding not in after.findings:
+        return False
+    old, new = before.findings.get(finding), after.findings[finding]
+    return finding not in before.findings or bool(old and new and abs(math.log(abs(new / old))) > _OTHER)
 
 
 def is_recovered(injection: Injection, label: str, before: Answer, after: Answer) -> bool:
-    """Whether a number is what was injected on top of that of the unchanged recording."""
-    effect, parameter = label.split(".")
-    neutral = (find_effect(effect)().parameter(parameter).neutral, 0.0)
-    start = before.numbers.get(label) or before.estimates.get(label, neutral)
-    expected = (injection.numbers[label](start[0]), start[1])
-    return label in after.numbers and is_close(expected, after.numbers[label])
+    """Whether a number is what was injected on top of that of the unchanged recording.
+
+    Where the two cancel nothing is left to be named.
+    """
+    value, half = before.find_number(label)
+    expected = (injection.numbers[label](value), half)
+    found = after.numbers.get(label) or after.immaterial.get(label)
+    if found is None:
+        effect, parameter = label.split(".")
+        neutral, least = find_effect(effect)().parameter(parameter).neutral, after.detectable.get(label, 0.0)
+        was_there = abs(value - neutral) > max(half, abs(expected[0] - neutral))
+        return was_there and is_close(expected, (neutral, least)) and effect not in after.names
+    # Of what the unchanged recording does not speak it knows as much as the changed one.
+    return is_close(expected if before.knows(label) else (expected[0], found[1]), found)
 
 
 def shared(before: Answer, after: Answer) -> list[str]:
@@ -147,44 +200,81 @@ def is_close(one: tuple[float, float], other: tuple[float, float]) -> bool:
     return abs(one[0] - other[0]) <= math.hypot(*halves)
 
 
-def describe(rows: Iterable[Json]) -> str:
-    """The table: a line an injection, and every miss."""
-    by_name: dict[str, list[Json]] = defaultdict(list)
+def score(rows: Iterable[Json]) -> list[Json]:
+    """For each answer a verdict, extra names, those that no recording of the vehicle has, and a note."""
+    rows = list(rows)
+    plain = {
+        (row["log"], row["both"]): Answer(**row["answer"])
+        for row in rows
+        if row["injection"] == _UNCHANGED.name
+    }
+    known = {one.name: one for one in list_injections()}
+    scored = []
     for row in rows:
-        by_name[row["injection"]].append(row)
-    lines = [f"{'injected':<32}{'logs':>5}" + "".join(f"{key:>11}" for key in (*_VERDICTS, "extra names"))]
-    total: dict[str, int] = defaultdict(int)
-    for name, found in by_name.items():
-        counts = {key: sum(row["verdict"] == key for row in found) for key in _VERDICTS}
-        extra = sum(len(row["extra"]) for row in found)
-        lines.append(
-            f"{name:<32}{len(found):>5}" + "".join(f"{count:>11}" for count in (*counts.values(), extra))
+        if row["injection"] not in known:
+            continue
+        injection, before = known[row["injection"]], plain[row["log"], row["both"]]
+        if "answer" in row:
+            after = Answer(**row["answer"])
+            verdict, extra = judge(injection, before, after)
+            text = note(injection, before, after)
+        else:
+            verdict, extra, text = "missed", [], row["error"]
+        vehicle = row["log"].split("_")[0]
+        usual = {name for (log, _), one in plain.items() if log.startswith(vehicle) for name in one.mentioned}
+        scored.append(
+            {**row, "verdict": verdict, "extra": extra, "foreign": [*{*extra} - usual], "note": text}
         )
-        for key, count in (*counts.items(), ("logs", len(found)), ("extra", extra)):
-            total[key] += count
-    right = total["recovered"] + total["told"]
-    share = right / max(total["logs"], 1)
-    lines.append(
-        f"{right} of {total['logs']} recovered or told ({share:.0%}), {total['undecided']} undecided, of "
-        f"{total['cannot']} the log is said not to tell; {total['extra']} names that no unchanged log has"
-    )
-    for name, found in by_name.items():
-        for row in found:
-            if row["verdict"] not in {"recovered", "told"} or row["extra"]:
-                told = f", extra {', '.join(row['extra'])}" if row["extra"] else ""
-                lines.append(f"  {name}: {row['log']} {row['verdict']}{told}; {row['note']}")
+    return scored
+
+
+def describe(rows: Iterable[Json]) -> str:
+    """The table: a line for each change and each recording, the sum, and every miss."""
+    scored = score(rows)
+    lines = []
+    for key in ("injection", "log"):
+        lines.append(f"{key:<44}{'asked':>6}" + "".join(f"{one:>10}" for one in (*_VERDICTS, "extra")))
+        lines += [
+            f"{name:<44}{len(found):>6}" + "".join(f"{count:>10}" for count in _count(found).values())
+            for name in dict.fromkeys(row[key] for row in scored)
+            if (found := [row for row in scored if row[key] == name])
+        ]
+        lines.append("")
+    total, asked = _count(scored), max(len(scored), 1)
+    right, foreign = total["recovered"] + total["told"], sum(bool(row["foreign"]) for row in scored)
+    can = max(asked - total["cannot"], 1)
+    lines += [
+        f"{right} of {asked} recovered or told ({right / asked:.0%}),",
+        f"{right} of the {can} of which the log is not said not to tell ({right / can:.0%});",
+        f"{total['undecided']} told less, as one of several explanations;",
+        f"{total['number']} named with another number; {total['missed']} missed;",
+        f"a name that the unchanged recording lacks in {total['extra']} ({total['extra'] / asked:.0%}),",
+        f"that no recording of the vehicle has in {foreign} ({foreign / asked:.0%}).",
+        "",
+    ]
+    for row in scored:
+        if row["verdict"] not in {"recovered", "told"} or row["extra"]:
+            told = f", extra {', '.join(row['extra'])}" if row["extra"] else ""
+            lines.append(f"  {row['injection']}: {row['log']} {row['verdict']}{told}; {row['note']}")
     return "\n".join(lines) + "\n"
 
 
+def _count(rows: Sequence[Json]) -> dict[str, int]:
+    counts = {key: sum(row["verdict"] == key for row in rows) for key in _VERDICTS}
+    return counts | {"extra": sum(bool(row["extra"]) for row in rows)}
+
+
 def note(injection: Injection, before: Answer, after: Answer) -> str:
-    """The numbers that were asked for, before and after."""
-    labels = list(injection.numbers) or [
-        label for label in shared(before, after) if not is_close(before.numbers[label], after.numbers[label])
+    """Numbers that were asked for or changed, before and after; in brackets those without a name."""
+    labels = list(injection.numbers) + [
+        label for label in after.numbers if not is_close(before.find_number(label), after.numbers[label])
     ]
     parts = []
-    for label in labels:
+    for label in dict.fromkeys(labels):
         one, two = (
-            "{:.3g} +- {:.2g}".format(*answer.numbers[label]) if label in answer.numbers else "-"
+            ("{:.3g} +- {:.2g}" if label in answer.numbers else "({:.3g} +- {:.2g})").format(
+                *answer.find_number(label)
+            )
             for answer in (before, after)
         )
         parts.append(f"{label} {one} -> {two}")
@@ -198,44 +288,33 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", default=[""], help="words of the injections' names")
     parser.add_argument("--out", type=Path, help="file to add a JSON line to for each answer")
     parser.add_argument("--resume", action="store_true", help="go on where the file of --out ends")
+    parser.add_argument(
+        "--table", type=Path, help="file of --out of which the table is printed, asking nothing"
+    )
     asked = parser.parse_args()
+    if asked.table is not None:
+        sys.stdout.write(describe(read_rows(asked.table)))
+        return 0
     rows = read_rows(asked.out) if asked.resume else []
-    done = {(row["log"], row["injection"]) for row in rows}
+    done = {(row["log"], row["injection"], row["both"]) for row in rows}
     chosen = [one for one in list_injections() if any(word in one.name for word in asked.only)]
     logs = [
         log
-        for log in sorted(LOGS.glob("*.mcap"))
+        for log in sorted(LOGS.glob("*.mcap"), key=lambda log: log.stat().st_size)
         if not log.stem.startswith(STANDING) and any(word in log.name for word in asked.logs)
     ]
-    unchanged = Injection("nothing", lambda tables, _: tables)
-    plain = {(log, both): ask(log, unchanged, both=both) for log in logs for both in (False, True)}
     for log in logs:
-        vehicle = log.name.split("_")[0]
-        usual = {
-            name
-            for (other, _), answer in plain.items()
-            if other.name.startswith(vehicle)
-            for name in (*answer.names, *answer.undecided)
-        }
-        for injection in chosen:
-            if (log.stem, injection.name) in done:
+        unchanged = [(_UNCHANGED, both) for both in sorted({one.both for one in chosen})]
+        for injection, both in (*unchanged, *((one, one.both) for one in chosen)):
+            if (log.stem, injection.name, both) in done:
                 continue
-            before, extra = plain[log, injection.both], list[str]()
+            row: Json = {"log": log.stem, "injection": injection.name, "both": both}
             try:
-                after = ask(log, injection, both=injection.both)
-                verdict, extra = judge(injection, before, after, usual)
-                text = note(injection, before, after)
+                row["answer"] = asdict(ask(log, injection, both=both))
             except SlipError as error:
-                verdict, text = "missed", str(error)
-            row = {
-                "log": log.stem,
-                "injection": injection.name,
-                "verdict": verdict,
-                "extra": extra,
-                "note": text,
-            }
+                row["error"] = str(error)
             rows.append(row)
-            sys.stderr.write(f"{log.stem}: {injection.name}: {verdict} {extra or ''}\n")
+            sys.stderr.write(f"{log.stem}: {injection.name}\n")
             add_row(asked.out, row)
     sys.stdout.write(describe(rows))
     return 0

@@ -36,7 +36,7 @@ class Injection:
         change: of the extracted tables.
         findings: any of them tells of the fault; empty where none is expected.
         numbers: by ``effect.parameter`` the number that must be named, from that of the unchanged recording
-            (or from the neutral one); any of them will do.
+            (or from the neutral one); of several effects, which are one to first order, any will do.
         same: the answer must stay what it was.
         both: needs the way from command to wheels.
     """
@@ -80,7 +80,10 @@ def list_injections() -> list[Injection]:
         Injection(
             "poses .15 s late", _on("poses", lambda t: _later(t, 0.15)), (), {"clock_offset.d": shift(0.15)}
         ),
-        Injection("heading .1 s late", _heading_late, (), {"heading_skew.d": shift(0.1)}),
+        Injection(
+            "heading .1 s late", _heading_late, (),
+            {"heading_skew.d": shift(0.1), "lateral_skid.c": shift(-0.1)},
+        ),
         Injection("poses from the wheels", _from_wheels(0.5), ("pose_from_wheels",)),
         Injection("poses from the wheels, Euler's", _from_wheels(1.0), ("pose_from_wheels",)),
         Injection("misalignment 3 deg", _misaligned, (), {"yaw_misalignment.psi": shift(math.radians(3.0))}),
@@ -89,7 +92,12 @@ def list_injections() -> list[Injection]:
             {"icr_offset.x_icr": shift(-0.3), "lever_arm.l_x": shift(0.3)},
         ),
         Injection(
-            "skid .1 s", _moved(lambda m: (0.0, -0.1 * m.v * m.w, 0.0)), (), {"lateral_skid.c": shift(0.1)}
+            "turning about a point .15 m ahead", _moved(lambda m: (0.0, -0.15 * m.w, 0.0)), (),
+            {"icr_offset.x_icr": shift(0.15), "lever_arm.l_x": shift(-0.15)},
+        ),
+        Injection(
+            "skid .1 s", _moved(lambda m: (0.0, -0.1 * m.v * m.w, 0.0)), (),
+            {"lateral_skid.c": shift(0.1), "heading_skew.d": shift(-0.1)},
         ),
         Injection(
             "resistance .15 s", _moved(lambda m: (-0.15 * m.v * np.abs(m.w), 0.0, 0.0)), (),
@@ -121,7 +129,7 @@ class Motion:
     Attributes:
         v: forward speed of the ideal vehicle by its measured wheels [m/s].
         w: yaw rate of the poses [rad/s].
-        done: share of the run that is over.
+        done: share of the run that is over, of what is looked at of it.
     """
 
     v: Floats
@@ -170,10 +178,10 @@ def _all_later(tables: Tables, _: Drive) -> Tables:
 
 
 def _thin(poses: pl.DataFrame) -> pl.DataFrame:
-    """Poses no nearer to each other than a fifth of a second."""
+    """New poses no nearer to each other than a fifth of a second, and none that repeats another."""
     kept, last = [], -np.inf
-    for time in poses["t"].to_list():
-        kept.append(time - last >= 0.199)
+    for time, held in poses.select("t", "held").iter_rows():
+        kept.append(not held and time - last >= 0.199)
         last = time if kept[-1] else last
     return poses.filter(pl.Series(kept))
 
@@ -275,7 +283,7 @@ def _moved(push: Callable[[Motion], tuple[Floats | float, Floats | float, Floats
         place = poses["x"].to_numpy() + 1j * poses["y"].to_numpy()
         moments, speed = wheels["t"].to_numpy(), np.zeros(0)
         speed = 0.5 * drive.radius_m * (wheels["left"].to_numpy() + wheels["right"].to_numpy())
-        spans = (float(times[0]), float(times[-1] - times[0]))
+        looked_at = np.cumsum(poses["active"].to_numpy()) / poses["active"].sum()
         turned, new_place = np.zeros(times.size), place.copy()
         rates: list[tuple[Floats, Floats]] = []
         for rows in _list_segments(poses):
@@ -286,7 +294,9 @@ def _moved(push: Callable[[Motion], tuple[Floats | float, Floats | float, Floats
             angle = np.unwrap(yaw[fresh])
             middle = 0.5 * (times[fresh][1:] + times[fresh][:-1])
             motion = Motion(
-                np.interp(middle, moments, speed), np.diff(angle) / step, (middle - spans[0]) / spans[1]
+                np.interp(middle, moments, speed),
+                np.diff(angle) / step,
+                np.interp(middle, times, looked_at),
             )
             x, y, w = (np.broadcast_to(np.asarray(part, dtype=float), step.shape) for part in push(motion))
             own = np.diff(place[fresh]) * np.exp(-1j * 0.5 * (angle[1:] + angle[:-1]))

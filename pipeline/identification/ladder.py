@@ -91,6 +91,7 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
             rungs.append(last)
     if last is not rungs[-1]:
         rungs = _join_rungs(rungs, last)
+    rungs[-1] = _start_from_model(problem, model, rungs[-1], per_run)
     # What was taken since the last rung has not made up for the error that it raised.
     left = tuple(effect.id for effect in problem.active_effects(model) if effect.id not in rungs[-1].effects)
     return Ladder(tuple(rungs), left)
@@ -109,6 +110,18 @@ def _join_rungs(rungs: list[Rung], last: Rung) -> list[Rung]:
         return rungs
     kept = [n for n, rung in enumerate(rungs) if not list_rises(rung.errors, last.errors, CHANCE)]
     return [*rungs[: kept[-1] + 1], last] if kept else rungs
+
+
+def _start_from_model(problem: Problem, model: Model, top: Rung, per_run: Sequence[str]) -> Rung:
+    """The last rung with the model's own values as starts, where these end at a smaller loss.
+
+    A moment or a limit that stood for other effects on the rungs below may have gone where no descent
+    brings it back from.
+    """
+    if len(top.effects) < 2 or all(number.is_smooth for number in top.fitted.free):  # noqa: PLR2004
+        return top
+    fitted = fit_model(problem, model.keep(top.effects), per_run=per_run, exact=True)
+    return Rung(fitted, hold_out(problem, fitted)) if _scale_free(fitted) < _scale_free(top.fitted) else top
 
 
 def _take_next(

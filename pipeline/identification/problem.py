@@ -35,6 +35,7 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _FEWEST_WINDOWS = 20
+_STILL = 1e-9
 
 
 class Problem:
@@ -192,6 +193,24 @@ def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
             aside = max(aside, float(np.abs(sideways).max()))
         wheel = max(wheel, float(find_fastest_wheel(series).max()))
         difference = max(difference, float(np.abs(series.right - series.left).max()))
-    moments = np.concatenate([run.track.times[run.track.active] for run in runs])
-    tenths = np.quantile(moments, np.linspace(0.0, 1.0, 11)) if moments.size else np.zeros(11)
-    return Largest(speed, turn, wheel, max(difference, 1e-6), tenths, sideways=aside)
+    moments, turns = _find_tenths(runs, vehicle)
+    return Largest(speed, turn, wheel, max(difference, 1e-6), moments, sideways=aside, turns=turns)
+
+
+def _find_tenths(runs: Sequence[MotionRun], vehicle: Vehicle) -> Floats:
+    """Times before which the tenths of the fastest wheel's way lie, and of the turning [s], shape (2, 11)."""
+    times, moved = list[Floats](), list[Floats]()
+    for run in runs:
+        series, at = run.wheels or run.commands, run.track.times[run.track.active]
+        if series is not None and at.size:
+            around = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)[2]
+            both = np.array([find_fastest_wheel(series), np.abs(around)])
+            times.append(at)
+            # Where nothing turns at all, all moments are alike.
+            moved.append(np.array([np.interp(at, series.times, one) + _STILL for one in both]))
+    if not times:
+        return np.zeros((2, 11))
+    order = np.argsort(np.concatenate(times), kind="stable")
+    done = np.cumsum(np.concatenate(moved, axis=1)[:, order], axis=1)
+    when, share = np.concatenate(times)[order], np.linspace(0.0, 1.0, 11)
+    return np.array([np.interp(share * one[-1], one, when) for one in done])

@@ -27,8 +27,9 @@ class Largest:
     Attributes:
         speed, turn, wheel: speed [m/s], yaw rate [rad/s], wheel speed [rad/s].
         difference: of the wheel speeds [rad/s].
-        moments: times [s] before which the tenths of the driving lie, shape (11,).
+        moments: times [s] before which the tenths of the way of the fastest wheel lie, shape (11,).
         sideways: speed to the left or right [m/s].
+        turns: the moments of the turning, where it has others.
     """
 
     speed: float
@@ -37,6 +38,7 @@ class Largest:
     difference: float
     moments: Floats
     sideways: float = 0.0
+    turns: Floats | None = None
 
     @property
     def fastest(self) -> float:
@@ -64,6 +66,13 @@ class Largest:
             return float(self.moments[round(share * (self.moments.size - 1))])
         whole = {"speed": self.speed, "turn": self.turn, "wheel": self.wheel}
         return share * whole.get(of, 1.0)
+
+    def is_within(self, time_s: float) -> bool:
+        """Whether there is driving, and turning, on both sides of a moment: a seventh of each."""
+        known = (self.moments,) if self.turns is None else (self.moments, self.turns)
+        return all(
+            0.5 * (tenths[1] + tenths[2]) <= time_s <= 0.5 * (tenths[-3] + tenths[-2]) for tenths in known
+        )
 
     def reaches(self, limit: float, of: Relative) -> bool:
         """Whether commands went beyond a limit of `speed`, `turn` or `wheel` speed."""

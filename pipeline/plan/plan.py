@@ -329,7 +329,7 @@ def find_largest(knowledge: Knowledge, limits: Limits, time_s: float) -> Largest
     """What plans within these limits ask for at most, of which usual sizes of effects are shares."""
     library = join([one.commands for one in list_manoeuvres(knowledge.vehicle, limits)])
     largest = Rehearsal(library, knowledge.vehicle, knowledge.senses, np.zeros(1)).largest
-    return replace(largest, moments=np.linspace(0.0, time_s, largest.moments.size))
+    return replace(largest, moments=np.linspace(0.0, time_s, largest.moments.size), turns=None)
 
 
 def _list_models(

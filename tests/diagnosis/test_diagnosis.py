@@ -395,6 +395,13 @@ def test_what_is_large_enough_is_named(name: str, values: dict[str, float]) -> N
     assert is_nameable(find_effect(name)(**values), _EVIDENCE)
 
 
+def test_a_break_before_which_nothing_turned_is_a_track() -> None:
+    late = replace(_EVIDENCE.largest, turns=np.linspace(80.0, 120.0, 11))
+    change = find_effect("terrain_change")(k_v=0.9, k_w=0.6, at_s=60.0)
+    assert not is_nameable(change, replace(_EVIDENCE, largest=late))
+    assert is_nameable(change.change(at_s=95.0), replace(_EVIDENCE, largest=late))
+
+
 def test_what_sampling_makes_of_nothing_is_not_named() -> None:
     sampled = replace(_EVIDENCE, encoders=True, least_delay_s=0.06)
     assert is_nameable(find_effect("drive_lag")(tau=0.05), _EVIDENCE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -27,7 +28,7 @@ def tables() -> Tables:
             "t": times, "stamp": stamps, "segment": np.zeros(times.size, dtype=np.int32),
             "x": place.real, "y": place.imag, "z": still,
             "q_x": still, "q_y": still, "q_z": np.sin(0.5 * yaw), "q_w": np.cos(0.5 * yaw),
-            "held": np.zeros(times.size, dtype=bool),
+            "held": np.zeros(times.size, dtype=bool), "active": np.ones(times.size, dtype=bool),
         }
     )  # fmt: skip
     wheels = pl.DataFrame(
@@ -101,21 +102,33 @@ def test_a_heading_that_is_late_is_that_of_before(tables: Tables) -> None:
 
 def test_answers_are_judged() -> None:
     track = Injection("t", lambda tables, _: tables, (), {"effective_track.k": lambda k: 1.2 * k})
-    plain = Answer({"effective_track.k": (1.5, 0.01)}, (), (), ())
+    plain = Answer({"effective_track.k": (1.5, 0.01)})
 
     def name(value: float, **more: float) -> Answer:
         numbers = {"effective_track.k": (value, 0.01), **{f"{key}.k": (v, 0.01) for key, v in more.items()}}
-        return Answer(numbers, (), (), ())
+        return Answer(numbers)
 
     assert judge(track, plain, name(1.81)) == ("recovered", [])
-    assert judge(track, plain, name(1.5)) == ("missed", [])
+    assert judge(track, plain, name(1.5)) == ("number", [])
+    assert judge(track, plain, Answer({})) == ("missed", [])
     assert judge(track, plain, name(1.8, speed_slip=0.1)) == ("recovered", ["speed_slip"])
-    assert judge(track, plain, name(1.8, speed_slip=0.1), {"speed_slip"}) == ("recovered", [])
-    assert judge(track, plain, Answer({}, (), ("effective_track",), ()))[0] == "undecided"
-    assert judge(track, plain, Answer({}, (), (), ("effective_track",)))[0] == "cannot"
+    assert judge(track, replace(plain, undecided=("speed_slip",)), name(1.8, speed_slip=0.1))[1] == []
+    assert judge(track, plain, Answer({}, undecided=("effective_track",)))[0] == "undecided"
+    assert judge(track, plain, Answer({}, unobservable=("effective_track",)))[0] == "cannot"
+    assert judge(track, plain, Answer({}, detectable={"effective_track.k": 0.5}))[0] == "cannot"
     told = Injection("f", lambda tables, _: tables, ("wheel_dead",))
-    assert judge(told, plain, Answer({}, ("wheel_dead",), (), ())) == ("told", [])
+    assert judge(told, plain, Answer({}, {"wheel_dead": 0.5})) == ("told", [])
+    assert judge(told, Answer({}, {"wheel_dead": 0.5}), Answer({}, {"wheel_dead": 0.5}))[0] == "missed"
+    assert judge(told, Answer({}, {"wheel_dead": 0.5}), Answer({}, {"wheel_dead": 0.75}))[0] == "told"
     same = Injection("s", lambda tables, _: tables, same=True)
     assert judge(same, plain, plain)[0] == "recovered"
-    assert judge(same, plain, Answer({}, (), (), ()))[0] == "missed"
+    assert judge(same, plain, Answer({}))[0] == "missed"
     assert judge(same, plain, name(1.6))[0] == "missed"
+    assert judge(same, plain, name(1.5, speed_slip=0.1)) == ("missed", ["speed_slip"])
+
+
+def test_what_an_effect_cancels_is_not_named() -> None:
+    skid = Injection("t", lambda tables, _: tables, (), {"lateral_skid.c": lambda c: c + 0.1})
+    sliding = Answer({"lateral_skid.c": (-0.1, 0.01)})
+    assert judge(skid, sliding, Answer({}, detectable={"lateral_skid.c": 0.03}))[0] == "recovered"
+    assert judge(skid, Answer({}), Answer({}, detectable={"lateral_skid.c": 0.03}))[0] == "missed"

@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from inject import LOGS, STANDING, Answer, ask
+from inject import LOGS, STANDING, Answer, ask, judge
 from injections import Injection, list_injections
 
 _SAMPLES = Path(__file__).parents[2] / "data_samples"
@@ -61,3 +61,14 @@ def test_fewer_or_noisier_poses_give_hardly_any_other_name() -> None:
             named += len(after.names)
             others += [f"{name}, {change}: {one}" for one in after.names - before.names - {*before.undecided}]
     assert len(others) <= 0.03 * named, others
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not _DRIVEN, reason="the recordings are not there")
+def test_a_break_in_a_recording_is_told_where_it_is() -> None:
+    """Where it stands for the track on the ladder's lower rungs, the last one has it in its place again."""
+    (log,) = (LOGS / f"{one}.mcap" for one in _DRIVEN if "grass_2024_7" in one)
+    change = _BY_NAME["gains .8 and .7 half-way"]
+    after = ask(log, change, both=False)
+    assert judge(change, ask(log, _NOTHING, both=False), after)[0] == "recovered", after
+    assert after.numbers["terrain_change.at_s"][1] < 60.0

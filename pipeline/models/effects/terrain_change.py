@@ -106,6 +106,5 @@ class TerrainChange(KinematicEffect):
     def is_degenerate(self, evidence: Evidence) -> bool:
         """It does not lie within the run."""
         # Nearer to the ends of what was driven it is a wheel radius and a track under another name.
-        at, tenths = self.values["at_s"], evidence.largest.moments
-        low, high = 0.5 * (tenths[1] + tenths[2]), 0.5 * (tenths[-3] + tenths[-2])
-        return math.isfinite(at) and not bool(low <= at <= high)
+        at = self.values["at_s"]
+        return math.isfinite(at) and not evidence.largest.is_within(at)
