@@ -72,7 +72,7 @@ def price_of(tested: CandidateModel, other: CandidateModel) -> float:
 
 
 def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
-    """Drop effects whose absence is not missed, alone or with those dropped before, the least missed first."""
+    """Drop effects that are not missed, nor together with those dropped before; the least missed first."""
     begun = current
     while True:
         smaller = []
@@ -80,7 +80,8 @@ def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
             if name in selection.kept:
                 continue
             without = selection.drop(current, [name])
-            if not any(selection.prefers(without, more, price_of(more, without)) for more in (current, begun)):
+            larger = (current, begun)
+            if not any(selection.prefers(without, more, price_of(more, without)) for more in larger):
                 smaller.append(without)
         if not smaller:
             return current

@@ -155,10 +155,11 @@ class Selection:
             # A few steps tell which of them are worth fitting to the end.
             tried = [self._try(base.ids, proposal.state) for proposal in proposals[taken:wanted]]
             best, taken = min([best, *(fit.loss for fit in tried)]), taken + len(tried)
+            worth = _WORTH * best
             entered = [
-                self._finish(base.ids, fit) if fit.loss < _WORTH * best else self._present(fit) for fit in tried
+                self._simplify(self._finish(base.ids, fit) if fit.loss < worth else self._present(fit))
+                for fit in tried
             ]
-            entered = [self._simplify(tested) for tested in entered]
             ranked += [tested for tested in entered if self.is_sound(tested)]
             # What gains much with numbers that no vehicle has takes nobody's place.
             least = (1.0 - LEAST_GAIN) * base.score

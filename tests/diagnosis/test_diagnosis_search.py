@@ -91,13 +91,16 @@ def test_a_run_without_a_usable_gyro_leaves_the_clock_of_another_run_free(tmp_pa
     assert effect.values["tau"] == pytest.approx(0.52, abs=0.004)
 
 
+_NOTHING = State((), ())
+
+
 @dataclass(frozen=True)
 class _Set:
     """A model of which only its effects and its score matter."""
 
     ids: tuple[str, ...]
     score: float
-    state: State = State((), ())
+    state: State = _NOTHING
 
 
 class _Scores:
@@ -143,7 +146,7 @@ def test_a_set_that_was_come_to_before_ends_the_growth() -> None:
 
     def suggest(base: _Set, count: int) -> list[_Set]:
         scores.asked, scores.least = scores.asked + 1, 0.5
-        return [scores.sets["a",]][:count]
+        return [one for one in scores.sets.values() if one is not base][:count]
 
     scores.adapt, scores.suggest = adapt, suggest  # type: ignore[method-assign]
     assert grow(scores, scores.sets[()]).ids == ()  # type: ignore[arg-type]
