@@ -34,8 +34,7 @@ _GAPS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
 _LATEST_S = 0.5
 # Quarters of a second before a window at which the input is looked at.
 _LAGS = (0, 1, 2, 3, 4, 6, 8)
-# Of a quarter of a second each: of these the input's curves matter, not its mean alone.
-_CURVED = 4
+_QUIET_SHARE = 0.7
 _FEWEST = 20
 # Pairs by how much is explained of them, and from how many standard errors on more is left of the later ones.
 _CLASSES = 12
@@ -63,7 +62,9 @@ def estimate_floor(problem: Problem) -> Errors:
     """
     comparisons = problem.parts[0].comparisons
     described = [_describe(comparison) for comparison in comparisons]
-    squares = np.array([_measure_repeats(comparisons, described, gap) for gap in _GAPS_S])
+    repeats = np.array([_measure_repeats(comparisons, described, gap) for gap in _GAPS_S])
+    # One share for all gaps: how they differ tells noise from motion.
+    squares = repeats[:, 0] * np.nan_to_num(np.nanmedian(repeats[:, 1], axis=0), nan=1.0)
     # What grows with the time between windows lasts: something causes it, though nobody knows what.
     windows = sum(history.shape[0] for history, _ in described)
     x, y, w = (split_differences(np.maximum(np.nan_to_num(row), _LEAST), windows) for row in squares.T)
@@ -103,16 +104,18 @@ def _describe(comparison: Comparison) -> tuple[Floats, Floats]:
     yaw = np.interp(middle, around.times, around.from_start[:, 2])
     moves = np.clip(np.abs(history[:, 0]).sum(axis=1) / _MOVING_MPS, 0.0, 1.0)[:, None]
     world = moves * np.column_stack((np.sin(yaw), np.cos(yaw), np.sin(roll), np.sin(pitch)))
-    late = history[:, :_CURVED].reshape(history.shape[0], -1)
-    ways = np.clip(history[:, 0] / _MOVING_MPS, -1.0, 1.0)
-    curves = (history[:, :, 0] * history[:, :, 1], late * np.abs(late), np.abs(late), ways)
-    return history, np.column_stack((history.reshape(history.shape[0], -1), *curves, world))
+    curve = history[:, :, 0] * history[:, :, 1]
+    return history, np.column_stack((history.reshape(history.shape[0], -1), curve, world))
 
 
 def _measure_repeats(
     comparisons: tuple[Comparison, ...], described: list[tuple[Floats, Floats]], gap_s: float
 ) -> Floats:
-    """Half the mean square of the difference of two windows under the same input, x, y, w; NaN if unknown."""
+    """Half the mean square of the difference of two windows under the same input, x, y, w; NaN if unknown.
+
+    Returns:
+        Of all pairs, and the share of it that is left where little is owed to changes, shape (2, 3).
+    """
     differences, features, moving, standing, lively = [], [], [], [], []
     for comparison, (history, recorded) in zip(comparisons, described, strict=True):
         first, second = pair_windows(comparison.windows.times, gap_s, _LATEST_S if gap_s > 0.0 else NEAR_S)
@@ -125,18 +128,19 @@ def _measure_repeats(
     rest, change = np.concatenate(differences), np.concatenate(features)
     moves, stands = np.concatenate(moving), np.concatenate(standing)
     if moves.sum() < _FEWEST:
-        return np.full(3, np.nan)
-    square = _take_away_changes(rest[moves], change[moves])
+        return np.full((2, 3), np.nan)
+    square, alike = _take_away_changes(rest[moves], change[moves])
     still = 0.5 * np.mean(rest[stands] ** 2, axis=0) if stands.sum() >= _FEWEST else square
     share = float(np.concatenate(lively).mean())
-    mixed: Floats = share * square + (1.0 - share) * still
-    return mixed
+    return np.array((share * square + (1.0 - share) * still, alike))
 
 
 def _take_away_changes(rest: Floats, change: Floats) -> Floats:
-    """Half the mean square of differences (n, 3), without what they owe to changes (n, p)."""
+    """Half the mean square of differences (n, 3), without what they owe to changes (n, p); see `_average`."""
     scaled = change / (np.sqrt((change**2).mean(axis=0)) + 1e-9)
-    count = rest.shape[0]
+    size = np.abs(scaled).max(axis=1)
+    quiet = np.argsort(size, kind="stable")[: max(int(_QUIET_SHARE * size.size), min(size.size, 5 * _FEWEST))]
+    rest, scaled, count = rest[quiet], scaled[quiet], quiet.size
     normal = scaled.T @ scaled / count
     ridge = _RIDGE * float(np.trace(normal)) / normal.shape[0] + 1e-12
     inverse = np.linalg.inv(normal + ridge * np.eye(normal.shape[0]))
@@ -147,13 +151,12 @@ def _take_away_changes(rest: Floats, change: Floats) -> Floats:
     leverage = np.einsum("ij,jk,ik->i", scaled, inverse, scaled) * _PAIRS_EACH / count
     free = 1.0 - np.minimum(leverage, _MOST_FREEDOM)
     owed = np.abs(scaled) @ np.abs(weights)
-    return np.array(
-        [_average_alike(*one, free) for one in zip((0.5 * _hold(left) ** 2).T, owed.T, strict=True)]
-    )
+    squares = 0.5 * _hold(left) ** 2
+    return np.array([_average(*one, free) for one in zip(squares.T, owed.T, strict=True)]).T
 
 
-def _average_alike(squares: Floats, owed: Floats, free: Floats) -> float:
-    """Mean of squares (n,) by degree of freedom, without those that grow with what is owed to changes."""
+def _average(squares: Floats, owed: Floats, free: Floats) -> tuple[float, float]:
+    """Mean of squares (n,) by degree of freedom, and its share without those that grow with what is owed."""
     classes = min(_CLASSES, max(owed.size // _FEWEST_IN_CLASS, 1))
     edges = np.linspace(0, owed.size, classes + 1).astype(np.int64)[1:]
     order = np.argsort(owed, kind="stable")
@@ -162,7 +165,7 @@ def _average_alike(squares: Floats, owed: Floats, free: Floats) -> float:
     beyond = (total[-1] - total[:-1]) / (freedom[-1] - freedom[:-1])
     error = least[:-1] * np.sqrt(2.0 / seen[:-1] + 2.0 / (seen[-1] - seen[:-1]))
     alike = least[:-1][beyond - least[:-1] > _CLEARLY * error]
-    return float(min([least[-1], *alike]))
+    return float(least[-1]), float(min([least[-1], *alike]) / max(least[-1], _LEAST))
 
 
 def _hold(values: Floats) -> Floats:
