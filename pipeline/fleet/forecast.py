@@ -26,8 +26,9 @@ if TYPE_CHECKING:
 DRAWS = 400
 """Draws of every number: ends of 95 % intervals are then known to a tenth of their width."""
 RUNS_SHARE = USUAL_SPREAD / 0.67449
-"""Runs of one ground differ by so much of what grounds may, which is the usual size of the number: a half-normal
-prior of that scale has the usual spread between runs as its median."""
+"""Runs of one ground differ by so much of what grounds may, which is the usual size of the number: the
+half-normal prior of that scale has the usual spread between runs as its median, and intervals of a ground
+with two to four runs hold 93 to 97 % of drawn runs (`make fleets ARGS="--drawn 200"`)."""
 _ENDS = (0.025, 0.975)
 # Between these ends a normal distribution has so many standard deviations.
 _WIDTH = 2 * 1.959964
