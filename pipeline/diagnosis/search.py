@@ -46,8 +46,10 @@ def search_effects(selection: Selection, start: CandidateModel) -> CandidateMode
 
 
 def grow(selection: Selection, current: CandidateModel) -> CandidateModel:
-    """Add effects while one is accepted, dropping what has become superfluous."""
-    while len(current.ids) < _MOST_EFFECTS and not selection.budget.is_spent():
+    """Add effects while one is accepted, dropping what has become superfluous; no set is come to twice."""
+    seen = set[tuple[str, ...]]()
+    while current.ids not in seen and len(current.ids) < _MOST_EFFECTS and not selection.budget.is_spent():
+        seen.add(current.ids)
         added = _add(selection, current)
         if added is None:
             return current
@@ -70,15 +72,16 @@ def price_of(tested: CandidateModel, other: CandidateModel) -> float:
 
 
 def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
-    """Drop effects whose absence is not missed, the least missed first."""
+    """Drop effects that are not missed, nor together with those dropped before; the least missed first."""
+    begun = current
     while True:
         smaller = []
         for name in current.ids:
             if name in selection.kept:
                 continue
             without = selection.drop(current, [name])
-            needed = price_of(current, without)
-            if not selection.prefers(without, current, needed):
+            larger = (current, begun)
+            if not any(selection.prefers(without, more, price_of(more, without)) for more in larger):
                 smaller.append(without)
         if not smaller:
             return current

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -148,15 +149,23 @@ class Selection:
         if key in self._suggested:
             return self._suggested[key]
         proposals = self._propose(base, barred)
-        proposals = (propose_pairs(base.fit, proposals[:_PAIRED]) if pairs else proposals)[:count]
-        # A few steps tell which of them are worth fitting to the end.
-        tried = [self._try(base.ids, proposal.state) for proposal in proposals]
-        best = min((fit.loss for fit in tried), default=0.0)
-        entered = [
-            self._finish(base.ids, fit) if fit.loss < _WORTH * best else self._present(fit) for fit in tried
-        ]
-        entered = [self._simplify(tested) for tested in entered]
-        ranked = sorted((c for c in entered if self.is_sound(c)), key=lambda c: c.score)
+        if pairs:
+            proposals = propose_pairs(base.fit, proposals[:_PAIRED])
+        ranked, taken, best, wanted = list[CandidateModel](), 0, math.inf, count
+        while taken < min(wanted, len(proposals)):
+            # A few steps tell which of them are worth fitting to the end.
+            tried = [self._try(base.ids, proposal.state) for proposal in proposals[taken:wanted]]
+            best, taken = min([best, *(fit.loss for fit in tried)]), taken + len(tried)
+            worth = _WORTH * best
+            entered = [
+                self._simplify(self._finish(base.ids, fit) if fit.loss < worth else self._present(fit))
+                for fit in tried
+            ]
+            ranked += [tested for tested in entered if self.is_sound(tested)]
+            # What gains much with numbers that no vehicle has takes nobody's place.
+            least = (1.0 - LEAST_GAIN) * base.score
+            wanted += sum(tested.score < least and not self.is_sound(tested) for tested in entered)
+        ranked.sort(key=lambda tested: tested.score)
         self._suggested[key] = ranked
         return ranked
 

@@ -44,11 +44,12 @@ def expect_another_run(parameter: Parameter, value: float, low: float, high: flo
     """95 % interval of a number in another run on the same ground, NaN where this run has none.
 
     The interval of this run, and the spread between runs that recordings have shown or that is usual
-    (`Parameter.spread`), independent of each other; within the bounds of the search.
+    (`Parameter.spread`), independent of each other, of this run and of the other: two runs differ by the root
+    of two more than either does from the ground's mean. Within the bounds of the search.
     """
     if not math.isfinite(high - low):
         return math.nan, math.nan
-    change = _SURE * parameter.spread.size
+    change = _SURE * math.sqrt(2.0) * parameter.spread.size
     least, most = parameter.bounds
     return max(value - math.hypot(value - low, change), least), min(
         value + math.hypot(high - value, change), most

@@ -15,7 +15,7 @@ from pipeline.fleet.statistics import draw_run
 from pipeline.models.bounds import stands_at_bound
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Place
-from pipeline.models.parameter import is_of_one_run
+from pipeline.models.parameter import USUAL_SPREAD, is_of_one_run
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,9 +25,10 @@ if TYPE_CHECKING:
 
 DRAWS = 400
 """Draws of every number: ends of 95 % intervals are then known to a tenth of their width."""
-RUNS_SHARE = 0.5
-"""Runs of one ground differ by half as much as grounds may, which is the usual size of the number: intervals
-from two runs are half as wide, and hold 95 to 99 % of drawn runs (`make fleets ARGS="--drawn 200"`)."""
+RUNS_SHARE = USUAL_SPREAD / 0.67449
+"""Runs of one ground differ by so much of what grounds may, which is the usual size of the number: the
+half-normal prior of that scale has the usual spread between runs as its median, and intervals of a ground
+with two to four runs hold 93 to 97 % of drawn runs (`make fleets ARGS="--drawn 200"`)."""
 _ENDS = (0.025, 0.975)
 # Between these ends a normal distribution has so many standard deviations.
 _WIDTH = 2 * 1.959964

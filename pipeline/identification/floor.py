@@ -4,8 +4,9 @@ Two displacements over half a second, none to two seconds apart, differ by what 
 differently, and by noise of the poses and random motion. The former is small and locally linear, so that a
 regression of differences on differences takes it away (a difference-based estimator of variance: Rice,
 Annals of Statistics 12 (1984); with regressors Yatchew, Economics Letters 57 (1997)); half the mean square of
-the rest is the floor, whatever is true of the vehicle. What changes slowly cancels out, and what makes
-windows differ the more the further they are apart (`persistence`) is no part of it.
+the rest is the floor, whatever is true of the vehicle. Where more is left of pairs of which the regression
+explains much than of the others, it is no line, and only the others count. What changes slowly cancels out,
+and what makes windows differ the more the further they are apart (`persistence`) is no part of it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.identification.parts import average_lags, find_live
-from pipeline.identification.persistence import Makeup, split_differences
+from pipeline.identification.persistence import NEAR_S, Makeup, pair_windows, split_differences
 from pipeline.identification.scoring import Errors
 from pipeline.models.forward import Timing
 
@@ -30,12 +31,15 @@ Flags = NDArray[np.bool_]
 
 # From the end of one window to the start of the other [s]: at zero they share a pose.
 _GAPS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
-_NEAR_S = 0.07
 _LATEST_S = 0.5
 # Quarters of a second before a window at which the input is looked at.
 _LAGS = (0, 1, 2, 3, 4, 6, 8)
 _QUIET_SHARE = 0.7
 _FEWEST = 20
+# Pairs by how much is explained of them, and from how many standard errors on more is left of the later ones.
+_CLASSES = 12
+_FEWEST_IN_CLASS = 30
+_CLEARLY = 4.0
 _CLIP = 3.0
 _SHARE_OF_RMS = 0.5
 _ROUNDS = 5
@@ -58,7 +62,9 @@ def estimate_floor(problem: Problem) -> Errors:
     """
     comparisons = problem.parts[0].comparisons
     described = [_describe(comparison) for comparison in comparisons]
-    squares = np.array([_measure_repeats(comparisons, described, gap) for gap in _GAPS_S])
+    repeats = np.array([_measure_repeats(comparisons, described, gap) for gap in _GAPS_S])
+    # One share for all gaps: how they differ tells noise from motion.
+    squares = repeats[:, 0] * np.nan_to_num(np.nanmedian(repeats[:, 1], axis=0), nan=1.0)
     # What grows with the time between windows lasts: something causes it, though nobody knows what.
     windows = sum(history.shape[0] for history, _ in described)
     x, y, w = (split_differences(np.maximum(np.nan_to_num(row), _LEAST), windows) for row in squares.T)
@@ -105,10 +111,14 @@ def _describe(comparison: Comparison) -> tuple[Floats, Floats]:
 def _measure_repeats(
     comparisons: tuple[Comparison, ...], described: list[tuple[Floats, Floats]], gap_s: float
 ) -> Floats:
-    """Half the mean square of the difference of two windows under the same input, x, y, w; NaN if unknown."""
+    """Half the mean square of the difference of two windows under the same input, x, y, w; NaN if unknown.
+
+    Returns:
+        Of all pairs, and the share of it that is left where little is owed to changes, shape (2, 3).
+    """
     differences, features, moving, standing, lively = [], [], [], [], []
     for comparison, (history, recorded) in zip(comparisons, described, strict=True):
-        first, second = _pair(comparison.windows.times, gap_s)
+        first, second = pair_windows(comparison.windows.times, gap_s, _LATEST_S if gap_s > 0.0 else NEAR_S)
         residual, live = comparison.find_residuals((), Timing()), find_live(history)
         differences.append(residual[second] - residual[first])
         features.append(recorded[second] - recorded[first])
@@ -118,30 +128,19 @@ def _measure_repeats(
     rest, change = np.concatenate(differences), np.concatenate(features)
     moves, stands = np.concatenate(moving), np.concatenate(standing)
     if moves.sum() < _FEWEST:
-        return np.full(3, np.nan)
-    square = _take_away_changes(rest[moves], change[moves])
+        return np.full((2, 3), np.nan)
+    square, alike = _take_away_changes(rest[moves], change[moves])
     still = 0.5 * np.mean(rest[stands] ** 2, axis=0) if stands.sum() >= _FEWEST else square
     share = float(np.concatenate(lively).mean())
-    mixed: Floats = share * square + (1.0 - share) * still
-    return mixed
-
-
-def _pair(times: Floats, gap_s: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Windows, and the first of those that begin a gap after their ends."""
-    wanted = times[:, 1] + gap_s
-    second = np.minimum(np.searchsorted(times[:, 0], wanted - _NEAR_S), times.shape[0] - 1)
-    late = times[second, 0] - wanted
-    kept = (late >= -_NEAR_S) & (late <= (_LATEST_S if gap_s > 0.0 else _NEAR_S))
-    return np.flatnonzero(kept), second[kept].astype(np.int64)
+    return np.array((share * square + (1.0 - share) * still, alike))
 
 
 def _take_away_changes(rest: Floats, change: Floats) -> Floats:
-    """Half the mean square of differences (n, 3), without what they owe to changes (n, p), of quiet pairs."""
+    """Half the mean square of differences (n, 3), without what they owe to changes (n, p); see `_average`."""
     scaled = change / (np.sqrt((change**2).mean(axis=0)) + 1e-9)
     size = np.abs(scaled).max(axis=1)
     quiet = np.argsort(size, kind="stable")[: max(int(_QUIET_SHARE * size.size), min(size.size, 5 * _FEWEST))]
-    rest, scaled = rest[quiet], scaled[quiet]
-    count = rest.shape[0]
+    rest, scaled, count = rest[quiet], scaled[quiet], quiet.size
     normal = scaled.T @ scaled / count
     ridge = _RIDGE * float(np.trace(normal)) / normal.shape[0] + 1e-12
     inverse = np.linalg.inv(normal + ridge * np.eye(normal.shape[0]))
@@ -149,10 +148,24 @@ def _take_away_changes(rest: Floats, change: Floats) -> Floats:
     for _ in range(_ROUNDS):
         weights = weights + inverse @ (scaled.T @ _hold(left) / count - ridge * weights)
         left = rest - scaled @ weights
-    seen = count / _PAIRS_EACH
-    freedom = max(1.0 - float(np.trace(inverse @ normal)) / seen, _MOST_FREEDOM)
-    square: Floats = 0.5 * np.mean(_hold(left) ** 2, axis=0) / freedom
-    return square
+    leverage = np.einsum("ij,jk,ik->i", scaled, inverse, scaled) * _PAIRS_EACH / count
+    free = 1.0 - np.minimum(leverage, _MOST_FREEDOM)
+    owed = np.abs(scaled) @ np.abs(weights)
+    squares = 0.5 * _hold(left) ** 2
+    return np.array([_average(*one, free) for one in zip(squares.T, owed.T, strict=True)]).T
+
+
+def _average(squares: Floats, owed: Floats, free: Floats) -> tuple[float, float]:
+    """Mean of squares (n,) by degree of freedom, and its share without those that grow with what is owed."""
+    classes = min(_CLASSES, max(owed.size // _FEWEST_IN_CLASS, 1))
+    edges = np.linspace(0, owed.size, classes + 1).astype(np.int64)[1:]
+    order = np.argsort(owed, kind="stable")
+    total, freedom = np.cumsum(squares[order])[edges - 1], np.cumsum(free[order])[edges - 1]
+    least, seen = total / freedom, edges / _PAIRS_EACH
+    beyond = (total[-1] - total[:-1]) / (freedom[-1] - freedom[:-1])
+    error = least[:-1] * np.sqrt(2.0 / seen[:-1] + 2.0 / (seen[-1] - seen[:-1]))
+    alike = least[:-1][beyond - least[:-1] > _CLEARLY * error]
+    return float(least[-1]), float(min([least[-1], *alike]) / max(least[-1], _LEAST))
 
 
 def _hold(values: Floats) -> Floats:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 _LAGS = 6
-_NEAR_S = 0.07
+NEAR_S = 0.07
 _CLIP = 6.0
 _SHARE_OF_RMS = 0.5
 # Correlation times [s] of random motion, and of what lasts.
@@ -115,8 +115,10 @@ def _covary(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
         rows = slice(shift, shift + times.shape[0])
         shift += times.shape[0]
         mine, good = values[rows], known[rows]
-        for lag in range(_LAGS + 1):
-            first, second = _pair(times, lag)
+        sums[:, 0] += (mine[good] ** 2).sum(axis=0)
+        counts[0] += int(good.sum())
+        for lag in range(1, _LAGS + 1):
+            first, second = pair_windows(times, (lag - 1) * WINDOW_S)
             kept = good[first] & good[second]
             sums[:, lag] += (mine[first[kept]] * mine[second[kept]]).sum(axis=0)
             counts[lag] += int(kept.sum())
@@ -136,7 +138,7 @@ def take_own_past(comparisons: Sequence[Comparison], residuals: Floats) -> Float
     for comparison in comparisons:
         times = comparison.windows.times
         for lag in (1, 2):
-            first, second = _pair(times, lag)
+            first, second = pair_windows(times, (lag - 1) * WINDOW_S)
             past[lag - 1, shift + second] = residuals[shift + first]
         shift += times.shape[0]
     known = np.isfinite(past).all(axis=(0, 2))
@@ -147,15 +149,21 @@ def take_own_past(comparisons: Sequence[Comparison], residuals: Floats) -> Float
     return fresh
 
 
-def _pair(times: Floats, lag: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Windows and those that begin where ``lag`` windows later begin."""
-    first = np.arange(times.shape[0])
-    if lag == 0:
-        return first, first
-    wanted = times[:, 1] + (lag - 1) * WINDOW_S
-    second = np.minimum(np.searchsorted(times[:, 0], wanted - _NEAR_S), times.shape[0] - 1)
-    kept = np.abs(times[second, 0] - wanted) <= _NEAR_S
-    return first[kept], second[kept]
+def pair_windows(
+    times: Floats, gap_s: float, latest_s: float = NEAR_S
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Windows, and the first of those that begin a gap after their ends.
+
+    Args:
+        times: start and end of each window [s], shape (n, 2).
+        gap_s: from the end of the one to the start of the other [s].
+        latest_s: how much later the other may begin [s].
+    """
+    wanted = times[:, 1] + gap_s
+    second = np.minimum(np.searchsorted(times[:, 0], wanted - NEAR_S), times.shape[0] - 1)
+    late = times[second, 0] - wanted
+    kept = (late >= -NEAR_S) & (late <= latest_s)
+    return np.flatnonzero(kept), second[kept].astype(np.int64)
 
 
 def _split(covariance: Floats) -> Makeup:

@@ -67,7 +67,8 @@ class Spread:
 
 
 WARTHOG_RUNS = "nine runs of a Warthog on five grounds"
-_USUAL_SPREAD = 0.25
+USUAL_SPREAD = 0.25
+"""Standard deviation between runs of a ground, over the usual size of a number, where none was measured."""
 STAMPS = "stamps are off by as much"
 MOUNTING = "sensors are mounted no better"
 DATA_SHEET = "a data sheet allows as much"
@@ -137,7 +138,7 @@ class Parameter:
     def spread(self) -> Spread:
         """Between runs: what is known of it, else the median of what was measured of other numbers."""
         usual = f"a quarter of its usual size, the median over the numbers of {WARTHOG_RUNS}"
-        return self.between_runs or Spread(_USUAL_SPREAD * self.usual_size, usual)
+        return self.between_runs or Spread(USUAL_SPREAD * self.usual_size, usual)
 
 
 @dataclass(frozen=True)

@@ -469,8 +469,8 @@ def test_residuals_lose_what_their_own_past_tells_of_them() -> None:
 def test_another_run_is_known_less_than_this_one_and_what_begins_in_this_one_not_at_all() -> None:
     track = find_effect("effective_track")().parameter("k")
     low, high = expect_another_run(track, 1.8, 1.78, 1.83)
-    assert low < 1.8 - 1.95 * track.spread.size < 1.78
-    assert 1.83 < high < 1.83 + 1.97 * track.spread.size
+    assert low == pytest.approx(1.8 - np.hypot(0.02, 1.96 * 2.0**0.5 * track.spread.size))
+    assert high == pytest.approx(1.8 + np.hypot(0.03, 1.96 * 2.0**0.5 * track.spread.size))
     lag = find_effect("drive_lag")().parameter("tau")
     assert expect_another_run(lag, 0.1, 0.09, 0.11)[0] == lag.bounds[0]
     assert not np.isfinite(expect_another_run(track, 1.8, math.nan, math.nan)).any()

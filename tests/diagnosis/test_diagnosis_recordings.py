@@ -142,6 +142,11 @@ def test_nothing_is_named_of_a_vehicle_that_stands(asked: Asked, name: str, sour
     assert run.ladder == ()
 
 
+def test_a_drivetrain_that_half_a_minute_shows_is_explained_from_commands(asked: Asked) -> None:
+    rungs = asked.diagnose("warthog_wheels_asphalt_2024_9_20_8h13s12", "command").ladder
+    assert rungs[-1]["t_mrmse_m"] < 0.5 * rungs[0]["t_mrmse_m"]
+
+
 @pytest.mark.parametrize("name", _DRIVEN)
 @pytest.mark.parametrize("source", ["command", "measured"])
 def test_what_is_named_is_what_a_vehicle_can_do(asked: Asked, name: str, source: str) -> None:

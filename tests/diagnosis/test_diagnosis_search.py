@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -13,9 +13,10 @@ from pipeline.analysis.options import Options
 from pipeline.diagnosis.budget import Budget
 from pipeline.diagnosis.context import prepare
 from pipeline.diagnosis.recording import load_recording
-from pipeline.diagnosis.search import search_effects
+from pipeline.diagnosis.search import grow, prune, search_effects
 from pipeline.diagnosis.selection import open_selection
 from pipeline.identification import Input, Problem, fit_model
+from pipeline.identification.state import State
 from pipeline.models import Model, find_effect
 from pipeline.simulate import (
     VEHICLES,
@@ -88,3 +89,65 @@ def test_a_run_without_a_usable_gyro_leaves_the_clock_of_another_run_free(tmp_pa
     fitted = fit_model(problem, Model(vehicle, (find_effect("body_inertia")(),)))
     (effect,) = fitted.state.effects
     assert effect.values["tau"] == pytest.approx(0.52, abs=0.004)
+
+
+_NOTHING = State((), ())
+
+
+@dataclass(frozen=True)
+class _Set:
+    """A model of which only its effects and its score matter."""
+
+    ids: tuple[str, ...]
+    score: float
+    state: State = _NOTHING
+
+
+class _Scores:
+    """A selection in which sets of effects have fixed scores, and what halves the score is preferred."""
+
+    kept = frozenset[str]()
+    budget = Budget()
+    asked = 0
+    least = 0.5
+
+    def __init__(self, **scores: float) -> None:
+        self.sets = {tuple(name): _Set(tuple(name), score) for name, score in scores.items()}
+        self.sets[()] = _Set((), 100.0)
+
+    def drop(self, current: _Set, names: list[str]) -> _Set:
+        return self.sets[tuple(name for name in current.ids if name not in names)]
+
+    def prefers(self, before: _Set, after: _Set, least_gain: float) -> bool:
+        assert least_gain >= 0.0
+        return after.score < self.least * before.score
+
+    def adapt(self, tested: _Set) -> _Set:
+        return tested
+
+    def suggest(self, base: _Set, count: int) -> list[_Set]:
+        self.asked += 1
+        more = (one for ids, one in self.sets.items() if set(ids) > set(base.ids))
+        return sorted(more, key=lambda one: one.score)[:count]
+
+
+def test_effects_of_which_either_will_do_are_not_both_dropped() -> None:
+    scores = _Scores(a=60.0, b=50.0, ab=30.0)
+    assert prune(scores, scores.sets["a", "b"]).ids == ("b",)  # type: ignore[arg-type]
+
+
+def test_a_set_that_was_come_to_before_ends_the_growth() -> None:
+    scores = _Scores(a=40.0)
+
+    def adapt(tested: _Set) -> _Set:
+        # Under the weights of the model with it, the effect is not missed any more.
+        scores.least = 0.1
+        return tested
+
+    def suggest(base: _Set, count: int) -> list[_Set]:
+        scores.asked, scores.least = scores.asked + 1, 0.5
+        return [one for one in scores.sets.values() if one is not base][:count]
+
+    scores.adapt, scores.suggest = adapt, suggest  # type: ignore[method-assign]
+    assert grow(scores, scores.sets[()]).ids == ()  # type: ignore[arg-type]
+    assert scores.asked == 1

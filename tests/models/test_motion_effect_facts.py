@@ -85,7 +85,7 @@ def test_sizes_have_reasons_and_fit_each_other(effect: type[Effect]) -> None:
             assert parameter.plausible.low <= parameter.typical <= parameter.plausible.high
             assert parameter.plausible.source in page
         if not is_of_one_run(effect.parameters):
-            assert 0.0 <= parameter.spread.size < parameter.usual_size
+            assert 0.0 < parameter.spread.size < parameter.usual_size
             assert parameter.spread.source in page
         if parameter.one_sign:
             assert parameter.typical > parameter.neutral

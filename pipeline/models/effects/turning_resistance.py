@@ -14,12 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.models.effect import (
-    WARTHOG_RUNS,
     Excitation,
     LinearEffect,
     Parameter,
     Plausible,
-    Spread,
 )
 from pipeline.models.wording import describe_share
 
@@ -45,7 +43,6 @@ class TurningResistance(LinearEffect):
             0.24,
             plausible=Plausible(-0.05, 0.6, "wider than the 0.24 of a Husky in snow"),
             one_sign=True,
-            between_runs=Spread(0.0, WARTHOG_RUNS),
         ),
     )
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
