@@ -125,3 +125,79 @@ def _follow(late: list[int], gap: list[float], alone: list[float], reach: list[f
                 break
             gap[place] = after
     return np.array(gap)
+
+
+def lag_unevenly(
+    signal: Floats, taus: tuple[float, float], step_s: float, resets: Resets, start: Floats
+) -> Floats:
+    """First-order lag as `lag_signal`, with another time constant where the output is slowed down.
+
+    Args:
+        signal: cell means of the input, shape (n,).
+        taus: time constants of speeding up and of slowing down [s].
+        step_s: width of a cell [s].
+        resets: where the state begins anew.
+        start: the state there; the input's own value where it is NaN, shape (k,).
+    """
+    from scipy.linalg.blas import dtbsv  # noqa: PLC0415 - heavy
+
+    keeps = np.array([math.exp(-step_s / tau) if tau > 0.0 else 0.0 for tau in taus])
+    shares = np.array(taus) / step_s * (1.0 - keeps)
+    begins = np.concatenate((resets.first, resets.at))
+    state = np.zeros_like(signal)
+    state[resets.first] = signal[resets.first]
+    state[resets.at] = np.where(np.isfinite(start), start, signal[resets.at])
+    slows = np.zeros(signal.size, dtype=np.int64)
+    for _ in range(_ROUND):
+        # y = keep * (y before) + (1 - keep) * u, as a band of two diagonals; which cells slow down follows
+        # from it, from the first cell on, so that each round knows some more of them.
+        keep = keeps[slows]
+        band = np.vstack((np.ones_like(keep), -np.append(keep[1:], 0.0)))
+        band[1, begins[begins > 0] - 1] = 0.0
+        source = (1.0 - keep) * signal
+        source[begins] += keep[begins] * state[begins]
+        before = np.concatenate(([0.0], dtbsv(1, band, source, lower=1, diag=1)[:-1]))
+        before[begins] = state[begins]
+        now = ((before * signal < 0.0) | (np.abs(signal) < np.abs(before))).astype(np.int64)
+        if np.array_equal(now, slows):
+            break
+        slows = now
+    lagged: Floats = signal + (before - signal) * shares[slows]
+    return lagged
+
+
+def wait_at_reversal(signal: Floats, wait_s: float, step_s: float, resets: Resets) -> Floats:
+    """A signal that is zero for a while whenever its sign has changed, not counting zeros in between.
+
+    Args:
+        signal: cell means of the input, shape (n,).
+        wait_s: how long [s].
+        step_s: width of a cell [s].
+        resets: where nothing is known of what was before.
+    """
+    cells, way = np.arange(signal.size), np.sign(signal)
+    last = np.maximum.accumulate(np.where(way != 0.0, cells, -1))
+    before = np.concatenate(([-1], last[:-1]))
+    known = before >= resets.first[resets.number]
+    turns = known & (way * way[before] < 0.0)
+    since = cells - np.maximum.accumulate(np.where(turns, cells, -signal.size - math.ceil(wait_s / step_s)))
+    waiting: Floats = signal * np.clip(since + 1.0 - wait_s / step_s, 0.0, 1.0)
+    return waiting
+
+
+def follow_with_play(signal: Floats, half: float, resets: Resets) -> Floats:
+    """The play operator: what stays where it is while its input is nearer than half the play, shape (n,).
+
+    Args:
+        signal: cell means of the input, shape (n,).
+        half: of the play, in the signal's unit.
+        resets: where it begins at the input's own value.
+    """
+    followed: list[float] = []
+    ends = np.append(resets.first[1:], signal.size)
+    for first, end in zip(resets.first.tolist(), ends.tolist(), strict=True):
+        now = float(signal[first])
+        for asked in signal[first:end].tolist():
+            now = min(max(now, asked - half), asked + half)
+            followed.append(now)
+    return np.array(followed)

@@ -15,6 +15,7 @@ from pipeline.simulate.cases import (
     simulate_case,
     write_samples,
 )
+from pipeline.simulate.drivetrain import Drive
 from pipeline.simulate.effects import EffectSpec, ParameterSpec
 from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.layouts import LAYOUTS, CommandTopic, Layout, PoseTopic, WheelTopic
@@ -46,6 +47,7 @@ __all__ = [
     "Clock",
     "CommandTopic",
     "Disturbance",
+    "Drive",
     "EffectSpec",
     "Encoders",
     "Ground",

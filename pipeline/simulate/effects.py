@@ -61,12 +61,27 @@ _SPECS: tuple[EffectSpec, ...] = (
     EffectSpec("transport_delay", "Omega(t) = u(t - d)", _one("d", "s", 0.0, 0.2)),
     EffectSpec("wheel_speed_limit", "Omega clipped to +-limit", _one("limit", "rad/s", _INF, 4.5), _WHEELED),
     EffectSpec("acceleration_limit", "|dOmega/dt| <= limit", _one("limit", "rad/s^2", _INF, 3.0), _WHEELED),
+    EffectSpec(
+        "reversal_pause", "Omega = 0 for d after the sign of u changes", _one("d", "s", 0.0, 0.4), _WHEELED
+    ),
     EffectSpec("drive_lag", "tau dOmega/dt = u - Omega, each wheel", _one("tau", "s", 0.0, 0.5)),
+    EffectSpec(
+        "brake_lag",
+        "tau_drive dOmega/dt = u - Omega, each wheel; tau_brake where it is slowed down",
+        (ParameterSpec("tau_drive", "s", 0.0, 0.6), ParameterSpec("tau_brake", "s", 0.0, 0.2)),
+        _WHEELED,
+    ),
     EffectSpec(
         "turn_lag",
         "tau_mean on the mean and tau_diff on the difference of the wheels",
         (ParameterSpec("tau_mean", "s", 0.0, 0.3), ParameterSpec("tau_diff", "s", 0.0, 1.0)),
         _SKID,
+    ),
+    EffectSpec(
+        "side_lag",
+        "tau_left on the left wheels and tau_right on the right ones",
+        (ParameterSpec("tau_left", "s", 0.0, 0.5), ParameterSpec("tau_right", "s", 0.0, 0.2)),
+        ("differential",),
     ),
     EffectSpec(
         "turn_droop",
@@ -77,6 +92,7 @@ _SPECS: tuple[EffectSpec, ...] = (
     EffectSpec("steering_gain", "delta = g delta_u", _one("g", "1", 1.0, 0.85), _CAR),
     EffectSpec("steering_offset", "delta = delta_u + o", _one("o", "rad", 0.0, 0.04), _CAR),
     EffectSpec("steering_lag", "tau ddelta/dt = delta_u - delta", _one("tau", "s", 0.0, 0.4), _CAR),
+    EffectSpec("steering_play", "delta stays within g of delta_u", _one("g", "rad", 0.0, 0.05), _CAR),
     EffectSpec(
         "steering_sensor_offset",
         "tyres steer delta + o, sensors read delta",
@@ -212,13 +228,14 @@ def _check_parameters(spec: EffectSpec, given: Mapping[str, float] | float) -> d
     return {name: float(value) for name, value in given.items()}
 
 
-_NEVER_NEGATIVE = {"tau", "tau_mean", "tau_diff", "limit", "threshold"}
+_NEVER_NEGATIVE = {"limit", "threshold"}
 _SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0}
 
 
 def _check_value(effect: str, name: str, value: float) -> None:
     low = -_INF
-    if name in _NEVER_NEGATIVE or (effect in {"deadband", "transport_delay"} and name == "d"):
+    waits = effect in {"deadband", "transport_delay", "reversal_pause"} and name == "d"
+    if name in _NEVER_NEGATIVE or name.startswith("tau") or effect == "steering_play" or waits:
         low = 0.0
     elif name == "k" and effect in _SCALES:
         low = _SCALES[effect]

@@ -1,0 +1,100 @@
+"""Drivetrains that no catalogue has: what wheels and steering make of what they would do without."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.simulate import Drive, Vehicle
+
+Floats = NDArray[np.float64]
+Step = Callable[[float, float], float]
+
+
+def _follow(asked: Floats, step: Step) -> Floats:
+    """A state from rest that each cell moves on: its value before and what is asked give the next."""
+    now, told = 0.0, []
+    for value in asked.tolist():
+        now = step(now, value)
+        told.append(now)
+    return np.array(told)
+
+
+def weaken_left(vehicle: Vehicle, drive: Drive) -> Drive:
+    """The left motor follows first order, 0.5 s; the right one at once."""
+    del vehicle
+    share = -math.expm1(-drive.step_s / 0.5)
+    return replace(drive, left=_follow(drive.left, lambda now, asked: now + share * (asked - now)))
+
+
+def brake_fast(vehicle: Vehicle, drive: Drive) -> Drive:
+    """Wheels speed up first order, 0.6 s, and slow down so in 0.12 s."""
+    del vehicle
+    slow, fast = (-math.expm1(-drive.step_s / tau) for tau in (0.6, 0.12))
+
+    def step(now: float, asked: float) -> float:
+        brakes = now * asked < 0.0 or abs(asked) < abs(now)
+        return now + (fast if brakes else slow) * (asked - now)
+
+    return replace(drive, left=_follow(drive.left, step), right=_follow(drive.right, step))
+
+
+def rest_at_reversal(vehicle: Vehicle, drive: Drive) -> Drive:
+    """A wheel stands for 0.4 s whenever it is asked for another direction than it last had."""
+    del vehicle
+
+    def rest(asked: Floats) -> Floats:
+        way, until, told = 0.0, -1, []
+        for cell, value in enumerate(asked.tolist()):
+            if value * way < 0.0:
+                until = cell + round(0.4 / drive.step_s)
+            way = value or way
+            told.append(0.0 if cell < until else value)
+        return np.array(told)
+
+    return replace(drive, left=rest(drive.left), right=rest(drive.right))
+
+
+def loosen_steering(vehicle: Vehicle, drive: Drive) -> Drive:
+    """Tyres stay where they are while the steering moves inside of its play of 0.05 rad to each side."""
+    del vehicle
+    half = 0.05
+    return replace(
+        drive,
+        steering=_follow(drive.steering, lambda now, asked: min(max(now, asked - half), asked + half)),
+    )
+
+
+def lock_sides(vehicle: Vehicle, drive: Drive) -> Drive:
+    """Within 0.2 s of a change of speed by a quarter of the largest the axle locks for 2 s."""
+    mean, difference = 0.5 * (drive.left + drive.right), drive.right - drive.left
+    hard = 0.25 * vehicle.max_speed_mps / vehicle.wheel_radius_m
+    before = round(0.2 / drive.step_s)
+    jump = np.abs(mean - np.concatenate((np.zeros(before), mean[:-before]))) > hard
+    last = np.maximum.accumulate(np.where(jump, np.arange(mean.size), -mean.size))
+    locked = np.arange(mean.size) - last < 2.0 / drive.step_s
+    difference = np.where(locked, 0.3, 1.0) * difference
+    return replace(drive, left=mean - 0.5 * difference, right=mean + 0.5 * difference)
+
+
+def wind_up(vehicle: Vehicle, drive: Drive) -> Drive:
+    """Proportional and integral speed control of a motor of 0.5 s whose voltage is limited."""
+    fastest = vehicle.max_speed_mps + 0.5 * vehicle.track_width_m * vehicle.max_turn_radps
+    top, step_s = fastest / vehicle.wheel_radius_m, drive.step_s
+
+    def regulate(asked: Floats) -> Floats:
+        gathered = 0.0
+
+        def step(now: float, goal: float) -> float:
+            nonlocal gathered
+            gathered += 3.0 * (goal - now) * step_s
+            voltage = min(max(goal + (goal - now) + gathered, -top), top)
+            return now + (voltage - now) * step_s / 0.5
+
+        return _follow(asked, step)
+
+    return replace(drive, left=regulate(drive.left), right=regulate(drive.right))
