@@ -361,7 +361,7 @@ def _draw_poor(draw: np.random.Generator, seed: int, effect: str | None) -> Ridd
 def _draw_odd(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:
     name = effect or str(draw.choice(DRAWN))
     odd = ODD[name]
-    scene = _draw_scene(draw, seed, CAR[0] if odd.car else None)
+    scene = _draw_scene(draw, seed)
     scene = replace(
         scene,
         extra=odd.make(scene.vehicle) if odd.make else None,

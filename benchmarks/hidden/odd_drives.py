@@ -24,51 +24,6 @@ def _follow(asked: Floats, step: Step) -> Floats:
     return np.array(told)
 
 
-def weaken_left(vehicle: Vehicle, drive: Drive) -> Drive:
-    """The left motor follows first order, 0.5 s; the right one at once."""
-    del vehicle
-    share = -math.expm1(-drive.step_s / 0.5)
-    return replace(drive, left=_follow(drive.left, lambda now, asked: now + share * (asked - now)))
-
-
-def brake_fast(vehicle: Vehicle, drive: Drive) -> Drive:
-    """Wheels speed up first order, 0.6 s, and slow down so in 0.12 s."""
-    del vehicle
-    slow, fast = (-math.expm1(-drive.step_s / tau) for tau in (0.6, 0.12))
-
-    def step(now: float, asked: float) -> float:
-        brakes = now * asked < 0.0 or abs(asked) < abs(now)
-        return now + (fast if brakes else slow) * (asked - now)
-
-    return replace(drive, left=_follow(drive.left, step), right=_follow(drive.right, step))
-
-
-def rest_at_reversal(vehicle: Vehicle, drive: Drive) -> Drive:
-    """A wheel stands for 0.4 s whenever it is asked for another direction than it last had."""
-    del vehicle
-
-    def rest(asked: Floats) -> Floats:
-        way, until, told = 0.0, -1, []
-        for cell, value in enumerate(asked.tolist()):
-            if value * way < 0.0:
-                until = cell + round(0.4 / drive.step_s)
-            way = value or way
-            told.append(0.0 if cell < until else value)
-        return np.array(told)
-
-    return replace(drive, left=rest(drive.left), right=rest(drive.right))
-
-
-def loosen_steering(vehicle: Vehicle, drive: Drive) -> Drive:
-    """Tyres stay where they are while the steering moves inside of its play of 0.05 rad to each side."""
-    del vehicle
-    half = 0.05
-    return replace(
-        drive,
-        steering=_follow(drive.steering, lambda now, asked: min(max(now, asked - half), asked + half)),
-    )
-
-
 def lock_sides(vehicle: Vehicle, drive: Drive) -> Drive:
     """Within 0.2 s of a change of speed by a quarter of the largest the axle locks for 2 s."""
     mean, difference = 0.5 * (drive.left + drive.right), drive.right - drive.left

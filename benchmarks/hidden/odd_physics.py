@@ -24,7 +24,6 @@ class Odd:
         drive: the same of what acts on the drivetrain: what it makes of wheels and steering.
         alike: effects of the catalogue that say the same.
         ground: on which it shows.
-        car: whether only cars have it.
     """
 
     about: str
@@ -33,7 +32,6 @@ class Odd:
     drive: Callable[[Vehicle, Drive], Drive] | None = None
     alike: tuple[str, ...] = ()
     ground: Ground = Ground()
-    car: bool = False
 
 
 def _crosswind(vehicle: Vehicle) -> Push:
@@ -163,10 +161,6 @@ ODD: dict[str, Odd] = {
 DRAWN = tuple(sorted(ODD))
 """What a seed may draw; the rest is asked for by name, so that every seed draws what it always drew."""
 ODD |= {
-    "weak_motor": Odd("the left motor follows its commands slowly", "xw", drive=odd_drives.weaken_left),
-    "reversal": Odd("a wheel rests when its direction changes", "xw", drive=odd_drives.rest_at_reversal),
-    "braking": Odd("wheels speed up slowly and brake fast", "xw", drive=odd_drives.brake_fast),
-    "steering_play": Odd("the steering has play", "w", drive=odd_drives.loosen_steering, car=True),
     "locked_axle": Odd(
         "after a hard start both sides turn together for a while", "w", drive=odd_drives.lock_sides
     ),
