@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulate import Drive, Vehicle
+if TYPE_CHECKING:
+    from pipeline.simulate import Drive, Vehicle
 
 Floats = NDArray[np.float64]
 Step = Callable[[float, float], float]

@@ -12,6 +12,8 @@ from pipeline.simulate import Drive, Ground, State, Vehicle
 
 Push = Callable[[State], tuple[float, float, float]]
 
+_PLANE = Ground()
+
 
 @dataclass(frozen=True)
 class Odd:
@@ -31,7 +33,7 @@ class Odd:
     make: Callable[[Vehicle], Push] | None = None
     drive: Callable[[Vehicle, Drive], Drive] | None = None
     alike: tuple[str, ...] = ()
-    ground: Ground = Ground()
+    ground: Ground = _PLANE
 
 
 def _crosswind(vehicle: Vehicle) -> Push:
@@ -167,5 +169,7 @@ ODD |= {
     "wind_up": Odd("the integrator of the speed loop winds up", "xw", drive=odd_drives.wind_up),
     "sinkage": Odd("wheels dig in on the way", "xw", _sinkage, alike=("time_drift",)),
     "saturating_skid": Odd("skid sideways that saturates", "y", _saturating_skid, alike=("lateral_skid",)),
-    "crests": Odd("wheels lose grip over crests", "x", _crests, ground=Ground(hill_m=0.25, hill_length_m=10.0)),
+    "crests": Odd(
+        "wheels lose grip over crests", "x", _crests, ground=Ground(hill_m=0.25, hill_length_m=10.0)
+    ),
 }

@@ -217,7 +217,9 @@ def _describe(comparison: Comparison) -> tuple[Floats, tuple[str, ...]]:
         columns[f"sin {name} since the start"] = np.sin(times * yaw)
         columns[f"cos {name} since the start"] = np.cos(times * yaw)
     for place, name in enumerate(("roll", "pitch")):
-        now, before = (np.interp(at - late, around.times, around.attitude[:, place]) for late in (0.0, _MOMENT_S))
+        now, before = (
+            np.interp(at - late, around.times, around.attitude[:, place]) for late in (0.0, _MOMENT_S)
+        )
         columns |= {name: now, f"change of {name} in {_MOMENT_S:g} s": now - before}
     columns |= {"x ahead of the start": x, "y left of the start": y}
     half = 0.5 * around.track_m * velocity.w if vehicle.kind == "differential" else 0.0 * velocity.w

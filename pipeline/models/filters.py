@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 _FORGOTTEN = 40.0
 """Time constants after which a state is forgotten to the last bit."""
+_INSTANT_S = 1e-9
+_SETTLED = 1e-9
 _ROUND = 100
 """Plateaus that are followed one by one in the time that a step of all at once takes."""
 
@@ -147,22 +149,30 @@ def lag_unevenly(
     state = np.zeros_like(signal)
     state[resets.first] = signal[resets.first]
     state[resets.at] = np.where(np.isfinite(start), start, signal[resets.at])
-    slows = np.zeros(signal.size, dtype=np.int64)
+    up, down = taus
+    before = np.zeros_like(signal)
     for _ in range(_ROUND):
-        # y = keep * (y before) + (1 - keep) * u, as a band of two diagonals; which cells slow down follows
-        # from it, from the first cell on, so that each round knows some more of them.
-        keep = keeps[slows]
+        # y = keep * (y before) + source, as a band of two diagonals. Which cells slow down, and when they
+        # pass zero and speed up again, follows from the round before: each knows some more from the first on.
+        turns = before * signal < 0.0
+        slows = turns | (np.abs(signal) < np.abs(before))
+        passed = down * np.log1p(np.where(turns, -before / np.where(turns, signal, 1.0), 0.0))
+        turns &= passed < step_s
+        after = -np.expm1(-(step_s - passed) / max(up, _INSTANT_S))
+        keep = np.where(turns, 0.0, keeps[slows.astype(np.int64)])
+        source = signal * np.where(turns, after, 1.0 - keep)
         band = np.vstack((np.ones_like(keep), -np.append(keep[1:], 0.0)))
         band[1, begins[begins > 0] - 1] = 0.0
-        source = (1.0 - keep) * signal
         source[begins] += keep[begins] * state[begins]
-        before = np.concatenate(([0.0], dtbsv(1, band, source, lower=1, diag=1)[:-1]))
+        last, before = before, np.concatenate(([0.0], dtbsv(1, band, source, lower=1, diag=1)[:-1]))
         before[begins] = state[begins]
-        now = ((before * signal < 0.0) | (np.abs(signal) < np.abs(before))).astype(np.int64)
-        if np.array_equal(now, slows):
+        if np.abs(before - last).max(initial=0.0) <= _SETTLED * np.abs(signal).max(initial=0.0):
             break
-        slows = now
-    lagged: Floats = signal + (before - signal) * shares[slows]
+    lagged: Floats = signal + np.where(
+        turns,
+        (down * before - up * signal * after) / step_s,
+        (before - signal) * shares[slows.astype(np.int64)],
+    )
     return lagged
 
 

@@ -14,7 +14,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import STAMPS, WHEELED, DriveEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import (
+    STAMPS,
+    WHEELED,
+    DriveEffect,
+    Excitation,
+    Least,
+    Parameter,
+    Plausible,
+    Search,
+)
 from pipeline.models.filters import wait_at_reversal
 
 if TYPE_CHECKING:

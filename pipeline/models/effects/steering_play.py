@@ -60,7 +60,9 @@ class SteeringPlay(DriveEffect):
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""
         del vehicle
-        return f"does not steer before its steering has moved by {2.0 * self.values['g']:.2g} rad the other way"
+        return (
+            f"does not steer before its steering has moved by {2.0 * self.values['g']:.2g} rad the other way"
+        )
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
