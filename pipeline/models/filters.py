@@ -156,9 +156,10 @@ def lag_unevenly(
         # pass zero and speed up again, follows from the round before: each knows some more from the first on.
         turns = before * signal < 0.0
         slows = turns | (np.abs(signal) < np.abs(before))
-        passed = down * np.log1p(np.where(turns, -before / np.where(turns, signal, 1.0), 0.0))
+        size = np.where(turns, np.abs(signal), 1.0)
+        passed = down * (np.log(size + np.abs(before)) - np.log(size))
         turns &= passed < step_s
-        after = -np.expm1(-(step_s - passed) / max(up, _INSTANT_S))
+        after = -np.expm1(-np.maximum(step_s - passed, 0.0) / max(up, _INSTANT_S))
         keep = np.where(turns, 0.0, keeps[slows.astype(np.int64)])
         source = signal * np.where(turns, after, 1.0 - keep)
         band = np.vstack((np.ones_like(keep), -np.append(keep[1:], 0.0)))
