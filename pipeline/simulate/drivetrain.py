@@ -162,7 +162,9 @@ def _brake(asked: Floats, effects: Effects, step_s: float) -> Floats:
 
     def step(now: float, goal: float) -> float:
         slows = now * goal < 0.0 or abs(goal) < abs(now)
-        return now + (down if slows else up) * (goal - now)
+        then = now + (down if slows else up) * (goal - now)
+        # Braked, it comes to rest before it speeds up the other way.
+        return then if then * now >= 0.0 else 0.0
 
     return follow(asked, step)
 
