@@ -153,11 +153,15 @@ ODD: dict[str, Odd] = {
     "reverse_slip": Odd("wheels slip in reverse only", "x", _reverse_slip),
     "right_turns": Odd("turning right falls short, turning left does not", "w", _right_turns),
     "oval_wheel": Odd("the left wheel is out of round", "xw", _oval_wheel),
-    "grass_patch": Odd("stripes of grass across the map slow it down", "x", _grass_patch),
+    "grass_patch": Odd(
+        "stripes of grass across the map slow it down", "x", _grass_patch, alike=("terrain_change",)
+    ),
     "magnetic_floor": Odd(
         "the floor turns the vehicle towards two directions of the world", "w", _magnetic_floor
     ),
-    "turn_climb": Odd("sideways motion that saturates with the yaw rate", "y", _turn_climb),
+    "turn_climb": Odd(
+        "sideways motion that saturates with the yaw rate", "y", _turn_climb, alike=("icr_offset",)
+    ),
     "fast_left": Odd("above a speed the vehicle is pushed to the left", "y", _fast_left),
 }
 DRAWN = tuple(sorted(ODD))
