@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,18 +10,9 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from pipeline.simulate import Drive, Vehicle
+from pipeline.simulate.signals import follow
 
 Floats = NDArray[np.float64]
-Step = Callable[[float, float], float]
-
-
-def _follow(asked: Floats, step: Step) -> Floats:
-    """A state from rest that each cell moves on: its value before and what is asked give the next."""
-    now, told = 0.0, []
-    for value in asked.tolist():
-        now = step(now, value)
-        told.append(now)
-    return np.array(told)
 
 
 def lock_sides(vehicle: Vehicle, drive: Drive) -> Drive:
@@ -51,6 +41,6 @@ def wind_up(vehicle: Vehicle, drive: Drive) -> Drive:
             voltage = min(max(goal + (goal - now) + gathered, -top), top)
             return now + (voltage - now) * step_s / 0.5
 
-        return _follow(asked, step)
+        return follow(asked, step)
 
     return replace(drive, left=regulate(drive.left), right=regulate(drive.right))
