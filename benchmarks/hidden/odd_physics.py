@@ -166,6 +166,9 @@ ODD: dict[str, Odd] = {
 }
 DRAWN = tuple(sorted(ODD))
 """What a seed may draw; the rest is asked for by name, so that every seed draws what it always drew."""
+# Real, but without a name of their own: `time_drift` and `lateral_skid` say what sinkage and a skid that
+# saturates do to a planner; what an integrator or a lock does takes three numbers or more of one controller,
+# and is flagged; of crests the tilt of poses tells too little.
 ODD |= {
     "locked_axle": Odd(
         "after a hard start both sides turn together for a while", "w", drive=odd_drives.lock_sides

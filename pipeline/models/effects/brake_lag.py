@@ -63,6 +63,8 @@ class BrakeLag(DriveEffect):
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "acceleration_limit")
     contains = ("drive_lag",)
+    # Where ground disturbs the wheels a second time constant always helps a little.
+    price = 0.1
     python_state = ("braked",)
     python = """
         wheels, braked = split(left, right, sideways), braked or [0.0] * 4
