@@ -147,7 +147,9 @@ class Selection:
         if key in self._suggested:
             return self._suggested[key]
         proposals = self._propose(base, barred)
-        proposals = (propose_pairs(base.fit, proposals[:_PAIRED]) if pairs else proposals)[:count]
+        if pairs:
+            proposals = propose_pairs(base.fit, _take(proposals, _PAIRED))
+        proposals = _take(proposals, count)
         # A few steps tell which of them are worth fitting to the end.
         tried = [self._try(base.ids, proposal.state) for proposal in proposals]
         best = min((fit.loss for fit in tried), default=0.0)
@@ -208,6 +210,17 @@ class Selection:
         return all(
             effect.id in self.kept or is_nameable(effect, self.evidence) for effect in tested.state.effects
         )
+
+
+def _take(proposals: list[Proposal], count: int) -> list[Proposal]:
+    """The first few; what has a price comes on top, and takes no place from what has none."""
+    taken: list[Proposal] = []
+    for proposal in proposals:
+        count -= not any(trial.effect.price for trial in proposal.trials)
+        if count < 0:
+            break
+        taken.append(proposal)
+    return taken
 
 
 def open_selection(
