@@ -18,7 +18,7 @@ from typing import Literal
 
 import numpy as np
 from closed_loop import close_loop
-from odd_physics import ODD
+from odd_physics import DRAWN, ODD
 
 from pipeline.simulate import (
     LAYOUTS,
@@ -59,6 +59,8 @@ CAR = ("steering_offset", "steering_gain", "steering_lag", "understeer")
 # Asked for by name only, so that every seed draws what it always drew.
 SENSED = ("steering_sensor_offset",)
 AT_SPEED = ("speed_track",)
+UNEVEN = ("brake_lag", "reversal_pause", "side_lag")
+PLAY = ("steering_play",)
 EMPTY = ("plain", "jumps", "noisy", "tilted")
 # In closed loop, with random motion of its usual size and three times that; asked for by name, too.
 CLOSED = ("closed", "closed_rough")
@@ -69,8 +71,8 @@ _EQUIPMENT = ("effective_track", "drive_lag")
 _MORE = tuple(name for name in DIFFERENTIAL if name not in {*_EQUIPMENT, "turn_lag"})
 _POOR = tuple(name for name in DIFFERENTIAL if name != "slope_drift")
 POOLS: dict[str, tuple[str, ...]] = {
-    "single": DIFFERENTIAL + CAR + SENSED + AT_SPEED,
-    "small": DIFFERENTIAL + CAR + SENSED + AT_SPEED,
+    "single": DIFFERENTIAL + CAR + SENSED + AT_SPEED + UNEVEN + PLAY,
+    "small": DIFFERENTIAL + CAR + SENSED + AT_SPEED + UNEVEN + PLAY,
     "equipped": (*_MORE, "nothing"),
     "empty": EMPTY + CLOSED,
     "poor": _POOR + CAR,
@@ -228,13 +230,17 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         "steering_gain": {"g": 1.0 - 0.15 * size},
         "steering_lag": {"tau": 0.4 * size},
         "understeer": {"K": 0.035 * size},
+        "steering_play": {"g": 0.05 * size},
+        "reversal_pause": {"d": 0.4 * size},
+        "brake_lag": {"tau_drive": 0.6 * size, "tau_brake": 0.2 * size},
+        "side_lag": {"tau_left" if sign > 0.0 else "tau_right": 0.5 * size},
     }
     return sizes[effect]
 
 
 def _draw_scene(draw: np.random.Generator, seed: int, effect: str | None = None) -> Scenario:
     """Everything but the riddle itself."""
-    car = effect in CAR + SENSED or (
+    car = effect in CAR + SENSED + PLAY or (
         effect in {"drive_lag", "wheel_radius", "time_drift"} and draw.random() < _CARS
     )
     name = "car" if car else str(draw.choice(["husky", "husky", "warthog", "jackal", "marmotte"]))
@@ -367,10 +373,16 @@ def _draw_poor(draw: np.random.Generator, seed: int, effect: str | None) -> Ridd
 
 
 def _draw_odd(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:
-    name = effect or str(draw.choice(sorted(ODD)))
-    scene = _draw_scene(draw, seed)
+    name = effect or str(draw.choice(DRAWN))
     odd = ODD[name]
-    scene = replace(scene, extra=odd.make(scene.vehicle), duration_s=max(scene.duration_s, 180.0))
+    scene = _draw_scene(draw, seed)
+    scene = replace(
+        scene,
+        extra=odd.make(scene.vehicle) if odd.make else None,
+        machinery=partial(odd.drive, scene.vehicle) if odd.drive else None,
+        ground=odd.ground,
+        duration_s=max(scene.duration_s, 180.0),
+    )
     answer = Answer("odd", odd=name, channel=odd.channels, program=scene.program.name)
     return Riddle(scene, answer)
 

@@ -6,18 +6,34 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pipeline.simulate import State, Vehicle
+import odd_drives
+
+from pipeline.simulate import Drive, Ground, State, Vehicle
 
 Push = Callable[[State], tuple[float, float, float]]
+
+_PLANE = Ground()
 
 
 @dataclass(frozen=True)
 class Odd:
-    """One cause: what it does, the channels it acts on, and its physics for a vehicle."""
+    """One cause.
+
+    Attributes:
+        about: what it does.
+        channels: on which it acts.
+        make: its physics for a vehicle, what it adds to the velocity of the body.
+        drive: the same of what acts on the drivetrain: what it makes of wheels and steering.
+        alike: effects of the catalogue that say the same.
+        ground: on which it shows.
+    """
 
     about: str
     channels: str
-    make: Callable[[Vehicle], Push]
+    make: Callable[[Vehicle], Push] | None = None
+    drive: Callable[[Vehicle, Drive], Drive] | None = None
+    alike: tuple[str, ...] = ()
+    ground: Ground = _PLANE
 
 
 def _crosswind(vehicle: Vehicle) -> Push:
@@ -96,15 +112,71 @@ def _fast_left(vehicle: Vehicle) -> Push:
     return push
 
 
+def _sinkage(vehicle: Vehicle) -> Push:
+    """Ruts deepen on the way: wheels that dig in lose ever more of their speed."""
+    way, deep = 0.0, 150.0 * min(vehicle.max_speed_mps, 2.0)
+
+    def push(state: State) -> tuple[float, float, float]:
+        nonlocal way
+        way = 0.0 if state.t < state.dt else way + abs(state.v0) * state.dt
+        lost = 0.3 * (1.0 - math.exp(-way / deep))
+        return -lost * state.v0, 0.0, -lost * state.w0
+
+    return push
+
+
+def _saturating_skid(vehicle: Vehicle) -> Push:
+    most = 0.05 * min(vehicle.max_speed_mps, 2.0)
+
+    def push(state: State) -> tuple[float, float, float]:
+        return 0.0, -most * math.tanh(0.3 * state.v0 * state.w0 / most), 0.0
+
+    return push
+
+
+def _crests(vehicle: Vehicle) -> Push:
+    """Wheels that the ground falls away from grip less: the speed ahead falls short where pitch grows."""
+    del vehicle
+    before = 0.0
+
+    def push(state: State) -> tuple[float, float, float]:
+        nonlocal before
+        falls = (state.pitch - before) / state.dt * math.copysign(1.0, state.v0) / max(abs(state.v0), 0.05)
+        before = state.pitch
+        return -0.35 * state.v0 * min(max(falls / 0.1, 0.0), 1.0), 0.0, 0.0
+
+    return push
+
+
 ODD: dict[str, Odd] = {
     "crosswind": Odd("a steady wind pushes in one direction of the world", "xy", _crosswind),
     "reverse_slip": Odd("wheels slip in reverse only", "x", _reverse_slip),
     "right_turns": Odd("turning right falls short, turning left does not", "w", _right_turns),
     "oval_wheel": Odd("the left wheel is out of round", "xw", _oval_wheel),
-    "grass_patch": Odd("stripes of grass across the map slow it down", "x", _grass_patch),
+    "grass_patch": Odd(
+        "stripes of grass across the map slow it down", "x", _grass_patch, alike=("terrain_change",)
+    ),
     "magnetic_floor": Odd(
         "the floor turns the vehicle towards two directions of the world", "w", _magnetic_floor
     ),
-    "turn_climb": Odd("sideways motion that saturates with the yaw rate", "y", _turn_climb),
+    "turn_climb": Odd(
+        "sideways motion that saturates with the yaw rate", "y", _turn_climb, alike=("icr_offset",)
+    ),
     "fast_left": Odd("above a speed the vehicle is pushed to the left", "y", _fast_left),
+}
+DRAWN = tuple(sorted(ODD))
+"""What a seed may draw; the rest is asked for by name, so that every seed draws what it always drew."""
+# Real, but without a name of their own: `time_drift` and `lateral_skid` say what sinkage and a skid that
+# saturates do to a planner; what an integrator or a lock does takes three numbers or more of one controller,
+# and is flagged; of crests the tilt of poses tells too little.
+ODD |= {
+    "locked_axle": Odd(
+        "after a hard start both sides turn together for a while", "w", drive=odd_drives.lock_sides
+    ),
+    "wind_up": Odd("the integrator of the speed loop winds up", "xw", drive=odd_drives.wind_up),
+    "sinkage": Odd("wheels dig in on the way", "xw", _sinkage, alike=("time_drift",)),
+    "saturating_skid": Odd("skid sideways that saturates", "y", _saturating_skid, alike=("lateral_skid",)),
+    "crests": Odd(
+        "wheels lose grip over crests", "x", _crests, ground=Ground(hill_m=0.25, hill_length_m=10.0)
+    ),
 }

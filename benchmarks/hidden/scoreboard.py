@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from draw import CATEGORIES
+from odd_physics import ODD
 from records import Record
 from score import confusion_table, describe_rate
 
@@ -56,6 +57,8 @@ def describe(category: str, played: Sequence[Record]) -> list[str]:
         lines.append(_rate(played, "nothing named and nothing flagged", is_clean))
     elif category == "odd":
         lines.append(_rate(played, "flagged in the right channel", is_flagged))
+        lines.append(_rate(played, "so flagged, or named as what it is like", is_owned_up_to))
+        lines.append(_rate(played, "a wrong name, and nothing flagged", is_mistaken))
         lines.append(_rate(played, "the pasted formula lowers the held-out error", has_useful_formula))
     elif category == "poor":
         lines.append(_rate(played, "undecided or unobservable", is_admitted))
@@ -161,6 +164,16 @@ def is_flagged(record: Record) -> bool:
     return bool(set(record.score.flagged) & set(record.answer.channel))
 
 
+def is_owned_up_to(record: Record) -> bool:
+    """It is flagged in its channel, or what is named says the same."""
+    return is_flagged(record) or bool(set(record.score.named) & set(ODD[record.answer.odd].alike))
+
+
+def is_mistaken(record: Record) -> bool:
+    """Something is named that it is not like, without a flag that more is there."""
+    return bool(set(record.score.named) - set(ODD[record.answer.odd].alike)) and not is_flagged(record)
+
+
 def has_useful_formula(record: Record) -> bool:
     """The formula, pasted after what was named, lowers one 2 s error and raises none."""
     checked = record.checked
@@ -220,7 +233,7 @@ def _rate(played: Sequence[Record], name: str, test: Test) -> str:
 
 def _choose_test(category: str) -> Test:
     """What counts as right, where one thing must be chosen for a table."""
-    tests: dict[str, Test] = {"empty": is_clean, "odd": is_flagged}
+    tests: dict[str, Test] = {"empty": is_clean, "odd": is_owned_up_to}
     tests["rigid"] = lambda record: is_found_in_contact(record) and not list_unphysical(record)
     tests["poor"] = lambda record: is_not_missed(record) and not has_wrong_name(record)
     return tests.get(category, is_exact)

@@ -17,11 +17,13 @@ from pipeline.diagnosis.naming_rules import Clocks, read_clocks
 from pipeline.diagnosis.recording import FATAL, load_recording
 from pipeline.diagnosis.undecided import find_undecided
 from pipeline.diagnosis.unexplained import (
+    LEAST_OF_DRIVE,
     Explainable,
     boost_residuals,
     collect_terms,
     describe_windows,
     find_places,
+    measure_asked,
     search_formula,
 )
 from pipeline.identification import Input, choose_input
@@ -126,7 +128,12 @@ def _explore_body(context: Context, source: Input, known: Sequence[Effect], budg
 
 def _explore_wheels(context: Context, known: Sequence[Effect], body: Search, budget: Budget) -> Explored:
     found = search_wheels(context, known, body, budget)
-    return _gather(found, None)
+    selection, final = found.selection, found.final
+    left = np.sqrt((final.held**2).mean(axis=0)) / measure_asked(selection)
+    if not (left > LEAST_OF_DRIVE).any():
+        return _gather(found, None)
+    features = describe_windows(selection.part.comparisons)[0]
+    return _gather(found, boost_residuals(selection, final, features))
 
 
 def _gather(found: Search, explainable: Explainable | None) -> Explored:

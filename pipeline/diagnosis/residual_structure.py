@@ -13,7 +13,13 @@ from pipeline.diagnosis.diagnosis import Unexplained
 from pipeline.diagnosis.error_regions import CHANNELS
 from pipeline.diagnosis.library import join_formula
 from pipeline.diagnosis.materiality import LEAST_TURN_RAD, LEAST_WAY_SHARE
-from pipeline.diagnosis.unexplained import collect_terms, describe_windows, is_explainable
+from pipeline.diagnosis.unexplained import (
+    LEAST_OF_DRIVE,
+    collect_terms,
+    describe_windows,
+    is_explainable,
+    measure_asked,
+)
 from pipeline.identification.persistence import split_residuals
 from pipeline.runs.windows import HORIZON_S
 
@@ -54,17 +60,8 @@ def describe(ways: Sequence[Explored]) -> Unexplained | None:
         signal = without.fit.residual - final.fit.residual
         return _describe_signal(body, signal, share, write_formula(join_formula(terms)))
     found: list[tuple[float, Unexplained]] = []
-    explainable = body.explainable
-    if explainable is not None and is_explainable(explainable):
-        signal = explainable.predicted * selection.weights.scale * (explainable.shares > 0.0)
-        left = _describe_signal(body, signal, 0.0, None)
-        channel = CHANNELS.index(left.channel)
-        left = replace(left, share=float(explainable.shares[channel]))
-        size = float(np.sqrt((signal[:, channel] ** 2).mean()))
-        part = size / float(_measure_asked(body)[channel])
-        if is_felt(left.channel, size, part):
-            found.append((part, left))
-    found += [one for way in ways if (one := _find_lasting(way)) is not None]
+    for way in ways:
+        found += [one for one in (_find_explainable(way), _find_lasting(way)) if one is not None]
     return max(found, key=lambda item: item[0])[1] if found else None
 
 
@@ -79,6 +76,23 @@ def is_felt(channel: str, size: float, part: float) -> bool:
     return size * HORIZON_S >= LEAST_TURN_RAD if channel == "w" else part >= LEAST_WAY_SHARE
 
 
+def _find_explainable(way: Explored) -> tuple[float, Unexplained] | None:
+    """What can be predicted from what was recorded, and its size against the motion asked for."""
+    explainable = way.explainable
+    if explainable is None or not is_explainable(explainable):
+        return None
+    selection = way.search.selection
+    signal = explainable.predicted * np.where(explainable.shares > 0.0, selection.weights.scale, 0.0)
+    left = _describe_signal(way, signal, 0.0, None)
+    channel = CHANNELS.index(left.channel)
+    left = replace(left, share=float(explainable.shares[channel]))
+    size = float(np.sqrt((signal[:, channel] ** 2).mean()))
+    part = size / float(measure_asked(selection)[channel])
+    # Encoders have next to no noise: what their stamps and steps make of nothing can be predicted, too.
+    least = LEAST_OF_DRIVE if way.search.way == "wheels" else 0.0
+    return (part, left) if part >= least and is_felt(left.channel, size, part) else None
+
+
 def _describe_signal(body: Explored, signal: Floats, share: float, formula: str | None) -> Unexplained:
     """What a push of x, y, w at every window depends on most."""
     sizes = np.sqrt(((signal / body.search.selection.weights.scale) ** 2).mean(axis=0))
@@ -87,8 +101,9 @@ def _describe_signal(body: Explored, signal: Floats, share: float, formula: str 
     every = tuple(CHANNELS[i] for i in np.argsort(-sizes) if sizes[i] > _PART * sizes[channel])
     unit = _unit(channel)
     low, high = min(table, key=lambda row: row[1]), max(table, key=lambda row: row[1])
+    whose = " of the wheels" if body.search.way == "wheels" else ""
     where = (
-        f"the {CHANNELS[channel]} error depends on {name}: {high[1]:+.3g} {unit} near {high[0]:.3g}, "
+        f"the {CHANNELS[channel]} error{whose} depends on {name}: {high[1]:+.3g} {unit} near {high[0]:.3g}, "
         f"{low[1]:+.3g} {unit} near {low[0]:.3g}"
     )
     partial: Mapping[str, Json] = {
@@ -106,7 +121,7 @@ def _find_lasting(way: Explored) -> tuple[float, Unexplained] | None:
         return None
     shares, repeats = _share_lasting(way)
     sizes = np.sqrt(shares * (held**2).mean(axis=0))
-    parts = sizes / _measure_asked(way)
+    parts = sizes / measure_asked(way.search.selection)
     sure = np.where((shares >= _LEAST_SHARE) & (repeats >= _LEAST_REPEAT), parts, 0.0)
     channel = int(np.argmax(sure))
     if sure[channel] < _LEAST_OF_MOTION:
@@ -118,14 +133,6 @@ def _find_lasting(way: Explored) -> tuple[float, Unexplained] | None:
     where = f"{_WORDS.get(way.search.way, _WORDS['body'])}: {', '.join(told)}"
     left = Unexplained(float(shares[channel]), CHANNELS[channel], every, where, None, {}, way.search.way)
     return float(parts[channel]), left
-
-
-def _measure_asked(way: Explored) -> Floats:
-    """Motion that was asked for, rms of x, y, w; sideways it is measured by the way forward."""
-    ideal = way.search.selection.part.find_ideal()[:, 0, :]
-    forward, turning, *sideways = np.sqrt((ideal**2).mean(axis=0)).tolist()
-    asked: Floats = np.maximum(np.array([forward, max([forward, *sideways]), turning]), 1e-9)
-    return asked
 
 
 def _share_lasting(way: Explored) -> tuple[Floats, Floats]:

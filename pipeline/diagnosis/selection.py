@@ -150,8 +150,8 @@ class Selection:
             return self._suggested[key]
         proposals = self._propose(base, barred)
         if pairs:
-            proposals = propose_pairs(base.fit, proposals[:_PAIRED])
-        ranked, taken, best, wanted = list[CandidateModel](), 0, math.inf, count
+            proposals = propose_pairs(base.fit, proposals[: _count(proposals, _PAIRED)])
+        ranked, taken, best, wanted = list[CandidateModel](), 0, math.inf, _count(proposals, count)
         while taken < min(wanted, len(proposals)):
             # A few steps tell which of them are worth fitting to the end.
             tried = [self._try(base.ids, proposal.state) for proposal in proposals[taken:wanted]]
@@ -223,6 +223,13 @@ class Selection:
             delays = [one.delay for one in acting]
             acting.append(effect.of_delay(min(delays) - max(delays)))
         return any(is_nameable(one, self.evidence) for one in acting)
+
+
+def _count(proposals: list[Proposal], free: int) -> int:
+    """How many proposals hold that many without a price; what has one takes no place from them."""
+    priced = [any(trial.effect.price for trial in proposal.trials) for proposal in proposals]
+    places = np.cumsum(np.logical_not(priced))
+    return int(np.searchsorted(places, free, side="right"))
 
 
 def open_selection(

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 _FORGOTTEN = 40.0
 """Time constants after which a state is forgotten to the last bit."""
+_INSTANT_S = 1e-9
+_SETTLED = 1e-9
 _ROUND = 100
 """Plateaus that are followed one by one in the time that a step of all at once takes."""
 
@@ -125,3 +127,88 @@ def _follow(late: list[int], gap: list[float], alone: list[float], reach: list[f
                 break
             gap[place] = after
     return np.array(gap)
+
+
+def lag_unevenly(
+    signal: Floats, taus: tuple[float, float], step_s: float, resets: Resets, start: Floats
+) -> Floats:
+    """First-order lag as `lag_signal`, with another time constant where the output is slowed down.
+
+    Args:
+        signal: cell means of the input, shape (n,).
+        taus: time constants of speeding up and of slowing down [s].
+        step_s: width of a cell [s].
+        resets: where the state begins anew.
+        start: the state there; the input's own value where it is NaN, shape (k,).
+    """
+    from scipy.linalg.blas import dtbsv  # noqa: PLC0415 - heavy
+
+    keeps = np.array([math.exp(-step_s / tau) if tau > 0.0 else 0.0 for tau in taus])
+    shares = np.array(taus) / step_s * (1.0 - keeps)
+    begins = np.concatenate((resets.first, resets.at))
+    state = np.zeros_like(signal)
+    state[resets.first] = signal[resets.first]
+    state[resets.at] = np.where(np.isfinite(start), start, signal[resets.at])
+    up, down = taus
+    before = np.zeros_like(signal)
+    for _ in range(_ROUND):
+        # y = keep * (y before) + source, as a band of two diagonals. Which cells slow down, and when they
+        # pass zero and speed up again, follows from the round before: each knows some more from the first on.
+        turns = before * signal < 0.0
+        slows = turns | (np.abs(signal) < np.abs(before))
+        size = np.where(turns, np.abs(signal), 1.0)
+        passed = down * (np.log(size + np.abs(before)) - np.log(size))
+        turns &= passed < step_s
+        after = -np.expm1(-np.maximum(step_s - passed, 0.0) / max(up, _INSTANT_S))
+        keep = np.where(turns, 0.0, keeps[slows.astype(np.int64)])
+        source = signal * np.where(turns, after, 1.0 - keep)
+        band = np.vstack((np.ones_like(keep), -np.append(keep[1:], 0.0)))
+        band[1, begins[begins > 0] - 1] = 0.0
+        source[begins] += keep[begins] * state[begins]
+        last, before = before, np.concatenate(([0.0], dtbsv(1, band, source, lower=1, diag=1)[:-1]))
+        before[begins] = state[begins]
+        if np.abs(before - last).max(initial=0.0) <= _SETTLED * np.abs(signal).max(initial=0.0):
+            break
+    lagged: Floats = signal + np.where(
+        turns,
+        (down * before - up * signal * after) / step_s,
+        (before - signal) * shares[slows.astype(np.int64)],
+    )
+    return lagged
+
+
+def wait_at_reversal(signal: Floats, wait_s: float, step_s: float, resets: Resets) -> Floats:
+    """A signal that is zero for a while whenever its sign has changed, not counting zeros in between.
+
+    Args:
+        signal: cell means of the input, shape (n,).
+        wait_s: how long [s].
+        step_s: width of a cell [s].
+        resets: where nothing is known of what was before.
+    """
+    cells, way = np.arange(signal.size), np.sign(signal)
+    last = np.maximum.accumulate(np.where(way != 0.0, cells, -1))
+    before = np.concatenate(([-1], last[:-1]))
+    known = before >= resets.first[resets.number]
+    turns = known & (way * way[before] < 0.0)
+    since = cells - np.maximum.accumulate(np.where(turns, cells, -signal.size - math.ceil(wait_s / step_s)))
+    waiting: Floats = signal * np.clip(since + 1.0 - wait_s / step_s, 0.0, 1.0)
+    return waiting
+
+
+def follow_with_play(signal: Floats, half: float, resets: Resets) -> Floats:
+    """The play operator: what stays where it is while its input is nearer than half the play, shape (n,).
+
+    Args:
+        signal: cell means of the input, shape (n,).
+        half: of the play, in the signal's unit.
+        resets: where it begins at the input's own value.
+    """
+    followed: list[float] = []
+    ends = np.append(resets.first[1:], signal.size)
+    for first, end in zip(resets.first.tolist(), ends.tolist(), strict=True):
+        now = float(signal[first])
+        for asked in signal[first:end].tolist():
+            now = min(max(now, asked - half), asked + half)
+            followed.append(now)
+    return np.array(followed)

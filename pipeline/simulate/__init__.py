@@ -15,6 +15,7 @@ from pipeline.simulate.cases import (
     simulate_case,
     write_samples,
 )
+from pipeline.simulate.drivetrain import Drive
 from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.layouts import LAYOUTS, CommandTopic, Layout, PoseTopic, WheelTopic
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
@@ -44,6 +45,7 @@ __all__ = [
     "Clock",
     "CommandTopic",
     "Disturbance",
+    "Drive",
     "Encoders",
     "Ground",
     "Imu",

@@ -1,4 +1,4 @@
-"""From commands to wheels: limits, deadband, delay, rate limit, lags and droop, in that order.
+"""From commands to wheels: limits, deadband, delay, reversal, rate limit, lags and droop, in that order.
 
 Static limits act on the commands at their own stamps, so that nothing depends on the integration step there.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulate.programs import Commands
-from pipeline.simulate.signals import hold_on_grid, integrate_cells, lag_signal, limit_rate
+from pipeline.simulate.signals import follow, hold_on_grid, integrate_cells, lag_signal, limit_rate
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -122,11 +122,13 @@ def drive_wheels(
         heard = np.where(np.abs(asked) * vehicle.wheel_radius_m < deadband, 0.0, asked)
         top = effects.value("wheel_speed_limit", "limit")
         wheel: Floats = np.clip(hold(heard), -top, top)
+        if effects.is_active("reversal_pause"):
+            wheel = _rest_at_reversal(wheel, effects.value("reversal_pause", "d"), step_s)
         if effects.is_active("acceleration_limit"):
             wheel = limit_rate(wheel, per_second=effects.value("acceleration_limit", "limit"), step_s=step_s)
         if effects.is_active("drive_lag"):
             wheel = lag_signal(wheel, tau_s=effects.value("drive_lag", "tau"), step_s=step_s)
-        return wheel
+        return _brake(wheel, effects, step_s) if effects.is_active("brake_lag") else wheel
 
     if vehicle.moves_sideways:
         asked = invert_corners(vehicle, speed, commands.sideways, turn)
@@ -138,6 +140,33 @@ def drive_wheels(
         return Drive(step_s, axle, axle, _steer(hold(turn), effects, step_s))
     left, right = _couple_sides(turn_wheel(asked_left), turn_wheel(asked_right), effects, step_s)
     return Drive(step_s, left, right, np.zeros(cells))
+
+
+def _rest_at_reversal(asked: Floats, rest_s: float, step_s: float) -> Floats:
+    """A wheel that stands for so long whenever it is asked for another direction than it had last."""
+    way, until, told = 0.0, -1, []
+    for cell, speed in enumerate(asked.tolist()):
+        if speed * way < 0.0:
+            until = cell + round(rest_s / step_s)
+        way = speed or way
+        told.append(0.0 if cell < until else speed)
+    return np.array(told)
+
+
+def _brake(asked: Floats, effects: Effects, step_s: float) -> Floats:
+    """A wheel that speeds up with one time constant and slows down with another."""
+    up, down = (
+        -np.expm1(-step_s / tau) if tau > 0.0 else 1.0
+        for tau in (effects.value("brake_lag", "tau_drive"), effects.value("brake_lag", "tau_brake"))
+    )
+
+    def step(now: float, goal: float) -> float:
+        slows = now * goal < 0.0 or abs(goal) < abs(now)
+        then = now + (down if slows else up) * (goal - now)
+        # Braked, it comes to rest before it speeds up the other way.
+        return then if then * now >= 0.0 else 0.0
+
+    return follow(asked, step)
 
 
 def _join_corners(corners: dict[str, Floats], effects: Effects, step_s: float) -> Drive:
@@ -179,7 +208,7 @@ def _limit_body(commands: Commands, vehicle: Vehicle, effects: Effects) -> tuple
 
 
 def _couple_sides(left: Floats, right: Floats, effects: Effects, step_s: float) -> tuple[Floats, Floats]:
-    if not (effects.is_active("turn_lag") or effects.is_active("turn_droop")):
+    if not any(map(effects.is_active, ("turn_lag", "side_lag", "turn_droop"))):
         return left, right
     mean, difference = 0.5 * (left + right), right - left
     tau_mean, tau_difference = effects.value("turn_lag", "tau_mean"), effects.value("turn_lag", "tau_diff")
@@ -187,6 +216,13 @@ def _couple_sides(left: Floats, right: Floats, effects: Effects, step_s: float) 
         mean = lag_signal(mean, tau_s=tau_mean, step_s=step_s)
     if tau_difference > 0.0:
         difference = lag_signal(difference, tau_s=tau_difference, step_s=step_s)
+    weak = [effects.value("side_lag", name) for name in ("tau_left", "tau_right")]
+    if max(weak) > 0.0:
+        sides = [
+            lag_signal(side, tau_s=tau, step_s=step_s) if tau > 0.0 else side
+            for side, tau in zip((mean - 0.5 * difference, mean + 0.5 * difference), weak, strict=True)
+        ]
+        mean, difference = 0.5 * (sides[0] + sides[1]), sides[1] - sides[0]
     if effects.is_active("turn_droop"):
         threshold = float(np.nan_to_num(effects.value("turn_droop", "threshold")))
         kept = np.clip(difference, -threshold, threshold)
@@ -198,4 +234,7 @@ def _steer(asked: Floats, effects: Effects, step_s: float) -> Floats:
     angle = effects.value("steering_gain", "g") * asked
     if effects.is_active("steering_lag"):
         angle = lag_signal(angle, tau_s=effects.value("steering_lag", "tau"), step_s=step_s)
+    if effects.is_active("steering_play"):
+        half = effects.value("steering_play", "g")
+        angle = follow(angle, lambda now, asked: min(max(now, asked - half), asked + half))
     return angle + effects.value("steering_offset", "o")

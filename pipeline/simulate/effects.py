@@ -134,13 +134,14 @@ def _check_parameters(spec: EffectSpec, given: Mapping[str, float] | float) -> d
     return {name: float(value) for name, value in given.items()}
 
 
-_NEVER_NEGATIVE = {"tau", "tau_mean", "tau_diff", "limit", "threshold"}
+_NEVER_NEGATIVE = {"limit", "threshold"}
 _SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0}
 
 
 def _check_value(effect: str, name: str, value: float) -> None:
     low = -_INF
-    if name in _NEVER_NEGATIVE or (effect in {"deadband", "transport_delay"} and name == "d"):
+    waits = effect in {"deadband", "transport_delay", "reversal_pause"} and name == "d"
+    if name in _NEVER_NEGATIVE or name.startswith("tau") or effect == "steering_play" or waits:
         low = 0.0
     elif name == "k" and effect in _SCALES:
         low = _SCALES[effect]

@@ -84,6 +84,8 @@ def simulate_run(scenario: Scenario) -> SimulatedRun:
     drive = drive_wheels(
         commands, vehicle, effects, hold_s=scenario.program.hold_s, step_s=scenario.step_s, cells=cells
     )
+    if scenario.machinery is not None:
+        drive = scenario.machinery(drive)
     motion = move_body(
         drive,
         vehicle,

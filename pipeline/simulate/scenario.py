@@ -10,6 +10,7 @@ from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.vehicles import VEHICLES, Vehicle
 
 if TYPE_CHECKING:
+    from pipeline.simulate.drivetrain import Drive
     from pipeline.simulate.layouts import Layout
     from pipeline.simulate.programs import Commands
 
@@ -264,6 +265,7 @@ class Scenario:
             sensor or an effect leaves the others' numbers alone.
         ground, disturbance, pose, encoders, imu, clock, recording: see there. No encoders or IMU when None.
         extra: physics that no catalogue has, added to the body velocity; called 200 times a second.
+        machinery: the same of the drivetrain: what wheels and steering do in place of what they would.
         ground_input: whether ground effects act on the drive's v0, w0 (``drive``) or, as another plausible
             order of nature, on what body inertia made of them (``inertia``).
         step_s: integration step.
@@ -285,6 +287,7 @@ class Scenario:
     clock: Clock = Clock()
     recording: Recording = Recording()
     extra: ExtraPhysics | None = None
+    machinery: Callable[[Drive], Drive] | None = None
     ground_input: Literal["drive", "inertia"] = "drive"
     step_s: float = 0.001
     start_pose: tuple[float, float, float] = (0.0, 0.0, 0.0)

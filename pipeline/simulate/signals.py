@@ -5,8 +5,13 @@ A signal lives on cells of ``step`` seconds: entry k is its mean over [k step, (
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 Floats = NDArray[np.float64]
 
@@ -56,20 +61,28 @@ def filter_pole(signal: Floats, pole: float) -> Floats:
     return filtered
 
 
+def follow(signal: Floats, step: Callable[[float, float], float]) -> Floats:
+    """Follow a signal from rest, cell by cell: what is there and what is asked give what is there next.
+
+    For what depends on its own past and has no closed form for arbitrary input; floats in a plain list are
+    several times faster here than elements of an array.
+    """
+    now, out = 0.0, []
+    for target in signal.tolist():
+        now = step(now, target)
+        out.append(now)
+    return np.array(out)
+
+
 def limit_rate(signal: Floats, *, per_second: float, step_s: float) -> Floats:
     """Follow a signal from rest with at most ``per_second`` of change a second."""
     largest = per_second * step_s
-    followed = np.empty_like(signal)
-    now = 0.0
-    # A rate limit depends on its own past and has no closed form for arbitrary input; floats in a plain list
-    # are several times faster here than elements of an array.
-    out: list[float] = []
-    for target in signal.tolist():
+
+    def step(now: float, target: float) -> float:
         gap = target - now
-        now = target if -largest <= gap <= largest else now + (largest if gap > 0.0 else -largest)
-        out.append(now)
-    followed[:] = out
-    return followed
+        return target if -largest <= gap <= largest else now + (largest if gap > 0.0 else -largest)
+
+    return follow(signal, step)
 
 
 def make_coloured_noise(

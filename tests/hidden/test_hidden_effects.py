@@ -209,6 +209,24 @@ def test_physics_that_no_catalogue_has_is_flagged_and_its_formula_helps(tmp_path
     assert has_useful_formula(record)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("seed", "kind", "channel"),
+    [(150_000, "wind_up", "x"), (150_001, "wind_up", "x"), (150_001, "locked_axle", "w")],
+)
+def test_what_a_drive_remembers_is_flagged_though_no_effect_takes_it(
+    seed: int, kind: str, channel: str, tmp_path: Path
+) -> None:
+    """Encoders showed it, and nothing was said: only the way from the wheels on was asked for structure."""
+    assert channel in play(Job("odd", seed, kind), tmp_path).score.flagged
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["brake_lag", "reversal_pause", "side_lag", "steering_play"])
+def test_uneven_drives_are_named(kind: str, tmp_path: Path) -> None:
+    assert is_exact(play(Job("single", 150_500, kind), tmp_path))
+
+
 def score_many(jobs: list[Job]) -> list[Record]:
     records: list[Record] = []
     play_all(jobs, records.append, workers=2)

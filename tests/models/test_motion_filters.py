@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.models.filters import lag_signal, limit_rate
+from pipeline.models.filters import follow_with_play, lag_signal, lag_unevenly, limit_rate, wait_at_reversal
 from pipeline.runs.grid import Grid, hold_on_cells
 from pipeline.runs.signals import Commands, Resets
 
@@ -111,3 +111,51 @@ def test_a_rate_limit_follows_its_input_step_by_step(seed: int) -> None:
         half = value + np.clip(signal[cell] - value, -limit * step / 2.0, limit * step / 2.0)
         value += np.clip(signal[cell] - value, -limit * step, limit * step)
         assert found[cell] == pytest.approx(half, abs=1e-9)
+
+
+@given(
+    st.lists(st.floats(-5.0, 5.0), min_size=2, max_size=12),
+    st.tuples(st.floats(0.05, 1.0), st.floats(0.05, 1.0)),
+    st.floats(-5.0, 5.0),
+)
+@settings(max_examples=40, deadline=None)
+def test_an_uneven_lag_agrees_with_stepping_through_it(
+    levels: list[float], taus: tuple[float, float], start: float
+) -> None:
+    cells, fine, width = 20, 100, 0.02
+    signal = np.repeat(levels, cells)
+    lagged = lag_unevenly(signal, taus, width, resets_at([0], signal.size, [start]), np.array([start]))
+    value, expected = start, []
+    for target in signal.tolist():
+        inside = []
+        for _ in range(fine):
+            slows = value * target < 0.0 or abs(target) < abs(value)
+            moved = target + (value - target) * np.exp(-width / fine / taus[int(slows)])
+            inside.append(0.5 * (value + moved))
+            value = moved
+        expected.append(np.mean(inside))
+    assert np.allclose(lagged, expected, atol=0.03)
+
+
+def test_with_equal_time_constants_an_uneven_lag_is_a_lag() -> None:
+    signal = np.repeat(np.random.default_rng(1).uniform(-3.0, 3.0, 30), 25)
+    resets = resets_at([0, 300], signal.size, [0.5, np.nan])
+    plain = lag_signal(signal, 0.3, STEP, resets, resets.start[:, 0])
+    assert np.allclose(lag_unevenly(signal, (0.3, 0.3), STEP, resets, resets.start[:, 0]), plain, atol=1e-9)
+
+
+def test_a_signal_waits_where_its_sign_changes_and_nowhere_else() -> None:
+    signal = np.repeat([2.0, 0.0, 1.0, -1.0, 0.0, 3.0, -3.0], 10)
+    resets = resets_at([0, 60], signal.size, [np.nan, np.nan])
+    waiting = wait_at_reversal(signal, 3.5 * STEP, STEP, resets)
+    expected = signal.copy()
+    # Before the last plateau the recording has a hole: nothing is known of what was before.
+    for first in (30, 50):
+        expected[first : first + 3], expected[first + 3] = 0.0, 0.5 * signal[first]
+    assert np.allclose(waiting, expected, atol=1e-9)
+
+
+def test_play_keeps_what_follows_within_half_of_it() -> None:
+    signal = np.array([0.0, 0.3, 0.5, 0.45, 0.2, 0.0, -1.0, 1.0])
+    resets = resets_at([0, 7], signal.size, [np.nan, np.nan])
+    assert np.allclose(follow_with_play(signal, 0.1, resets), [0.0, 0.2, 0.4, 0.4, 0.3, 0.1, -0.9, 1.0])

@@ -48,6 +48,7 @@ CATALOGUE_IDS = {
     *("turn_droop", "acceleration_limit", "wheel_speed_limit", "deadband", "body_inertia", "heading_skew"),
     *("yaw_misalignment", "lever_arm", "clock_offset"),
     *("lateral_scale", "roller_slip", "speed_track"),
+    *("brake_lag", "reversal_pause", "side_lag", "steering_play"),
     *("steering_offset", "steering_gain", "steering_lag", "steering_sensor_offset", "understeer"),
 }
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.core.rigid import rotate
 from pipeline.simulate.effects import CATALOGUE
+from pipeline.simulate.programs import Commands
 from pipeline.simulate.run import simulate_run
 from pipeline.simulate.scenario import Disturbance, Ground, Program, Scenario, State
 from pipeline.simulate.vehicles import VEHICLES
@@ -199,6 +200,59 @@ def test_turn_lag_has_one_time_constant_for_the_mean_and_one_for_the_difference(
     time, left, right = wheel_response({"turn_lag": {"tau_mean": 0.3, "tau_diff": 1.2}}, CIRCLE)
     np.testing.assert_allclose((left + right) / 2, V0 / 0.165 * (1 - np.exp(-time / 0.3)), atol=2e-5)
     np.testing.assert_allclose(right - left, W0 * 0.55 / 0.165 * (1 - np.exp(-time / 1.2)), atol=2e-5)
+
+
+def test_each_side_has_a_lag_of_its_own() -> None:
+    time, left, right = wheel_response({"side_lag": {"tau_left": 0.5, "tau_right": 0.1}})
+    np.testing.assert_allclose(left, V0 / 0.165 * (1 - np.exp(-time / 0.5)), atol=2e-5)
+    np.testing.assert_allclose(right, V0 / 0.165 * (1 - np.exp(-time / 0.1)), atol=2e-5)
+
+
+# Forward for four seconds, backward for four, both from a command at a round second.
+THERE_AND_BACK = replace(
+    STRAIGHT,
+    duration_s=8.0,
+    played=Commands(np.arange(0.0, 8.0, 0.1), np.repeat([V0, -V0], 40), np.zeros(80)),
+)
+
+
+def test_a_braked_wheel_slows_down_fast_and_speeds_up_slowly() -> None:
+    drive = simulate_run(
+        replace(THERE_AND_BACK, effects={"brake_lag": {"tau_drive": 0.5, "tau_brake": 0.1}})
+    ).truth.drive
+    left, time = drive.left * 0.165 / V0, (np.arange(drive.left.size) + 1.0) * drive.step_s
+    up, down = time < 4.0, (time > 4.0) & (left > 0.0)
+    np.testing.assert_allclose(left[up], 1.0 - np.exp(-time[up] / 0.5), atol=1e-9)
+    np.testing.assert_allclose(left[down], 2.0 * np.exp((4.0 - time[down]) / 0.1) - 1.0, atol=2e-3)
+    stands = 4.0 + 0.1 * math.log(2.0)
+    back = time > stands + 0.01
+    np.testing.assert_allclose(left[back], np.exp((stands - time[back]) / 0.5) - 1.0, atol=5e-3)
+
+
+def test_a_wheel_rests_before_it_reverses() -> None:
+    drive = simulate_run(replace(THERE_AND_BACK, effects={"reversal_pause": 0.3})).truth.drive
+    time = (np.arange(drive.left.size) + 0.5) * drive.step_s
+    rests = (time > 4.0) & (time < 4.3)
+    assert not drive.left[rests].any()
+    np.testing.assert_allclose(drive.right[~rests] * 0.165, np.where(time[~rests] < 4.0, V0, -V0))
+
+
+def test_tyres_stay_within_the_play_of_their_steering() -> None:
+    asked = 0.3 * np.sin(np.arange(80) * 0.2)
+    car = Scenario(
+        vehicle=VEHICLES["car"],
+        duration_s=8.0,
+        played=Commands(np.arange(0.0, 8.0, 0.1), np.ones(80), asked),
+    )
+    plain, loose = (
+        simulate_run(replace(car, effects=given)).truth.drive.steering
+        for given in ({}, {"steering_play": 0.04})
+    )
+    moves = np.diff(loose) != 0.0
+    np.testing.assert_allclose(np.abs(plain - loose)[1:][moves], 0.04, atol=1e-12)
+    assert np.abs(plain - loose).max() <= 0.04 + 1e-12
+    # It follows from behind: after each peak it stays until the steering has come back through the play.
+    assert loose.max() == pytest.approx(plain.max() - 0.04)
 
 
 def test_acceleration_limit_makes_a_ramp() -> None:

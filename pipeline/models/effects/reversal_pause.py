@@ -1,0 +1,77 @@
+"""Reversal pause: a wheel that is asked for the other direction stands still for a while first.
+
+    Omega = 0 for d seconds after the sign of u changes, each wheel
+
+d [s]: the time that play between motor and wheel takes, or a controller's pause before it reverses. Drive
+forward and backward, and turn on the spot to both sides.
+
+Source: Nordin and Gutman, Automatica 38 (2002): mechanical systems with backlash.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.models.effect import (
+    STAMPS,
+    WHEELED,
+    DriveEffect,
+    Excitation,
+    Least,
+    Parameter,
+    Plausible,
+    Search,
+)
+from pipeline.models.filters import wait_at_reversal
+
+if TYPE_CHECKING:
+    from pipeline.runs.signals import RunContext, Wheels
+    from pipeline.vehicles import Vehicle
+
+
+class ReversalPause(DriveEffect):
+    """Reversal pause: a wheel that is asked for the other direction stands still for a while first."""
+
+    id = "reversal_pause"
+    rank = 5
+    kinds = WHEELED
+    parameters = (
+        Parameter(
+            "d",
+            "s",
+            (0.0, 3.0),
+            0.0,
+            "how long a wheel stands before it reverses",
+            0.4,
+            search=Search.STARTS,
+            starts=(0.15, 0.5),
+            step=1e-2,
+            least=Least(0.03, STAMPS, sampled=True),
+            plausible=Plausible(0.0, 1.5, "longer than controllers wait"),
+        ),
+    )
+    needs = (Excitation.BOTH_SIGNS, Excitation.CHANGES)
+    confused_with = ("acceleration_limit", "drive_lag", "transport_delay", "deadband")
+    python_state = ("ways", "waited")
+    python = """
+        wheels, ways, waited = split(left, right, sideways), ways or [0.0] * 4, waited or [math.inf] * 4
+        waited = [0.0 if was * wheel < 0.0 else s + step_s for was, wheel, s in zip(ways, wheels, waited)]
+        ways = [sign(wheel) or was for was, wheel in zip(ways, wheels)]
+        left, right, sideways = join([wheel if s >= {d} else 0.0 for wheel, s in zip(wheels, waited)])"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        return f"lets a wheel stand for {self.values['d']:.2f} s before it reverses"
+
+    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+        """See the formula above."""
+        d, resets = self.values["d"], around.spans
+        if d <= 0.0:
+            return wheels
+        unknown = np.full((resets.first.size, 3), np.nan)
+        return wheels.change_each_wheel(
+            lambda speed, _: wait_at_reversal(speed, d, around.step_s, resets), unknown
+        )

@@ -1,0 +1,71 @@
+"""Steering play: tyres stay where they are until the steering has moved through its play.
+
+    delta = min(max(delta, u_delta - g), u_delta + g)
+
+g [rad], half of the play at the tyres: 0.01 is usual, 0.05 a worn linkage. Steer to both sides, in small and
+large steps, while driving.
+
+Source: the play operator; Nordin and Gutman, Automatica 38 (2002): mechanical systems with backlash.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pipeline.models.effect import (
+    ACKERMANN,
+    DATA_SHEET,
+    DriveEffect,
+    Excitation,
+    Least,
+    Parameter,
+    Plausible,
+    Search,
+)
+from pipeline.models.filters import follow_with_play
+
+if TYPE_CHECKING:
+    from pipeline.runs.signals import RunContext, Wheels
+    from pipeline.vehicles import Vehicle
+
+
+class SteeringPlay(DriveEffect):
+    """Steering play: tyres stay where they are until the steering has moved through its play."""
+
+    id = "steering_play"
+    rank = 65
+    kinds = ACKERMANN
+    parameters = (
+        Parameter(
+            "g",
+            "rad",
+            (0.0, 0.3),
+            0.0,
+            "half of the play, at the tyres",
+            0.05,
+            search=Search.STARTS,
+            starts=(0.02, 0.06),
+            step=1e-3,
+            least=Least(0.004, DATA_SHEET),
+            plausible=Plausible(0.0, 0.15, "three times a worn linkage"),
+        ),
+    )
+    needs = (Excitation.STEERING, Excitation.CHANGES)
+    confused_with = ("steering_gain", "steering_lag")
+    python_state = ("played",)
+    python = """
+        steering = played = min(max(played, steering - {g}), steering + {g})"""
+
+    def describe_motion(self, vehicle: Vehicle) -> str:
+        """The effect as what the vehicle does."""
+        del vehicle
+        return (
+            f"does not steer before its steering has moved by {2.0 * self.values['g']:.2g} rad the other way"
+        )
+
+    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+        """See the formula above."""
+        if self.is_neutral:
+            return wheels
+        return replace(wheels, steering=follow_with_play(wheels.steering, self.values["g"], around.spans))
