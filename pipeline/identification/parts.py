@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.identification.columns import make_columns
 from pipeline.identification.prior import NO_PRIOR, Prior
 from pipeline.identification.state import State
 from pipeline.identification.weights import measure_noise
@@ -133,7 +134,7 @@ class Part(ABC):
             free: the numbers.
             both_sides: from both sides, where bounds leave room: for the same end from every start.
         """
-        columns = np.zeros((*residual.shape, len(free)))
+        columns = make_columns(residual.shape[0], len(free))
         for place, number in enumerate(free):
             rows = slice(None) if number.run is None else self.run == number.run
             value, (low, high) = state.get(number), number.bounds
