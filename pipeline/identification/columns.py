@@ -1,4 +1,4 @@
-"""Derivative columns of many residuals, one column after the other in memory: they are made, picked and summed so.
+"""Derivative columns of many residuals, one after the other in memory: so they are made, picked and summed.
 
 All arrays are of shape (n, 3, p): n windows, three channels, p numbers.
 """

@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.identification.columns import combine_columns, flatten, pick_columns, pick_windows, weigh_columns
+from pipeline.identification.columns import (
+    combine_columns,
+    flatten,
+    pick_columns,
+    pick_windows,
+    weigh_columns,
+)
 from pipeline.identification.fit import PartFit, measure_loss, solve_step
 from pipeline.identification.weights import Weights
 
@@ -113,7 +119,9 @@ def refit(part: Part, fit: PartFit, train: Flags) -> State:
         held = hold + part.prior.weigh(state, fit.free)[smooth]
         step, _ = solve_step(jacobian, residual[train], weights, hold=held, pull=pull)
         moved = state.move(free, step.tolist())
-        promised = measure_loss(part, weights, residual[train] - combine_columns(jacobian, step), moved, fit.free)
+        promised = measure_loss(
+            part, weights, residual[train] - combine_columns(jacobian, step), moved, fit.free
+        )
         if loss - promised < _NOTHING * loss:
             break
         trial = part.find_residuals(moved)

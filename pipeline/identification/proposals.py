@@ -257,5 +257,10 @@ def _leave_out_silent(trial: Trial, factor: Floats) -> tuple[Trial, Floats, Floa
     # Driven straight only, a change of ground shows in one gain: the other is left as it is.
     silent = [n for n, seen in zip(trial.names, traced.tolist(), strict=True) if not seen]
     loud = tuple(name for name in trial.names if name not in silent)
-    kept = Trial(trial.effect.fix(*silent), loud, pick_columns(trial.columns, np.flatnonzero(traced).tolist()), trial.shift)
+    kept = Trial(
+        trial.effect.fix(*silent),
+        loud,
+        pick_columns(trial.columns, np.flatnonzero(traced).tolist()),
+        trial.shift,
+    )
     return kept, rows[:, traced], size[traced]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from pipeline.models.filters import lag_signal, limit_rate
 from pipeline.runs.grid import Grid, Raster
-from pipeline.runs.signals import Commands, Resets
+from pipeline.runs.signals import Resets
 
 STEP = 0.005
 
