@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _LOOKED_AT = 6
 _AS_GOOD = 0.01
-# No evidence decides between models of unlike losses: of 89 rivals that served none had more than 1.34 times.
+# Larger losses are told apart by evidence: on 20 recordings and 40 drawn logs no list changed with it.
 _MOST_LOSS = 1.5
 _ALIKE = 0.7
 # Both effects were found worth a name: between two of that kind less evidence decides than for a new one.
