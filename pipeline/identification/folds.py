@@ -88,7 +88,8 @@ def hold_out_part(fit: PartFit, folds: tuple[Fold, ...]) -> Floats:
         # What is fitted is nearly everything: all of it less what is left out.
         out = _sum_normals(pick_windows(rows, ~fold.train), target[~fold.train])
         normal, gradient = whole[0] - out[0], whole[1] - out[1]
-        step = np.linalg.solve(normal + np.diag((np.diag(normal) + 1e-12) * 1e-9 + hold), gradient)
+        stiff = normal + np.diag((np.diag(normal) + 1e-12) * 1e-9 + hold)
+        step = np.asarray(np.linalg.solve(stiff, gradient), dtype=np.float64)
         held[fold.test] -= combine_columns(pick_windows(jacobian, fold.test), step)
     return held
 
