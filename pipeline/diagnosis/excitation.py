@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.diagnosis.verdict import LEAST_STRETCHES, SHORT_S
+from pipeline.identification.columns import weigh_columns
 from pipeline.models.effect import Excitation, Search
 
 if TYPE_CHECKING:
@@ -132,7 +133,7 @@ def _evidence(selection: Selection, final: CandidateModel, shift: Floats) -> tup
     column = shift * factor
     beside = column
     if fit.free:
-        rows = (fit.jacobian * factor[:, :, None]).reshape(-1, len(fit.free))
+        rows = weigh_columns(fit.jacobian, factor)
         solution = np.linalg.lstsq(rows, column.reshape(-1), rcond=1e-8)[0]
         beside = (column.reshape(-1) - rows @ solution).reshape(column.shape)
     rest = weights.weigh(fit.residual)

@@ -99,11 +99,12 @@ def _swap(selection: Selection, current: CandidateModel) -> CandidateModel | Non
         if selection.is_done(_MOST_WORK):
             return best
         without = selection.drop(current, [name])
-        for rival in selection.suggest(without, _SWAPPED, without=[name]):
+        most = (1.0 + _TIE) * current.score
+        for rival in selection.suggest(without, _SWAPPED, without=[name], most=most):
             if rival.score < (1.0 - _BETTER) * current.score:
                 if best is None or rival.score < best.score:
                     best = rival
-            elif rival.score < (1.0 + _TIE) * current.score:
+            elif rival.score < most:
                 pruned = prune(selection, rival)
                 fewer = len(current.ids) - len(pruned.ids)
                 if fewer > 0 and pruned.score < (1.0 + LEAST_GAIN * fewer) * current.score:
@@ -120,8 +121,9 @@ def _join(selection: Selection, current: CandidateModel) -> CandidateModel | Non
         if selection.is_done(_MOST_WORK):
             return None
         without = selection.drop(current, group)
-        for rival in selection.suggest(without, _SWAPPED, without=group):
-            if rival.score < (1.0 + LEAST_GAIN) * current.score:
+        most = (1.0 + LEAST_GAIN) * current.score
+        for rival in selection.suggest(without, _SWAPPED, without=group, most=most):
+            if rival.score < most:
                 return rival
     return None
 
@@ -134,7 +136,8 @@ def _split(selection: Selection, current: CandidateModel) -> CandidateModel | No
         if selection.budget.is_spent():
             return None
         without = selection.drop(current, [name])
-        for rival in selection.suggest(without, _SWAPPED, without=[name], pairs=True):
+        most = current.score
+        for rival in selection.suggest(without, _SWAPPED, without=[name], pairs=True, most=most):
             if rival.score < current.score and selection.prefers(current, rival):
                 return rival
     return None

@@ -108,9 +108,9 @@ def _replace(selection: Selection, current: CandidateModel, narrow: set[str]) ->
         if selection.is_done(_MOST_WORK):
             return None
         without = selection.drop(current, names)
-        for rival in selection.suggest(without, _TRIED, without={*narrow, *names}):
-            bonus = _BETTER if len(names) == 1 else 0.0
-            if rival.score < (1.0 - bonus) * current.score:
+        most = (1.0 - (_BETTER if len(names) == 1 else 0.0)) * current.score
+        for rival in selection.suggest(without, _TRIED, without={*narrow, *names}, most=most):
+            if rival.score < most:
                 return rival
     return None
 

@@ -128,6 +128,8 @@ class Comparison:
         lead = find_lead(run, run.alignment.heading_delay_s)
         self.windows = join_windows(run, self.cells, self.nodes, lead)
         self.horizons = join_horizons(run, self.cells, self.nodes, lead)
+        # Where each prediction begins; all of its rows begin there.
+        self._begins = self.horizons.origin[np.flatnonzero(np.diff(self.horizons.number, prepend=-1))]
         self._pose_times = run.track.times[self.nodes.poses]
         self._path = self.nodes.average(run.track.path[self.nodes.poses])
         self._frames: dict[float, Complex] = {}
@@ -228,9 +230,9 @@ class Comparison:
         moved, turned = self._predict_horizons(effects, timing, delay)
         heading = self._node_headings(delay)
         origin, node = self.horizons.origin, self.horizons.node
-        predicted = self._path[origin] + np.exp(1j * heading[origin]) * moved
+        predicted = self._path[origin] + np.exp(1j * heading[self._begins])[self.horizons.number] * moved
         yaw = (heading[node] - heading[origin]) - turned
-        wrapped = np.abs(np.angle(np.exp(1j * yaw)))
+        wrapped = np.abs(np.remainder(yaw + np.pi, 2.0 * np.pi) - np.pi)
         return HorizonErrors(np.abs(predicted - self._path[node]), wrapped, np.abs(yaw))
 
     def find_horizon_shifts(
@@ -262,7 +264,7 @@ class Comparison:
         travelled = self._at_nodes(self.cells.sum_up((velocity.x + 1j * velocity.y) * own), place)
         turned = self._at_nodes(edges, place)
         origin, node = self.horizons.origin, self.horizons.node
-        back: Complex = np.exp(-1j * turned[origin])
+        back: Complex = np.exp(-1j * turned[self._begins])[self.horizons.number]
         return back * (travelled[node] - travelled[origin]), turned[node] - turned[origin]
 
     def list_starts(self) -> tuple[Floats, Floats]:

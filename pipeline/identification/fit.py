@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.identification.columns import combine_columns, pick_columns, weigh_columns
 from pipeline.identification.proposals import propose
 from pipeline.identification.state import State
 from pipeline.identification.weights import make_weights
@@ -268,7 +269,7 @@ def solve_step(
         The step, shape (p,), and the normal matrix, shape (p, p).
     """
     factor = weights.factors(residual)
-    rows = (jacobian * factor[:, :, None]).reshape(-1, jacobian.shape[2])
+    rows = weigh_columns(jacobian, factor)
     target = (residual * factor).reshape(-1)
     normal = np.asarray(rows.T @ rows, dtype=np.float64)
     size = np.diag(normal) + 1e-12
@@ -296,9 +297,9 @@ def _descend(part: Part, start: PartFit, until: tuple[int, float]) -> PartFit:
         ]
         if not moving:
             break
-        movable = [free[place] for place in moving]
+        movable, columns = [free[place] for place in moving], pick_columns(jacobian, moving)
         step, _ = solve_step(
-            jacobian[:, :, moving],
+            columns,
             residual,
             weights,
             damping,
@@ -307,7 +308,7 @@ def _descend(part: Part, start: PartFit, until: tuple[int, float]) -> PartFit:
         )
         trial = state.move(movable, step.tolist())
         # What the step promises, were the model linear: where that is nothing, the fit is done.
-        linear = residual - jacobian[:, :, moving] @ step
+        linear = residual - combine_columns(columns, step)
         if (loss - measure_loss(part, weights, linear, trial, free)) / max(loss, 1e-12) < 0.5 * enough:
             break
         after = part.find_residuals(trial)
@@ -344,7 +345,7 @@ def _pushes_out(state: State, number: Free, column: Floats, residual: Floats, pr
 
 def _walk_grid(part: Part, fit: PartFit, number: Free) -> State | None:
     """Shrinking grid around a number, the others following linearly; None where it is best already."""
-    others, weights = fit.smooth, fit.weights
+    columns, weights = pick_columns(fit.jacobian, fit.smooth), fit.weights
     value = fit.state.get(number)
     # A moment has no size that its neighbourhood could be a share of.
     width = 8.0 * number.step if math.isnan(fit.state.neutral_of(number)) else 0.5 * abs(value)
@@ -355,9 +356,9 @@ def _walk_grid(part: Part, fit: PartFit, number: Free) -> State | None:
                 continue
             moved = fit.state.set(number, at)
             residual = part.find_residuals(moved)
-            if others:
-                step, _ = solve_step(fit.jacobian[:, :, others], residual, weights)
-                residual = residual - fit.jacobian[:, :, others] @ step
+            if fit.smooth:
+                step, _ = solve_step(columns, residual, weights)
+                residual = residual - combine_columns(columns, step)
             loss = measure_loss(part, weights, residual, moved, fit.free)
             if loss < best_loss:
                 best, best_loss = at, loss

@@ -12,6 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.identification.columns import (
+    combine_columns,
+    flatten,
+    pick_columns,
+    pick_windows,
+    weigh_columns,
+)
 from pipeline.identification.fit import PartFit, measure_loss, solve_step
 from pipeline.identification.weights import Weights
 
@@ -71,24 +78,25 @@ def hold_out_part(fit: PartFit, folds: tuple[Fold, ...]) -> Floats:
     held = np.array(fit.residual)
     if not smooth:
         return held
-    jacobian, factor = fit.jacobian[:, :, smooth], fit.weights.factors(fit.residual)
+    jacobian, factor = pick_columns(fit.jacobian, smooth), fit.weights.factors(fit.residual)
     rows, target = jacobian * factor[:, :, None], fit.residual * factor
-    hold = _LEAST_SHARE * (rows**2).sum(axis=(0, 1))
     whole = _sum_normals(rows, target)
+    hold = _LEAST_SHARE * np.diag(whole[0])
     for fold in folds:
         if not fold.test.any() or not fold.train.any():
             continue
         # What is fitted is nearly everything: all of it less what is left out.
-        out = _sum_normals(rows[~fold.train], target[~fold.train])
+        out = _sum_normals(pick_windows(rows, ~fold.train), target[~fold.train])
         normal, gradient = whole[0] - out[0], whole[1] - out[1]
-        step = np.linalg.solve(normal + np.diag((np.diag(normal) + 1e-12) * 1e-9 + hold), gradient)
-        held[fold.test] -= jacobian[fold.test] @ step
+        stiff = normal + np.diag((np.diag(normal) + 1e-12) * 1e-9 + hold)
+        step = np.asarray(np.linalg.solve(stiff, gradient), dtype=np.float64)
+        held[fold.test] -= combine_columns(pick_windows(jacobian, fold.test), step)
     return held
 
 
 def _sum_normals(rows: Floats, target: Floats) -> tuple[Floats, Floats]:
     """Normal matrix (p, p) and gradient (p,) of weighted columns (n, 3, p) and residuals (n, 3)."""
-    flat = rows.reshape(-1, rows.shape[2])
+    flat = flatten(rows)
     return flat.T @ flat, flat.T @ target.reshape(-1)
 
 
@@ -103,7 +111,8 @@ def refit(part: Part, fit: PartFit, train: Flags) -> State:
     smooth, state, residual = fit.smooth, fit.state, fit.residual
     if not smooth or not train.any():
         return state
-    weights, jacobian, hold = _take(fit.weights, train), fit.jacobian[train][:, :, smooth], _hold(fit)
+    weights, hold = _take(fit.weights, train), _hold(fit)
+    jacobian = pick_windows(pick_columns(fit.jacobian, smooth), train)
     free = [fit.free[place] for place in smooth]
     loss = measure_loss(part, weights, residual[train], state, fit.free)
     for _ in range(_CHORD_STEPS):
@@ -111,7 +120,9 @@ def refit(part: Part, fit: PartFit, train: Flags) -> State:
         held = hold + part.prior.weigh(state, fit.free)[smooth]
         step, _ = solve_step(jacobian, residual[train], weights, hold=held, pull=pull)
         moved = state.move(free, step.tolist())
-        promised = measure_loss(part, weights, residual[train] - jacobian @ step, moved, fit.free)
+        promised = measure_loss(
+            part, weights, residual[train] - combine_columns(jacobian, step), moved, fit.free
+        )
         if loss - promised < _NOTHING * loss:
             break
         trial = part.find_residuals(moved)
@@ -124,8 +135,8 @@ def refit(part: Part, fit: PartFit, train: Flags) -> State:
 
 def _hold(fit: PartFit) -> Floats:
     """Information that speaks for staying: what acts in a few moments may act in one fold only."""
-    weighted = fit.jacobian[:, :, fit.smooth] * fit.weights.factors(fit.residual)[:, :, None]
-    hold: Floats = _LEAST_SHARE * (weighted**2).sum(axis=(0, 1))
+    rows = weigh_columns(pick_columns(fit.jacobian, fit.smooth), fit.weights.factors(fit.residual))
+    hold: Floats = _LEAST_SHARE * np.einsum("ij,ij->j", rows, rows)
     return hold
 
 

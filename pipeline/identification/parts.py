@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.identification.columns import make_columns
 from pipeline.identification.prior import NO_PRIOR, Prior
 from pipeline.identification.state import State
 from pipeline.identification.weights import measure_noise
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from pipeline.identification.state import DelayName, Free
     from pipeline.models.effect import Effect
     from pipeline.models.evidence import Largest
-    from pipeline.runs.signals import Velocity
+    from pipeline.runs.signals import Signal, Velocity
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -85,6 +86,7 @@ class Part(ABC):
         self.times: Floats = np.concatenate([w.times for w in windows])
         begin = np.array([comparison.run.start_s for comparison in self.comparisons])
         self._since: Floats = self.times.mean(axis=1) - begin[self.run]
+        self._stretches: dict[float, Integers] = {}
         self.unit = self.number_stretches(UNIT_S)
         shift = np.concatenate(([0], np.cumsum([int(w.block.max(initial=-1)) + 1 for w in windows])))
         self.block: Integers = np.concatenate([w.block + shift[i] for i, w in enumerate(windows)])
@@ -92,7 +94,9 @@ class Part(ABC):
 
     def number_stretches(self, length: float) -> Integers:
         """Stretches of a length [s] since each run's start, numbered through all runs, shape (n,)."""
-        return number_stretches(self.run, self._since, length)
+        if length not in self._stretches:
+            self._stretches[length] = number_stretches(self.run, self._since, length)
+        return self._stretches[length]
 
     def list_free(self, state: State, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
         """Free numbers of a state on this part: clocks belong to one run, and so does what `per_run` names.
@@ -151,7 +155,7 @@ class Part(ABC):
             free: the numbers.
             both_sides: from both sides, where bounds leave room: for the same end from every start.
         """
-        columns = np.zeros((*residual.shape, len(free)))
+        columns = make_columns(residual.shape[0], len(free))
         for place, number in enumerate(free):
             rows = slice(None) if number.run is None else self.run == number.run
             value, (low, high) = state.get(number), number.bounds
@@ -293,12 +297,12 @@ class Spans:
     into_last: Floats
     width: Floats
 
-    def average(self, comparison: Comparison, signal: Floats) -> Floats:
+    def average(self, comparison: Comparison, signal: Signal) -> Signal:
         """Mean of a signal on cells over every window, shape (n,)."""
         total = comparison.cells.sum_up(signal)
         end = total[self.last] + self.into_last * (total[self.last + 1] - total[self.last])
         start = total[self.first] + self.into_first * (total[self.first + 1] - total[self.first])
-        means: Floats = (end - start) / self.width
+        means: Signal = (end - start) / self.width
         return means
 
 
@@ -314,14 +318,13 @@ def locate_windows(comparison: Comparison, late: float = 0.0) -> Spans:
 
 def average_windows(comparison: Comparison, velocity: Velocity, spans: Spans) -> Floats:
     """Mean of (x, y, w) over every window, shape (n, 3)."""
-    y = velocity.y
-    return np.column_stack(
-        (
-            spans.average(comparison, velocity.x),
-            spans.average(comparison, y) if y.any() else np.zeros(spans.first.size),
-            spans.average(comparison, velocity.w),
-        )
-    )
+    means, y = np.zeros((spans.first.size, 3)), velocity.y
+    # Two real signals as one complex one: summing up takes as long for both as for either.
+    both = spans.average(comparison, velocity.x + 1j * velocity.w)
+    means[:, 0], means[:, 2] = both.real, both.imag
+    if y.any():
+        means[:, 1] = spans.average(comparison, y)
+    return means
 
 
 def average_lags(comparison: Comparison, velocity: Velocity, lags: int = 9) -> Floats:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.identification.columns import combine_columns, pick_columns, stack_columns, weigh_columns
 from pipeline.models.effect import Effect, Parameter, Search
 
 if TYPE_CHECKING:
@@ -140,7 +141,7 @@ def list_trials(part: Part, fit: PartFit, candidate: Candidate, largest: Largest
             changed = start.change(**{name: parameter.neutral + parameter.step})
             after = part.find_residuals(fit.state.add(changed))
             columns.append((base - after) / parameter.step)
-        yield Trial(start, direct, np.stack(columns, axis=2), fit.residual - base)
+        yield Trial(start, direct, stack_columns(columns), fit.residual - base)
 
 
 def _start_clocks(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Trial:
@@ -232,7 +233,7 @@ def _weigh(fit: PartFit) -> _Base:
 
 def _scale(columns: Floats, factor: Floats) -> tuple[Floats, Floats]:
     """Weighted columns, each of size one, shape (3 n, p), and their sizes."""
-    rows = (columns * factor[:, :, None]).reshape(factor.size, columns.shape[2])
+    rows = weigh_columns(columns, factor)
     size = np.sqrt(np.einsum("ij,ij->j", rows, rows)) + 1e-12
     return rows / size, size
 
@@ -252,7 +253,7 @@ def _promise(base: _Base, trials: tuple[Trial, ...]) -> Proposal | None:
     normal = np.block([[base.normal, across], [across.T, rows.T @ rows]]) + 1e-7 * np.eye(own + size.size)
     moved = np.linalg.solve(normal, np.concatenate((base.rows.T @ target, rows.T @ target)))
     step = moved / np.concatenate((base.size, size))
-    after = residual - fit.jacobian @ step[:own] - columns @ step[own:]
+    after = residual - combine_columns(fit.jacobian, step[:own]) - combine_columns(columns, step[own:])
     state = fit.state
     for number, change in zip(fit.free, step[:own].tolist(), strict=True):
         if number.is_smooth:
@@ -284,5 +285,10 @@ def _leave_out_silent(trial: Trial, factor: Floats) -> tuple[Trial, Floats, Floa
     # Driven straight only, a change of ground shows in one gain: the other is left as it is.
     silent = [n for n, seen in zip(trial.names, traced.tolist(), strict=True) if not seen]
     loud = tuple(name for name in trial.names if name not in silent)
-    kept = Trial(trial.effect.fix(*silent), loud, trial.columns[:, :, traced], trial.shift)
+    kept = Trial(
+        trial.effect.fix(*silent),
+        loud,
+        pick_columns(trial.columns, np.flatnonzero(traced).tolist()),
+        trial.shift,
+    )
     return kept, rows[:, traced], size[traced]

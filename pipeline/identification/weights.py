@@ -47,8 +47,9 @@ class Weights:
     def cost(self, residual: Floats) -> Floats:
         """Huber cost of every window, shape (n,)."""
         size = np.abs(residual / self.scale)
-        each = np.where(size <= self.clip, size**2, self.clip * (2.0 * size - self.clip))
-        total: Floats = each.sum(axis=1)
+        held = np.minimum(size, self.clip)
+        each = held * (2.0 * size - held)
+        total: Floats = each[:, 0] + each[:, 1] + each[:, 2]
         return total
 
     def loss(self, residual: Floats) -> float:

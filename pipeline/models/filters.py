@@ -10,8 +10,6 @@ import numpy as np
 if TYPE_CHECKING:
     from pipeline.runs.signals import Floats, Integers, Resets, Signal
 
-_FORGOTTEN = 40.0
-"""Time constants after which a state is forgotten to the last bit."""
 _INSTANT_S = 1e-9
 _SETTLED = 1e-9
 _ROUND = 100
@@ -40,24 +38,15 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
     before = np.concatenate((np.zeros(1, dtype=signal.dtype), end[:-1]))
     # The filter ran through the resets: what it carried over is taken back, and the state put in its place.
     # One reset after the other, in closed form: what is missing at each fades until the next.
-    fade = step_s / tau
+    from_first, from_set = resets.fade(step_s / tau)
     known = np.where(np.isfinite(start), start, signal[resets.at])
     if np.array_equal(resets.at, resets.first):
-        _add_fading(before, known - before[resets.at], resets.number, resets.since_set, fade)
+        before += (known - before[resets.at])[resets.number] * from_set
     else:
-        missing = signal[resets.first] - before[resets.first]
-        _add_fading(before, missing, resets.number, resets.since_first, fade)
-        _add_fading(before, known - before[resets.at], resets.number, resets.since_set, fade)
+        before += (signal[resets.first] - before[resets.first])[resets.number] * from_first
+        before += (known - before[resets.at])[resets.number] * from_set
     lagged: Signal = signal + (before - signal) * (tau / step_s * (1.0 - decay))
     return lagged
-
-
-def _add_fading(state: Signal, missing: Signal, number: Integers, since: Integers, fade: float) -> None:
-    """Add what is missing at each reset to the state; it fades until the next reset comes."""
-    forgotten = int(_FORGOTTEN / fade) + 1
-    # The last entry is that of cells before the state was set, too: their place is -1.
-    table = np.append(np.exp(-fade * np.arange(forgotten)), 0.0)
-    state += missing[number] * table[np.minimum(since, forgotten)]
 
 
 def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, start: Floats) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
@@ -19,7 +19,7 @@ from pipeline.models.effect import (
     Place,
     ReportEffect,
 )
-from pipeline.runs.grid import MeasuredDrive, begin_spans, hold_on_cells
+from pipeline.runs.grid import HeldDrive, MeasuredDrive
 from pipeline.runs.signals import Rolling, RunContext, Velocity, Wheels, roll_ideally
 
 if TYPE_CHECKING:
@@ -78,6 +78,10 @@ class Forward:
         self._kept: dict[Place, OrderedDict[object, object]] = {place: OrderedDict() for place in Place}
         self._known: OrderedDict[float, RunContext] = OrderedDict()
 
+    @cached_property
+    def _held(self) -> HeldDrive:
+        return HeldDrive(self.series, self.cells)
+
     def run_commands(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
         """Body velocity as reported, of commands."""
         told = [e for e in effects if e.place is Place.COMMAND]
@@ -125,10 +129,10 @@ class Forward:
         first = np.full((self.cells.first.size, 3), np.nan)
         if self._encoders is not None:
             first = self._encoders.interpolate(self.cells.starts, delay_s).stack()
-        commands = begin_spans(self.series, self.cells, first)
+        commands = self._held.begin_spans(first)
         for effect in effects:
             commands = cast("CommandEffect", effect).change_commands(commands, self.around)
-        return hold_on_cells(commands, self.cells)
+        return self._held.hold_on_cells(commands)
 
     def _drive(
         self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect], around: RunContext

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from pipeline.runs.signals import Commands, Signal, Wheels
 if TYPE_CHECKING:
     from pipeline.runs.recording import DriveSeries, MotionRun
 
+Number = TypeVar("Number", np.float64, np.int64)
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
@@ -120,55 +121,90 @@ class MeasuredDrive:
         )
 
 
-def begin_spans(series: DriveSeries, cells: Grid, measured: Floats) -> Commands:
-    """Commands with a first value for every span: what the wheels did there, or the span's first command.
+class HeldDrive:
+    """Held commands on cells; what depends on their stamps alone is worked out once.
 
     Args:
         series: held commands.
         cells: the grid.
-        measured: left, right and sideways speeds at each span's start, NaN where unknown, shape (k, 3).
     """
-    following = np.minimum(np.searchsorted(series.times, cells.starts - 1e-6), series.times.size - 1)
-    # At a hole nobody knows what was asked meanwhile; at the start of the recording nothing was.
-    ends_before = np.concatenate(([-np.inf], cells.ends[:-1]))
-    stamp = np.maximum(ends_before + 1e-3, cells.starts - _BEFORE)
-    inside = cells.find_span(series.times) >= 0
-    times = np.concatenate((stamp, series.times[inside]))
-    order = np.argsort(times, kind="stable")
 
-    def begin(source: Floats, seen: Floats | None) -> Floats:
-        first = source[following]
-        if seen is not None:
-            first = np.where(np.isfinite(seen), seen, first)
-        return np.concatenate((first, source[inside]))[order]
+    def __init__(self, series: DriveSeries, cells: Grid) -> None:
+        self._series, self._cells = series, cells
+        self._following = np.minimum(
+            np.searchsorted(series.times, cells.starts - 1e-6), series.times.size - 1
+        )
+        # At a hole nobody knows what was asked meanwhile; at the start of the recording nothing was.
+        ends_before = np.concatenate(([-np.inf], cells.ends[:-1]))
+        stamp = np.maximum(ends_before + 1e-3, cells.starts - _BEFORE)
+        self._inside = cells.find_span(series.times) >= 0
+        times = np.concatenate((stamp, series.times[self._inside]))
+        self._order = np.argsort(times, kind="stable")
+        self._times = times[self._order]
+        self._raster = Raster(self._times, cells)
 
-    return Commands(
-        times[order],
-        begin(series.left, measured[:, 0]),
-        begin(series.right, measured[:, 1]),
-        begin(series.steering, None),
-        None if series.sideways is None else begin(series.sideways, measured[:, 2]),
-    )
+    def begin_spans(self, measured: Floats) -> Commands:
+        """Commands with a first value for every span: what the wheels did there, or its first command.
+
+        Args:
+            measured: left, right and sideways speeds at each span's start, NaN where unknown, shape (k, 3).
+        """
+        series = self._series
+
+        def begin(source: Floats, seen: Floats | None) -> Floats:
+            first = source[self._following]
+            if seen is not None:
+                first = np.where(np.isfinite(seen), seen, first)
+            return np.concatenate((first, source[self._inside]))[self._order]
+
+        return Commands(
+            self._times,
+            begin(series.left, measured[:, 0]),
+            begin(series.right, measured[:, 1]),
+            begin(series.steering, None),
+            None if series.sideways is None else begin(series.sideways, measured[:, 2]),
+        )
+
+    def hold_on_cells(self, commands: Commands) -> Wheels:
+        """Cell means of held commands, at the stamps of `begin_spans` or at others."""
+        raster = self._raster if commands.times is self._times else Raster(commands.times, self._cells)
+        steering = raster.average(commands.steering) if commands.steering.any() else None
+        return Wheels(
+            raster.average(commands.left),
+            raster.average(commands.right),
+            np.zeros(self._cells.times.size) if steering is None else steering,
+            None if commands.sideways is None else raster.average(commands.sideways),
+        )
 
 
-def hold_on_cells(commands: Commands, cells: Grid) -> Wheels:
-    """Cell means of held commands, exact wherever a stamp falls inside a cell."""
-    times = commands.times
-    edges = np.concatenate((cells.times - 0.5 * cells.step_s, cells.ends))
-    last_of_span = np.append(cells.first[1:], cells.times.size) - 1
-    index = np.clip(np.searchsorted(times, edges, side="right") - 1, 0, times.size - 1)
-    into = edges - times[index]
-    until = np.arange(cells.times.size) + 1
-    until[last_of_span] = cells.times.size + np.arange(cells.first.size)
+class Raster:
+    """Stamps of held values laid over cells: means are exact wherever a stamp falls inside a cell.
 
-    def average(values: Floats) -> Floats:
-        area = np.concatenate(([0.0], np.cumsum(values[:-1] * np.diff(times))))
-        at = area[index] + values[index] * into
-        means: Floats = (at[until] - at[: cells.times.size]) / cells.step_s
+    Args:
+        times: stamps [s], increasing, shape (m,).
+        cells: the grid.
+    """
+
+    def __init__(self, times: Floats, cells: Grid) -> None:
+        self._step_s, self._count = cells.step_s, cells.times.size
+        self._width = np.diff(times)
+        edges = np.concatenate((cells.times - 0.5 * cells.step_s, cells.ends))
+        self._last_of_span = np.append(cells.first[1:], self._count) - 1
+        self._index = np.clip(np.searchsorted(times, edges, side="right") - 1, 0, times.size - 1)
+        self._into = edges - times[self._index]
+        self._steady = self._until(self._index) == self._index[: self._count]
+
+    def average(self, values: Floats) -> Floats:
+        """Cell means of held values of shape (m,), shape (n,)."""
+        area = np.concatenate(([0.0], np.cumsum(values[:-1] * self._width)))
+        held = values[self._index]
+        at = area[self._index] + held * self._into
+        means: Floats = (self._until(at) - at[: self._count]) / self._step_s
         # Differences of a growing integral leave rounding; where nothing changed the value is known exactly.
-        steady = index[until] == index[: cells.times.size]
-        return np.where(steady, values[index[: cells.times.size]], means)
+        return np.where(self._steady, held[: self._count], means)
 
-    steering = average(commands.steering) if commands.steering.any() else np.zeros(cells.times.size)
-    sideways = None if commands.sideways is None else average(commands.sideways)
-    return Wheels(average(commands.left), average(commands.right), steering, sideways)
+    def _until(self, at: NDArray[Number]) -> NDArray[Number]:
+        """Of values at the edges those at the end of each cell."""
+        until = at[1 : self._count + 1].copy()
+        until[self._last_of_span] = at[self._count :]
+        return until

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Integers = NDArray[np.int64]
+_FORGOTTEN = 40.0
+"""Time constants after which a state is forgotten to the last bit."""
 Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 
 
@@ -207,6 +209,25 @@ class Resets:
         """How many cells after the state was set each cell comes, -1 before, shape (n,)."""
         since: Integers = np.maximum(np.arange(self.number.size) - self.at[self.number], -1)
         return since
+
+    def fade(self, rate: float) -> tuple[Floats, Floats]:
+        """What is left in every cell of 1 at its reset, and of 1 where the state was set, shape (n,) each.
+
+        It falls by exp(-rate) from cell to cell; the tables of the last rate are kept.
+        """
+        if rate not in self._faded:
+            forgotten = int(_FORGOTTEN / rate) + 1
+            # The last entry is that of cells before the state was set, too: their place is -1.
+            table = np.append(np.exp(-rate * np.arange(forgotten)), 0.0)
+            self._faded.clear()
+            places = (self.since_first, self.since_set)
+            first, at = (table[np.minimum(since, forgotten)] for since in places)
+            self._faded[rate] = first, at
+        return self._faded[rate]
+
+    @cached_property
+    def _faded(self) -> dict[float, tuple[Floats, Floats]]:
+        return {}
 
 
 @dataclass(frozen=True)

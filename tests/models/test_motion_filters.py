@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.models.filters import follow_with_play, lag_signal, lag_unevenly, limit_rate, wait_at_reversal
-from pipeline.runs.grid import Grid, hold_on_cells
-from pipeline.runs.signals import Commands, Resets
+from pipeline.runs.grid import Grid, Raster
+from pipeline.runs.signals import Resets
 
 STEP = 0.005
 
@@ -83,11 +83,11 @@ def test_held_commands_keep_their_area_wherever_their_stamps_fall(gaps: list[flo
         np.array([0.0]),
         np.array([size * STEP]),
     )
-    wheels = hold_on_cells(Commands(times, values, values, np.zeros(times.size)), cells)
+    held = Raster(times, cells).average(values)
     inside = np.clip(np.append(times, size * STEP), 0.0, None)
-    assert wheels.left.sum() * STEP == pytest.approx(float(np.sum(values * np.diff(inside))), abs=1e-9)
-    assert wheels.left.min() >= values.min() - 1e-9
-    assert wheels.left.max() <= values.max() + 1e-9
+    assert held.sum() * STEP == pytest.approx(float(np.sum(values * np.diff(inside))), abs=1e-9)
+    assert held.min() >= values.min() - 1e-9
+    assert held.max() <= values.max() + 1e-9
 
 
 @pytest.mark.parametrize("seed", range(6))
