@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 LEAST_GAIN = 0.01
-LEAST_T = 2.5
+LEAST_T = 2.2
 _FEWEST_WINDOWS = 6
 _FEWEST_ACTIVE = 2.5
 # In shorter stretches neighbours are not quite independent: more is asked of them.

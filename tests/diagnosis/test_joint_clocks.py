@@ -129,9 +129,8 @@ def test_undecided_repeats_no_name() -> None:
             return [model(("drive_lag",), 1.0), model(("drive_lag",), 1.0)]
 
     def model(ids: tuple[str, ...], residual: float) -> SimpleNamespace:
-
         rest = np.full((4, 3), residual)
-        return SimpleNamespace(ids=ids, held=rest, fit=SimpleNamespace(residual=rest))
+        return SimpleNamespace(ids=ids, held=rest, score=1.0, fit=SimpleNamespace(residual=rest))
 
     final = model(("transport_delay",), 1.0)
     final.state = SimpleNamespace(effects=(effect,))

@@ -203,9 +203,9 @@ def test_turn_lag_has_one_time_constant_for_the_mean_and_one_for_the_difference(
 
 
 def test_each_side_has_a_lag_of_its_own() -> None:
-    time, left, right = wheel_response({"side_lag": {"tau_left": 0.5, "tau_right": 0.1}})
-    np.testing.assert_allclose(left, V0 / 0.165 * (1 - np.exp(-time / 0.5)), atol=2e-5)
-    np.testing.assert_allclose(right, V0 / 0.165 * (1 - np.exp(-time / 0.1)), atol=2e-5)
+    time, left, right = wheel_response({"side_lag": {"tau_left": 0.9, "tau_right": 0.5}})
+    np.testing.assert_allclose(left, V0 / 0.165 * (1 - np.exp(-time / 0.9)), atol=2e-5)
+    np.testing.assert_allclose(right, V0 / 0.165 * (1 - np.exp(-time / 0.5)), atol=2e-5)
 
 
 # Forward for four seconds, backward for four, both from a command at a round second.
