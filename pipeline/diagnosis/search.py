@@ -60,7 +60,7 @@ def grow(selection: Selection, current: CandidateModel) -> CandidateModel:
 def _add(selection: Selection, current: CandidateModel) -> CandidateModel | None:
     for tested in selection.suggest(current, _TRIED):
         # What has put simpler effects in the place of others, and needs no more numbers, is an exchange.
-        exchanged = len(tested.fit.free) <= len(current.fit.free)
+        exchanged = tested.numbers <= current.numbers
         if exchanged and tested.score < (1.0 - _BETTER) * current.score:
             return tested
         if tested.score < current.score and selection.prefers(current, tested, price_of(tested, current)):

@@ -61,6 +61,11 @@ class CandidateModel:
         """Ids of its effects."""
         return self.fit.state.ids
 
+    @property
+    def numbers(self) -> int:
+        """How many numbers were fitted."""
+        return len(self.fit.free)
+
 
 @dataclass
 class Selection:

@@ -102,7 +102,9 @@ def _does_the_same(
 
 
 def _is_larger(selection: Selection, name: str, effect: Effect) -> bool:
-    """Whether an effect fits as well only by more numbers, or by holding the other as a special case."""
+    """Whether an effect fits as well only by more numbers or at a price, or holds the other as a case."""
     rival = next(candidate() for candidate in selection.candidates if candidate.id == name)
+    if rival.price > effect.price:
+        return True
     numbers = sum(bool(np.isfinite(value)) for value in effect.values.values())
     return effect.id in rival.contains or len([p for p in rival.parameters if not p.instead_of]) > numbers

@@ -87,7 +87,7 @@ def propose(
     largest: Largest,
     known: dict[str, list[Trial]],
 ) -> list[Proposal]:
-    """Candidates by promised loss, the best start of each.
+    """Candidates by promised loss and price, the best start of each.
 
     Args:
         part: of the way that is explained.
@@ -113,7 +113,7 @@ def propose(
                 best = proposal
         if best is not None:
             found.append(best)
-    return sorted(found, key=lambda proposal: proposal.loss)
+    return sorted(found, key=lambda proposal: (1.0 + proposal.trials[0].effect.price) * proposal.loss)
 
 
 def list_trials(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Iterator[Trial]:

@@ -132,37 +132,42 @@ def lag_unevenly(
     """
     from scipy.linalg.blas import dtbsv  # noqa: PLC0415 - heavy
 
-    keeps = np.array([math.exp(-step_s / tau) if tau > 0.0 else 0.0 for tau in taus])
-    shares = np.array(taus) / step_s * (1.0 - keeps)
-    begins = np.concatenate((resets.first, resets.at))
-    state = np.zeros_like(signal)
-    state[resets.first] = signal[resets.first]
-    state[resets.at] = np.where(np.isfinite(start), start, signal[resets.at])
     up, down = taus
-    before = np.zeros_like(signal)
-    for _ in range(_ROUND):
-        # y = keep * (y before) + source, as a band of two diagonals. Which cells slow down, and when they
-        # pass zero and speed up again, follows from the round before: each knows some more from the first on.
-        turns = before * signal < 0.0
-        slows = turns | (np.abs(signal) < np.abs(before))
-        size = np.where(turns, np.abs(signal), 1.0)
-        passed = down * (np.log(size + np.abs(before)) - np.log(size))
-        turns &= passed < step_s
-        after = -np.expm1(-np.maximum(step_s - passed, 0.0) / max(up, _INSTANT_S))
-        keep = np.where(turns, 0.0, keeps[slows.astype(np.int64)])
-        source = signal * np.where(turns, after, 1.0 - keep)
+    keeps = [math.exp(-step_s / tau) if tau > 0.0 else 0.0 for tau in taus]
+    size = np.abs(signal)
+    least = _SETTLED * float(size.max(initial=0.0))
+    begins = np.concatenate((resets.first, resets.at))
+    begun = np.concatenate((signal[resets.first], np.where(np.isfinite(start), start, signal[resets.at])))
+
+    def solve(keep: Floats, source: Floats) -> Floats:
+        """States before each cell of y = keep * (y before) + source: a band of two diagonals."""
         band = np.vstack((np.ones_like(keep), -np.append(keep[1:], 0.0)))
         band[1, begins[begins > 0] - 1] = 0.0
-        source[begins] += keep[begins] * state[begins]
-        last, before = before, np.concatenate(([0.0], dtbsv(1, band, source, lower=1, diag=1)[:-1]))
-        before[begins] = state[begins]
-        if np.abs(before - last).max(initial=0.0) <= _SETTLED * np.abs(signal).max(initial=0.0):
+        source[begins] += keep[begins] * begun
+        before = np.concatenate(([0.0], dtbsv(1, band, source, lower=1, diag=1)[:-1]))
+        before[begins] = begun
+        return before
+
+    # Which cells slow down, and when they pass zero and speed up again, follows from the round before: each
+    # knows some more from the first on. It begins with one time constant.
+    one = np.full(signal.size, 0.5 * sum(keeps))
+    before = solve(one, signal * (1.0 - one))
+    for _ in range(_ROUND):
+        crosses = before * signal < 0.0
+        slows = crosses | (size < np.abs(before))
+        keep = np.where(slows, keeps[1], keeps[0])
+        source = signal * (1.0 - keep)
+        turns = np.flatnonzero(crosses)
+        passed = down * (np.log(size[turns] + np.abs(before[turns])) - np.log(size[turns]))
+        turns, passed = turns[passed < step_s], passed[passed < step_s]
+        sped = -np.expm1((passed - step_s) / max(up, _INSTANT_S))
+        keep[turns], source[turns] = 0.0, signal[turns] * sped
+        last, before = before, solve(keep, source)
+        if np.abs(before - last).max(initial=0.0) <= least:
             break
-    lagged: Floats = signal + np.where(
-        turns,
-        (down * before - up * signal * after) / step_s,
-        (before - signal) * shares[slows.astype(np.int64)],
-    )
+    share_up, share_down = (tau / step_s * (1.0 - keep) for tau, keep in zip(taus, keeps, strict=True))
+    lagged: Floats = signal + (before - signal) * np.where(slows, share_down, share_up)
+    lagged[turns] = signal[turns] + (down * before[turns] - up * signal[turns] * sped) / step_s
     return lagged
 
 

@@ -102,6 +102,10 @@ class _Set:
     score: float
     state: State = _NOTHING
 
+    @property
+    def numbers(self) -> int:
+        return len(self.ids)
+
 
 class _Scores:
     """A selection in which sets of effects have fixed scores, and what halves the score is preferred."""
