@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.selection import CandidateModel, Selection
 
 _TRIED = 4
+_MUCH = 0.67
 _SWAPPED = 2
 _MOST_EFFECTS = 8
 _ROUNDS = 6
@@ -37,7 +39,12 @@ def search_effects(selection: Selection, start: CandidateModel) -> CandidateMode
         moved = next((found for move in moves if (found := move(selection, current)) is not None), None)
         if moved is None:
             return current
-        current = grow(selection, prune(selection, selection.adapt(moved)))
+        after = grow(selection, prune(selection, selection.adapt(moved)))
+        if selection.rate(after) > (1.0 + _TIE) * selection.rate(current):
+            # What made the exchange better is not borne out by evidence alone: it is taken back.
+            current = selection.adapt(current)
+            continue
+        current = after
         if current.ids not in seen:
             # An exchange that ends where it began is not tried again; the others are.
             seen.add(current.ids)
@@ -58,13 +65,15 @@ def grow(selection: Selection, current: CandidateModel) -> CandidateModel:
 
 
 def _add(selection: Selection, current: CandidateModel) -> CandidateModel | None:
-    for tested in selection.suggest(current, _TRIED):
-        # What has put simpler effects in the place of others, and needs no more numbers, is an exchange.
-        exchanged = tested.numbers <= current.numbers
-        if exchanged and tested.score < (1.0 - _BETTER) * current.score:
-            return tested
-        if tested.score < current.score and selection.prefers(current, tested, price_of(tested, current)):
-            return tested
+    """The best effect more; one of the less promising where it, too, promises much."""
+    for count, most in ((_TRIED, math.inf), (2 * _TRIED, _MUCH * current.score)):
+        for tested in selection.suggest(current, count, most=most):
+            # What has put simpler effects in the place of others, and needs no more numbers, is an exchange.
+            exchanged = tested.numbers <= current.numbers
+            if exchanged and tested.score < (1.0 - _BETTER) * current.score:
+                return tested
+            if tested.score < current.score and selection.prefers(current, tested, price_of(tested, current)):
+                return tested
     return None
 
 

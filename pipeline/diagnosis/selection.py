@@ -126,8 +126,14 @@ class Selection:
 
     def _present(self, fit: PartFit) -> CandidateModel:
         held = hold_out_part(fit, self.folds)
-        price = 1.0 + sum(effect.price for effect in fit.state.effects)
-        return CandidateModel(fit, held, self.weights.loss(held) * price)
+        return CandidateModel(fit, held, self._score(held, fit.state))
+
+    def rate(self, tested: CandidateModel) -> float:
+        """A model's score under the weights of now."""
+        return self._score(tested.held, tested.state)
+
+    def _score(self, held: Floats, state: State) -> float:
+        return self.weights.loss(held) * (1.0 + sum(effect.price for effect in state.effects))
 
     def judge(self, before: CandidateModel, after: CandidateModel) -> Verdict:
         """How much better ``after`` is."""
@@ -174,23 +180,15 @@ class Selection:
         proposals = self._propose(base, barred)
         if pairs:
             proposals = propose_pairs(base.fit, proposals[: _count(proposals, _PAIRED)])
-        ranked, taken, best, wanted = list[CandidateModel](), 0, most, _count(proposals, count)
-        while taken < min(wanted, len(proposals)):
-            hopeful = [one for one in proposals[taken:wanted] if one.loss < _HOPE * most]
-            taken = wanted
-            # A few steps tell which of them are worth fitting to the end.
-            tried = [self._try(base.ids, proposal.state) for proposal in hopeful]
-            best = min([best, *(fit.loss for fit in tried)])
-            worth = _WORTH * best
-            entered = [
-                self._simplify(self._finish(base.ids, fit) if fit.loss < worth else self._present(fit), base)
-                for fit in tried
-            ]
-            ranked += [tested for tested in entered if self.is_sound(tested)]
-            # What gains much with numbers that no vehicle has takes nobody's place.
-            least = (1.0 - LEAST_GAIN) * base.score
-            wanted += sum(tested.score < least and not self.is_sound(tested) for tested in entered)
-        ranked.sort(key=lambda tested: tested.score)
+        hopeful = [one for one in proposals[: _count(proposals, count)] if one.loss < _HOPE * most]
+        # A few steps tell which of them are worth fitting to the end.
+        tried = [self._try(base.ids, proposal.state) for proposal in hopeful]
+        best = min((most, *(fit.loss for fit in tried)))
+        entered = [
+            self._finish(base.ids, fit) if fit.loss < _WORTH * best else self._present(fit) for fit in tried
+        ]
+        entered = [self._simplify(tested, base) for tested in entered]
+        ranked = sorted((c for c in entered if self.is_sound(c)), key=lambda c: c.score)
         self._suggested[key] = ranked
         return ranked
 

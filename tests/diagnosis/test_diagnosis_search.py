@@ -129,7 +129,7 @@ class _Scores:
     def adapt(self, tested: _Set) -> _Set:
         return tested
 
-    def suggest(self, base: _Set, count: int) -> list[_Set]:
+    def suggest(self, base: _Set, count: int, **_: object) -> list[_Set]:
         self.asked += 1
         more = (one for ids, one in self.sets.items() if set(ids) > set(base.ids))
         return sorted(more, key=lambda one: one.score)[:count]
@@ -148,7 +148,7 @@ def test_a_set_that_was_come_to_before_ends_the_growth() -> None:
         scores.least = 0.1
         return tested
 
-    def suggest(base: _Set, count: int) -> list[_Set]:
+    def suggest(base: _Set, count: int, **_: object) -> list[_Set]:
         scores.asked, scores.least = scores.asked + 1, 0.5
         return [one for one in scores.sets.values() if one is not base][:count]
 
