@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.identification import Input, Problem, fit_model
+from pipeline.identification.columns import pick_columns, weigh_columns
 from pipeline.identification.few_shot import tie_to_prior
 from pipeline.identification.intervals import count_repeats
 from pipeline.models import Model
@@ -200,8 +201,8 @@ def _inform(fitted: Fitted) -> Hypothesis:
     place = {number.label: index for index, number in enumerate(free)}
     total = np.diag(_expect(effects, free, fitted.problem.parts[0].prior.numbers))
     for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
-        columns = fit.jacobian[:, :, fit.smooth] * fit.weights.factors(fit.residual)[:, :, None]
-        normal = np.einsum("ncp,ncq->pq", columns, columns) / _inflate(part, fit)
+        rows = weigh_columns(pick_columns(fit.jacobian, fit.smooth), fit.weights.factors(fit.residual))
+        normal = rows.T @ rows / _inflate(part, fit)
         numbers = [fit.free[index] for index in fit.smooth]
         mine = [index for index, number in enumerate(numbers) if number.effect and number.run is None]
         clocks = [index for index in range(len(numbers)) if index not in mine]

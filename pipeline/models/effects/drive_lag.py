@@ -10,13 +10,14 @@ Source: the powertrain model of Samson et al. 2024 and of DRIVE, Baril et al. 20
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from pipeline.models.effect import STAMPS, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
+    from pipeline.models.effect import Effect
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Wheels
     from pipeline.vehicles import Vehicle
@@ -77,3 +78,50 @@ class DriveLag(DriveEffect):
     def is_equivalent(self, evidence: Evidence) -> bool:
         """Encoders tell a wheel from a body; without them only driving and turning at once does."""
         return not (evidence.encoders or evidence.largest.moves_both_ways)
+
+
+class TwoLags(DriveEffect):
+    """A drive lag of which two parts have time constants of their own; with both equal it is a drive lag.
+
+    Attributes:
+        apart: closer together than this share of the slower one, both are one.
+        least_apart_s: or than this [s].
+    """
+
+    apart: ClassVar[float]
+    least_apart_s: ClassVar[float]
+    contains = ("drive_lag",)
+
+    @property
+    def taus(self) -> tuple[float, float]:
+        """Both time constants [s], in the order of the parameters."""
+        one, other = self.values.values()
+        return one, other
+
+    def is_degenerate(self, evidence: Evidence) -> bool:
+        """With equal time constants it is a drive lag."""
+        one, other = self.taus
+        least = max(evidence.least_delay_s, self.least_apart_s)
+        return abs(one - other) <= max(self.apart * max(one, other), least)
+
+    def collapse(self) -> Effect | None:
+        """A drive lag of the mean time constant."""
+        return DriveLag(tau=0.5 * sum(self.taus))
+
+
+def time_constant(
+    name: str, about: str, typical: float, starts: tuple[float, ...], plausible: str = "as of a drive lag"
+) -> Parameter:
+    """One of the numbers of `TwoLags`; what is known of it beyond that is put in by `replace`."""
+    return Parameter(
+        name,
+        "s",
+        (0.0, 10.0),
+        0.0,
+        about,
+        typical,
+        search=Search.STARTS,
+        starts=starts,
+        step=5e-3,
+        plausible=Plausible(0.0, 3.0, plausible),
+    )

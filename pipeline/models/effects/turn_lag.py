@@ -15,64 +15,33 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    SIDES,
-    WARTHOG_RUNS,
-    DriveEffect,
-    Excitation,
-    Parameter,
-    Plausible,
-    Search,
-    Spread,
-)
-from pipeline.models.effects.drive_lag import DriveLag
+from pipeline.models.effect import SIDES, WARTHOG_RUNS, Excitation, Spread
+from pipeline.models.effects.drive_lag import TwoLags, time_constant
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
-    from pipeline.models.effect import Effect
-    from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Wheels
     from pipeline.vehicles import Vehicle
 
-_PLAUSIBLE = Plausible(0.0, 3.0, "wider than the 0.1 to 1.6 s of Husky and Warthog")
-# Closer together, as a share of the slower one or in seconds, both time constants are one.
-_APART = 0.08
-_LEAST_APART_S = 0.02
+_SEEN = "wider than the 0.1 to 1.6 s of Husky and Warthog"
 
 
-class TurnLag(DriveEffect):
+class TurnLag(TwoLags):
     """Turn lag: the difference of the wheels follows its command more slowly than their mean."""
 
     id = "turn_lag"
     rank = 30
     kinds = SIDES
+    apart, least_apart_s = 0.08, 0.02
     parameters = (
-        Parameter(
-            "tau_mean",
-            "s",
-            (0.0, 10.0),
-            0.0,
-            "time constant of the mean",
-            0.3,
-            search=Search.STARTS,
-            starts=(0.1, 0.4),
-            step=5e-3,
-            plausible=_PLAUSIBLE,
+        replace(
+            time_constant("tau_mean", "time constant of the mean", 0.3, (0.1, 0.4), _SEEN),
             quantities=(Quantity.SPEED_LAG,),
             between_runs=Spread(0.12, WARTHOG_RUNS),
         ),
-        Parameter(
-            "tau_diff",
-            "s",
-            (0.0, 10.0),
-            0.0,
-            "time constant of the difference",
-            1.0,
-            search=Search.STARTS,
-            starts=(0.3, 1.2),
-            step=5e-3,
-            plausible=_PLAUSIBLE,
+        replace(
+            time_constant("tau_diff", "time constant of the difference", 1.0, (0.3, 1.2), _SEEN),
             quantities=(Quantity.TURN_LAG,),
             between_runs=Spread(0.24, WARTHOG_RUNS),
         ),
@@ -80,7 +49,6 @@ class TurnLag(DriveEffect):
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("drive_lag", "transport_delay", "turn_droop")
     same_in_one_motion = ("drive_lag",)
-    contains = ("drive_lag",)
     python_state = ("lag_mean", "lag_difference", "lag_aside")
     python = """
         keep = math.exp(-step_s / {tau_mean}) if {tau_mean} > 0.0 else 0.0
@@ -93,12 +61,12 @@ class TurnLag(DriveEffect):
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""
         del vehicle
-        mean, difference = self.values["tau_mean"], self.values["tau_diff"]
+        mean, difference = self.taus
         return f"follows commanded turning {difference:.2f} s late, and speed {mean:.2f} s"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
-        slow, fast = self.values["tau_diff"], self.values["tau_mean"]
+        fast, slow = self.taus
         if slow <= 0.0 and fast <= 0.0:
             # Splitting into mean and difference and back would leave rounding behind.
             return wheels
@@ -110,13 +78,3 @@ class TurnLag(DriveEffect):
         if sideways is not None:
             sideways = lag_signal(sideways, fast, step, resets, resets.start[:, 2])
         return replace(wheels, left=mean - 0.5 * difference, right=mean + 0.5 * difference, sideways=sideways)
-
-    def is_degenerate(self, evidence: Evidence) -> bool:
-        """With equal time constants it is a drive lag."""
-        fast, slow = self.values["tau_mean"], self.values["tau_diff"]
-        least, larger = max(evidence.least_delay_s, _LEAST_APART_S), max(fast, slow)
-        return not (larger > least and abs(fast - slow) > max(_APART * larger, least))
-
-    def collapse(self) -> Effect | None:
-        """A drive lag of the mean time constant."""
-        return DriveLag(tau=0.5 * (self.values["tau_mean"] + self.values["tau_diff"]))
