@@ -149,7 +149,9 @@ def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]
         and (effect.is_neutral or (effect.id in part.clocks and not state.has_own(effect.id)))
     ]
     state = state.drop([effect.id for effect in fresh])
-    fit = fit_part(part, make_weights(part.find_residuals(state), part), state, per_run=per_run)
+    weights = make_weights(part.find_residuals(state), part)
+    state = _date(part, weights, state)
+    fit = fit_part(part, weights, state, per_run=per_run)
     for effect in fresh:
         found = propose(part, fit, [Unset(effect)], problem.largest, {})
         begun = found[0].state if found else fit.state
@@ -163,6 +165,15 @@ def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]
             break
         fit = fit_part(part, weights, fit, per_run=per_run)
     return fit
+
+
+def _date(part: Part, weights: Weights, state: State) -> State:
+    """The state with the delays that suit its effects: begun with all at once, these would go astray."""
+    delays = tuple(number for number in part.list_free(state) if not number.effect)
+    if not state.effects or not delays or any(state.get(number) for number in delays):
+        return state
+    until = (_ITERATIONS, _ENOUGH)
+    return _descend(part, _enter(part, weights, state, delays, until), until).state
 
 
 def _settle(part: Part, fit: PartFit, per_run: Sequence[str]) -> PartFit:
@@ -227,8 +238,12 @@ def fit_part(
     fit = _descend(part, replace(start, weights=weights), until)
     for number in fit.free:
         moved = None if number.is_smooth else _walk_grid(part, fit, number)
-        if moved is not None:
-            fit = _descend(part, _enter(part, weights, moved, fit.free, until), until)
+        if moved is None:
+            continue
+        # The grid takes the others as linear: where they are not, it promises what no descent finds.
+        beyond = _descend(part, _enter(part, weights, moved, fit.free, until), until)
+        if beyond.loss < fit.loss:
+            fit = beyond
     return fit
 
 
