@@ -5,5 +5,3 @@ this folder. Units and frames stand in the columns' metadata and reach the Parqu
 """
 
 from schemas.contract import Contract, Table, contract_of, list_contracts
-
-__all__ = ["Contract", "Table", "contract_of", "list_contracts"]

@@ -12,21 +12,6 @@ from pipeline.models.settings import Amount, combine
 if TYPE_CHECKING:
     from pipeline.models.settings import Facts
 
-__all__ = [
-    "find_deadband",
-    "find_largest_steering",
-    "find_radius",
-    "find_speed_acceleration",
-    "find_speed_delay",
-    "find_speed_limit",
-    "find_track",
-    "find_turn_acceleration",
-    "find_turn_delay",
-    "find_turn_limit",
-    "find_turning_radius",
-    "negate",
-]
-
 
 def negate(amount: Amount) -> Amount:
     """The same limit in the other direction."""

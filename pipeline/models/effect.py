@@ -11,7 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
 
-from pipeline.models.parameter import (
+from pipeline.models.parameter import (  # noqa: F401 - what a file of an effect needs
     DATA_SHEET,
     MOUNTING,
     STAMPS,
@@ -35,38 +35,6 @@ if TYPE_CHECKING:
     from pipeline.runs.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
     from pipeline.vehicles import Vehicle
 
-__all__ = [  # what a file of an effect needs
-    "ACKERMANN",
-    "ANY",
-    "DATA_SHEET",
-    "INF",
-    "MOUNTING",
-    "NAN",
-    "SIDES",
-    "SIDEWAYS",
-    "STAMPS",
-    "WARTHOG_RUNS",
-    "WHEELED",
-    "AddedEffect",
-    "BodyEffect",
-    "Column",
-    "CommandEffect",
-    "DriveEffect",
-    "Effect",
-    "Excitation",
-    "KinematicEffect",
-    "Late",
-    "Least",
-    "LinearEffect",
-    "Parameter",
-    "Part",
-    "Place",
-    "Plausible",
-    "ReportEffect",
-    "Search",
-    "Spread",
-    "find_late",
-]
 
 INF = math.inf
 NAN = math.nan

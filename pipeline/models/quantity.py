@@ -10,8 +10,6 @@ import enum
 import math
 from collections.abc import Callable, Iterable
 
-__all__ = ["Quantity"]
-
 Joined = Callable[[Iterable[float]], float]
 
 

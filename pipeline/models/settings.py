@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from pipeline.models.quantity import Quantity
     from pipeline.models.target import Target
 
-__all__ = ["Amount", "Facts", "Setting", "Sheet", "combine", "start_sheet"]
-
 
 @dataclass(frozen=True)
 class Amount:

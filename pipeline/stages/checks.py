@@ -15,7 +15,6 @@ from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.stages.delays import estimate_delay
 from pipeline.stages.finding import Finding
-from pipeline.stages.samples import Samples, gather_samples
 from pipeline.stages.scale import check_scale
 from pipeline.stages.trust import check_live_commands
 from pipeline.stages.wiring import check_wiring
@@ -23,9 +22,9 @@ from pipeline.stages.wiring import check_wiring
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from pipeline.stages.samples import Samples
     from pipeline.vehicles import Vehicle
 
-__all__ = ["gather_samples", "run_checks"]
 
 Floats = NDArray[np.float64]
 

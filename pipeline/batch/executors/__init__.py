@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from pipeline.batch.work import Report, Task
 
-__all__ = ["Blame", "Executor", "Settings", "find_executor"]
-
 
 @dataclass(frozen=True)
 class Settings:
