@@ -24,6 +24,7 @@ from pipeline.models.parameter import (  # noqa: F401 - what a file of an effect
     Search,
     Spread,
 )
+from pipeline.models.wording import describe_share
 from pipeline.runs.errors import MotionError
 from pipeline.vehicles.kinematics import list_kinds
 
@@ -89,6 +90,9 @@ class Effect(ABC):
         parts: numbers of other effects under which it is searched; found together, they are named as it.
         late: what it makes late, where its only number is a delay.
         price: share of the held-out error that it must take away before it counts.
+        motion: what the vehicle does, with numbers as `{name}`; of the first one also `{size}`, its absolute
+            value in units of which SI has `size_in`, `{way}`, of `ways` the one for its sign, and `{share}`,
+            how much less or more than one `share_of` makes of it (a constant, and what it is multiplied by).
         python: its step in the exported function, numbers as `{name}`; None where there is none.
         python_state: names that its step carries on to the next one; zero at the start.
         readings: what it is if its numbers prove to be the vehicle's, the ground's or a run's own, where one
@@ -111,6 +115,10 @@ class Effect(ABC):
     parts: tuple[Part, ...] = ()
     late: Late | None = None
     price: float = 0.0
+    motion: str = ""
+    ways: tuple[str, str] = ("left", "right")
+    size_in: float = 1.0
+    share_of: tuple[float, float] = (0.0, 1.0)
     python: str | None = None
     python_state: tuple[str, ...] = ()
     readings: tuple[Reading, ...] = ()
@@ -170,8 +178,14 @@ class Effect(ABC):
         )
 
     def describe_motion(self, vehicle: Vehicle) -> str:
-        """What the vehicle does, with numbers; by default what the docstring begins with."""
+        """What the vehicle does, with numbers; without a `motion` what the docstring begins with."""
         del vehicle
+        if self.motion:
+            first, *_ = self.values.values()
+            base, slope = self.share_of
+            words = {"size": abs(first) * self.size_in, "way": self.ways[first < 0.0]}
+            words["share"] = describe_share(base + slope * first)
+            return self.motion.format(**self.values, **words)
         summary = (type(self).__doc__ or self.id).strip().splitlines()[0].rstrip(".")
         return summary.partition(": ")[2] or summary
 

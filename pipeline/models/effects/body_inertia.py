@@ -34,7 +34,6 @@ from pipeline.runs.signals import Velocity
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import Rolling, RunContext
-    from pipeline.vehicles import Vehicle
 
 
 class BodyInertia(BodyEffect):
@@ -58,6 +57,7 @@ class BodyInertia(BodyEffect):
             between_runs=Spread(0.034, WARTHOG_RUNS),
         ),
     )
+    motion = "slides on for {tau:.2f} s before it follows its wheels"
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("lateral_skid", "drive_lag", "acceleration_limit", "heading_skew")
     equivalent_to = ("drive_lag",)
@@ -72,11 +72,6 @@ class BodyInertia(BodyEffect):
         slide_x = ahead * math.cos(turn) + aside * math.sin(turn)
         slide_y = aside * math.cos(turn) - ahead * math.sin(turn)
         v_x, v_y, v_w = slide_x, slide_y, slide_w"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"slides on for {self.values['tau']:.2f} s before it follows its wheels"
 
     def move_body(self, rolling: Rolling, around: RunContext) -> Velocity:
         """See the formula above."""

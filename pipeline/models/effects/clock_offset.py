@@ -32,7 +32,6 @@ from pipeline.models.level import Level, Reading
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class ClockOffset(ReportEffect):
@@ -56,6 +55,9 @@ class ClockOffset(ReportEffect):
             between_runs=Spread(0.14, WARTHOG_RUNS),
         ),
     )
+    motion = "stamps its poses {size:.0f} ms {way}"
+    ways = ("late", "early")
+    size_in = 1e3
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "body_inertia")
     equivalent_to = ("transport_delay",)
@@ -66,13 +68,6 @@ class ClockOffset(ReportEffect):
         Reading(Level.TERRAIN, "body_inertia", "a body that follows its wheels late on this ground"),
         Reading(Level.RUN, "clock_offset", "clocks set anew"),
     )
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        late = self.values["d"]
-        way = "late" if late >= 0.0 else "early"
-        return f"stamps its poses {abs(late) * 1e3:.0f} ms {way}"
 
     def report(self, velocity: Velocity, around: RunContext) -> Velocity:
         """See the formula above."""

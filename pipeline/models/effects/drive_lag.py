@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from pipeline.models.effect import Effect
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 
 class DriveLag(DriveEffect):
@@ -44,6 +43,7 @@ class DriveLag(DriveEffect):
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
         ),
     )
+    motion = "follows its commands {tau:.2f} s late, gradually"
     needs = (Excitation.CHANGES,)
     confused_with = ("transport_delay", "turn_lag", "acceleration_limit")
     equivalent_to = ("body_inertia",)
@@ -56,11 +56,6 @@ class DriveLag(DriveEffect):
         lag_right = right + (lag_right - right) * keep
         lag_sideways = sideways + (lag_sideways - sideways) * keep
         left, right, sideways = lag_left, lag_right, lag_sideways"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"follows its commands {self.values['tau']:.2f} s late, gradually"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -23,7 +23,6 @@ from pipeline.runs.signals import earlier_in_span
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class HeadingSkew(ReportEffect):
@@ -46,6 +45,9 @@ class HeadingSkew(ReportEffect):
             one_sign=True,
         ),
     )
+    motion = "reports a heading {size:.0f} ms {way} than the position beside it"
+    ways = ("older", "newer")
+    size_in = 1e3
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("lateral_skid", "body_inertia", "icr_offset")
     late = Late.HEADING
@@ -54,13 +56,6 @@ class HeadingSkew(ReportEffect):
         Reading(Level.TERRAIN, "lateral_skid", "sliding outward in turns on this ground"),
         Reading(Level.RUN, "heading_skew", "clocks set anew"),
     )
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        late = self.values["d"]
-        way = "older" if late >= 0.0 else "newer"
-        return f"reports a heading {abs(late) * 1e3:.0f} ms {way} than the position beside it"
 
     def report(self, velocity: Velocity, around: RunContext) -> Velocity:
         """See the formula above."""

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class IcrOffset(LinearEffect):
@@ -55,19 +54,15 @@ class IcrOffset(LinearEffect):
             between_runs=Spread(0.013, WARTHOG_RUNS),
         ),
     )
+    motion = "turns about a point {size:.2g} cm {way} its middle"
+    ways = ("ahead of", "behind")
+    size_in = 100.0
     needs = (Excitation.TURNING,)
     confused_with = ("lateral_skid", "heading_skew")
     equivalent_to = ("lever_arm",)
     equivalent_when = "always: a pose of a point l_x = -x_icr ahead moves alike"
     python = """
         v_y = v_y - {x_icr} * v_w"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        offset = self.values["x_icr"]
-        way = "ahead of" if offset >= 0.0 else "behind"
-        return f"turns about a point {abs(offset) * 100.0:.2g} cm {way} its middle"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

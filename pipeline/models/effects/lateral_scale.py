@@ -24,12 +24,10 @@ from pipeline.models.effect import (
     Plausible,
 )
 from pipeline.models.effects.wheel_radius import WheelRadius
-from pipeline.models.wording import describe_share
 
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
     from pipeline.runs.signals import Rolling, RunContext
-    from pipeline.vehicles import Vehicle
 
 
 class LateralScale(KinematicEffect):
@@ -52,15 +50,11 @@ class LateralScale(KinematicEffect):
             ),
         ),
     )
+    motion = "travels {share} sideways than its wheels turn"
     needs = (Excitation.SIDEWAYS,)
     confused_with = ("roller_slip", "wheel_radius")
     python = """
         s0 = {k} * s0"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"travels {describe_share(self.values['k'])} sideways than its wheels turn"
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class LateralSkid(LinearEffect):
@@ -51,18 +50,13 @@ class LateralSkid(LinearEffect):
             between_runs=Spread(0.064, WARTHOG_RUNS),
         ),
     )
+    motion = "slides {way} at {size:.2g} m/s in a turn of 1 rad/s at 1 m/s"
+    ways = ("outward", "inward")
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("icr_offset", "body_inertia", "heading_skew", "drive_lag")
     python = """
         v_x = v_x + {c} * s0 * w0
         v_y = v_y - {c} * v0 * w0"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        slide, at = self.values["c"], 1.0
-        way = "outward" if slide >= 0.0 else "inward"
-        return f"slides {way} at {abs(slide) * at:.2g} m/s in a turn of 1 rad/s at 1 m/s"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

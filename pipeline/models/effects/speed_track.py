@@ -16,14 +16,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.models.effect import DATA_SHEET, SIDES, Excitation, Least, LinearEffect, Parameter, Plausible
-from pipeline.models.wording import describe_share
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class SpeedTrack(LinearEffect):
@@ -43,17 +41,12 @@ class SpeedTrack(LinearEffect):
             plausible=Plausible(-0.3, 0.3, "wider than the 0.035 to 0.053 of a Warthog on asphalt"),
         ),
     )
+    motion = "turns {share} at 1 m/s than on the spot, for the same wheels"
+    share_of = (1.0, 1.0)
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("effective_track", "turn_lag")
     python = """
         v_w = v_w + {k} * abs(v0) * w0"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return (
-            f"turns {describe_share(1.0 + self.values['k'])} at 1 m/s than on the spot, for the same wheels"
-        )
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

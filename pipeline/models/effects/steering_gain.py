@@ -17,7 +17,6 @@ from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 
 class SteeringGain(DriveEffect):
@@ -39,15 +38,11 @@ class SteeringGain(DriveEffect):
             quantities=(Quantity.STEERING_GAIN,),
         ),
     )
+    motion = "steers {g:.2f} times what is asked"
     needs = (Excitation.STEERING,)
     confused_with = ("understeer",)
     python = """
         steering = {g} * steering"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"steers {self.values['g']:.2f} times what is asked"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -18,7 +18,6 @@ from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 
 class SteeringLag(DriveEffect):
@@ -42,6 +41,7 @@ class SteeringLag(DriveEffect):
             quantities=(Quantity.STEERING_LAG,),
         ),
     )
+    motion = "follows its steering commands {tau:.2f} s late, gradually"
     needs = (Excitation.CHANGES, Excitation.STEERING)
     confused_with = ("transport_delay",)
     python_state = ("lag_steering",)
@@ -49,11 +49,6 @@ class SteeringLag(DriveEffect):
         keep = math.exp(-step_s / {tau}) if {tau} > 0.0 else 0.0
         lag_steering = steering + (lag_steering - steering) * keep
         steering = lag_steering"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"follows its steering commands {self.values['tau']:.2f} s late, gradually"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -14,12 +14,10 @@ from typing import TYPE_CHECKING
 
 from pipeline.models.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter
 from pipeline.models.quantity import Quantity
-from pipeline.models.wording import name_side
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 
 class SteeringOffset(DriveEffect):
@@ -40,18 +38,13 @@ class SteeringOffset(DriveEffect):
             quantities=(Quantity.STEERING_OFFSET,),
         ),
     )
+    motion = "steers {size:.2g} rad to the {way} when straight ahead is asked"
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("yaw_drift",)
     equivalent_to = ("steering_sensor_offset",)
     equivalent_when = "only the way from the command to the body counts"
     python = """
         steering = steering + {o}"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        angle = self.values["o"]
-        return f"steers {abs(angle):.2g} rad to the {name_side(angle)} when straight ahead is asked"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

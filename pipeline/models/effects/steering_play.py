@@ -27,7 +27,6 @@ from pipeline.models.filters import follow_with_play
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 
 class SteeringPlay(DriveEffect):
@@ -51,18 +50,13 @@ class SteeringPlay(DriveEffect):
             plausible=Plausible(0.0, 0.15, "three times a worn linkage"),
         ),
     )
+    motion = "does not steer before its steering has moved by {size:.2g} rad the other way"
+    size_in = 2.0
     needs = (Excitation.STEERING, Excitation.CHANGES)
     confused_with = ("steering_gain", "steering_lag")
     python_state = ("played",)
     python = """
         steering = played = min(max(played, steering - {g}), steering + {g})"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return (
-            f"does not steer before its steering has moved by {2.0 * self.values['g']:.2g} rad the other way"
-        )
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -20,7 +20,6 @@ from pipeline.models.quantity import Quantity
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import Commands, RunContext
-    from pipeline.vehicles import Vehicle
 
 
 class TransportDelay(CommandEffect):
@@ -44,17 +43,13 @@ class TransportDelay(CommandEffect):
             quantities=(Quantity.COMMAND_DELAY,),
         ),
     )
+    motion = "does what was asked {d:.2f} s ago"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "body_inertia")
     equivalent_to = ("clock_offset",)
     equivalent_when = "the input is the command and there are neither encoders, gyro nor another clock"
 
     python = ""  # the exported function looks commands up that much earlier
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"does what was asked {self.values['d']:.2f} s ago"
 
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""

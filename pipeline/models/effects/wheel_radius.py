@@ -23,11 +23,9 @@ from pipeline.models.effect import (
 )
 from pipeline.models.level import Level, Reading
 from pipeline.models.quantity import Quantity
-from pipeline.models.wording import describe_share
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import Rolling, RunContext
-    from pipeline.vehicles import Vehicle
 
 
 class WheelRadius(KinematicEffect):
@@ -49,6 +47,7 @@ class WheelRadius(KinematicEffect):
             between_runs=Spread(0.019, WARTHOG_RUNS),
         ),
     )
+    motion = "travels {share} than its wheels turn"
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("speed_slip", "effective_track")
     python = """
@@ -58,11 +57,6 @@ class WheelRadius(KinematicEffect):
         Reading(Level.TERRAIN, "longitudinal_slip", "wheels that turn on without grip on this ground"),
         Reading(Level.RUN, "wheel_radius", "another tyre pressure or load"),
     )
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"travels {describe_share(self.values['k'])} than its wheels turn"
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

@@ -28,7 +28,6 @@ from pipeline.models.quantity import Quantity
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import Commands, RunContext
-    from pipeline.vehicles import Vehicle
 
 
 class WheelSpeedLimit(CommandEffect):
@@ -53,16 +52,12 @@ class WheelSpeedLimit(CommandEffect):
             between_runs=Spread(0.2, WARTHOG_RUNS),
         ),
     )
+    motion = "turns no wheel faster than {limit:.3g} rad/s"
     needs = (Excitation.LARGE,)
     confused_with = ("body_speed_limit", "body_turn_limit")
     python = """
         wheels = split(left, right, sideways)
         left, right, sideways = join([max(-{limit}, min({limit}, wheel)) for wheel in wheels])"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"turns no wheel faster than {self.values['limit']:.3g} rad/s"
 
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""

@@ -16,11 +16,9 @@ from typing import TYPE_CHECKING
 
 from pipeline.models.effect import MOUNTING, Excitation, Least, Parameter, Plausible, ReportEffect
 from pipeline.models.level import Level, Reading
-from pipeline.models.wording import name_side
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class YawMisalignment(ReportEffect):
@@ -40,6 +38,8 @@ class YawMisalignment(ReportEffect):
             plausible=Plausible(-0.35, 0.35, "wider than the 1 to 5 degrees that were seen"),
         ),
     )
+    motion = "reports a heading {size:.2g} degrees too far {way}, or crabs as much"
+    size_in = math.degrees(1.0)
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("lateral_drift",)
     readings = (
@@ -47,12 +47,6 @@ class YawMisalignment(ReportEffect):
         Reading(Level.TERRAIN, "crabbing", "a ground that pushes the vehicle aside"),
         Reading(Level.RUN, "yaw_misalignment", "a sensor mounted anew"),
     )
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        angle = math.degrees(self.values["psi"])
-        return f"reports a heading {abs(angle):.2g} degrees too far {name_side(angle)}, or crabs as much"
 
     def report(self, velocity: Velocity, around: RunContext) -> Velocity:
         """See the formula above."""
