@@ -179,7 +179,6 @@ class Effect(ABC):
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """What the vehicle does, with numbers; without a `motion` what the docstring begins with."""
-        del vehicle
         if self.motion:
             first, *_ = self.values.values()
             base, slope = self.share_of
@@ -191,22 +190,18 @@ class Effect(ABC):
 
     def choose_python(self, kind: str) -> str | None:
         """Its step in the exported function on a kind of vehicle; see `python`."""
-        del kind
         return self.python
 
     def can_show(self, evidence: Evidence) -> bool:
         """Whether sensors and driving let it be told at all."""
-        del evidence
         return True
 
     def is_degenerate(self, evidence: Evidence) -> bool:
         """Whether it is, with these numbers, nothing in these runs or another effect in disguise."""
-        del evidence
         return False
 
     def is_equivalent(self, evidence: Evidence) -> bool:
         """Whether nothing in these runs tells it from those that it is equivalent to."""
-        del evidence
         return True
 
     def collapse(self) -> Effect | None:
@@ -215,12 +210,10 @@ class Effect(ABC):
 
     def list_softer(self, largest: Largest) -> tuple[Effect, ...]:
         """Effects that bend where this one breaks, to be tried as such though they have more numbers."""
-        del largest
         return ()
 
     def depends_on(self, other: Effect) -> bool:
         """Whether one motion shows only the ratio of its number to that of another effect."""
-        del other
         return False
 
     def is_used(self, parameter: Parameter) -> bool:

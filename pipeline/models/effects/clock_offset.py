@@ -71,7 +71,6 @@ class ClockOffset(ReportEffect):
 
     def report(self, velocity: Velocity, around: RunContext) -> Velocity:
         """See the formula above."""
-        del around
         return velocity
 
     def delay_s(self) -> float:

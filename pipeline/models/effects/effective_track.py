@@ -72,7 +72,6 @@ class EffectiveTrack(KinematicEffect):
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
-        del around
         return rolling.scale(1.0, 1.0 / self.values["k"])
 
     def depends_on(self, other: Effect) -> bool:

@@ -79,7 +79,6 @@ class HeadingSkew(ReportEffect):
 
     def report_gyro(self, velocity: Velocity, around: RunContext) -> Velocity:
         """The gyro's heading has no skew: nothing but the delay of the position is left."""
-        del around
         return velocity
 
     def can_show(self, evidence: Evidence) -> bool:

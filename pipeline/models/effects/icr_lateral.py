@@ -48,5 +48,4 @@ class IcrLateral(LinearEffect):
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del rolling, around
         return {"y_icr": (velocity.w, 0.0, 0.0)}

@@ -66,5 +66,4 @@ class IcrOffset(LinearEffect):
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del rolling, around
         return {"x_icr": (0.0, -velocity.w, 0.0)}

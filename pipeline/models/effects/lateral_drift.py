@@ -34,5 +34,4 @@ class LateralDrift(LinearEffect):
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity
         return {"c": (0.0, find_turning(rolling.wheels, around), 0.0)}

@@ -58,7 +58,6 @@ class LateralScale(KinematicEffect):
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
-        del around
         return replace(rolling, s0=self.values["k"] * rolling.s0)
 
     def depends_on(self, other: Effect) -> bool:

@@ -60,5 +60,4 @@ class LateralSkid(LinearEffect):
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity, around
         return {"c": (rolling.s0 * rolling.w0, -rolling.v0 * rolling.w0, 0.0)}

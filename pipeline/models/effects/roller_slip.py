@@ -49,5 +49,4 @@ class RollerSlip(LinearEffect):
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity, around
         return {"k": (0.0, -rolling.s0 * np.abs(rolling.s0), 0.0)}

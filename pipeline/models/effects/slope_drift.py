@@ -52,7 +52,6 @@ class SlopeDrift(LinearEffect):
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity
         turning = find_turning(rolling.wheels, around)
         roll, pitch = around.attitude[:, 0], around.attitude[:, 1]
         return {"k": (np.sin(pitch) * turning, -np.cos(pitch) * np.sin(roll) * turning, 0.0)}

@@ -47,5 +47,4 @@ class SpeedSlip(LinearEffect):
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity, around
         return {"k": (-rolling.v0 * np.abs(rolling.v0), 0.0, 0.0)}

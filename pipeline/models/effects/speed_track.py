@@ -50,5 +50,4 @@ class SpeedTrack(LinearEffect):
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity, around
         return {"k": (0.0, 0.0, np.abs(rolling.v0) * rolling.w0)}

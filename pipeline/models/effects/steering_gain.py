@@ -46,5 +46,4 @@ class SteeringGain(DriveEffect):
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
-        del around
         return replace(wheels, steering=self.values["g"] * wheels.steering)

@@ -48,7 +48,6 @@ class SteeringOffset(DriveEffect):
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
-        del around
         return replace(wheels, steering=wheels.steering + self.values["o"])
 
     def is_equivalent(self, evidence: Evidence) -> bool:

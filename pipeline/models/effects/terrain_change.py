@@ -78,14 +78,12 @@ class TerrainChange(KinematicEffect):
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""
-        del vehicle
         at_x, at_s = self.values["at_x"], self.values["at_s"]
         where = f"beyond x = {at_x:.3g} m" if math.isfinite(at_x) else f"from {at_s:.0f} s on"
         return f"travels {self.values['k_v']:.0%} and turns {self.values['k_w']:.0%} of before {where}"
 
     def choose_python(self, kind: str) -> str | None:
         """The place of the change where it is given, else its time."""
-        del kind
         beyond = "x > {at_x}" if math.isfinite(self.values["at_x"]) else "t >= {at_s}"
         return f"""
         if {beyond}:

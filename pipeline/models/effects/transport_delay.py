@@ -53,7 +53,6 @@ class TransportDelay(CommandEffect):
 
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""
-        del around
         return replace(commands, times=commands.times + self.values["d"])
 
     def is_equivalent(self, evidence: Evidence) -> bool:

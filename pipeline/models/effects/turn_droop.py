@@ -77,7 +77,6 @@ class TurnDroop(DriveEffect):
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
-        del around
         gain = self.values["gain"]
         threshold = float(np.nan_to_num(self.values["threshold"]))
         difference = wheels.right - wheels.left

@@ -52,5 +52,4 @@ class TurningResistance(LinearEffect):
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity, around
         return {"k": (-rolling.v0 * np.abs(rolling.w0), 0.0, 0.0)}

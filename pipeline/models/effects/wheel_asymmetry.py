@@ -57,7 +57,6 @@ class WheelAsymmetry(KinematicEffect):
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""
-        del vehicle
         share = self.values["e"]
         return f"rolls on {name_side(-share)} wheels {abs(share):.1%} larger than those on the other side"
 

@@ -60,5 +60,4 @@ class WheelRadius(KinematicEffect):
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
-        del around
         return rolling.scale(self.values["k"], self.values["k"])

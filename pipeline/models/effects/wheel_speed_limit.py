@@ -61,7 +61,6 @@ class WheelSpeedLimit(CommandEffect):
 
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""
-        del around
         limit = self.values["limit"]
         if self.is_neutral:
             return commands

@@ -35,5 +35,4 @@ class YawDrift(LinearEffect):
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity
         return {"c": (0.0, 0.0, find_turning(rolling.wheels, around))}

@@ -50,7 +50,6 @@ class YawMisalignment(ReportEffect):
 
     def report(self, velocity: Velocity, around: RunContext) -> Velocity:
         """See the formula above."""
-        del around
         sine, cosine = math.sin(self.values["psi"]), math.cos(self.values["psi"])
         return replace(
             velocity, x=cosine * velocity.x + sine * velocity.y, y=cosine * velocity.y - sine * velocity.x

@@ -111,12 +111,10 @@ class FormulaEffect(AddedEffect):
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The formulas themselves."""
-        del vehicle
         return "moves by " + ", ".join(f"{channel} += {text}" for channel, text in self.formulas.items())
 
     def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
         """Add the formulas' values."""
-        del velocity
         signals = _Signals(rolling, around)
         added = {}
         for channel, expression in self._expressions.items():
