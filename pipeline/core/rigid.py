@@ -7,9 +7,8 @@ as in ROS messages. Angles are in radians.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Floats
 
 _TINY = 1e-12
 

@@ -9,12 +9,9 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
 
 from pipeline.core.errors import shorten
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
 
 LONGEST = 2_000_000
 DEEPEST = 16

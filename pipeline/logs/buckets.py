@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING, Final, Protocol, cast
+from collections.abc import Callable, Mapping
+from typing import Final, Protocol, cast
 
 from pipeline.logs.errors import LogError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
 
 Info = dict[str, object]
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
+from pipeline.core.arrays import Flags, Ints
 from pipeline.logs.assemble import ColumnParts
 from pipeline.logs.cdr import DIALECTS, OTHER_ENCAPSULATIONS, ROS1, Cursor, Dialect
 from pipeline.logs.decode import Decoder, plan_fields, wanted_leaves
@@ -15,12 +16,9 @@ from pipeline.logs.payloads import Block, Group, Payloads, join_groups
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
     from pipeline.logs.columns import Column
     from pipeline.logs.schema import Structure
 
-    Ints = NDArray[np.int64]
 
 _ENOUGH: Final = 4 << 20
 """Payload bytes that are collected before they are decoded together."""
@@ -138,7 +136,7 @@ class StructuredDecoder:
             missing &= np.isin(np.arange(ids.size), chosen)
             self._reject("undecodable", "the payload does not fit its type", ids, block, missing)
 
-    def _reject(self, kind: str, reason: str, ids: Ints, block: Block, wrong: NDArray[np.bool_]) -> None:
+    def _reject(self, kind: str, reason: str, ids: Ints, block: Block, wrong: Flags) -> None:
         self.rejected.append(Rejected(kind, reason, ids[wrong], int(block.size[wrong].sum())))
 
     def columns(self, rows: Ints) -> dict[str, Column]:

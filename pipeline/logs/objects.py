@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import Rejected
 from pipeline.logs.columns import Ragged, RaggedStrings
@@ -21,12 +22,9 @@ from pipeline.logs.fields import STAMPS, select_leaves
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.logs.columns import Column
     from pipeline.logs.payloads import Block
 
-    Ints = NDArray[np.int64]
 
 Value: TypeAlias = "float | str | bool | list[Value] | dict[str, Value] | None"
 Leaf: TypeAlias = "float | str | bool"

@@ -5,15 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Final, Protocol
+from pathlib import Path
+from typing import Final, Protocol
 
 from pipeline.logs.errors import LogError
 from pipeline.logs.remote import RemotePath, RemoteSource
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 _HASH_BLOCK: Final = 1 << 20
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
+from pipeline.core.arrays import Flags, Ints
 from pipeline.logs.definitions import definition_text
 from pipeline.logs.encode import encode_rows
 from pipeline.logs.errors import LogError
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from pipeline.logs.normalize import Given
     from pipeline.logs.schema import Structure
 
-    Ints = NDArray[np.int64]
 
 LIBRARY: Final = "slip-pipeline"
 COMPRESSIONS: Final = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
@@ -45,7 +45,7 @@ class _Rows(NamedTuple):
     sequence: Ints
     payloads: NDArray[np.uint8]
 
-    def select(self, chosen: NDArray[np.bool_]) -> _Rows:
+    def select(self, chosen: Flags) -> _Rows:
         return _Rows(
             self.channel,
             self.log_time[chosen],
@@ -109,11 +109,11 @@ class LogWriter:
         self,
         topic: str,
         type_name: str,
-        log_time: NDArray[np.int64],
+        log_time: Ints,
         fields: Mapping[str, Given],
         *,
-        publish_time: NDArray[np.int64] | None = None,
-        header_time: NDArray[np.int64] | None = None,
+        publish_time: Ints | None = None,
+        header_time: Ints | None = None,
         definition: str | None = None,
     ) -> None:
         """Add messages to a topic; may be called again for the same topic.

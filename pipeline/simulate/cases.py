@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, get_args
+from pathlib import Path
+from typing import get_args
 
 from pipeline.simulate.case_table import CASES, Case
 from pipeline.simulate.effects import CATALOGUE, EffectSpec, resolve_effects
@@ -17,10 +19,6 @@ from pipeline.simulate.record import write_log
 from pipeline.simulate.run import simulate_run
 from pipeline.simulate.scenario import Ground, ProgramName, Scenario
 from pipeline.simulate.vehicles import find_vehicle
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
 
 _BY_NAME = {case.name: case for case in CASES}
 _SAMPLES = ("husky_tile", "warthog_ice", "ackermann_gravel")

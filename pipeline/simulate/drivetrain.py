@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.simulate.programs import Commands
 from pipeline.simulate.signals import follow, hold_on_grid, integrate_cells, lag_signal, limit_rate
 
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from pipeline.simulate.effects import Effects
     from pipeline.simulate.vehicles import Vehicle
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

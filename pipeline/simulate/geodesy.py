@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Floats
 
 ORIGIN_DEG = (46.78, -71.27)
 _ALTITUDE_M = 90.0

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.core.rigid import (
     interpolate_poses,
     multiply_quaternions,
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from pipeline.simulate.path import Path
     from pipeline.simulate.scenario import PoseSensor
 
-Floats = NDArray[np.float64]
 
 _DRIFT_STEP_S = 0.1
 _STRETCH_S = 2.0

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.core.rigid import multiply_quaternions, quaternions_from_euler, quaternions_from_yaw, rotate
 from pipeline.simulate.scenario import ExtraPhysics, Ground, State
 from pipeline.simulate.signals import integrate_cells
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from pipeline.simulate.drivetrain import Drive
     from pipeline.simulate.effects import Effects
 
-Floats = NDArray[np.float64]
 
 _SLOW_STEP_S = 0.005
 

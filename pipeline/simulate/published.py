@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.core.rigid import (
     interpolate_poses,
     invert_quaternions,
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from pipeline.simulate.messages import Field
     from pipeline.simulate.run import SimulatedRun
 
-Floats = NDArray[np.float64]
 Series = dict[str, Floats]
 Source = Literal[
     "command",

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
 from pipeline.simulate.layouts import find_layout
 from pipeline.simulate.messages import (
     command_sheets,
@@ -23,8 +24,6 @@ from pipeline.simulate.stamps import stamp_headers, stamp_times
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from pipeline.simulate.messages import Field
     from pipeline.simulate.run import SimulatedRun
@@ -84,7 +83,7 @@ def write_log(run: SimulatedRun, path: Path) -> None:
             )
 
 
-def _write_stamp(field: str, stamps: NDArray[np.int64], start_ns: int) -> dict[str, Field]:
+def _write_stamp(field: str, stamps: Ints, start_ns: int) -> dict[str, Field]:
     """Fields of a stamp [ns] outside a header; a counter of microseconds began some time before the run."""
     if field.startswith("timestamp"):
         return {field: ((stamps - start_ns + _BOOTED_NS) // 1000).astype(np.float64)}

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.core.rigid import (
     invert_quaternions,
     multiply_quaternions,
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from pipeline.simulate.scenario import Encoders, Imu
     from pipeline.simulate.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
 
 _GRAVITY_MPS2 = 9.80665
 _GYRO_WINDOW_S = 0.01

@@ -5,15 +5,11 @@ A signal lives on cells of ``step`` seconds: entry k is its mean over [k step, (
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Floats
 
 
 def hold_on_grid(event_s: Floats, values: Floats, *, delay_s: float, step_s: float, cells: int) -> Floats:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Floats
 
 
 def open_stream(seed: int, purpose: str) -> np.random.Generator:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats, Ints
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.stages.delays import estimate_delay
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from pipeline.stages.samples import Samples
     from pipeline.vehicles import Vehicle
 
-
-Floats = NDArray[np.float64]
 
 _GAIN_OF_NO_MOTION = 0.05
 _NET_OF_NO_MOTION = 0.5
@@ -164,7 +162,7 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
 
 
 def _delay_of(
-    signal: Floats, reference: Floats, places: NDArray[np.int64], samples: Samples
+    signal: Floats, reference: Floats, places: Ints, samples: Samples
 ) -> tuple[float, float] | None:
     """Delay and standard deviation [s] of a signal against a reference; None where they do not correlate."""
     times = samples.times[places]

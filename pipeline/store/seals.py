@@ -7,12 +7,9 @@ read as they are.
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 from pipeline.store.manifest import hash_bytes
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 _START = b'{"checksum": "'
 _DIGITS = 64

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import msgspec
 
 from pipeline.vehicles.recognition import Recognized
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
 
 _QUANTITIES: Final = {
     "wheel_separation": "track_width_m",

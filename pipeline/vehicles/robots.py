@@ -10,13 +10,10 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Iterable, Mapping
 
 from pipeline.vehicles.errors import ConfigurationError
 from pipeline.vehicles.presets import find_preset
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping
 
 _NUMBERED = re.compile(r"\d+|_[a-d]$")
 _FUNCTION = re.compile(

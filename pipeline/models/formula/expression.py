@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.models.formula.units import PLAIN, Unit
 from pipeline.runs.errors import MotionError
 
-Floats = NDArray[np.float64]
 Values = Mapping[str, "Floats | float"]
 Evaluate = Callable[[Values], "Floats | float"]
 

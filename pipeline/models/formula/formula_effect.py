@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from pipeline.core.arrays import Floats
 from pipeline.models.effect import AddedEffect, Excitation, Parameter
 from pipeline.models.formula.expression import Expression, parse_expression
 from pipeline.models.formula.units import parse_unit
@@ -19,8 +20,6 @@ from pipeline.runs.signals import roll_ideally
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
-
-    from numpy.typing import NDArray
 
     from pipeline.models.formula.units import Unit
     from pipeline.runs.signals import Rolling, RunContext, Velocity
@@ -118,7 +117,7 @@ class FormulaEffect(AddedEffect):
         signals = _Signals(rolling, around)
         added = {}
         for channel, expression in self._expressions.items():
-            known: dict[str, NDArray[np.float64] | float] = {
+            known: dict[str, Floats | float] = {
                 name: self.values[name] if name in self.values else signals.read(name)
                 for name in expression.names
             }
@@ -196,7 +195,7 @@ class _Signals:
     def __init__(self, rolling: Rolling, around: RunContext) -> None:
         ideal = roll_ideally(rolling.wheels, around)
         self._around = around
-        self._makers: Mapping[str, Callable[[], NDArray[np.float64]]] = {
+        self._makers: Mapping[str, Callable[[], Floats]] = {
             "v0": lambda: rolling.v0,
             "w0": lambda: rolling.w0,
             "s0": lambda: rolling.velocity.y,
@@ -213,7 +212,7 @@ class _Signals:
             "t": lambda: around.times,
         }
 
-    def read(self, name: str) -> NDArray[np.float64]:
+    def read(self, name: str) -> Floats:
         """A signal on the cells."""
         if name in self._makers:
             return self._makers[name]()

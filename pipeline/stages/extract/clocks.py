@@ -8,12 +8,13 @@ right again through the log time; the place is remembered, so that no segment cr
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Ints
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.stages.extract.clock_maps import (
@@ -25,10 +26,7 @@ from pipeline.stages.extract.clock_maps import (
 )
 from pipeline.stages.finding import Finding
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-Stamps = NDArray[np.int64]
+Stamps = Ints
 
 DAY_NS = 86_400 * 10**9
 _JUMP_NS = 500_000_000
@@ -80,7 +78,7 @@ class TopicClock:
     topic: str
     clock: str
     stamp: Stamps
-    usable: NDArray[np.bool_]
+    usable: Flags
     breaks: tuple[int, ...] = ()
     latency_s: float = 0.0
     findings: tuple[Finding, ...] = field(default=())
@@ -249,7 +247,7 @@ def _read_clock(times: Recorded) -> TopicClock:
     return TopicClock(times.topic, "header", stamp, usable, breaks, latency, tuple(found))
 
 
-def _flag_unset(topic: str, unset: NDArray[np.bool_]) -> list[Finding]:
+def _flag_unset(topic: str, unset: Flags) -> list[Finding]:
     count = int(unset.sum())
     if not count:
         return []
@@ -266,8 +264,8 @@ def _flag_placed(topic: str, count: int) -> Finding:
 
 
 def _mend_jumps(
-    topic: str, header: Stamps, log_time: Stamps, log_known: NDArray[np.bool_]
-) -> tuple[Stamps, NDArray[np.bool_], tuple[int, ...], list[Finding]]:
+    topic: str, header: Stamps, log_time: Stamps, log_known: Flags
+) -> tuple[Stamps, Flags, tuple[int, ...], list[Finding]]:
     """Shift each stretch of constant clock offset onto the longest one."""
     offset = np.where(log_known, header - log_time, 0)
     usable = np.where(log_known, np.ones(header.size, dtype=bool), header > DAY_NS)
@@ -407,7 +405,7 @@ def leave_out_twice_told(
     return single, [Finding("clock_jump", "warning", text, where="recorder", value=seconds, count=1)]
 
 
-def _count_messages(stamp: Stamps) -> tuple[Stamps, NDArray[np.int64]]:
+def _count_messages(stamp: Stamps) -> tuple[Stamps, Ints]:
     """Numbers of the bins of half a second that hold messages, and how many each holds."""
     places, sizes = np.unique(stamp // _BIN_NS, return_counts=True)
     return places, sizes.astype(np.int64)

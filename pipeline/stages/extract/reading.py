@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.core import rigid
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.logs import Strings, TopicColumns, Wanted, wanted_transforms
 from pipeline.stages.errors import StageError
 from pipeline.vehicles import DriveForm, DriveSource, PoseContent, PoseSource, Signal, Sources
 from pipeline.vehicles.message_types import find_type, plain_type
 from pipeline.vehicles.topics import TRANSFORM_TYPES
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-Floats = NDArray[np.float64]
 
 _LONGEST_NAME = 200
 _SIDEWAYS_MPS = 0.02
@@ -239,7 +234,7 @@ class PoseArrays:
     parent: str
     child: str
 
-    def take(self, rows: NDArray[np.int64]) -> PoseArrays:
+    def take(self, rows: Ints) -> PoseArrays:
         """Some of them, in that order."""
         return replace(self, position=self.position[rows], quaternion=self.quaternion[rows])
 
@@ -263,7 +258,7 @@ def read_pose_topic(columns: TopicColumns) -> PoseArrays:
     return _turn_axes(arrays) if pose.convention == "ned_frd" else arrays
 
 
-def read_fixes(columns: TopicColumns) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+def read_fixes(columns: TopicColumns) -> tuple[Floats, Floats, Floats, Flags]:
     """Latitude and longitude [deg], altitude [m] and whether there is a fix at all, each (n,)."""
     fix = find_type(columns.type_name).fix
     if fix is None:

@@ -14,6 +14,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.errors import SlipError
 from pipeline.logs import join_channels
 from pipeline.stages.errors import StageError
@@ -61,9 +62,7 @@ if TYPE_CHECKING:
 
     from pipeline.logs import LogData, TopicColumns
 
-Floats = NDArray[np.float64]
-Stamps = NDArray[np.int64]
-Flags = NDArray[np.bool_]
+Stamps = Ints
 
 _DEFAULT_SECTION = IntervalSection(topic=DEFAULT_INTERVAL[0], equals=DEFAULT_INTERVAL[1])
 
@@ -118,7 +117,7 @@ class _Extraction:
         self.vehicle = vehicle
         self.where = where
         self.frames = ("", "")
-        self._orders: dict[str, NDArray[np.int64]] = {}
+        self._orders: dict[str, Ints] = {}
         joined = map(self._join_channels, dict.fromkeys(columns.topic for columns in topics))
         stamped = [reading.with_stamps(columns) for columns in joined if columns is not None]
         # None of a topic's texts may be one that can be read.
@@ -196,7 +195,7 @@ class _Extraction:
     def _seconds(self, stamp: Stamps) -> Floats:
         return (stamp - self.start_ns).astype(np.float64) / 1e9
 
-    def _ordered(self, topic: str) -> tuple[TopicColumns, TopicClock, NDArray[np.int64]] | None:
+    def _ordered(self, topic: str) -> tuple[TopicColumns, TopicClock, Ints] | None:
         """A topic with its clock, and the order of its usable messages in time."""
         columns, clock = self.columns.get(topic), self.clocks.get(topic)
         if columns is None or clock is None:
@@ -205,7 +204,7 @@ class _Extraction:
             self._orders[topic] = self._order(clock)
         return columns, clock, self._orders[topic]
 
-    def _order(self, clock: TopicClock) -> NDArray[np.int64]:
+    def _order(self, clock: TopicClock) -> Ints:
         """Usable messages in the order of their stamps; disorder is noted."""
         usable = np.flatnonzero(clock.usable)
         stamp, topic = clock.stamp[usable], clock.topic
@@ -314,7 +313,7 @@ class _Extraction:
         self.findings.append(Finding("body_chosen", "info", text, where=source.topic))
         return arrays
 
-    def _locate_vehicle(self, source: PoseSource) -> tuple[NDArray[np.int64], reading.PoseArrays]:
+    def _locate_vehicle(self, source: PoseSource) -> tuple[Ints, reading.PoseArrays]:
         """Messages of a receiver of satellites that give a pose, in time, and these poses."""
         receiver, beside, imu = (
             self._timed(topic)
@@ -405,7 +404,7 @@ class _Extraction:
             self.findings.append(Finding("no_measured_wheels", "info", text, where=str(source)))
             return pl.DataFrame()
 
-    def _require(self, topic: str, *, held: bool) -> tuple[TopicColumns, TopicClock, NDArray[np.int64]]:
+    def _require(self, topic: str, *, held: bool) -> tuple[TopicColumns, TopicClock, Ints]:
         found = self._ordered(topic)
         if found is None:
             raise self._nothing("command" if held else "wheels", topic)
