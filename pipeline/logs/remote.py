@@ -142,11 +142,12 @@ class RemotePath(PosixPath):
 
     def _list(self, url: str) -> list[Info]:
         try:
-            return open_store(url).ls(url, detail=True)
+            listed: list[Info] = open_store(url).ls(url, detail=True)
         except FileNotFoundError:
             raise
         except OSError as error:
             raise unreachable(str(self), error) from None
+        return listed
 
 
 def to_location(path: str | os.PathLike[str]) -> Path:
@@ -181,26 +182,32 @@ class RemoteSource(AbstractContextManager["RemoteSource"]):
         path: the object.
         version: the version that must be there still, as `RemoteSource.version` told; None for any.
 
+    Attributes:
+        size: count of bytes when it was opened.
+        name: the address.
+        version: as `RemotePath.version`, when it was opened.
+        fetched: bytes that were fetched so far.
+
     Raises:
         LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``, ``log_changed``.
     """
 
     def __init__(self, path: RemotePath, version: str | None = None) -> None:
-        self._path = path
-        self._store = open_store(str(path))
+        self._path, self.name = path, str(path)
+        self._store = open_store(self.name)
         self._lock = threading.Lock()
-        self._fetched = 0
+        self.fetched = 0
         # What the store said a moment ago of its objects may be out of date: nothing was read yet.
         for attempt in range(_OPENINGS):
             if attempt:
                 path.refresh()
             self._info = self._look()
-            self._size = cast("int", self._info["size"])
-            self._version = _name_version(self._info)
-            self._tail_start = max(0, self._size - _TAIL)
+            self.size = cast("int", self._info["size"])
+            self.version = _name_version(self._info)
+            self._tail_start = max(0, self.size - _TAIL)
             try:
-                if version is None or version == self._version:
-                    self._tail = self._fetch(self._tail_start, self._size)
+                if version is None or version == self.version:
+                    self._tail = self._fetch(self._tail_start, self.size)
                     return
             except LogError as error:
                 if error.code != "log_changed":
@@ -223,29 +230,9 @@ class RemoteSource(AbstractContextManager["RemoteSource"]):
             )
         return info
 
-    @property
-    def size(self) -> int:
-        """Count of bytes when it was opened."""
-        return self._size
-
-    @property
-    def name(self) -> str:
-        """The address."""
-        return str(self._path)
-
-    @property
-    def version(self) -> str:
-        """As `RemotePath.version`, when it was opened."""
-        return self._version
-
-    @property
-    def fetched(self) -> int:
-        """Bytes that were fetched so far."""
-        return self._fetched
-
     def read_at(self, offset: int, length: int) -> bytes:
         """The bytes from ``offset``; fewer than ``length`` only at the end."""
-        end = min(offset + max(0, length), self._size)
+        end = min(offset + max(0, length), self.size)
         if end <= offset:
             return b""
         if offset >= self._tail_start:
@@ -261,7 +248,7 @@ class RemoteSource(AbstractContextManager["RemoteSource"]):
         except OSError as error:
             raise unreachable(str(self._path), error) from None
         with self._lock:
-            self._fetched += len(found)
+            self.fetched += len(found)
         return found
 
     def __exit__(self, *_exception: object) -> None:

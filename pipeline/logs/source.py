@@ -19,13 +19,10 @@ _HASH_BLOCK: Final = 1 << 20
 class ByteSource(Protocol):
     """Bytes that can be read anywhere, from several threads at once."""
 
-    @property
-    def size(self) -> int:
-        """Count of bytes."""
-
-    @property
-    def name(self) -> str:
-        """What to call it in messages."""
+    size: int
+    """Count of bytes."""
+    name: str
+    """What to call it in messages."""
 
     def read_at(self, offset: int, length: int) -> bytes:
         """The bytes from ``offset``; fewer than ``length`` only at the end."""
@@ -37,12 +34,16 @@ class FileSource(AbstractContextManager["FileSource"]):
     Args:
         path: the file.
 
+    Attributes:
+        size: count of bytes when it was opened.
+        name: the path.
+
     Raises:
         LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``.
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.name = str(path)
         try:
             # Opening a pipe would wait for somebody to write into it.
             self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
@@ -58,7 +59,7 @@ class FileSource(AbstractContextManager["FileSource"]):
                 hint="Check its permissions",
             ) from None
         status = os.fstat(self._descriptor)
-        self._size = status.st_size
+        self.size = status.st_size
         if not stat.S_ISREG(status.st_mode):
             self.close()
             raise LogError(
@@ -67,7 +68,7 @@ class FileSource(AbstractContextManager["FileSource"]):
                 where=str(path),
                 hint="Give an .mcap file",
             )
-        if self._size == 0:
+        if self.size == 0:
             self.close()
             raise LogError(
                 "log_empty",
@@ -76,19 +77,9 @@ class FileSource(AbstractContextManager["FileSource"]):
                 hint="The recorder was stopped before it wrote anything; leave it out",
             )
 
-    @property
-    def size(self) -> int:
-        """Count of bytes when it was opened."""
-        return self._size
-
-    @property
-    def name(self) -> str:
-        """The path."""
-        return str(self._path)
-
     def read_at(self, offset: int, length: int) -> bytes:
         """The bytes from ``offset``; fewer than ``length`` only at the end."""
-        wanted = max(0, min(length, self._size - offset))
+        wanted = max(0, min(length, self.size - offset))
         try:
             found = os.pread(self._descriptor, wanted, offset) if wanted else b""
             while len(found) < wanted:

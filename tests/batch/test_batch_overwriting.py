@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     import fsspec
 
-    from pipeline.logs.buckets import FileSystem, Info
+    from pipeline.logs.buckets import Info
 
 ADDRESS = f"{BUCKET}/log.mcap"
 ROWS = 600
@@ -64,7 +64,13 @@ def act_before_range(monkeypatch: pytest.MonkeyPatch, number: int, act: Callable
     fetched: list[int] = []
 
     def fetch(
-        store: FileSystem, url: str, start: int, end: int, *, known: Info, look: Callable[[], Info]
+        store: fsspec.AbstractFileSystem,
+        url: str,
+        start: int,
+        end: int,
+        *,
+        known: Info,
+        look: Callable[[], Info],
     ) -> bytes:
         if len(fetched) == number:
             act()
