@@ -16,7 +16,6 @@ SUBSETS = ("all", "transitory", "steady")
 class Aggregates(Table):
     """One row an input and subset of the samples."""
 
-    NAME: ClassVar[str] = "aggregates"
     VERSION: ClassVar[int] = 2
 
     input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})

@@ -11,7 +11,6 @@ from schemas.contract import Table
 class Alignments(Table):
     """One row a run."""
 
-    NAME: ClassVar[str] = "alignments"
     VERSION: ClassVar[int] = 2
 
     hold_time = fields.number("s", "the controller stops this long after its last command", nullable=True)

@@ -17,7 +17,6 @@ KINDS = ("effect", "disturbance", "localization_noise")
 class Budget(Table):
     """One row a cause: the shares of an input and a quantity add up to one."""
 
-    NAME: ClassVar[str] = "budget"
     VERSION: ClassVar[int] = 1
 
     input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})

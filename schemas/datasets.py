@@ -18,7 +18,6 @@ class Datasets(Table):
     `slip compare` alone works out are null until it has run.
     """
 
-    NAME: ClassVar[str] = "datasets"
     VERSION: ClassVar[int] = 3
 
     by = fields.text("columns that make a dataset, for example `dataset` or `vehicle,terrain`")

@@ -39,6 +39,20 @@ def number(unit: str, description: str, *, frame: str = "", nullable: bool = Fal
     return dy.Float64(nullable=nullable, check=lambda value: value.is_finite(), metadata=metadata)
 
 
+def bounded(
+    unit: str,
+    description: str,
+    low: float | None = None,
+    high: float | None = None,
+    *,
+    nullable: bool = False,
+) -> dy.Float64:
+    """A number with a unit within what can be; one without bounds may be anything."""
+    return dy.Float64(
+        nullable=nullable, min=low, max=high, metadata={"unit": unit, "description": description}
+    )
+
+
 def body(unit: str, description: str, *, nullable: bool = False) -> dy.Float64:
     """A finite number in the body frame (x forward, y left, z up; REP-103)."""
     return number(unit, description, frame="base_link", nullable=nullable)

@@ -15,7 +15,6 @@ SEVERITIES = ("info", "warning", "error")
 class Findings(Table):
     """One row a finding."""
 
-    NAME: ClassVar[str] = "findings"
     VERSION: ClassVar[int] = 1
 
     stage = fields.text("stage that noticed it")

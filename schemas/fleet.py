@@ -18,7 +18,6 @@ class Fleet(Table):
     ``run`` and ``dataset`` are `*`; ``keys`` names the runs.
     """
 
-    NAME: ClassVar[str] = "fleet"
     VERSION: ClassVar[int] = 1
 
     effect = dy.String(min_length=1, metadata={"description": "id of the effect"})

@@ -11,7 +11,6 @@ from schemas.contract import Table
 class Imu(Table):
     """One row an IMU message, in the sensor's own axes and sign, as recorded."""
 
-    NAME: ClassVar[str] = "imu"
     VERSION: ClassVar[int] = 1
 
     t = fields.seconds()

@@ -16,7 +16,6 @@ KINDS = ("rung", "floor")
 class Ladder(Table):
     """One row a rung; the last row of an input is its noise floor."""
 
-    NAME: ClassVar[str] = "ladder"
     VERSION: ClassVar[int] = 1
 
     input = dy.Enum(INPUTS, metadata={"description": "what the model was fed with"})

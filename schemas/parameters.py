@@ -14,7 +14,6 @@ from schemas.slip import INPUTS
 class Parameters(Table):
     """One row a parameter of an effect that is missing from the ideal model, as in `diagnosis.json`."""
 
-    NAME: ClassVar[str] = "parameters"
     VERSION: ClassVar[int] = 2
 
     input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})

@@ -16,7 +16,6 @@ UNIT_TOLERANCE = 1e-6
 class Poses(Table):
     """One row a pose message of base_link in a fixed frame."""
 
-    NAME: ClassVar[str] = "poses"
     VERSION: ClassVar[int] = 2
 
     t = fields.seconds()

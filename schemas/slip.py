@@ -16,7 +16,6 @@ INPUTS = ("command", "measured")
 class Slip(Table):
     """One row a time step and input: g = f(u) - v."""
 
-    NAME: ClassVar[str] = "slip"
     VERSION: ClassVar[int] = 2
 
     input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})

@@ -11,7 +11,6 @@ from schemas.contract import Table
 class Velocities(Table):
     """One row a step of the uniform grid inside a segment."""
 
-    NAME: ClassVar[str] = "velocities"
     VERSION: ClassVar[int] = 2
 
     t = fields.seconds()

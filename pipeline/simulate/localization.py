@@ -196,12 +196,4 @@ def _drop_out(sensor: PoseSensor, poses: Poses, duration_s: float, seed: int) ->
     )
     for start in starts.tolist():
         kept &= (poses.stamp_s < start) | (poses.stamp_s >= start + sensor.dropout_s)
-    return Poses(
-        poses.sampled_s[kept],
-        poses.stamp_s[kept],
-        poses.log_s[kept],
-        poses.position[kept],
-        poses.quaternion[kept],
-        poses.correction_yaw[kept],
-        poses.correction[kept],
-    )
+    return Poses(**{name: series[kept] for name, series in vars(poses).items()})

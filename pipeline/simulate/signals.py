@@ -42,7 +42,12 @@ def hold_on_grid(event_s: Floats, values: Floats, *, delay_s: float, step_s: flo
 
 
 def lag_signal(signal: Floats, *, tau_s: float, step_s: float) -> Floats:
-    """First-order lag from rest, exact for a signal constant in each cell: tau dy/dt = u - y."""
+    """First-order lag from rest, exact for a signal constant in each cell: tau dy/dt = u - y.
+
+    Without a time constant it is the signal itself.
+    """
+    if tau_s <= 0.0:
+        return signal
     decay = float(np.exp(-step_s / tau_s))
     at_end = filter_pole(signal * (1.0 - decay), decay)
     means: Floats = 0.5 * (at_end + np.concatenate(([0.0], at_end[:-1])))

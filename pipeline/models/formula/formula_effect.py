@@ -65,6 +65,9 @@ class FormulaEffect(AddedEffect):
         where: file and line, for error messages.
         values: of the parameters.
 
+    Attributes:
+        expressions: the parsed formulas by channel.
+
     Raises:
         MotionError: a formula that cannot be parsed, knows a name that does not exist, has another unit than
             its channel, or does not vanish at the parameters' neutral values.
@@ -87,15 +90,10 @@ class FormulaEffect(AddedEffect):
         self.formulas = dict(formulas)
         self._where = where or name
         self._check_names()
-        self._expressions = {channel: self._parse(channel, text) for channel, text in self.formulas.items()}
+        self.expressions = {channel: self._parse(channel, text) for channel, text in self.formulas.items()}
         self._check_parameters()
         super().__init__(fixed=fixed, **values)
         self._check_neutral()
-
-    @property
-    def expressions(self) -> Mapping[str, Expression]:
-        """The parsed formulas by channel."""
-        return self._expressions
 
     @property
     def key(self) -> tuple[object, ...]:
@@ -116,7 +114,7 @@ class FormulaEffect(AddedEffect):
         """Add the formulas' values."""
         signals = _Signals(rolling, around)
         added = {}
-        for channel, expression in self._expressions.items():
+        for channel, expression in self.expressions.items():
             known: dict[str, Floats | float] = {
                 name: self.values[name] if name in self.values else signals.read(name)
                 for name in expression.names
@@ -158,7 +156,7 @@ class FormulaEffect(AddedEffect):
             )
 
     def _check_parameters(self) -> None:
-        used = frozenset[str]().union(*(e.names for e in self._expressions.values()))
+        used = frozenset[str]().union(*(e.names for e in self.expressions.values()))
         for parameter in self.parameters:
             if parameter.name not in used:
                 raise MotionError(
@@ -173,7 +171,7 @@ class FormulaEffect(AddedEffect):
         generator = np.random.default_rng(1)
         signals = {name: generator.uniform(0.1, 1.0, 8) for name in SIGNAL_UNITS}
         neutral = {p.name: p.neutral for p in self.parameters}
-        for channel, expression in self._expressions.items():
+        for channel, expression in self.expressions.items():
             value = np.asarray(expression.evaluate({**signals, **neutral}))
             if not np.allclose(value, 0.0, atol=1e-12):
                 raise MotionError(

@@ -28,7 +28,6 @@ def write(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    del current
     facts, sheet = start_sheet(file, TARGET, "ackermann")
     sheet.add(f"{_ALL}.wheel_radius", find_radius(facts), _INFO)
     sheet.add(f"{_ALL}.wheel_base", facts.measure("wheelbase_m"), _INFO)

@@ -37,7 +37,6 @@ def write(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    del current
     facts, sheet = start_sheet(file, TARGET, *_SYSTEMS)
     sheet.add("plugin.wheel_radius", find_radius(facts))
     if facts.vehicle.kind == "differential":

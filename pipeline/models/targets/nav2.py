@@ -37,7 +37,6 @@ def write(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    del current
     facts, sheet = start_sheet(file, TARGET, "differential", "ackermann")
     sheet.add(f"{_CONTROLLER}.model_delay_vx", find_speed_delay(facts), _DELAY)
     sheet.add(f"{_CONTROLLER}.model_delay_wz", find_turn_delay(facts), _DELAY)

@@ -49,7 +49,6 @@ def write(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``; ``not_fitted``, the file has no ladder.
     """
-    del current
     facts, sheet = start_sheet(file, TARGET, *_CONTROLLERS)
     controller, known = _CONTROLLERS[facts.vehicle.kind]
     step = _find_step(file, known)

@@ -29,7 +29,6 @@ def write(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    del current
     facts, sheet = start_sheet(file, TARGET, "differential", "ackermann")
     if facts.vehicle.kind == "differential":
         _add_differential(facts, sheet)

@@ -113,8 +113,8 @@ def _judge(
     if gain < _LEAST_GAIN:
         return None
     # Lateral motion in turns is what slip is about: the direction is judged against what turning explains.
-    usual = _fit_angle(sums.turned[tested], sums.direction[tested])
-    off = np.abs(_wrap(sums.direction - usual(sums.turned)))
+    slope, offset = _fit_angle(sums.turned[tested], sums.direction[tested])
+    off = np.abs(_wrap(sums.direction - (slope * sums.turned + offset)))
     ratio = length / np.maximum(gain * driven, 1e-9)
     right_length = (ratio > _SHORTEST) & (ratio < _LONGEST)
     # A sliding vehicle turns its direction of travel on the way; a wrong heading is wrong by one angle.
@@ -216,19 +216,11 @@ def _sum_vectors_by(label: Ints, values: Complex, count: int) -> Complex:
     return _sum_by(label, values.real, count) + 1j * _sum_by(label, values.imag, count)
 
 
-class _AngleLine:
-    """Usual direction of travel as a line over the turning of a stretch."""
+def _fit_angle(turned: Floats, angle: Floats) -> tuple[float, float]:
+    """Slope and offset of the usual direction of travel over the turning of a stretch.
 
-    def __init__(self, slope: float, offset: float) -> None:
-        self.slope = slope
-        self.offset = offset
-
-    def __call__(self, turned: Floats) -> Floats:
-        return self.slope * turned + self.offset
-
-
-def _fit_angle(turned: Floats, angle: Floats) -> _AngleLine:
-    """Robust line (iteratively reweighted, Cauchy weights)."""
+    A robust line (iteratively reweighted, Cauchy weights).
+    """
     slope = offset = 0.0
     weight = np.ones(angle.size)
     design = np.column_stack((turned, np.ones(angle.size)))
@@ -237,7 +229,7 @@ def _fit_angle(turned: Floats, angle: Floats) -> _AngleLine:
         residual = angle - design @ np.array([slope, offset])
         scale = max(1.4826 * float(np.median(np.abs(residual))), 0.02)
         weight = np.sqrt(1.0 / (1.0 + (residual / (2.0 * scale)) ** 2))
-    return _AngleLine(float(slope), float(offset))
+    return float(slope), float(offset)
 
 
 def _wrap(angle: Floats) -> Floats:
