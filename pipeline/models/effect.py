@@ -11,19 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
 
-from pipeline.models.parameter import (  # noqa: F401 - what a file of an effect needs
-    DATA_SHEET,
-    MOUNTING,
-    STAMPS,
-    WARTHOG_RUNS,
-    Excitation,
-    Least,
-    Parameter,
-    Part,
-    Plausible,
-    Search,
-    Spread,
-)
+from pipeline.models.parameter import Excitation, Least, Parameter, Part, Plausible, Search, Spread  # noqa: F401 - what a file of an effect needs
 from pipeline.models.wording import describe_share
 from pipeline.runs.errors import MotionError
 from pipeline.vehicles.kinematics import list_kinds

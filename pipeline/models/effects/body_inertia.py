@@ -15,18 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import (
-    STAMPS,
-    WARTHOG_RUNS,
-    BodyEffect,
-    Excitation,
-    Late,
-    Least,
-    Parameter,
-    Plausible,
-    Search,
-    Spread,
-)
+from pipeline.models.effect import BodyEffect, Excitation, Late, Least, Parameter, Plausible, Search, Spread
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Velocity
@@ -51,10 +40,10 @@ class BodyInertia(BodyEffect):
             search=Search.STARTS,
             starts=(0.15, 0.4, 0.9, 1.6),
             step=5e-3,
-            least=Least(0.02, STAMPS),
+            least=Least(0.02, Least.STAMPS),
             plausible=Plausible(0.0, 3.0, "wider than the 0.2 to 1 s of ice"),
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
-            between_runs=Spread(0.034, WARTHOG_RUNS),
+            between_runs=Spread(0.034),
         ),
     )
     motion = "slides on for {tau:.2f} s before it follows its wheels"

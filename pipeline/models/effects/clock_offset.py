@@ -14,18 +14,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    STAMPS,
-    WARTHOG_RUNS,
-    Excitation,
-    Late,
-    Least,
-    Parameter,
-    Plausible,
-    ReportEffect,
-    Search,
-    Spread,
-)
+from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect, Search, Spread
 from pipeline.models.evidence import LEAST_DELAY_S
 from pipeline.models.level import Level, Reading
 
@@ -50,9 +39,9 @@ class ClockOffset(ReportEffect):
             search=Search.STARTS,
             starts=(-0.3, -0.1, 0.1, 0.3),
             step=5e-3,
-            least=Least(LEAST_DELAY_S, STAMPS, sampled=True),
+            least=Least(LEAST_DELAY_S, Least.STAMPS, sampled=True),
             plausible=Plausible(-0.8, 0.8, "wider than the clocks of the DRIVE recordings"),
-            between_runs=Spread(0.14, WARTHOG_RUNS),
+            between_runs=Spread(0.14),
         ),
     )
     motion = "stamps its poses {size:.0f} ms {way}"

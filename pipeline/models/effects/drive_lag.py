@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
-from pipeline.models.effect import STAMPS, DriveEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 
@@ -38,7 +38,7 @@ class DriveLag(DriveEffect):
             search=Search.STARTS,
             starts=(0.1, 0.3, 0.7, 1.4),
             step=5e-3,
-            least=Least(0.015, STAMPS, sampled=True),
+            least=Least(0.015, Least.STAMPS, sampled=True),
             plausible=Plausible(0.0, 3.0, "wider than the 0.55 to 1.2 s of Husky and Warthog"),
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
         ),

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import STAMPS, Excitation, Late, Least, Parameter, Plausible, ReportEffect
+from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect
 from pipeline.models.evidence import LEAST_DELAY_S
 from pipeline.models.level import Level, Reading
 from pipeline.runs.signals import earlier_in_span
@@ -40,7 +40,7 @@ class HeadingSkew(ReportEffect):
             "age of the heading against the position",
             0.1,
             step=1e-3,
-            least=Least(LEAST_DELAY_S, STAMPS),
+            least=Least(LEAST_DELAY_S, Least.STAMPS),
             plausible=Plausible(-0.3, 0.4, "wider than the 0.1 s of the DRIVE recordings"),
             one_sign=True,
         ),

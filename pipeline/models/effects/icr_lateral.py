@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import MOUNTING, Excitation, Least, LinearEffect, Parameter, Place, Plausible
+from pipeline.models.effect import Excitation, Least, LinearEffect, Parameter, Place, Plausible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,7 +33,7 @@ class IcrLateral(LinearEffect):
             0.0,
             "centre of rotation left of base_link",
             0.08,
-            least=Least(0.004, MOUNTING),
+            least=Least(0.004, Least.MOUNTING),
             plausible=Plausible(-0.5, 0.5, "further out it lies beside the wheels of a Warthog"),
         ),
     )

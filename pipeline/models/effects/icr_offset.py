@@ -13,17 +13,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    MOUNTING,
-    WARTHOG_RUNS,
-    Excitation,
-    Least,
-    LinearEffect,
-    Parameter,
-    Place,
-    Plausible,
-    Spread,
-)
+from pipeline.models.effect import Excitation, Least, LinearEffect, Parameter, Place, Plausible, Spread
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -45,13 +35,13 @@ class IcrOffset(LinearEffect):
             0.0,
             "centre of rotation ahead of base_link",
             0.12,
-            least=Least(0.004, MOUNTING),
+            least=Least(0.004, Least.MOUNTING),
             plausible=Plausible(
                 -1.6,
                 0.6,
                 "wider than -0.08 to 0.24 m; the middle of a sedan is 1.35 m ahead of its rear axle",
             ),
-            between_runs=Spread(0.013, WARTHOG_RUNS),
+            between_runs=Spread(0.013),
         ),
     )
     motion = "turns about a point {size:.2g} cm {way} its middle"

@@ -14,15 +14,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    DATA_SHEET,
-    SIDEWAYS,
-    Excitation,
-    KinematicEffect,
-    Least,
-    Parameter,
-    Plausible,
-)
+from pipeline.models.effect import SIDEWAYS, Excitation, KinematicEffect, Least, Parameter, Plausible
 from pipeline.models.effects.wheel_radius import WheelRadius
 
 if TYPE_CHECKING:
@@ -44,7 +36,7 @@ class LateralScale(KinematicEffect):
             1.0,
             "sideways speed over that of ideal rollers",
             0.8,
-            least=Least(0.01, DATA_SHEET),
+            least=Least(0.01, Least.DATA_SHEET),
             plausible=Plausible(
                 0.3, 1.2, "wider than the lateral multipliers of 1 to 2 of competition robots"
             ),

@@ -13,16 +13,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    STAMPS,
-    WARTHOG_RUNS,
-    Excitation,
-    Least,
-    LinearEffect,
-    Parameter,
-    Plausible,
-    Spread,
-)
+from pipeline.models.effect import Excitation, Least, LinearEffect, Parameter, Plausible, Spread
 from pipeline.models.evidence import LEAST_DELAY_S
 
 if TYPE_CHECKING:
@@ -44,10 +35,10 @@ class LateralSkid(LinearEffect):
             0.0,
             "outward slip per centripetal acceleration",
             0.1,
-            least=Least(LEAST_DELAY_S, STAMPS),
+            least=Least(LEAST_DELAY_S, Least.STAMPS),
             plausible=Plausible(-0.02, 0.4, "wider than 0.02 on tile and 0.15 on ice"),
             one_sign=True,
-            between_runs=Spread(0.064, WARTHOG_RUNS),
+            between_runs=Spread(0.064),
         ),
     )
     motion = "slides {way} at {size:.2g} m/s in a turn of 1 rad/s at 1 m/s"

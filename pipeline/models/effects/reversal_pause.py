@@ -14,16 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import (
-    STAMPS,
-    WHEELED,
-    DriveEffect,
-    Excitation,
-    Least,
-    Parameter,
-    Plausible,
-    Search,
-)
+from pipeline.models.effect import WHEELED, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.filters import wait_at_reversal
 
 if TYPE_CHECKING:
@@ -47,7 +38,7 @@ class ReversalPause(DriveEffect):
             search=Search.STARTS,
             starts=(0.15, 0.5),
             step=1e-2,
-            least=Least(0.03, STAMPS, sampled=True),
+            least=Least(0.03, Least.STAMPS, sampled=True),
             plausible=Plausible(0.0, 1.5, "longer than controllers wait"),
         ),
     )

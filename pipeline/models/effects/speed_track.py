@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import DATA_SHEET, SIDES, Excitation, Least, LinearEffect, Parameter, Plausible
+from pipeline.models.effect import SIDES, Excitation, Least, LinearEffect, Parameter, Plausible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -37,7 +37,7 @@ class SpeedTrack(LinearEffect):
             0.0,
             "share of turning gained per speed",
             0.05,
-            least=Least(0.01, DATA_SHEET),
+            least=Least(0.01, Least.DATA_SHEET),
             plausible=Plausible(-0.3, 0.3, "wider than the 0.035 to 0.053 of a Warthog on asphalt"),
         ),
     )

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter, Plausible
+from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Plausible
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class SteeringGain(DriveEffect):
             1.0,
             "steered over asked angle",
             0.85,
-            least=Least(0.01, DATA_SHEET),
+            least=Least(0.01, Least.DATA_SHEET),
             plausible=Plausible(0.5, 1.5, "wider than the 0.85 of a worn linkage"),
             quantities=(Quantity.STEERING_GAIN,),
         ),

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import ACKERMANN, STAMPS, DriveEffect, Excitation, Least, Parameter, Search
+from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Search
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 
@@ -37,7 +37,7 @@ class SteeringLag(DriveEffect):
             search=Search.STARTS,
             starts=(0.1, 0.3, 0.7, 1.4),
             step=5e-3,
-            least=Least(0.015, STAMPS, sampled=True),
+            least=Least(0.015, Least.STAMPS, sampled=True),
             quantities=(Quantity.STEERING_LAG,),
         ),
     )

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter
+from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class SteeringOffset(DriveEffect):
             0.0,
             "angle at which straight ahead is asked",
             0.04,
-            least=Least(0.002, DATA_SHEET),
+            least=Least(0.002, Least.DATA_SHEET),
             quantities=(Quantity.STEERING_OFFSET,),
         ),
     )

@@ -13,16 +13,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    ACKERMANN,
-    DATA_SHEET,
-    DriveEffect,
-    Excitation,
-    Least,
-    Parameter,
-    Plausible,
-    Search,
-)
+from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.filters import follow_with_play
 
 if TYPE_CHECKING:
@@ -46,7 +37,7 @@ class SteeringPlay(DriveEffect):
             search=Search.STARTS,
             starts=(0.02, 0.06),
             step=1e-3,
-            least=Least(0.004, DATA_SHEET),
+            least=Least(0.004, Least.DATA_SHEET),
             plausible=Plausible(0.0, 0.15, "three times a worn linkage"),
         ),
     )

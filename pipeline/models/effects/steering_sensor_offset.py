@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import ACKERMANN, DATA_SHEET, Excitation, KinematicEffect, Least, Parameter
+from pipeline.models.effect import ACKERMANN, Excitation, KinematicEffect, Least, Parameter
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class SteeringSensorOffset(KinematicEffect):
             0.0,
             "steering of the tyres less that of the sensor",
             0.02,
-            least=Least(0.002, DATA_SHEET),
+            least=Least(0.002, Least.DATA_SHEET),
             quantities=(Quantity.STEERING_OFFSET,),
         ),
     )

@@ -16,23 +16,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import (
-    DATA_SHEET,
-    NAN,
-    Excitation,
-    KinematicEffect,
-    Least,
-    Parameter,
-    Plausible,
-    Search,
-)
+from pipeline.models.effect import NAN, Excitation, KinematicEffect, Least, Parameter, Plausible, Search
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import Rolling, RunContext
     from pipeline.vehicles import Vehicle
 
-_LEAST = Least(0.03, DATA_SHEET)
+_LEAST = Least(0.03, Least.DATA_SHEET)
 _PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")
 
 

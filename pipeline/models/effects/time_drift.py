@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import DATA_SHEET, Excitation, KinematicEffect, Least, Parameter, Plausible
+from pipeline.models.effect import Excitation, KinematicEffect, Least, Parameter, Plausible
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import Rolling, RunContext
@@ -30,7 +30,7 @@ class TimeDrift(KinematicEffect):
             0.0,
             "share lost at the end of the run",
             0.1,
-            least=Least(0.015, DATA_SHEET),
+            least=Least(0.015, Least.DATA_SHEET),
             plausible=Plausible(-0.4, 0.4, "wider than the 10 % of long deployments"),
         ),
     )

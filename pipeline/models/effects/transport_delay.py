@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import STAMPS, CommandEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import CommandEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.evidence import LEAST_DELAY_S
 from pipeline.models.quantity import Quantity
 
@@ -38,7 +38,7 @@ class TransportDelay(CommandEffect):
             search=Search.STARTS,
             starts=(0.05, 0.15, 0.3, 0.5),
             step=5e-3,
-            least=Least(LEAST_DELAY_S, STAMPS, sampled=True),
+            least=Least(LEAST_DELAY_S, Least.STAMPS, sampled=True),
             plausible=Plausible(0.0, 0.8, "wider than the 0.5 s after which a ros2_control drive stops"),
             quantities=(Quantity.COMMAND_DELAY,),
         ),

@@ -15,17 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import (
-    DATA_SHEET,
-    NAN,
-    SIDES,
-    DriveEffect,
-    Excitation,
-    Least,
-    Parameter,
-    Plausible,
-    Search,
-)
+from pipeline.models.effect import NAN, SIDES, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence, Largest
@@ -63,7 +53,7 @@ class TurnDroop(DriveEffect):
             1.0,
             "share of the excess that is reached",
             0.4,
-            least=Least(0.03, DATA_SHEET),
+            least=Least(0.03, Least.DATA_SHEET),
             plausible=Plausible(0.0, 0.97, "with all of it reached nothing droops"),
         ),
     )

@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import SIDES, WARTHOG_RUNS, Excitation, Spread
+from pipeline.models.effect import SIDES, Excitation, Spread
 from pipeline.models.effects.drive_lag import TwoLags, time_constant
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
@@ -37,12 +37,12 @@ class TurnLag(TwoLags):
         replace(
             time_constant("tau_mean", "time constant of the mean", 0.3, (0.1, 0.4), _SEEN),
             quantities=(Quantity.SPEED_LAG,),
-            between_runs=Spread(0.12, WARTHOG_RUNS),
+            between_runs=Spread(0.12),
         ),
         replace(
             time_constant("tau_diff", "time constant of the difference", 1.0, (0.3, 1.2), _SEEN),
             quantities=(Quantity.TURN_LAG,),
-            between_runs=Spread(0.24, WARTHOG_RUNS),
+            between_runs=Spread(0.24),
         ),
     )
     motion = "follows commanded turning {tau_diff:.2f} s late, and speed {tau_mean:.2f} s"

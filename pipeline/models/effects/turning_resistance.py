@@ -13,12 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import (
-    Excitation,
-    LinearEffect,
-    Parameter,
-    Plausible,
-)
+from pipeline.models.effect import Excitation, LinearEffect, Parameter, Plausible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -11,16 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    DATA_SHEET,
-    WARTHOG_RUNS,
-    Excitation,
-    KinematicEffect,
-    Least,
-    Parameter,
-    Plausible,
-    Spread,
-)
+from pipeline.models.effect import Excitation, KinematicEffect, Least, Parameter, Plausible, Spread
 from pipeline.models.level import Level, Reading
 from pipeline.models.quantity import Quantity
 
@@ -41,10 +32,10 @@ class WheelRadius(KinematicEffect):
             1.0,
             "true over nominal radius",
             0.92,
-            least=Least(0.004, DATA_SHEET),
+            least=Least(0.004, Least.DATA_SHEET),
             plausible=Plausible(0.4, 1.3, "radii are off by 2 to 25 %, wheels slip by half on loose ground"),
             quantities=(Quantity.RADIUS,),
-            between_runs=Spread(0.019, WARTHOG_RUNS),
+            between_runs=Spread(0.019),
         ),
     )
     motion = "travels {share} than its wheels turn"

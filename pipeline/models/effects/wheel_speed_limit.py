@@ -13,16 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import (
-    INF,
-    WARTHOG_RUNS,
-    WHEELED,
-    CommandEffect,
-    Excitation,
-    Parameter,
-    Search,
-    Spread,
-)
+from pipeline.models.effect import INF, WHEELED, CommandEffect, Excitation, Parameter, Search, Spread
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
@@ -49,7 +40,7 @@ class WheelSpeedLimit(CommandEffect):
             relative_to="wheel",
             step=1e-2,
             quantities=(Quantity.WHEEL_SPEED_LIMIT,),
-            between_runs=Spread(0.2, WARTHOG_RUNS),
+            between_runs=Spread(0.2),
         ),
     )
     motion = "turns no wheel faster than {limit:.3g} rad/s"

@@ -14,7 +14,7 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import MOUNTING, Excitation, Least, Parameter, Plausible, ReportEffect
+from pipeline.models.effect import Excitation, Least, Parameter, Plausible, ReportEffect
 from pipeline.models.level import Level, Reading
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class YawMisalignment(ReportEffect):
             0.0,
             "reported less true heading",
             0.05,
-            least=Least(0.003, MOUNTING),
+            least=Least(0.003, Least.MOUNTING),
             plausible=Plausible(-0.35, 0.35, "wider than the 1 to 5 degrees that were seen"),
         ),
     )
