@@ -17,13 +17,7 @@ import numpy as np
 from pipeline.core.arrays import Flags, Ints
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
-from pipeline.stages.extract.clock_maps import (
-    ClockMap,
-    find_held_up_s,
-    map_clock,
-    measure_drift,
-    spread_bunches,
-)
+from pipeline.stages.extract import clock_maps
 from pipeline.stages.finding import Finding
 
 Stamps = Ints
@@ -124,13 +118,13 @@ def _follow_simulated_time(
         key=lambda times: -times.log_time.size,
     )
     for leading in stamped:
-        found = map_clock(leading.log_time, cast("Stamps", leading.header_time))
+        found = clock_maps.map_clock(leading.log_time, cast("Stamps", leading.header_time))
         if found is not None and _is_simulated(found):
             return _follow(recorded, found, leading.topic)
     return recorded, []
 
 
-def _is_simulated(found: ClockMap) -> bool:
+def _is_simulated(found: clock_maps.ClockMap) -> bool:
     """Whether stamps pass at another rate than the recorder's time, or unevenly and from another start."""
     rate, span = found.usual_rate, float(found.log[-1] - found.log[0])
     if abs(rate - 1.0) >= _OTHER_RATE and abs(rate - 1.0) * span >= _JUMP_NS:
@@ -140,7 +134,7 @@ def _is_simulated(found: ClockMap) -> bool:
 
 
 def _follow(
-    recorded: Mapping[str, Recorded], found: ClockMap, leading: str
+    recorded: Mapping[str, Recorded], found: clock_maps.ClockMap, leading: str
 ) -> tuple[Mapping[str, Recorded], list[Finding]]:
     mapped, real = {}, []
     for key, times in recorded.items():
@@ -175,7 +169,7 @@ def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
         for key, header in headers.items()
     }
     drifts = {
-        key: measure_drift(recorded[key].log_time[counts[key]], header[counts[key]])
+        key: clock_maps.measure_drift(recorded[key].log_time[counts[key]], header[counts[key]])
         for key, header in headers.items()
     }
     known = [drift for drift in drifts.values() if drift.is_certain]
@@ -206,11 +200,11 @@ def _spread_bunches(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
     for key, times in recorded.items():
         if times.clock is not None or (times.header_time is not None and times.header_time.any()):
             continue
-        log = spread_bunches(times.log_time)
+        log = clock_maps.spread_bunches(times.log_time)
         if log is times.log_time:
             continue
         even[key] = replace(times, log_time=log)
-        late = find_held_up_s(times.log_time, log)
+        late = clock_maps.find_held_up_s(times.log_time, log)
         text = (
             f"{times.topic} has no stamps and was recorded in bunches, up to {late * 1e3:.0f} ms late: its "
             "messages were put back to the pace of their sender"

@@ -18,7 +18,7 @@ from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.errors import SlipError
 from pipeline.logs import join_channels
 from pipeline.stages.errors import StageError
-from pipeline.stages.extract import localization, reading
+from pipeline.stages.extract import localization, reading, transforms
 from pipeline.stages.extract.absurd import remove_absurd
 from pipeline.stages.extract.bodies import read_bodies
 from pipeline.stages.extract.clocks import Recorded, TopicClock, align_clocks
@@ -33,14 +33,6 @@ from pipeline.stages.extract.drive import (
 )
 from pipeline.stages.extract.intervals import Span, find_spans_given, find_spans_of_state, is_inside
 from pipeline.stages.extract.satellite import Receiver, locate_vehicle
-from pipeline.stages.extract.transforms import (
-    chain_poses,
-    describe_chain,
-    describe_frame,
-    find_antenna,
-    is_transforms,
-    to_base_link,
-)
 from pipeline.stages.finding import Finding
 from pipeline.vehicles import (
     DEFAULT_INTERVAL,
@@ -123,7 +115,7 @@ class _Extraction:
         # None of a topic's texts may be one that can be read.
         self.columns = {columns.topic: columns for columns in stamped if columns.log_time.size}
         pose = sources.pose
-        self.chain = chain_poses(topics, pose, where) if pose and pose.from_transforms else None
+        self.chain = transforms.chain_poses(topics, pose, where) if pose and pose.from_transforms else None
         self.clocks = self._align()
         self.start_ns = self._find_start()
 
@@ -163,7 +155,7 @@ class _Extraction:
                 topic, columns.log_time, columns.publish_time, columns.header_time, asked.get(topic)
             )
             for topic, columns in self.columns.items()
-            if not is_transforms(columns)
+            if not transforms.is_transforms(columns)
         }
         if self.chain is not None and self.sources.pose is not None:
             topic, times = self.sources.pose.topic, self.chain
@@ -283,12 +275,12 @@ class _Extraction:
             chain, order = self.chain, self._order(clock)
             arrays = reading.PoseArrays(chain.position, chain.quaternion, chain.parent, chain.child)
             arrays, log_times = arrays.take(order), chain.log_time
-            self.findings += describe_chain(chain, topic)
+            self.findings += transforms.describe_chain(chain, topic)
         elif columns is None:
             raise self._nothing("pose", topic)
         elif source.content is PoseContent.POSE:
             arrays, log_times = self._read_poses(source, columns), columns.log_time
-            self.findings += describe_frame(topic, arrays.parent)
+            self.findings += transforms.describe_frame(topic, arrays.parent)
             order = self._order(clock)
             arrays = arrays.take(order)
         else:
@@ -300,7 +292,7 @@ class _Extraction:
         for jump in clock.breaks:
             breaks[np.flatnonzero(log_time >= jump)[:1]] = True
         if self.chain is None and source.content is PoseContent.POSE:
-            arrays, more = to_base_link(arrays, self.data.topics, topic)
+            arrays, more = transforms.to_base_link(arrays, self.data.topics, topic)
             self.findings += more
         return stamp, log_time, arrays, breaks
 
@@ -323,7 +315,9 @@ class _Extraction:
             raise self._nothing("pose", source.topic)
         drives = (read_speed(table, self.vehicle) for table in (self._wheels, self._commands))
         ahead = next((drive for drive in drives if drive is not None), None)
-        lever, more = find_antenna(self.data.topics, reading.frame_of(receiver.columns), source.topic)
+        lever, more = transforms.find_antenna(
+            self.data.topics, reading.frame_of(receiver.columns), source.topic
+        )
         made = locate_vehicle(receiver, beside, imu, ahead, lever)
         self.findings += [*more, *made.findings]
         if not made.rows.size:
