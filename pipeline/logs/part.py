@@ -105,27 +105,18 @@ def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> int:
     if head == rec.MAGIC:
         return len(rec.MAGIC)
     alike = sum(a == b for a, b in zip(head, rec.MAGIC, strict=False))
+    what = hint = ""
     if head.startswith(b"\x89MCAP0\n"):
-        raise LogError(
-            "not_mcap",
-            "a text-mode copy has changed the file's line ends and with them its data",
-            where=source.name,
-            hint="Copy the file again in binary mode",
-        )
-    if alike < len(rec.MAGIC) - 2 and _FARM_NG in source.read_at(0, 2 * len(_FARM_NG)):
-        raise LogError(
-            "not_mcap",
-            "it is a recording of farm-ng's event recorder, whose messages have no definitions in the file",
-            where=source.name,
-            hint="Write them into an .mcap: farm_ng.core's EventsFileReader, and mcap_protobuf's Writer",
-        )
-    if alike < len(rec.MAGIC) - 2:
-        raise LogError(
-            "not_mcap",
-            "the file begins neither as MCAP does nor as a bag of ROS 1 or ROS 2",
-            where=source.name,
-            hint="Give an .mcap, .bag or .db3 file, or convert the recording (`ros2 bag convert`)",
-        )
+        what = "a text-mode copy has changed the file's line ends and with them its data"
+        hint = "Copy the file again in binary mode"
+    elif alike < len(rec.MAGIC) - 2 and _FARM_NG in source.read_at(0, 2 * len(_FARM_NG)):
+        what = "it is a recording of farm-ng's event recorder, whose messages have no definitions in the file"
+        hint = "Write them into an .mcap: farm_ng.core's EventsFileReader, and mcap_protobuf's Writer"
+    elif alike < len(rec.MAGIC) - 2:
+        what = "the file begins neither as MCAP does nor as a bag of ROS 1 or ROS 2"
+        hint = "Give an .mcap, .bag or .db3 file, or convert the recording (`ros2 bag convert`)"
+    if what:
+        raise LogError("not_mcap", what, where=source.name, hint=hint)
     catalog.losses.append(Loss("damaged_record", "the file's first 8 bytes are damaged", bytes=8))
     return len(rec.MAGIC)
 

@@ -52,30 +52,18 @@ class FileSource(AbstractContextManager["FileSource"]):
                 "log_not_found", "there is no such file", where=str(path), hint="Check the path"
             ) from None
         except OSError as error:
-            raise LogError(
-                "log_unreadable",
-                f"the file cannot be opened ({error.strerror})",
-                where=str(path),
-                hint="Check its permissions",
-            ) from None
+            what = f"the file cannot be opened ({error.strerror})"
+            raise LogError("log_unreadable", what, where=self.name, hint="Check its permissions") from None
         status = os.fstat(self._descriptor)
         self.size = status.st_size
         if not stat.S_ISREG(status.st_mode):
             self.close()
-            raise LogError(
-                "log_unreadable",
-                "it is a pipe, a socket or a device, and no file",
-                where=str(path),
-                hint="Give an .mcap file",
-            )
+            what = "it is a pipe, a socket or a device, and no file"
+            raise LogError("log_unreadable", what, where=self.name, hint="Give an .mcap file")
         if self.size == 0:
             self.close()
-            raise LogError(
-                "log_empty",
-                "the file holds no bytes",
-                where=str(path),
-                hint="The recorder was stopped before it wrote anything; leave it out",
-            )
+            hint = "The recorder was stopped before it wrote anything; leave it out"
+            raise LogError("log_empty", "the file holds no bytes", where=self.name, hint=hint)
 
     def read_at(self, offset: int, length: int) -> bytes:
         """The bytes from ``offset``; fewer than ``length`` only at the end."""
@@ -88,12 +76,9 @@ class FileSource(AbstractContextManager["FileSource"]):
                     break
                 found += more
         except OSError as error:
-            raise LogError(
-                "log_unreadable",
-                f"bytes {offset} to {offset + wanted} cannot be read ({error.strerror})",
-                where=self.name,
-                hint="Copy the file from its origin again",
-            ) from None
+            what = f"bytes {offset} to {offset + wanted} cannot be read ({error.strerror})"
+            hint = "Copy the file from its origin again"
+            raise LogError("log_unreadable", what, where=self.name, hint=hint) from None
         return found
 
     def close(self) -> None:

@@ -133,19 +133,11 @@ class LogWriter:
         log = np.asarray(log_time, dtype=np.int64).reshape(-1)
         publish = log if publish_time is None else np.asarray(publish_time, dtype=np.int64).reshape(-1)
         if publish.size != log.size:
-            raise LogError(
-                "bad_column",
-                f"{publish.size} publish times for {log.size} messages",
-                where=topic,
-                hint="Give one a message",
-            )
+            what = f"{publish.size} publish times for {log.size} messages"
+            raise LogError("bad_column", what, where=topic, hint="Give one a message")
         if log.size and min(log.min(), publish.min()) < 0:
-            raise LogError(
-                "bad_column",
-                "a log or publish time lies before 1970",
-                where=topic,
-                hint="Times are nanoseconds since 1970, zero or later",
-            )
+            hint = "Times are nanoseconds since 1970, zero or later"
+            raise LogError("bad_column", "a log or publish time lies before 1970", where=topic, hint=hint)
         kind = self._type(type_name, definition)
         given = dict(fields)
         if header_time is not None:

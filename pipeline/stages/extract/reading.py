@@ -243,12 +243,7 @@ def read_pose_topic(columns: TopicColumns) -> PoseArrays:
     """Poses of a topic whose type has a pose, axes ahead, left, up."""
     pose = find_type(columns.type_name).pose
     if pose is None:
-        raise StageError(
-            "no_pose",
-            f"{columns.type_name} holds no pose",
-            where=columns.topic,
-            hint="Name another pose.topic.",
-        )
+        raise _holds_no("pose", columns, "pose")
     arrays = PoseArrays(
         np.stack([numbers(columns, name) for name in axis_fields(pose.position, "xyz")], axis=-1),
         np.stack([numbers(columns, name) for name in axis_fields(pose.orientation, "xyzw")], axis=-1),
@@ -262,12 +257,7 @@ def read_fixes(columns: TopicColumns) -> tuple[Floats, Floats, Floats, Flags]:
     """Latitude and longitude [deg], altitude [m] and whether there is a fix at all, each (n,)."""
     fix = find_type(columns.type_name).fix
     if fix is None:
-        raise StageError(
-            "no_pose",
-            f"{columns.type_name} holds no fix",
-            where=columns.topic,
-            hint="Name another pose.topic.",
-        )
+        raise _holds_no("fix", columns, "pose")
     latitude, longitude, altitude, status = (
         numbers(columns, name) for name in (fix.latitude, fix.longitude, fix.altitude, fix.status)
     )
@@ -312,18 +302,18 @@ def read_imu(columns: TopicColumns) -> tuple[Floats, Floats]:
     """Angular velocity [rad/s] and specific force [m/s^2] of an IMU topic, each (n, 3)."""
     imu = find_type(columns.type_name).imu
     if imu is None:
-        raise StageError(
-            "no_imu",
-            f"{columns.type_name} holds no gyro",
-            where=columns.topic,
-            hint="Name another imu.topic.",
-        )
+        raise _holds_no("gyro", columns, "imu")
     signs = np.array([1.0, -1.0, -1.0]) if imu.convention == "ned_frd" else np.ones(3)
     rates, forces = (
         signs * np.stack([numbers(columns, name) for name in axis_fields(fields, "xyz")], axis=-1)
         for fields in (imu.rate, imu.force)
     )
     return rates, forces
+
+
+def _holds_no(what: str, columns: TopicColumns, role: str) -> StageError:
+    said, hint = f"{columns.type_name} holds no {what}", f"Name another {role}.topic."
+    return StageError(f"no_{role}", said, where=columns.topic, hint=hint)
 
 
 def numbers(columns: TopicColumns, name: str) -> Floats:
