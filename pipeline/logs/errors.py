@@ -16,6 +16,11 @@ class LogError(SlipError):
     """
 
 
+def unsupported(what: str, where: str, hint: str = "Leave the topic out") -> LogError:
+    """The error for messages that cannot be decoded."""
+    return LogError("unsupported_encoding", what, where=where, hint=hint)
+
+
 @dataclass(frozen=True, slots=True)
 class Loss:
     """Something that stood in the log and did not come out of it whole.

@@ -12,7 +12,7 @@ from mcap.writer import CompressionType, Writer
 from pipeline.core.arrays import Flags, Ints
 from pipeline.logs.definitions import definition_text
 from pipeline.logs.encode import encode_rows
-from pipeline.logs.errors import LogError
+from pipeline.logs.errors import LogError, unsupported
 from pipeline.logs.schema import leaf_paths, parse_msg
 
 if TYPE_CHECKING:
@@ -72,12 +72,8 @@ class LogWriter:
         self, path: str | os.PathLike[str], *, chunk_size: int = 1 << 20, compression: str = "zstd"
     ) -> None:
         if compression not in COMPRESSIONS:
-            raise LogError(
-                "unsupported_encoding",
-                f"chunks cannot be compressed with {compression!r}",
-                where=str(path),
-                hint=f"Use one of {', '.join(map(repr, COMPRESSIONS))}",
-            )
+            hint = f"Use one of {', '.join(map(repr, COMPRESSIONS))}"
+            raise unsupported(f"chunks cannot be compressed with {compression!r}", str(path), hint)
         self._path = Path(path)
         self._draft = self._path.with_name(f".{self._path.name}.{os.getpid()}.part")
         self._types: dict[str, _Type] = {}

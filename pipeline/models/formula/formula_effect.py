@@ -134,12 +134,8 @@ class FormulaEffect(AddedEffect):
         expression = parse_expression(text, {**_parse_signal_units(), **own}, self._where)
         wanted = parse_unit(CHANNELS[channel], self._where)
         if expression.unit != wanted:
-            raise MotionError(
-                "wrong_units",
-                f"{channel} = {text!r} is in {expression.unit}, not in {wanted}",
-                where=self._where,
-                hint="Mend the formula or the unit of a parameter.",
-            )
+            what = f"{channel} = {text!r} is in {expression.unit}, not in {wanted}"
+            raise self._refuse("wrong_units", what, "Mend the formula or the unit of a parameter.")
         return expression
 
     def _check_names(self) -> None:
@@ -148,23 +144,15 @@ class FormulaEffect(AddedEffect):
             if proper and name not in {*SIGNAL_UNITS, *CHANNELS, *_TAKEN} and not keyword.iskeyword(name):
                 continue
             what = "is taken" if proper else "is no name"
-            raise MotionError(
-                "name_taken",
-                f"the parameter {name[:80]!r} cannot be called so: the name {what}",
-                where=self._where,
-                hint="Choose another name, of letters, digits and _.",
-            )
+            text = f"the parameter {name[:80]!r} cannot be called so: the name {what}"
+            raise self._refuse("name_taken", text, "Choose another name, of letters, digits and _.")
 
     def _check_parameters(self) -> None:
         used = frozenset[str]().union(*(e.names for e in self.expressions.values()))
         for parameter in self.parameters:
             if parameter.name not in used:
-                raise MotionError(
-                    "unused_parameter",
-                    f"the parameter {parameter.name!r} stands in no formula",
-                    where=self._where,
-                    hint="Use it or drop it.",
-                )
+                what = f"the parameter {parameter.name!r} stands in no formula"
+                raise self._refuse("unused_parameter", what, "Use it or drop it.")
 
     def _check_neutral(self) -> None:
         """The effect must change nothing at neutral values: the ladder compares with its absence."""
@@ -174,12 +162,12 @@ class FormulaEffect(AddedEffect):
         for channel, expression in self.expressions.items():
             value = np.asarray(expression.evaluate({**signals, **neutral}))
             if not np.allclose(value, 0.0, atol=1e-12):
-                raise MotionError(
-                    "not_neutral",
-                    f"{channel} = {expression.text!r} is not zero at the parameters' neutral values",
-                    where=self._where,
-                    hint="Give `neutral` to a parameter so that the formula vanishes there, or add a factor.",
-                )
+                what = f"{channel} = {expression.text!r} is not zero at the parameters' neutral values"
+                hint = "Give `neutral` to a parameter so that the formula vanishes there, or add a factor."
+                raise self._refuse("not_neutral", what, hint)
+
+    def _refuse(self, code: str, what: str, hint: str) -> MotionError:
+        return MotionError(code, what, where=self._where, hint=hint)
 
 
 @functools.cache
