@@ -14,7 +14,6 @@ from pipeline.logs.objects import ObjectDecoder, decode_json, protobuf_decoder
 from pipeline.logs.schema import SchemaError, Structure, contains_text, leaf_paths, parse_msg
 
 if TYPE_CHECKING:
-    from pipeline.logs.channel import PayloadDecoder
     from pipeline.logs.index import ChannelInfo
 
 _EMPTY: Final = "the schema is empty"
@@ -31,7 +30,7 @@ class Recipe:
         notes: what is worth knowing.
     """
 
-    decoder: PayloadDecoder
+    decoder: StructuredDecoder | ObjectDecoder
     leaves: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
