@@ -1,7 +1,5 @@
 """What a run comes to: medians, root mean squares, the split into drivetrain and ground."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy

@@ -1,7 +1,5 @@
 """How the clocks, scales and signs of a recording were put right, once for everyone who reads the run."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from schemas import fields

@@ -1,7 +1,5 @@
 """Who carries the slip of a run, and the errors of its predictions."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy

@@ -1,7 +1,5 @@
 """Datasets compared pair by pair."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy

@@ -1,7 +1,5 @@
 """What a contract is, and where contracts are found."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import pkgutil

@@ -1,7 +1,5 @@
 """Runs pooled into datasets."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy

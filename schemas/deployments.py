@@ -1,7 +1,5 @@
 """Deployments of the literature and of anybody: features of vehicle and terrain, with their status."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import dataframely as dy

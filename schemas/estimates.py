@@ -1,7 +1,5 @@
 """Numbers of all effects that a run tells of, named or not."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy

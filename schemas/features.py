@@ -1,7 +1,5 @@
 """What a deployment shares with others: its features, never its data."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy

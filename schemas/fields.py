@@ -1,7 +1,5 @@
 """Columns that several contracts share, so that one quantity has one unit and one frame everywhere."""
 
-from __future__ import annotations
-
 import dataframely as dy
 import polars as pl
 

@@ -1,7 +1,5 @@
 """What was noticed about a log, in words, with stable ids."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy

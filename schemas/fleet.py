@@ -1,7 +1,5 @@
 """Numbers of a fleet by vehicle, terrain and run."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy

@@ -1,7 +1,5 @@
 """What the inertial unit measured."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from schemas import fields

@@ -1,7 +1,5 @@
 """Held-out errors of the ideal model, then with one effect more at each rung; and the noise floor."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy

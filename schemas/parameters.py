@@ -1,7 +1,5 @@
 """Parameters of the effects that the diagnosis of a run named."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy

@@ -1,7 +1,5 @@
 """Where the localization says the vehicle was."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy

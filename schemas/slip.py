@@ -1,7 +1,5 @@
 """How far the motion was from the ideal model, step by step."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy

@@ -1,7 +1,5 @@
 """How the body moved, from the poses."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from schemas import fields

@@ -1,7 +1,5 @@
 """Slip over windows of two seconds, the quantity of the published figure."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy

@@ -3,8 +3,6 @@
 Whatever cannot be looked at is named and left out; the rest is found all the same.
 """
 
-from __future__ import annotations
-
 import errno
 import fnmatch
 import os

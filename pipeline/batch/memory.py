@@ -1,7 +1,5 @@
 """A watchdog over the memory of workers or of this process: better one log lost than the machine."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Finding recordings: files, folders, globs, lists; a split one is one, one in the making is none."""
 
-from __future__ import annotations
-
 import fnmatch
 import os
 import re

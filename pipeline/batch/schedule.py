@@ -1,7 +1,5 @@
 """Units that run a batch every night: one at a time, caught up after downtime, heard in the journal."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Sequence

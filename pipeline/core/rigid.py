@@ -4,8 +4,6 @@ Quaternions are (x, y, z, w), unit length, and rotate vectors of the child frame
 as in ROS messages. Angles are in radians.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipeline.core.arrays import Floats

@@ -1,7 +1,5 @@
 """Robust linear regression, by iteratively reweighted least squares with Cauchy weights."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipeline.core.arrays import Floats

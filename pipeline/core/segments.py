@@ -4,8 +4,6 @@ A segment is a stretch in which time runs forward without a hole and the pose mo
 interpolated or differentiated across a segment's ends.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipeline.core import rigid

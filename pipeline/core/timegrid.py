@@ -3,8 +3,6 @@
 Times are float64 seconds, increasing. Nothing here crosses a segment: callers pass one segment at a time.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints

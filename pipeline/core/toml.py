@@ -4,8 +4,6 @@ The parser of the standard library ends with a recursion error on deep nesting, 
 on long dotted keys, and knows whole numbers of any length.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import tomllib

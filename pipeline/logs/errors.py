@@ -1,7 +1,5 @@
 """What can go wrong with a log, and what can be lost from one that is still read."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pipeline.core.errors import SlipError

@@ -1,7 +1,5 @@
 """The parser of ``ros2idl`` definitions: the part of OMG IDL that ROS 2 generates."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from typing import Final

@@ -1,7 +1,5 @@
 """Where the bytes of a log come from: one small interface, local files and object stores behind it."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import stat

@@ -1,7 +1,5 @@
 """Doing independent reads on several threads with bounded memory."""
 
-from __future__ import annotations
-
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator

@@ -1,7 +1,5 @@
 """Whether a number stopped because it may go no further."""
 
-from __future__ import annotations
-
 import math
 
 _MARGIN = 1e-6

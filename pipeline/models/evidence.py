@@ -1,7 +1,5 @@
 """What recordings can show of an effect: what was asked for, and which sensors tell of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -4,8 +4,6 @@ A `Scenario` says everything about a run; `simulate_run` drives it and `write_lo
 physics is written here a second time, independently: nothing is shared with the models that are fitted.
 """
 
-from __future__ import annotations
-
 from pipeline.simulate.case_table import Case
 from pipeline.simulate.cases import (
     find_case,

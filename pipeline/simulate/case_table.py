@@ -1,7 +1,5 @@
 """The named scenarios: what ``cases.toml`` says, on the bases here."""
 
-from __future__ import annotations
-
 import math
 import tomllib
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Named scenarios with changes: what the command line asks for, made into a log."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

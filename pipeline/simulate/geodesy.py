@@ -1,7 +1,5 @@
 """Where on Earth a place of the simulated world is: WGS84, the world's origin being a field in Quebec."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipeline.core.arrays import Floats

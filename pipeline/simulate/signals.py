@@ -3,8 +3,6 @@
 A signal lives on cells of ``step`` seconds: entry k is its mean over [k step, (k+1) step].
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Independent streams of random numbers, one a purpose, all from one seed."""
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np

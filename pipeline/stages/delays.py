@@ -1,7 +1,5 @@
 """How late one signal is against another, by the lag of their best correlation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

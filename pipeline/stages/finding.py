@@ -1,7 +1,5 @@
 """Findings: what a stage noticed, with an id that stays the same for scripts."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """Command steps: stretches of one command, and the transitory span that follows each change."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

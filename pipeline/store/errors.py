@@ -1,7 +1,5 @@
 """What can go wrong with results, in one line that says what to do."""
 
-from __future__ import annotations
-
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Files that are there whole or not at all, and stay there when the power goes."""
 
-from __future__ import annotations
-
 import errno
 import os
 import secrets

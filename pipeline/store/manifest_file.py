@@ -1,7 +1,5 @@
 """The manifest's file: sealed JSON, strict in reading, the same bytes for the same manifest."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any

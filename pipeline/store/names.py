@@ -5,8 +5,6 @@ find them; everything else is percent-encoded. Two different names never share a
 before a hash, `%` only before a code, and the text before the last slash becomes one part whatever it holds.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 import unicodedata

@@ -4,8 +4,6 @@ The checksum stands first and covers every other byte. Files of before there wer
 read as they are.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 

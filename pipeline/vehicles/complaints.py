@@ -1,7 +1,5 @@
 """What is wrong in a configuration: the line it stands in, and the words that would do."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path

@@ -6,8 +6,6 @@ speaks of such or of rollers. The radius is that of the wheel's cylinder, else t
 base_footprint.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Finding and merging configurations: presets < fleet.toml < run.toml < the command line."""
 
-from __future__ import annotations
-
 import fnmatch
 import os
 from collections.abc import Iterable, Mapping

@@ -1,7 +1,5 @@
 """Geometry that a controller was given: its parameters, as parameter events or metadata record them."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

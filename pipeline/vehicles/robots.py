@@ -6,8 +6,6 @@ the same topics (``alice/cmd_vel``, ``alice/odom``, ``bob/cmd_vel``, ``bob/odom`
 ``controller`` beside ``mapping``, is one robot.
 """
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping

@@ -1,7 +1,5 @@
 """Parsing formulas: Python's grammar gives the tree, and only arithmetic in it is let through."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Callable, Mapping

@@ -3,8 +3,6 @@
 It says where the vehicle is, not what the localization reports.
 """
 
-from __future__ import annotations
-
 from pipeline.models.python_text import write_function
 from pipeline.models.target import Target
 

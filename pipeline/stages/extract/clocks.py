@@ -5,8 +5,6 @@ preferred, since recording delays do not reach them. A clock that jumps while th
 right again through the log time; the place is remembered, so that no segment crosses it.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -5,8 +5,6 @@ from, and the course over ground gives that: the two are put together over a min
 course is the heading: unknown while the vehicle stands, and blind to sideways slip.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, TypeVar

@@ -1,7 +1,5 @@
 """Geometry of a vehicle that nothing names: as its poses show it, and as its controller drives with."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 
