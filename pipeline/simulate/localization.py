@@ -7,8 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import rigid
 from pipeline.core.arrays import Floats
+from pipeline.core.rigid import (
+    interpolate_poses,
+    multiply_quaternions,
+    quaternions_from_vectors,
+    quaternions_from_yaw,
+    rotate,
+)
 from pipeline.simulate.signals import make_coloured_noise
 from pipeline.simulate.streams import open_stream, spread_times
 
@@ -46,10 +52,8 @@ class Poses:
 
     def in_map(self) -> tuple[Floats, Floats]:
         """Positions (n, 3) and quaternions (n, 4) in the ``map`` frame."""
-        turn = rigid.quaternions_from_yaw(self.correction_yaw)
-        return self.correction + rigid.rotate(turn, self.position), rigid.multiply_quaternions(
-            turn, self.quaternion
-        )
+        turn = quaternions_from_yaw(self.correction_yaw)
+        return self.correction + rotate(turn, self.position), multiply_quaternions(turn, self.quaternion)
 
 
 def report_poses(sensor: PoseSensor, path: Path, effects: Effects, *, duration_s: float, seed: int) -> Poses:
@@ -97,16 +101,16 @@ def _choose_times(sensor: PoseSensor, duration_s: float, seed: int) -> tuple[Flo
 
 
 def _sample_path(path: Path, effects: Effects, at: Floats) -> tuple[Floats, Floats]:
-    position, quaternion = rigid.interpolate_poses(at, path.time_s, path.position, path.quaternion)
+    position, quaternion = interpolate_poses(at, path.time_s, path.position, path.quaternion)
     arm = np.array([effects.value("lever_arm", "l_x"), effects.value("lever_arm", "l_y"), 0.0])
     if effects.is_active("lever_arm"):
-        position = position + rigid.rotate(quaternion, np.broadcast_to(arm, position.shape))
+        position = position + rotate(quaternion, np.broadcast_to(arm, position.shape))
     if effects.is_active("heading_skew"):
         late = at - effects.value("heading_skew", "d")
-        _, quaternion = rigid.interpolate_poses(late, path.time_s, path.position, path.quaternion)
+        _, quaternion = interpolate_poses(late, path.time_s, path.position, path.quaternion)
     if effects.is_active("yaw_misalignment"):
-        twist = rigid.quaternions_from_yaw(np.full(at.size, effects.value("yaw_misalignment", "psi")))
-        quaternion = rigid.multiply_quaternions(quaternion, twist)
+        twist = quaternions_from_yaw(np.full(at.size, effects.value("yaw_misalignment", "psi")))
+        quaternion = multiply_quaternions(quaternion, twist)
     return position, quaternion
 
 
@@ -114,8 +118,8 @@ def _mount_frame(sensor: PoseSensor, position: Floats, quaternion: Floats) -> tu
     if sensor.child_frame == "base_link":
         return position, quaternion
     arm = np.broadcast_to(np.array([sensor.mount_x_m, sensor.mount_y_m, 0.0]), position.shape)
-    twist = rigid.quaternions_from_yaw(np.full(position.shape[0], sensor.mount_yaw_rad))
-    return position + rigid.rotate(quaternion, arm), rigid.multiply_quaternions(quaternion, twist)
+    twist = quaternions_from_yaw(np.full(position.shape[0], sensor.mount_yaw_rad))
+    return position + rotate(quaternion, arm), multiply_quaternions(quaternion, twist)
 
 
 def _add_noise(
@@ -124,7 +128,7 @@ def _add_noise(
     white = open_stream(seed, "pose noise").standard_normal((at.size, 6))
     position = position + white[:, :3] * np.array([sensor.noise_m, sensor.noise_m, sensor.noise_z_m])
     shake = white[:, 3:] * np.array([sensor.noise_tilt_rad, sensor.noise_tilt_rad, sensor.noise_rad])
-    quaternion = rigid.multiply_quaternions(quaternion, rigid.quaternions_from_vectors(shake))
+    quaternion = multiply_quaternions(quaternion, quaternions_from_vectors(shake))
     if sensor.drift_m == 0.0 and sensor.drift_rad == 0.0:
         return position, quaternion
     generator = open_stream(seed, "pose drift")
@@ -141,7 +145,7 @@ def _add_noise(
         return np.interp(at, grid, noise)
 
     slow = np.stack((wander(sensor.drift_m), wander(sensor.drift_m), np.zeros(at.size)), axis=1)
-    turned = rigid.multiply_quaternions(rigid.quaternions_from_yaw(wander(sensor.drift_rad)), quaternion)
+    turned = multiply_quaternions(quaternions_from_yaw(wander(sensor.drift_rad)), quaternion)
     return position + slow, turned
 
 
@@ -157,8 +161,8 @@ def _add_jumps(sensor: PoseSensor, poses: Poses, duration_s: float, seed: int) -
         here = poses.in_map()[0][after[0]]
         # The correction turns the map about the robot, so that the jump has the asked size wherever it is.
         moved = np.array([np.cos(way), np.sin(way), 0.0]) * sensor.jump_m
-        by = rigid.quaternions_from_yaw(np.full(after.size, turn))
-        shift[after] = here + moved + rigid.rotate(by, shift[after] - here)
+        by = quaternions_from_yaw(np.full(after.size, turn))
+        shift[after] = here + moved + rotate(by, shift[after] - here)
         yaw[after] += turn
         poses = replace(poses, correction_yaw=yaw.copy(), correction=shift.copy())
     return poses
@@ -171,9 +175,7 @@ def _rotate_stretches(sensor: PoseSensor, poses: Poses, duration_s: float, seed:
         turn[(poses.sampled_s >= start) & (poses.sampled_s < start + _STRETCH_S)] = 0.5 * np.pi
     if not turn.any():
         return poses
-    return replace(
-        poses, quaternion=rigid.multiply_quaternions(poses.quaternion, rigid.quaternions_from_yaw(turn))
-    )
+    return replace(poses, quaternion=multiply_quaternions(poses.quaternion, quaternions_from_yaw(turn)))
 
 
 def _invalidate(sensor: PoseSensor, poses: Poses, seed: int) -> Poses:
