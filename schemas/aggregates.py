@@ -1,7 +1,5 @@
 """What a run comes to: medians, root mean squares, the split into drivetrain and ground."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy
@@ -16,7 +14,6 @@ SUBSETS = ("all", "transitory", "steady")
 class Aggregates(Table):
     """One row an input and subset of the samples."""
 
-    NAME: ClassVar[str] = "aggregates"
     VERSION: ClassVar[int] = 2
 
     input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})

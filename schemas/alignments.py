@@ -1,7 +1,5 @@
 """How the clocks, scales and signs of a recording were put right, once for everyone who reads the run."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from schemas import fields
@@ -11,7 +9,6 @@ from schemas.contract import Table
 class Alignments(Table):
     """One row a run."""
 
-    NAME: ClassVar[str] = "alignments"
     VERSION: ClassVar[int] = 2
 
     hold_time = fields.number("s", "the controller stops this long after its last command", nullable=True)

@@ -1,7 +1,5 @@
 """Who carries the slip of a run, and the errors of its predictions."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy
@@ -17,7 +15,6 @@ KINDS = ("effect", "disturbance", "localization_noise")
 class Budget(Table):
     """One row a cause: the shares of an input and a quantity add up to one."""
 
-    NAME: ClassVar[str] = "budget"
     VERSION: ClassVar[int] = 1
 
     input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 class Commands(Table):
     """One row a command message, held until the next one or until it is stale."""
 
-    NAME: ClassVar[str] = "commands"
     VERSION: ClassVar[int] = 3
 
     t = fields.seconds()

@@ -1,7 +1,5 @@
 """Datasets compared pair by pair."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy
@@ -11,13 +9,11 @@ from schemas.contract import Table
 from schemas.slip import INPUTS
 
 UNITS = ("runs", "blocks")
-SHARE = {"unit": "1"}
 
 
 class Comparisons(Table):
     """One row a pair; ``run``, ``vehicle`` and ``terrain`` are `*`, ``dataset`` names both sides."""
 
-    NAME: ClassVar[str] = "comparisons"
     VERSION: ClassVar[int] = 1
 
     by = fields.text("columns that make a dataset")
@@ -30,32 +26,17 @@ class Comparisons(Table):
     shift = fields.number("m/s", "Hodges-Lehmann shift b - a of the units")
     low = fields.number("m/s", "lower end of its 95 % interval", nullable=True)
     high = fields.number("m/s", "upper end of it", nullable=True)
-    cliffs_delta = dy.Float64(
-        min=-1.0,
-        max=1.0,
-        metadata={**SHARE, "description": "Cliff's delta of the units; above 0: b is larger"},
-    )
+    cliffs_delta = fields.bounded("1", "Cliff's delta of the units; above 0: b is larger", -1.0, 1.0)
     size = fields.text("Cliff's delta in a word")
-    p = dy.Float64(
-        min=0.0, max=1.0, metadata={**SHARE, "description": "two-sided permutation p of this pair"}
-    )
-    p_adjusted = dy.Float64(
-        min=0.0, max=1.0, metadata={**SHARE, "description": "the same corrected over the family of pairs"}
-    )
-    smallest_p = dy.Float64(
-        min=0.0, max=1.0, metadata={**SHARE, "description": "smallest corrected p that the counts allow"}
-    )
+    p = fields.bounded("1", "two-sided permutation p of this pair", 0.0, 1.0)
+    p_adjusted = fields.bounded("1", "the same corrected over the family of pairs", 0.0, 1.0)
+    smallest_p = fields.bounded("1", "smallest corrected p that the counts allow", 0.0, 1.0)
     method = fields.text("test and correction")
     unit_of_analysis = dy.Enum(
         UNITS, metadata={"description": "what is permuted: runs, or blocks of single runs"}
     )
-    p_uncorrected = dy.Float64(
-        min=0.0,
-        max=1.0,
-        metadata={
-            **SHARE,
-            "description": "plain Mann-Whitney of all samples: not valid, they are correlated",
-        },
+    p_uncorrected = fields.bounded(
+        "1", "plain Mann-Whitney of all samples: not valid, they are correlated", 0.0, 1.0
     )
     note = fields.text("what must be known to read the row; may be empty")
     keys = fields.text("run/generation of every run counted, separated by spaces")

@@ -1,7 +1,5 @@
 """What a contract is, and where contracts are found."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import pkgutil
@@ -14,9 +12,11 @@ import schemas
 
 
 class Table(dy.Schema):
-    """Columns that every table has: which run a row belongs to."""
+    """Columns that every table has: which run a row belongs to.
 
-    NAME: ClassVar[str]
+    The table is called as the class, in small letters.
+    """
+
     VERSION: ClassVar[int]
 
     run = dy.String(metadata={"description": "run the row belongs to"})
@@ -54,9 +54,9 @@ def list_contracts() -> tuple[Contract, ...]:
             continue
         content = vars(importlib.import_module(f"schemas.{module.name}"))
         found += [
-            Contract(table.NAME, table.VERSION, table)
+            Contract(table.__name__.lower(), table.VERSION, table)
             for table in content.values()
-            if isinstance(table, type) and issubclass(table, Table) and "NAME" in vars(table)
+            if isinstance(table, type) and issubclass(table, Table) and "VERSION" in vars(table)
         ]
     return tuple(sorted(found, key=lambda contract: contract.name))
 

@@ -1,7 +1,5 @@
 """Runs pooled into datasets."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy
@@ -18,7 +16,6 @@ class Datasets(Table):
     `slip compare` alone works out are null until it has run.
     """
 
-    NAME: ClassVar[str] = "datasets"
     VERSION: ClassVar[int] = 3
 
     by = fields.text("columns that make a dataset, for example `dataset` or `vehicle,terrain`")

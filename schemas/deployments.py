@@ -1,9 +1,11 @@
 """Deployments of the literature and of anybody: features of vehicle and terrain, with their status."""
 
-from __future__ import annotations
+from functools import partial
 
 import dataframely as dy
 import polars as pl
+
+from schemas import fields
 
 STATUSES = (
     "read", "vendor", "second-hand", "inferred", "measured", "assumed", "estimated", "placeholder",
@@ -38,8 +40,7 @@ def _status(of: str) -> dy.Enum:
     return dy.Enum(STATUSES, nullable=True, metadata={"description": f"how well {of} is known"})
 
 
-def _number(unit: str, description: str, low: float | None = None, high: float | None = None) -> dy.Float64:
-    return dy.Float64(nullable=True, min=low, max=high, metadata={"unit": unit, "description": description})
+_number = partial(fields.bounded, nullable=True)
 
 
 class Deployments(dy.Schema):

@@ -1,7 +1,5 @@
 """Numbers of all effects that a run tells of, named or not."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy
@@ -14,7 +12,6 @@ from schemas.slip import INPUTS
 class Estimates(Table):
     """One row a parameter: what runs are set side by side with."""
 
-    NAME: ClassVar[str] = "estimates"
     VERSION: ClassVar[int] = 1
 
     input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})
@@ -22,9 +19,7 @@ class Estimates(Table):
     parameter = dy.String(min_length=1, metadata={"description": "name of the parameter"})
     unit = fields.text("unit of value and standard_error")
     value = fields.number("1", "its estimate, in the unit of the column `unit`")
-    standard_error = dy.Float64(
-        min=0.0, metadata={"unit": "1", "description": "standard deviation of the estimate"}
-    )
+    standard_error = fields.bounded("1", "standard deviation of the estimate", 0.0)
     named = fields.flag(
         "the diagnosis names the effect; else the estimate is what one step of a joint fit gives"
     )

@@ -1,7 +1,5 @@
 """What a deployment shares with others: its features, never its data."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy
@@ -10,6 +8,11 @@ import polars as pl
 from schemas.contract import Table
 
 _NAME = r"^[^\x00-\x1f\x7f/\\]{1,120}$"
+
+
+def _text(pattern: str, description: str, *, nullable: bool = False) -> dy.String:
+    """A text that looks like this."""
+    return dy.String(nullable=nullable, regex=pattern, metadata={"description": description})
 
 
 def _feature(
@@ -28,26 +31,17 @@ def _feature(
 class Features(Table):
     """One row a run and input; ``run`` is the beginning of the log's hash: no name of a file is shared."""
 
-    NAME: ClassVar[str] = "features"
     VERSION: ClassVar[int] = 1
 
-    run = dy.String(regex=r"^[0-9a-f]{16}$", metadata={"description": "first 16 digits of sha256"})
-    dataset = dy.String(regex=_NAME, metadata={"description": "runs of one vehicle on one terrain"})
-    vehicle = dy.String(regex=_NAME, metadata={"description": "vehicle name"})
-    terrain = dy.String(regex=_NAME, metadata={"description": "terrain name"})
-    input = dy.String(
-        regex="^(command|measured)$", metadata={"description": "what u was: command or measured wheels"}
-    )
-    sha256 = dy.String(
-        regex=r"^[0-9a-f]{64}$", metadata={"description": "SHA-256 of the log, which counts once"}
-    )
-    month = dy.String(
-        nullable=True, regex=r"^(19|20)\d\d-(0[1-9]|1[0-2])$", metadata={"description": "month of the run"}
-    )
-    made_by = dy.String(regex=r"^[0-9A-Za-z.+_-]{1,40}$", metadata={"description": "version of slip"})
-    from_results = dy.String(
-        regex=r"^[0-9A-Za-z_-]{1,80}$", metadata={"description": "key of the results: inputs and versions"}
-    )
+    run = _text(r"^[0-9a-f]{16}$", "first 16 digits of sha256")
+    dataset = _text(_NAME, "runs of one vehicle on one terrain")
+    vehicle = _text(_NAME, "vehicle name")
+    terrain = _text(_NAME, "terrain name")
+    input = _text("^(command|measured)$", "what u was: command or measured wheels")
+    sha256 = _text(r"^[0-9a-f]{64}$", "SHA-256 of the log, which counts once")
+    month = _text(r"^(19|20)\d\d-(0[1-9]|1[0-2])$", "month of the run", nullable=True)
+    made_by = _text(r"^[0-9A-Za-z.+_-]{1,40}$", "version of slip")
+    from_results = _text(r"^[0-9A-Za-z_-]{1,80}$", "key of the results: inputs and versions")
     mass = _feature("kg", "mass as configured", 0.01, 1e6)
     inertia = _feature("kg m^2", "yaw inertia of a plate of that mass, as wide as the track", 0.0, 1e8)
     length_scale = _feature("m", "L that turns yaw rate into speed in the modulus", 1e-3, 100.0)

@@ -1,7 +1,5 @@
 """Columns that several contracts share, so that one quantity has one unit and one frame everywhere."""
 
-from __future__ import annotations
-
 import dataframely as dy
 import polars as pl
 
@@ -37,6 +35,20 @@ def number(unit: str, description: str, *, frame: str = "", nullable: bool = Fal
     if frame:
         metadata["frame"] = frame
     return dy.Float64(nullable=nullable, check=lambda value: value.is_finite(), metadata=metadata)
+
+
+def bounded(
+    unit: str,
+    description: str,
+    low: float | None = None,
+    high: float | None = None,
+    *,
+    nullable: bool = False,
+) -> dy.Float64:
+    """A number with a unit within what can be; one without bounds may be anything."""
+    return dy.Float64(
+        nullable=nullable, min=low, max=high, metadata={"unit": unit, "description": description}
+    )
 
 
 def body(unit: str, description: str, *, nullable: bool = False) -> dy.Float64:

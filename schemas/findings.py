@@ -1,7 +1,5 @@
 """What was noticed about a log, in words, with stable ids."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy
@@ -15,7 +13,6 @@ SEVERITIES = ("info", "warning", "error")
 class Findings(Table):
     """One row a finding."""
 
-    NAME: ClassVar[str] = "findings"
     VERSION: ClassVar[int] = 1
 
     stage = fields.text("stage that noticed it")

@@ -1,7 +1,5 @@
 """Numbers of a fleet by vehicle, terrain and run."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy
@@ -18,7 +16,6 @@ class Fleet(Table):
     ``run`` and ``dataset`` are `*`; ``keys`` names the runs.
     """
 
-    NAME: ClassVar[str] = "fleet"
     VERSION: ClassVar[int] = 1
 
     effect = dy.String(min_length=1, metadata={"description": "id of the effect"})

@@ -1,7 +1,5 @@
 """What the inertial unit measured."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from schemas import fields
@@ -11,7 +9,6 @@ from schemas.contract import Table
 class Imu(Table):
     """One row an IMU message, in the sensor's own axes and sign, as recorded."""
 
-    NAME: ClassVar[str] = "imu"
     VERSION: ClassVar[int] = 1
 
     t = fields.seconds()

@@ -1,7 +1,5 @@
 """Held-out errors of the ideal model, then with one effect more at each rung; and the noise floor."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy
@@ -16,7 +14,6 @@ KINDS = ("rung", "floor")
 class Ladder(Table):
     """One row a rung; the last row of an input is its noise floor."""
 
-    NAME: ClassVar[str] = "ladder"
     VERSION: ClassVar[int] = 1
 
     input = dy.Enum(INPUTS, metadata={"description": "what the model was fed with"})

@@ -1,7 +1,5 @@
 """Parameters of the effects that the diagnosis of a run named."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy
@@ -14,7 +12,6 @@ from schemas.slip import INPUTS
 class Parameters(Table):
     """One row a parameter of an effect that is missing from the ideal model, as in `diagnosis.json`."""
 
-    NAME: ClassVar[str] = "parameters"
     VERSION: ClassVar[int] = 2
 
     input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})

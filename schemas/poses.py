@@ -1,7 +1,5 @@
 """Where the localization says the vehicle was."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy
@@ -16,7 +14,6 @@ UNIT_TOLERANCE = 1e-6
 class Poses(Table):
     """One row a pose message of base_link in a fixed frame."""
 
-    NAME: ClassVar[str] = "poses"
     VERSION: ClassVar[int] = 2
 
     t = fields.seconds()

@@ -1,7 +1,5 @@
 """How far the motion was from the ideal model, step by step."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy
@@ -16,7 +14,6 @@ INPUTS = ("command", "measured")
 class Slip(Table):
     """One row a time step and input: g = f(u) - v."""
 
-    NAME: ClassVar[str] = "slip"
     VERSION: ClassVar[int] = 2
 
     input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})

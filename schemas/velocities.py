@@ -1,7 +1,5 @@
 """How the body moved, from the poses."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from schemas import fields
@@ -11,7 +9,6 @@ from schemas.contract import Table
 class Velocities(Table):
     """One row a step of the uniform grid inside a segment."""
 
-    NAME: ClassVar[str] = "velocities"
     VERSION: ClassVar[int] = 2
 
     t = fields.seconds()

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 class Wheels(Table):
     """One row an encoder message."""
 
-    NAME: ClassVar[str] = "wheels"
     VERSION: ClassVar[int] = 3
 
     t = fields.seconds()

@@ -1,7 +1,5 @@
 """Slip over windows of two seconds, the quantity of the published figure."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import dataframely as dy
@@ -14,7 +12,6 @@ from schemas.slip import INPUTS
 class Windows(Table):
     """One row a full window; windows start where a segment or a command step starts."""
 
-    NAME: ClassVar[str] = "windows"
     VERSION: ClassVar[int] = 1
 
     input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})
@@ -25,10 +22,5 @@ class Windows(Table):
     transitory = fields.flag("most of the window lies in the transitory span of a change of command")
     suspect = fields.flag("in a stretch with a rotated heading or a frozen position; left out of medians")
     samples = dy.Int32(min=1, metadata={"description": "grid steps in the window"})
-    rms_modulus = dy.Float64(
-        min=0.0, metadata={"unit": "m/s", "description": "root mean square of the slip modulus"}
-    )
-    window_norm = dy.Float64(
-        min=0.0,
-        metadata={"unit": "m/s", "description": "sqrt(40) rms_modulus: the published 2 s window norm"},
-    )
+    rms_modulus = fields.bounded("m/s", "root mean square of the slip modulus", 0.0)
+    window_norm = fields.bounded("m/s", "sqrt(40) rms_modulus: the published 2 s window norm", 0.0)

@@ -21,6 +21,7 @@ from pipeline.stages import aggregate, checks, slip, velocity
 from pipeline.stages.align import align_tables
 from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.finding import Finding, tabulate_findings
+from pipeline.stages.samples import gather_samples
 from pipeline.store.tables import check_table
 from pipeline.vehicles import DriveForm
 from schemas import contract_of
@@ -254,9 +255,7 @@ class Work:
         table, left_out = self._set_against_model(made.slip)
         self.write("slip", table)
         self.write("windows", made.windows)
-        samples = checks.gather_samples(
-            velocities, made.inputs, made.cut, body_commanded=self._is_body_commanded
-        )
+        samples = gather_samples(velocities, made.inputs, made.cut, body_commanded=self._is_body_commanded)
         return StageOutcome((*made.findings, *left_out, *checks.run_checks(samples, vehicle)))
 
     def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:

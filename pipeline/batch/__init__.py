@@ -14,14 +14,3 @@ from pipeline.batch.request import (
     parse_shard,
     parse_size,
 )
-
-__all__ = [
-    "BatchError",
-    "Pruning",
-    "Request",
-    "Shard",
-    "count_cores",
-    "measure_memory",
-    "parse_shard",
-    "parse_size",
-]

@@ -3,22 +3,18 @@
 Whatever cannot be looked at is named and left out; the rest is found all the same.
 """
 
-from __future__ import annotations
-
 import errno
 import fnmatch
 import os
 import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 from pipeline.logs import SUFFIXES
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
 
 _MAGIC = frozenset("*?[")
 

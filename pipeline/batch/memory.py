@@ -1,17 +1,12 @@
 """A watchdog over the memory of workers or of this process: better one log lost than the machine."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
 import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 _PERIOD_S = 0.05
 _PROC = Path("/proc/self/task")

@@ -4,16 +4,11 @@ A log keeps the name it has. Equal content counts once, under the name of the fi
 share a name the first by path gets it plain and the others with eight digits of their hash.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from pipeline.analysis.log_setup import name_plainly
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-    from pathlib import Path
 
 _DIGITS = 8
 

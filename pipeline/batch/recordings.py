@@ -1,23 +1,18 @@
 """Finding recordings: files, folders, globs, lists; a split one is one, one in the making is none."""
 
-from __future__ import annotations
-
 import fnmatch
 import os
 import re
 import time
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.batch.errors import BatchError
 from pipeline.batch.folders import Folder, Looker, Skipped
 from pipeline.logs import SUFFIXES, RemotePath, is_finished, list_files
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
 
 LISTING = "metadata.yaml"
 _GLOB = re.compile(r"[*?\[]")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from pipeline.batch.ledger import Ledger
 from pipeline.batch.pooling import POOLED, forget_pools
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from pipeline.store import Examination, Mirror, Problem, Store
-    from pipeline.store.verification import Files
 
 _UNREADABLE = ("manifest_damaged", "name_clash")
 _VERBS = {"comparison": "slip compare", "trend": "slip trend", "map": "slip map"}
@@ -42,14 +41,6 @@ class Repair:
     what: str
 
 
-class _Place(Protocol):
-    """What is used of a store, or of a mirror of one."""
-
-    def put_on_list(self, name: str) -> None: ...
-
-    def remove(self, name: str) -> None: ...
-
-
 def repair_results(
     store: Store, examination: Examination, mirror: Mirror | None = None
 ) -> tuple[Repair, ...]:
@@ -69,8 +60,8 @@ def repair_results(
 class _Repairer:
     def __init__(self, store: Store, examination: Examination, mirror: Mirror | None) -> None:
         self._store = store
-        self._place: _Place = store if mirror is None else mirror
-        self._files: Files = DiskFiles(store.root) if mirror is None else mirror
+        self._place = mirror or store
+        self._files = mirror or DiskFiles(store.root)
         self._examination = examination
         entries = Ledger(store).read_all().values()
         self._logs: Mapping[str, str] = {

@@ -1,18 +1,14 @@
 """Units that run a batch every night: one at a time, caught up after downtime, heard in the journal."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
-from typing import TYPE_CHECKING, Literal
+from pathlib import Path
+from typing import Literal
 
 from pipeline.batch.errors import BatchError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 System = Literal["systemd", "cron"]
 

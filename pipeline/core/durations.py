@@ -1,7 +1,5 @@
 """Durations in words, the same on every screen and page."""
 
-from __future__ import annotations
-
 _MINUTE, _HOUR = 60.0, 3600.0
 # Below this share of the recording it is worth saying how much of it could be compared.
 _NEARLY_ALL = 0.95

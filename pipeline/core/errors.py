@@ -4,8 +4,6 @@ An error has a stable code for scripts, says what is wrong and where, and ends w
 Each room derives one class of its own.
 """
 
-from __future__ import annotations
-
 _READABLE = 300
 _LONGEST = 1000
 

@@ -5,8 +5,6 @@ with somebody's logs would run. ``-P`` leaves that folder out. ``-I`` would also
 packages of the user, which are the user's word, not a stranger's, and by which slip itself may be installed.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 

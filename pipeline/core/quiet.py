@@ -1,7 +1,5 @@
 """Warnings of libraries are for whoever works on the program, not for whoever uses it."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 

@@ -4,12 +4,9 @@ Quaternions are (x, y, z, w), unit length, and rotate vectors of the child frame
 as in ROS messages. Angles are in radians.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Floats
 
 _TINY = 1e-12
 

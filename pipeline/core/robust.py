@@ -1,11 +1,8 @@
 """Robust linear regression, by iteratively reweighted least squares with Cauchy weights."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Floats
 
 _ROUNDS = 10
 _WIDTH = 2.0

@@ -4,16 +4,10 @@ A segment is a stretch in which time runs forward without a hole and the pose mo
 interpolated or differentiated across a segment's ends.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.core import rigid
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-Integers = NDArray[np.int64]
+from pipeline.core.arrays import Flags, Floats, Ints
 
 _GAUSSIAN = 1.4826
 _SIDE = 4
@@ -49,7 +43,7 @@ def find_held(position: Floats, quaternion: Floats) -> Flags:
     return np.concatenate((np.zeros(min(1, position.shape[0]), dtype=bool), same))
 
 
-def select_fresh_poses(times: Floats, held: Flags) -> Integers:
+def select_fresh_poses(times: Floats, held: Flags) -> Ints:
     """Indices of the poses that carry information: those that changed, and those of a vehicle at rest.
 
     A localization slower than its topic repeats its last estimate; such repeats are dropped. A vehicle that
@@ -177,9 +171,9 @@ def measure_increments(position: Floats, quaternion: Floats) -> tuple[Floats, Fl
     return moved - 0.5 * half + third * np.cross(turn, half), turn
 
 
-def number_segments(breaks: Flags) -> Integers:
+def number_segments(breaks: Flags) -> Ints:
     """Segment number of each sample from flags that say a break lies before it."""
-    numbers: Integers = np.cumsum(breaks, dtype=np.int64)
+    numbers: Ints = np.cumsum(breaks, dtype=np.int64)
     return numbers
 
 

@@ -3,13 +3,9 @@
 Times are float64 seconds, increasing. Nothing here crosses a segment: callers pass one segment at a time.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from pipeline.core.arrays import Floats, Ints
 
 _FEWEST_POINTS = 4
 _BLOCK = 4096
@@ -26,13 +22,13 @@ def make_grid(start: float, end: float, rate: float) -> Floats:
     return grid
 
 
-def hold_indices(at: Floats, times: Floats) -> Indices:
+def hold_indices(at: Floats, times: Floats) -> Ints:
     """Index of the last sample at or before each query time; -1 before the first sample."""
     # Stamps pass through nanoseconds and seconds: a sample at the very query time must count as known.
     return np.searchsorted(times, at + 1e-7, side="right").astype(np.int64) - 1
 
 
-def nearest_indices(at: Floats, times: Floats) -> Indices:
+def nearest_indices(at: Floats, times: Floats) -> Ints:
     """Index of the sample nearest to each query time; ``times`` of shape (n,), n >= 1, increasing."""
     after = np.clip(np.searchsorted(times, at), 1, max(times.size - 1, 1))
     after = np.minimum(after, times.size - 1)
@@ -82,7 +78,7 @@ def differentiate_locally(at: Floats, times: Floats, values: Floats, window: flo
     return derivative
 
 
-def _choose_neighbours(at: Floats, times: Floats, window: float) -> tuple[Indices, Indices]:
+def _choose_neighbours(at: Floats, times: Floats, window: float) -> tuple[Ints, Ints]:
     """First and one-past-last sample of each query's neighbourhood."""
     fewest = min(_FEWEST_POINTS, times.size)
     first = np.searchsorted(times, at - window / 2.0 - 1e-9).astype(np.int64)
@@ -100,9 +96,7 @@ def _choose_neighbours(at: Floats, times: Floats, window: float) -> tuple[Indice
     return first, last
 
 
-def _fit_slopes(
-    at: Floats, times: Floats, values: Floats, first: Indices, last: Indices, window: float
-) -> Floats:
+def _fit_slopes(at: Floats, times: Floats, values: Floats, first: Ints, last: Ints, window: float) -> Floats:
     """Slopes at the query times of quadratics fitted to each neighbourhood."""
     width = int((last - first).max())
     index = first[:, None] + np.arange(width)

@@ -4,17 +4,12 @@ The parser of the standard library ends with a recursion error on deep nesting, 
 on long dotted keys, and knows whole numbers of any length.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import tomllib
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
 
 from pipeline.core.errors import shorten
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
 
 LONGEST = 2_000_000
 DEEPEST = 16

@@ -16,38 +16,3 @@ from pipeline.logs.reader import LogData, TopicColumns, Wanted, read_topics
 from pipeline.logs.remote import RemotePath, spell_location, to_location
 from pipeline.logs.transforms import TransformBuffer, TransformSeries, wanted_transforms
 from pipeline.logs.writer import LogWriter
-
-__all__ = [
-    "FETCHED",
-    "ROS1_BAG",
-    "SQLITE_BAG",
-    "SUFFIXES",
-    "ChannelInfo",
-    "LogData",
-    "LogError",
-    "LogIndex",
-    "LogWriter",
-    "Loss",
-    "Ragged",
-    "RaggedStrings",
-    "RemotePath",
-    "Strings",
-    "TopicColumns",
-    "TransformBuffer",
-    "TransformSeries",
-    "Wanted",
-    "bundled_types",
-    "definition_text",
-    "field_names",
-    "hash_log",
-    "is_finished",
-    "join_channels",
-    "list_files",
-    "open_log",
-    "open_store",
-    "read_topics",
-    "shorten",
-    "spell_location",
-    "to_location",
-    "wanted_transforms",
-]

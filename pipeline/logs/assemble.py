@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final, Generic
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
 from pipeline.logs.columns import Ragged, RaggedStrings, Scalar, Strings
 from pipeline.logs.decode import take_ragged
 
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
     from pipeline.logs.cdr import Vocabulary
     from pipeline.logs.columns import Column
     from pipeline.logs.decode import Leaf, Piece
-
-    Ints = NDArray[np.int64]
 
 
 _FIRST_CAPACITY: Final = 64 << 20

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING, Final, Protocol, cast
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
 
 from pipeline.logs.errors import LogError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from fsspec import AbstractFileSystem
 
 Info = dict[str, object]
 
@@ -20,34 +21,6 @@ _ATTEMPTS: Final = 3
 
 _ROUNDS: Final = 2
 """Of those attempts: together with the times above a store that is silent costs a minute and a half."""
-
-
-class FileSystem(Protocol):
-    """What is used of fsspec."""
-
-    def ls(self, path: str, detail: bool) -> list[Info]:  # noqa: FBT001 - fsspec's own signature
-        """What is right below a prefix."""
-
-    def find(self, path: str, detail: bool) -> dict[str, Info]:  # noqa: FBT001 - fsspec's own signature
-        """Every object below a prefix."""
-
-    def cat_file(self, path: str, *, start: int | None = None, end: int | None = None) -> bytes:
-        """Bytes of an object."""
-
-    def invalidate_cache(self) -> None:
-        """Ask the store again for what it said before."""
-
-
-class _S3FileSystem(FileSystem, Protocol):
-    """What more is used of s3fs."""
-
-    loop: object
-
-    def split_path(self, path: str) -> tuple[str, str, str | None]:
-        """Bucket, key and version."""
-
-    def call_s3(self, method: str, **options: object) -> Mapping[str, object]:
-        """The answer to a request."""
 
 
 class VersionChangedError(Exception):
@@ -81,7 +54,7 @@ class _Plain:
         return call
 
 
-def open_store(url: str) -> FileSystem:
+def open_store(url: str) -> AbstractFileSystem:
     """Reach the store of an address; nothing is asked of it yet.
 
     Raises:
@@ -111,7 +84,7 @@ def open_store(url: str) -> FileSystem:
         ) from None
     if limits:
         store.retries = _ROUNDS
-    return cast("FileSystem", _Plain(store))
+    return _Plain(store)
 
 
 def unreachable(url: str, error: OSError) -> LogError:
@@ -147,19 +120,19 @@ FETCHED: Final = FetchCount()
 """Of this process: logs, and what configures them."""
 
 
-def fetch_all(store: FileSystem, url: str) -> bytes:
+def fetch_all(store: AbstractFileSystem, url: str) -> bytes:
     """All of a small object, counted.
 
     Raises:
         OSError: it cannot be read.
     """
-    found = store.cat_file(url)
+    found: bytes = store.cat_file(url)
     FETCHED.add(len(found))
     return found
 
 
 def fetch_range(
-    store: FileSystem, url: str, start: int, end: int, *, known: Info, look: Callable[[], Info]
+    store: AbstractFileSystem, url: str, start: int, end: int, *, known: Info, look: Callable[[], Info]
 ) -> bytes:
     """Bytes of the version of an object that is known, counted.
 
@@ -180,7 +153,7 @@ def fetch_range(
     """
     tag = known.get("ETag")
     if isinstance(tag, str) and tag and hasattr(store, "call_s3"):
-        found = _fetch_matching(cast("_S3FileSystem", store), url, start, end, tag)
+        found = _fetch_matching(store, url, start, end, tag)
     else:
         found = store.cat_file(url, start=start, end=end)
         store.invalidate_cache()
@@ -199,7 +172,7 @@ def describe_version(info: Info) -> str:
     return f"{tag} {info.get('size')}"
 
 
-def _fetch_matching(store: _S3FileSystem, url: str, start: int, end: int, tag: str) -> bytes:
+def _fetch_matching(store: AbstractFileSystem, url: str, start: int, end: int, tag: str) -> bytes:
     from fsspec.asyn import sync  # noqa: PLC0415 - an extra
 
     bucket, key, _ = store.split_path(url)
@@ -216,7 +189,7 @@ def _fetch_matching(store: _S3FileSystem, url: str, start: int, end: int, tag: s
         if str(reply.get("ETag")).strip('"') != tag.strip('"'):
             raise VersionChangedError(url)
         try:
-            found: bytes = sync(store.loop, reply["Body"].read)  # type: ignore[attr-defined]
+            found: bytes = sync(store.loop, reply["Body"].read)
         except Exception as broken:  # noqa: BLE001 - a connection that breaks off raises what its library likes
             error = broken
             continue

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
+from pipeline.core.arrays import Flags, Ints
 from pipeline.logs.errors import LogError
 from pipeline.logs.schema import NUMBER_TYPES, SIZES
 
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.logs.records import Buffer
-
-    Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +177,7 @@ class Cursor:
         """
         self.reject(self.place + size > self.limit)
 
-    def reject(self, wrong: NDArray[np.bool_]) -> None:
+    def reject(self, wrong: Flags) -> None:
         """Name the rows where ``wrong`` holds.
 
         Raises:

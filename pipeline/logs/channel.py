@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from pipeline.core.arrays import Flags, Ints
 from pipeline.logs.assemble import ColumnParts
 from pipeline.logs.cdr import DIALECTS, OTHER_ENCAPSULATIONS, ROS1, Cursor, Dialect
 from pipeline.logs.decode import Decoder, plan_fields, wanted_leaves
 from pipeline.logs.payloads import Block, Group, Payloads, join_groups
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-
     from pipeline.logs.columns import Column
+    from pipeline.logs.objects import ObjectDecoder
     from pipeline.logs.schema import Structure
 
-    Ints = NDArray[np.int64]
 
 _ENOUGH: Final = 4 << 20
 """Payload bytes that are collected before they are decoded together."""
@@ -43,28 +40,6 @@ class Rejected:
     reason: str
     rows: Ints
     bytes: int
-
-
-class PayloadDecoder(Protocol):
-    """Decodes the payloads of one channel batch by batch."""
-
-    def decode(self, ids: Ints, block: Block) -> None:
-        """Decode a block; ``ids`` are the numbers of its rows in the channel."""
-
-    def columns(self, rows: Ints) -> dict[str, Column]:
-        """Columns of the given rows, in their order; to be asked once."""
-
-    @property
-    def rejected(self) -> list[Rejected]:
-        """What could not be decoded."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What is worth knowing of what was decoded."""
-
-    @property
-    def shortened(self) -> Mapping[str, int]:
-        """Fields with strings that were too long and were cut, and how many."""
 
 
 class StructuredDecoder:
@@ -138,7 +113,7 @@ class StructuredDecoder:
             missing &= np.isin(np.arange(ids.size), chosen)
             self._reject("undecodable", "the payload does not fit its type", ids, block, missing)
 
-    def _reject(self, kind: str, reason: str, ids: Ints, block: Block, wrong: NDArray[np.bool_]) -> None:
+    def _reject(self, kind: str, reason: str, ids: Ints, block: Block, wrong: Flags) -> None:
         self.rejected.append(Rejected(kind, reason, ids[wrong], int(block.size[wrong].sum())))
 
     def columns(self, rows: Ints) -> dict[str, Column]:
@@ -159,7 +134,7 @@ class ChannelBuffer:
         decoder: does the decoding.
     """
 
-    decoder: PayloadDecoder
+    decoder: StructuredDecoder | ObjectDecoder
     _log: list[Ints] = field(default_factory=list)
     _publish: list[Ints] = field(default_factory=list)
     _pending: list[tuple[int, Group]] = field(default_factory=list)

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Final
 
 from pipeline.logs.channel import StructuredDecoder
 from pipeline.logs.definitions import bundled_structure
-from pipeline.logs.errors import LogError
+from pipeline.logs.errors import unsupported
 from pipeline.logs.fields import select_leaves
 from pipeline.logs.idl import parse_idl
 from pipeline.logs.objects import ObjectDecoder, decode_json, protobuf_decoder
 from pipeline.logs.schema import SchemaError, Structure, contains_text, leaf_paths, parse_msg
 
 if TYPE_CHECKING:
-    from pipeline.logs.channel import PayloadDecoder
     from pipeline.logs.index import ChannelInfo
 
 _EMPTY: Final = "the schema is empty"
@@ -31,7 +30,7 @@ class Recipe:
         notes: what is worth knowing.
     """
 
-    decoder: PayloadDecoder
+    decoder: StructuredDecoder | ObjectDecoder
     leaves: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
@@ -75,32 +74,19 @@ def _structure_of(
     info: ChannelInfo, schema: bytes, fields: tuple[str, ...] | None, where: str
 ) -> tuple[Structure, tuple[str, ...]]:
     if info.message_encoding not in ("cdr", "ros1"):
-        raise LogError(
-            "unsupported_encoding",
-            f"messages are encoded as {info.message_encoding!r}",
-            where=where,
-            hint="Leave the topic out, or convert the log to cdr",
-        )
+        what = f"messages are encoded as {info.message_encoding!r}"
+        raise unsupported(what, where, "Leave the topic out, or convert the log to cdr")
     structure, reason = _parse(info, schema)
     if structure is None:
         structure = bundled_structure(info.type_name) if info.message_encoding == "cdr" else None
         if structure is None and reason == _EMPTY and not fields:
             return Structure(info.type_name, ()), (f"{_EMPTY}; of its messages only the times were read",)
         if structure is None:
-            raise LogError(
-                "unsupported_encoding",
-                f"type {info.type_name or '(none)'}: {reason}, and none is bundled",
-                where=where,
-                hint="Record it again with its definition, or leave the topic out",
-            )
+            what = f"type {info.type_name or '(none)'}: {reason}, and none is bundled"
+            raise unsupported(what, where, "Record it again with its definition, or leave the topic out")
         return structure, (f"{reason}; the bundled one of {info.type_name} was used",)
     if contains_text(structure, "wstring"):
-        raise LogError(
-            "unsupported_encoding",
-            "the type holds wide strings, whose layout differs between vendors",
-            where=where,
-            hint="Leave the topic out",
-        )
+        raise unsupported("the type holds wide strings, whose layout differs between vendors", where)
     return structure, ()
 
 

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import numpy as np
 
+from pipeline.core.arrays import Floats, Ints
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Numbers: TypeAlias = NDArray[np.generic]
-    Offsets: TypeAlias = NDArray[np.int64]
+    Offsets: TypeAlias = Ints
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -43,7 +45,7 @@ class Ragged:
         """The values as (n, k, ...) when every message holds equally many, else None."""
         return _fold_equal_rows(self.values, self.offsets)
 
-    def at(self, position: int) -> NDArray[np.float64]:
+    def at(self, position: int) -> Floats:
         """Value number ``position`` of every message, NaN where a message is shorter; shape (n,)."""
         found = np.full(len(self), np.nan)
         there = np.diff(self.offsets) > position
@@ -104,7 +106,7 @@ class RaggedStrings:
         return Strings(found, self.values)
 
 
-def _fold_equal_rows(values: NDArray[Scalar], offsets: NDArray[np.int64]) -> NDArray[Scalar] | None:
+def _fold_equal_rows(values: NDArray[Scalar], offsets: Ints) -> NDArray[Scalar] | None:
     counts = np.diff(offsets)
     if counts.size == 0 or (counts != counts[0]).any():
         return None

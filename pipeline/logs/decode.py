@@ -5,21 +5,16 @@ Only wanted fields are copied; the others are stepped over, their lengths checke
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pipeline.core.arrays import Ints
 from pipeline.logs.cdr import Cursor, Dialect, MisfitError, Vocabulary
 from pipeline.logs.schema import NUMBER_TYPES, SEQUENCE, SIZES, Member, Structure
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from numpy.typing import NDArray
-
-    Ints = NDArray[np.int64]
-
 
 _PADDING: Final = 3
 """Serializers may pad a message to a multiple of four bytes."""

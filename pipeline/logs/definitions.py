@@ -3,8 +3,6 @@
 They stand in ``definitions.msg``, as a log's schema puts one type behind the other.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from importlib import resources
 from typing import Final

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
 from pipeline.logs.columns import Ragged, RaggedStrings, Strings
 from pipeline.logs.normalize import normalize_columns
 from pipeline.logs.schema import NUMBER_TYPES, SEQUENCE, SIZES, Member, Structure
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from pipeline.logs.columns import Column
     from pipeline.logs.normalize import Given
 
-    Ints = NDArray[np.int64]
 
 _ENCAPSULATION: Final = b"\x00\x01\x00\x00"
 

@@ -1,7 +1,5 @@
 """What can go wrong with a log, and what can be lost from one that is still read."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pipeline.core.errors import SlipError
@@ -14,6 +12,11 @@ class LogError(SlipError):
     ``topic_not_found``, ``field_not_found``, ``frame_not_found``, ``unknown_type``, ``bad_column``,
     ``unsupported_encoding``, ``no_object_store``.
     """
+
+
+def unsupported(what: str, where: str, hint: str = "Leave the topic out") -> LogError:
+    """The error for messages that cannot be decoded."""
+    return LogError("unsupported_encoding", what, where=where, hint=hint)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
 from pipeline.logs.columns import Ragged, RaggedStrings
 from pipeline.logs.errors import LogError
 
@@ -26,7 +27,7 @@ _LATEST_S: Final = 1 << 33
 _INDEXED: Final = re.compile(r"^(?P<path>.*[^\]])\[(?P<number>\d+)\]$")
 
 
-def join_stamp(seconds: NDArray[np.generic], nanoseconds: NDArray[np.generic]) -> NDArray[np.int64] | None:
+def join_stamp(seconds: NDArray[np.generic], nanoseconds: NDArray[np.generic]) -> Ints | None:
     """Stamps [ns] of seconds and nanoseconds, None where one of them is no time at all."""
     if not ((np.abs(seconds) <= _LATEST_S) & (np.abs(nanoseconds) <= _LATEST_S)).all():
         return None

@@ -1,9 +1,8 @@
 """The parser of ``ros2idl`` definitions: the part of OMG IDL that ROS 2 generates."""
 
-from __future__ import annotations
-
 import re
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator
+from typing import Final
 
 from pipeline.logs.schema import (
     MAX_DEPTH,
@@ -18,9 +17,6 @@ from pipeline.logs.schema import (
     resolve,
     short_name,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 _SEPARATOR: Final = re.compile(r"^={3,}[ \t\r]*$", re.MULTILINE)
 _HIDDEN: Final = re.compile(

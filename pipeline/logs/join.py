@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
 from pipeline.logs.columns import Ragged, RaggedStrings, Strings
 
 if TYPE_CHECKING:
@@ -16,8 +17,6 @@ if TYPE_CHECKING:
 
     from pipeline.logs.columns import Column
     from pipeline.logs.reader import TopicColumns
-
-    Ints = NDArray[np.int64]
 
 
 def join_channels(channels: Sequence[TopicColumns]) -> TopicColumns | None:

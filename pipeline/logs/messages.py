@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from mcap.records import Channel, Schema
 
+from pipeline.core.arrays import Ints
 from pipeline.logs import records as rec
 from pipeline.logs.resync import find_record
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
     from pipeline.logs.records import Buffer
 
-    Ints = NDArray[np.int64]
 
 CHUNK_RECORDS: Final = (rec.SCHEMA, rec.CHANNEL, rec.MESSAGE)
 """Kinds of record that stand in a chunk."""

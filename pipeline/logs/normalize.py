@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
 from pipeline.logs.columns import Ragged, RaggedStrings, Strings
 from pipeline.logs.decode import plan_fields, wanted_leaves
 from pipeline.logs.errors import LogError
@@ -139,14 +140,14 @@ def _cast(values: NDArray[np.generic], kind: np.dtype[np.generic]) -> NDArray[np
     return cast
 
 
-def _check_offsets(offsets: NDArray[np.int64], rows: int) -> NDArray[np.int64]:
+def _check_offsets(offsets: Ints, rows: int) -> Ints:
     if offsets.size != rows + 1:
         raise ValueError(f"sequences of {offsets.size - 1} messages for {rows}")
     return offsets.astype(np.int64)
 
 
 def _match_sequences(columns: Mapping[str, Column], rows: int, where: str) -> None:
-    counts: dict[str, tuple[str, NDArray[np.int64]]] = {}
+    counts: dict[str, tuple[str, Ints]] = {}
     for path, column in columns.items():
         owner, inside, _ = path.rpartition("[].")
         if not inside or not isinstance(column, Ragged | RaggedStrings):

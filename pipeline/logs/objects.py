@@ -12,21 +12,19 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import Rejected
 from pipeline.logs.columns import Ragged, RaggedStrings
-from pipeline.logs.errors import LogError
+from pipeline.logs.errors import LogError, unsupported
 from pipeline.logs.fields import STAMPS, select_leaves
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.logs.columns import Column
     from pipeline.logs.payloads import Block
 
-    Ints = NDArray[np.int64]
 
 Value: TypeAlias = "float | str | bool | list[Value] | dict[str, Value] | None"
 Leaf: TypeAlias = "float | str | bool"
@@ -157,20 +155,16 @@ def protobuf_decoder(schema: bytes, type_name: str, *, where: str) -> Callable[[
         from mcap.records import Schema  # noqa: PLC0415 - an extra
         from mcap_protobuf.decoder import DecoderFactory  # noqa: PLC0415 - an extra
     except ImportError:
-        raise LogError(
-            "unsupported_encoding",
-            "protobuf messages need another package",
-            where=where,
-            hint="Install mcap-protobuf-support",
-        ) from None
+        what = "protobuf messages need another package"
+        raise unsupported(what, where, "Install mcap-protobuf-support") from None
     try:
         parse = DecoderFactory().decoder_for(
             "protobuf", Schema(id=1, name=type_name, encoding="protobuf", data=schema)
         )
     except (DecodeError, McapError, TypeError, KeyError, ValueError) as error:
-        raise _damaged(str(error), where) from None
+        raise unsupported(f"the protobuf schema is damaged ({error})", where) from None
     if parse is None:
-        raise _damaged("its type is not in it", where)
+        raise unsupported("the protobuf schema is damaged (its type is not in it)", where)
 
     def decode(payload: bytes) -> Value:
         try:
@@ -179,15 +173,6 @@ def protobuf_decoder(schema: bytes, type_name: str, *, where: str) -> Callable[[
             raise ValueError(str(error)) from None
 
     return decode
-
-
-def _damaged(reason: str, where: str) -> LogError:
-    return LogError(
-        "unsupported_encoding",
-        f"the protobuf schema is damaged ({reason})",
-        where=where,
-        hint="Leave the topic out",
-    )
 
 
 def _plain(message: object, above: frozenset[str] = frozenset()) -> Value:

@@ -12,15 +12,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
 
+from pipeline.logs import bags
 from pipeline.logs import records as rec
-from pipeline.logs.bags import (
-    LONGEST_HEAD,
-    LONGEST_MAGIC,
-    catalog_bag,
-    is_whole,
-    is_written_to,
-    tell_container,
-)
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import checksum
 from pipeline.logs.loading import checksum_holds, load_spans
@@ -62,10 +55,10 @@ def catalog_file(source: ByteSource, *, threads: int = 1) -> Catalog:
     Raises:
         LogError: ``not_mcap``; of a bag, ``log_unreadable``.
     """
-    head = source.read_at(0, LONGEST_MAGIC)
-    container = tell_container(head)
+    head = source.read_at(0, bags.LONGEST_MAGIC)
+    container = bags.tell_container(head)
     if container:
-        return catalog_bag(source, container)
+        return bags.catalog_bag(source, container)
     catalog = Catalog()
     start = _check_magic(head[: len(rec.MAGIC)], source, catalog)
     ends_well = source.read_at(max(0, source.size - len(rec.MAGIC)), len(rec.MAGIC)) == rec.MAGIC
@@ -96,10 +89,10 @@ def is_finished(path: Path) -> bool:
         OSError: it cannot be read.
     """
     with path.open("rb") as stream:
-        head = stream.read(LONGEST_HEAD)
+        head = stream.read(bags.LONGEST_HEAD)
         size = stream.seek(0, os.SEEK_END)
-        if tell_container(head):
-            return is_whole(head, size) and not is_written_to(path)
+        if bags.tell_container(head):
+            return bags.is_whole(head, size) and not bags.is_written_to(path)
         stream.seek(max(0, size - len(rec.MAGIC)))
         return size >= 2 * len(rec.MAGIC) and stream.read() == rec.MAGIC
 
@@ -112,27 +105,18 @@ def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> int:
     if head == rec.MAGIC:
         return len(rec.MAGIC)
     alike = sum(a == b for a, b in zip(head, rec.MAGIC, strict=False))
+    what = hint = ""
     if head.startswith(b"\x89MCAP0\n"):
-        raise LogError(
-            "not_mcap",
-            "a text-mode copy has changed the file's line ends and with them its data",
-            where=source.name,
-            hint="Copy the file again in binary mode",
-        )
-    if alike < len(rec.MAGIC) - 2 and _FARM_NG in source.read_at(0, 2 * len(_FARM_NG)):
-        raise LogError(
-            "not_mcap",
-            "it is a recording of farm-ng's event recorder, whose messages have no definitions in the file",
-            where=source.name,
-            hint="Write them into an .mcap: farm_ng.core's EventsFileReader, and mcap_protobuf's Writer",
-        )
-    if alike < len(rec.MAGIC) - 2:
-        raise LogError(
-            "not_mcap",
-            "the file begins neither as MCAP does nor as a bag of ROS 1 or ROS 2",
-            where=source.name,
-            hint="Give an .mcap, .bag or .db3 file, or convert the recording (`ros2 bag convert`)",
-        )
+        what = "a text-mode copy has changed the file's line ends and with them its data"
+        hint = "Copy the file again in binary mode"
+    elif alike < len(rec.MAGIC) - 2 and _FARM_NG in source.read_at(0, 2 * len(_FARM_NG)):
+        what = "it is a recording of farm-ng's event recorder, whose messages have no definitions in the file"
+        hint = "Write them into an .mcap: farm_ng.core's EventsFileReader, and mcap_protobuf's Writer"
+    elif alike < len(rec.MAGIC) - 2:
+        what = "the file begins neither as MCAP does nor as a bag of ROS 1 or ROS 2"
+        hint = "Give an .mcap, .bag or .db3 file, or convert the recording (`ros2 bag convert`)"
+    if what:
+        raise LogError("not_mcap", what, where=source.name, hint=hint)
     catalog.losses.append(Loss("damaged_record", "the file's first 8 bytes are damaged", bytes=8))
     return len(rec.MAGIC)
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -15,7 +17,6 @@ if TYPE_CHECKING:
     from pipeline.logs.messages import Messages
     from pipeline.logs.records import Buffer
 
-    Ints = NDArray[np.int64]
 
 IN_PLACE: Final = 1 << 13
 """Payloads from this size on are not copied but decoded where they stand [bytes]."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
 from pipeline.logs.bags import read_bag
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
     import os
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.logs.bags import BagMessages
     from pipeline.logs.codecs import Recipe
     from pipeline.logs.columns import Column
@@ -38,7 +37,6 @@ if TYPE_CHECKING:
     from pipeline.logs.repeats import Key
     from pipeline.logs.spans import Loaded, Span
 
-    Ints = NDArray[np.int64]
 
 _LISTED: Final = 12
 """So many topics are named in an error."""

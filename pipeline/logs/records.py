@@ -11,18 +11,8 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
+from mcap import records
 from mcap.data_stream import ReadDataStream
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    ChunkIndex,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -72,14 +62,14 @@ LEAST_BODY: Final[Mapping[int, int]] = {
 """Fewest bytes of the body of every kind of record."""
 
 _KINDS: Final[Mapping[int, Any]] = {
-    HEADER: Header,
-    SCHEMA: Schema,
-    CHANNEL: Channel,
-    CHUNK_INDEX: ChunkIndex,
-    ATTACHMENT_INDEX: AttachmentIndex,
-    STATISTICS: Statistics,
-    METADATA: Metadata,
-    METADATA_INDEX: MetadataIndex,
+    HEADER: records.Header,
+    SCHEMA: records.Schema,
+    CHANNEL: records.Channel,
+    CHUNK_INDEX: records.ChunkIndex,
+    ATTACHMENT_INDEX: records.AttachmentIndex,
+    STATISTICS: records.Statistics,
+    METADATA: records.Metadata,
+    METADATA_INDEX: records.MetadataIndex,
 }
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _INDEX_HEAD: Final = struct.Struct("<HI")
@@ -136,14 +126,14 @@ class _Body(ReadDataStream):
             raise RecordError("a string is no UTF-8") from None
 
 
-def parse_record(opcode: int, body: Buffer) -> McapRecord | None:
+def parse_record(opcode: int, body: Buffer) -> records.McapRecord | None:
     """The record of a kind that says what a file holds; None for other kinds.
 
     Raises:
         RecordError: the body does not hold what the opcode promises.
     """
     kind = _KINDS.get(opcode)
-    return None if kind is None else cast("McapRecord", kind.read(_Body(body)))
+    return None if kind is None else cast("records.McapRecord", kind.read(_Body(body)))
 
 
 def parse_attachment_name(body: Buffer) -> str:

@@ -17,14 +17,7 @@ from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING, Final, cast
 from urllib.parse import quote_from_bytes, unquote_to_bytes
 
-from pipeline.logs.buckets import (
-    VersionChangedError,
-    describe_version,
-    fetch_all,
-    fetch_range,
-    open_store,
-    unreachable,
-)
+from pipeline.logs import buckets
 from pipeline.logs.errors import LogError
 
 if TYPE_CHECKING:
@@ -93,7 +86,7 @@ class RemotePath(PosixPath):
 
     def read_bytes(self) -> bytes:
         """All of an object."""
-        return fetch_all(open_store(str(self)), str(self))
+        return buckets.fetch_all(buckets.open_store(str(self)), str(self))
 
     def read_text(self, encoding: str | None = None, errors: str | None = None, **_: str) -> str:
         """All of an object as text."""
@@ -102,9 +95,9 @@ class RemotePath(PosixPath):
     def find_objects(self) -> list[Self]:
         """Every object under this prefix, sorted."""
         try:
-            found = open_store(str(self)).find(str(self), detail=True)
+            found = buckets.open_store(str(self)).find(str(self), detail=True)
         except OSError as error:
-            raise unreachable(str(self), error) from None
+            raise buckets.unreachable(str(self), error) from None
         return sorted(type(self)(_add_scheme(self, name)) for name in found)
 
     def version(self) -> str:
@@ -117,7 +110,7 @@ class RemotePath(PosixPath):
 
     def refresh(self) -> None:
         """Forget what the store said a moment ago: of objects that were overwritten or added since, too."""
-        open_store(str(self)).invalidate_cache()
+        buckets.open_store(str(self)).invalidate_cache()
 
     def _type(self) -> str:
         try:
@@ -142,11 +135,12 @@ class RemotePath(PosixPath):
 
     def _list(self, url: str) -> list[Info]:
         try:
-            return open_store(url).ls(url, detail=True)
+            listed: list[Info] = buckets.open_store(url).ls(url, detail=True)
         except FileNotFoundError:
             raise
         except OSError as error:
-            raise unreachable(str(self), error) from None
+            raise buckets.unreachable(str(self), error) from None
+        return listed
 
 
 def to_location(path: str | os.PathLike[str]) -> Path:
@@ -181,26 +175,32 @@ class RemoteSource(AbstractContextManager["RemoteSource"]):
         path: the object.
         version: the version that must be there still, as `RemoteSource.version` told; None for any.
 
+    Attributes:
+        size: count of bytes when it was opened.
+        name: the address.
+        version: as `RemotePath.version`, when it was opened.
+        fetched: bytes that were fetched so far.
+
     Raises:
         LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``, ``log_changed``.
     """
 
     def __init__(self, path: RemotePath, version: str | None = None) -> None:
-        self._path = path
-        self._store = open_store(str(path))
+        self._path, self.name = path, str(path)
+        self._store = buckets.open_store(self.name)
         self._lock = threading.Lock()
-        self._fetched = 0
+        self.fetched = 0
         # What the store said a moment ago of its objects may be out of date: nothing was read yet.
         for attempt in range(_OPENINGS):
             if attempt:
                 path.refresh()
             self._info = self._look()
-            self._size = cast("int", self._info["size"])
-            self._version = _name_version(self._info)
-            self._tail_start = max(0, self._size - _TAIL)
+            self.size = cast("int", self._info["size"])
+            self.version = _name_version(self._info)
+            self._tail_start = max(0, self.size - _TAIL)
             try:
-                if version is None or version == self._version:
-                    self._tail = self._fetch(self._tail_start, self._size)
+                if version is None or version == self.version:
+                    self._tail = self._fetch(self._tail_start, self.size)
                     return
             except LogError as error:
                 if error.code != "log_changed":
@@ -223,29 +223,9 @@ class RemoteSource(AbstractContextManager["RemoteSource"]):
             )
         return info
 
-    @property
-    def size(self) -> int:
-        """Count of bytes when it was opened."""
-        return self._size
-
-    @property
-    def name(self) -> str:
-        """The address."""
-        return str(self._path)
-
-    @property
-    def version(self) -> str:
-        """As `RemotePath.version`, when it was opened."""
-        return self._version
-
-    @property
-    def fetched(self) -> int:
-        """Bytes that were fetched so far."""
-        return self._fetched
-
     def read_at(self, offset: int, length: int) -> bytes:
         """The bytes from ``offset``; fewer than ``length`` only at the end."""
-        end = min(offset + max(0, length), self._size)
+        end = min(offset + max(0, length), self.size)
         if end <= offset:
             return b""
         if offset >= self._tail_start:
@@ -255,13 +235,13 @@ class RemoteSource(AbstractContextManager["RemoteSource"]):
     def _fetch(self, start: int, end: int) -> bytes:
         try:
             url, look = str(self._path), self._path.look
-            found = fetch_range(self._store, url, start, end, known=self._info, look=look)
-        except (VersionChangedError, FileNotFoundError):
+            found = buckets.fetch_range(self._store, url, start, end, known=self._info, look=look)
+        except (buckets.VersionChangedError, FileNotFoundError):
             raise _changed(self._path) from None
         except OSError as error:
-            raise unreachable(str(self._path), error) from None
+            raise buckets.unreachable(str(self._path), error) from None
         with self._lock:
-            self._fetched += len(found)
+            self.fetched += len(found)
         return found
 
     def __exit__(self, *_exception: object) -> None:
@@ -273,7 +253,7 @@ def _add_scheme(base: RemotePath, name: str) -> str:
 
 
 def _name_version(info: Info) -> str:
-    return hashlib.sha256(describe_version(info).encode()).hexdigest()
+    return hashlib.sha256(buckets.describe_version(info).encode()).hexdigest()
 
 
 def _read_time(info: Info) -> int:

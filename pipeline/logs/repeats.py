@@ -11,17 +11,15 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
 from pipeline.logs.messages import MESSAGE_OVERHEAD
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from numpy.typing import NDArray
-
     from pipeline.logs.messages import Messages
     from pipeline.logs.records import Buffer
 
-    Ints = NDArray[np.int64]
     Key = tuple[int, int, bytes]
 
 _DIGEST: Final = 16

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
 from pipeline.logs import records as rec
 
 if TYPE_CHECKING:
@@ -47,9 +48,7 @@ def find_record(buffer: Buffer, start: int, end: int, opcodes: Sequence[int]) ->
     return end
 
 
-def possible_places(
-    data: NDArray[np.uint8], low: int, high: int, end: int, opcodes: Sequence[int]
-) -> NDArray[np.int64]:
+def possible_places(data: NDArray[np.uint8], low: int, high: int, end: int, opcodes: Sequence[int]) -> Ints:
     """Places in [low, high) whose opcode and length are possible for a record that ends by ``end``."""
     least = np.full(256, np.iinfo(np.int64).max, dtype=np.int64)
     for opcode in opcodes:

@@ -1,19 +1,15 @@
 """Where the bytes of a log come from: one small interface, local files and object stores behind it."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import stat
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Final, Protocol
+from pathlib import Path
+from typing import Final, Protocol
 
 from pipeline.logs.errors import LogError
 from pipeline.logs.remote import RemotePath, RemoteSource
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 _HASH_BLOCK: Final = 1 << 20
 
@@ -21,13 +17,10 @@ _HASH_BLOCK: Final = 1 << 20
 class ByteSource(Protocol):
     """Bytes that can be read anywhere, from several threads at once."""
 
-    @property
-    def size(self) -> int:
-        """Count of bytes."""
-
-    @property
-    def name(self) -> str:
-        """What to call it in messages."""
+    size: int
+    """Count of bytes."""
+    name: str
+    """What to call it in messages."""
 
     def read_at(self, offset: int, length: int) -> bytes:
         """The bytes from ``offset``; fewer than ``length`` only at the end."""
@@ -39,12 +32,16 @@ class FileSource(AbstractContextManager["FileSource"]):
     Args:
         path: the file.
 
+    Attributes:
+        size: count of bytes when it was opened.
+        name: the path.
+
     Raises:
         LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``.
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.name = str(path)
         try:
             # Opening a pipe would wait for somebody to write into it.
             self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
@@ -53,44 +50,22 @@ class FileSource(AbstractContextManager["FileSource"]):
                 "log_not_found", "there is no such file", where=str(path), hint="Check the path"
             ) from None
         except OSError as error:
-            raise LogError(
-                "log_unreadable",
-                f"the file cannot be opened ({error.strerror})",
-                where=str(path),
-                hint="Check its permissions",
-            ) from None
+            what = f"the file cannot be opened ({error.strerror})"
+            raise LogError("log_unreadable", what, where=self.name, hint="Check its permissions") from None
         status = os.fstat(self._descriptor)
-        self._size = status.st_size
+        self.size = status.st_size
         if not stat.S_ISREG(status.st_mode):
             self.close()
-            raise LogError(
-                "log_unreadable",
-                "it is a pipe, a socket or a device, and no file",
-                where=str(path),
-                hint="Give an .mcap file",
-            )
-        if self._size == 0:
+            what = "it is a pipe, a socket or a device, and no file"
+            raise LogError("log_unreadable", what, where=self.name, hint="Give an .mcap file")
+        if self.size == 0:
             self.close()
-            raise LogError(
-                "log_empty",
-                "the file holds no bytes",
-                where=str(path),
-                hint="The recorder was stopped before it wrote anything; leave it out",
-            )
-
-    @property
-    def size(self) -> int:
-        """Count of bytes when it was opened."""
-        return self._size
-
-    @property
-    def name(self) -> str:
-        """The path."""
-        return str(self._path)
+            hint = "The recorder was stopped before it wrote anything; leave it out"
+            raise LogError("log_empty", "the file holds no bytes", where=self.name, hint=hint)
 
     def read_at(self, offset: int, length: int) -> bytes:
         """The bytes from ``offset``; fewer than ``length`` only at the end."""
-        wanted = max(0, min(length, self._size - offset))
+        wanted = max(0, min(length, self.size - offset))
         try:
             found = os.pread(self._descriptor, wanted, offset) if wanted else b""
             while len(found) < wanted:
@@ -99,12 +74,9 @@ class FileSource(AbstractContextManager["FileSource"]):
                     break
                 found += more
         except OSError as error:
-            raise LogError(
-                "log_unreadable",
-                f"bytes {offset} to {offset + wanted} cannot be read ({error.strerror})",
-                where=self.name,
-                hint="Copy the file from its origin again",
-            ) from None
+            what = f"bytes {offset} to {offset + wanted} cannot be read ({error.strerror})"
+            hint = "Copy the file from its origin again"
+            raise LogError("log_unreadable", what, where=self.name, hint=hint) from None
         return found
 
     def close(self) -> None:

@@ -12,19 +12,9 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
+from pipeline.logs import inflate
 from pipeline.logs import records as rec
 from pipeline.logs.errors import Loss
-from pipeline.logs.inflate import (
-    MAX_CHUNK,
-    InflateError,
-    check_size,
-    checksum,
-    holds_own_checksum,
-    inflate,
-    inflate_into,
-    inflate_prefix,
-    inflate_start,
-)
 from pipeline.logs.messages import Messages, locate_messages
 
 if TYPE_CHECKING:
@@ -46,7 +36,7 @@ _INVERTED: Final = 0xFFFFFFFF
 _ZERO_TAIL: Final = 64
 """So many zeros at the end of a chunk, and no record behind it, are bytes that were never written."""
 
-_MAX_SPAN: Final = MAX_CHUNK + (64 << 20)
+_MAX_SPAN: Final = inflate.MAX_CHUNK + (64 << 20)
 """Most bytes that are read at once: the largest chunk and its message indexes."""
 
 _WORTHWHILE: Final = 0.8
@@ -182,7 +172,7 @@ def _load_chunk(
     if span.kind is SpanKind.CUT_CHUNK:
         return _load_start(span, head, stored, "the file ends inside it")
     entries = _read_entries(blob[span.length :])
-    unchecked = head.crc == 0 and not holds_own_checksum(stored, head.compression)
+    unchecked = head.crc == 0 and not inflate.holds_own_checksum(stored, head.compression)
     if unchecked and entries and wanted:
         needed = _needed_size(span, entries, wanted)
         if needed is not None and needed < head.uncompressed_size * _WORTHWHILE:
@@ -220,10 +210,10 @@ def load_together(source: ByteSource, spans: Sequence[Span], size: int) -> Loade
             head, losses = _open_chunk(span, part)
             entries = _read_entries(part[span.length :])
             target = chunk[place : place + head.uncompressed_size]
-            inflate_into(part[head.body : head.body + head.compressed_size], head.compression, target)
-        except (_SpanError, InflateError, ValueError):
+            inflate.inflate_into(part[head.body : head.body + head.compressed_size], head.compression, target)
+        except (_SpanError, inflate.InflateError, ValueError):
             return None
-        if losses or entries is None or head.crc == 0 or checksum(target) != head.crc:
+        if losses or entries is None or head.crc == 0 or inflate.checksum(target) != head.crc:
             return None
         shift = np.array([0, place], dtype=np.uint64)
         joined += [(channel, entry + shift) for channel, entry in entries]
@@ -245,8 +235,8 @@ def _load_prefix(
     span: Span, head: rec.ChunkHead, stored: Buffer, entries: list[Entries], needed: int
 ) -> Loaded:
     try:
-        chunk = inflate_prefix(stored, head.compression, head.uncompressed_size, needed)
-    except InflateError as error:
+        chunk = inflate.inflate_prefix(stored, head.compression, head.uncompressed_size, needed)
+    except inflate.InflateError as error:
         raise _SpanError("damaged_chunk", f"it cannot be inflated: {error}") from None
     messages = locate_messages(chunk, [(c, e[e[:, 1] < needed]) for c, e in entries])
     return Loaded(chunk, messages, _damage_losses(span, messages, len(chunk)), unchecked=True)
@@ -292,10 +282,10 @@ def _inflate_checked(
 ) -> Buffer:
     """Records of a chunk. Notes a checksum that is wrong alone."""
     try:
-        chunk = inflate(stored, head.compression, head.uncompressed_size)
-    except InflateError as error:
+        chunk = inflate.inflate(stored, head.compression, head.uncompressed_size)
+    except inflate.InflateError as error:
         raise _SpanError("damaged_chunk", f"it cannot be inflated: {error}") from None
-    computed = checksum(chunk) if head.crc else 0
+    computed = inflate.checksum(chunk) if head.crc else 0
     if computed == head.crc:
         return chunk
     reason = explain_checksum(head.crc, computed, stored, head.compression)
@@ -325,7 +315,7 @@ def explain_checksum(stored_crc: int, computed: int, stored: Buffer, compression
     difference in one byte alone is damage of the stored CRC itself.
     """
     difference = stored_crc ^ computed
-    if holds_own_checksum(stored, compression):
+    if inflate.holds_own_checksum(stored, compression):
         return "the compression's checksum holds"
     if sum(1 for shift in (0, 8, 16, 24) if difference >> shift & 0xFF) == 1:
         return "one byte of the stored checksum differs"
@@ -333,7 +323,7 @@ def explain_checksum(stored_crc: int, computed: int, stored: Buffer, compression
         return "it is stored inverted"
     if stored_crc == int.from_bytes(computed.to_bytes(4, "little"), "big"):
         return "it is stored in the other byte order"
-    if compression and stored_crc == checksum(stored):
+    if compression and stored_crc == inflate.checksum(stored):
         return "it was taken over the compressed bytes"
     return None
 
@@ -341,10 +331,10 @@ def explain_checksum(stored_crc: int, computed: int, stored: Buffer, compression
 def _load_start(span: Span, head: rec.ChunkHead, stored: Buffer, reason: str) -> Loaded:
     """Keep the messages before the place where a chunk was cut."""
     try:
-        check_size(head.compressed_size, head.compression, head.uncompressed_size)
-    except InflateError as error:
+        inflate.check_size(head.compressed_size, head.compression, head.uncompressed_size)
+    except inflate.InflateError as error:
         return _lost(span, "truncated", str(error))
-    chunk = inflate_start(stored, head.compression, head.uncompressed_size)
+    chunk = inflate.inflate_start(stored, head.compression, head.uncompressed_size)
     messages = locate_messages(chunk, None)
     if not messages.start.size:
         return _lost(span, "truncated", reason)

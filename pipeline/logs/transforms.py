@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.rigid import interpolate_poses, invert_quaternions, multiply_quaternions, rotate
 from pipeline.logs.columns import Ragged, RaggedStrings
 from pipeline.logs.errors import LogError
@@ -21,12 +22,8 @@ from pipeline.logs.reader import Wanted
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from numpy.typing import NDArray
-
     from pipeline.logs.reader import TopicColumns
 
-    Ints = NDArray[np.int64]
-    Floats = NDArray[np.float64]
 
 _TRANSFORM: Final = "transforms[]."
 _NUMBERS: Final = (
@@ -274,14 +271,14 @@ def _join(links: list[Link]) -> Link:
     return replace(links[0], **arrays)
 
 
-def _covers(link: Link, time: Ints) -> NDArray[np.bool_]:
+def _covers(link: Link, time: Ints) -> Flags:
     """Where a link can answer: between its stamps, and as far beyond as it may be held."""
     if link.fixed or link.time.size == 1:
         return np.ones(time.size, dtype=np.bool_)
     interval = float(np.median(np.diff(link.time)))
     lead = max(0.0, float(np.median(link.time - link.log_time)))
     held = int(_HELD_INTERVALS * interval + lead)
-    covered: NDArray[np.bool_] = (time >= link.time[0] - held) & (time <= link.time[-1] + held)
+    covered: Flags = (time >= link.time[0] - held) & (time <= link.time[-1] + held)
     return covered
 
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
+from pipeline.core.arrays import Flags, Ints
 from pipeline.logs.definitions import definition_text
 from pipeline.logs.encode import encode_rows
-from pipeline.logs.errors import LogError
+from pipeline.logs.errors import LogError, unsupported
 from pipeline.logs.schema import leaf_paths, parse_msg
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from pipeline.logs.normalize import Given
     from pipeline.logs.schema import Structure
 
-    Ints = NDArray[np.int64]
 
 LIBRARY: Final = "slip-pipeline"
 COMPRESSIONS: Final = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
@@ -45,7 +45,7 @@ class _Rows(NamedTuple):
     sequence: Ints
     payloads: NDArray[np.uint8]
 
-    def select(self, chosen: NDArray[np.bool_]) -> _Rows:
+    def select(self, chosen: Flags) -> _Rows:
         return _Rows(
             self.channel,
             self.log_time[chosen],
@@ -72,12 +72,8 @@ class LogWriter:
         self, path: str | os.PathLike[str], *, chunk_size: int = 1 << 20, compression: str = "zstd"
     ) -> None:
         if compression not in COMPRESSIONS:
-            raise LogError(
-                "unsupported_encoding",
-                f"chunks cannot be compressed with {compression!r}",
-                where=str(path),
-                hint=f"Use one of {', '.join(map(repr, COMPRESSIONS))}",
-            )
+            hint = f"Use one of {', '.join(map(repr, COMPRESSIONS))}"
+            raise unsupported(f"chunks cannot be compressed with {compression!r}", str(path), hint)
         self._path = Path(path)
         self._draft = self._path.with_name(f".{self._path.name}.{os.getpid()}.part")
         self._types: dict[str, _Type] = {}
@@ -109,11 +105,11 @@ class LogWriter:
         self,
         topic: str,
         type_name: str,
-        log_time: NDArray[np.int64],
+        log_time: Ints,
         fields: Mapping[str, Given],
         *,
-        publish_time: NDArray[np.int64] | None = None,
-        header_time: NDArray[np.int64] | None = None,
+        publish_time: Ints | None = None,
+        header_time: Ints | None = None,
         definition: str | None = None,
     ) -> None:
         """Add messages to a topic; may be called again for the same topic.
@@ -133,19 +129,11 @@ class LogWriter:
         log = np.asarray(log_time, dtype=np.int64).reshape(-1)
         publish = log if publish_time is None else np.asarray(publish_time, dtype=np.int64).reshape(-1)
         if publish.size != log.size:
-            raise LogError(
-                "bad_column",
-                f"{publish.size} publish times for {log.size} messages",
-                where=topic,
-                hint="Give one a message",
-            )
+            what = f"{publish.size} publish times for {log.size} messages"
+            raise LogError("bad_column", what, where=topic, hint="Give one a message")
         if log.size and min(log.min(), publish.min()) < 0:
-            raise LogError(
-                "bad_column",
-                "a log or publish time lies before 1970",
-                where=topic,
-                hint="Times are nanoseconds since 1970, zero or later",
-            )
+            hint = "Times are nanoseconds since 1970, zero or later"
+            raise LogError("bad_column", "a log or publish time lies before 1970", where=topic, hint=hint)
         kind = self._type(type_name, definition)
         given = dict(fields)
         if header_time is not None:

@@ -22,25 +22,3 @@ from pipeline.models.forward import Timing
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile, read_model
 from pipeline.models.model_text import write_model
-
-__all__ = [
-    "AddedEffect",
-    "BodyEffect",
-    "CommandEffect",
-    "DriveEffect",
-    "Effect",
-    "Excitation",
-    "KinematicEffect",
-    "LinearEffect",
-    "Model",
-    "ModelFile",
-    "Parameter",
-    "Place",
-    "ReportEffect",
-    "Search",
-    "Timing",
-    "find_effect",
-    "list_effects",
-    "read_model",
-    "write_model",
-]

@@ -1,10 +1,6 @@
 """Whether a number stopped because it may go no further."""
 
-from __future__ import annotations
-
 import math
-
-__all__ = ["stands_at_bound"]
 
 _MARGIN = 1e-6
 """Of the size of the bounds: fits stop that close to them."""

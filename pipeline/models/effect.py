@@ -11,19 +11,8 @@ import math
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
 
-from pipeline.models.parameter import (
-    DATA_SHEET,
-    MOUNTING,
-    STAMPS,
-    WARTHOG_RUNS,
-    Excitation,
-    Least,
-    Parameter,
-    Part,
-    Plausible,
-    Search,
-    Spread,
-)
+from pipeline.models.parameter import Excitation, Least, Parameter, Part, Plausible, Search, Spread  # noqa: F401 - what a file of an effect needs
+from pipeline.models.wording import describe_share
 from pipeline.runs.errors import MotionError
 from pipeline.vehicles.kinematics import list_kinds
 
@@ -35,38 +24,6 @@ if TYPE_CHECKING:
     from pipeline.runs.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
     from pipeline.vehicles import Vehicle
 
-__all__ = [  # what a file of an effect needs
-    "ACKERMANN",
-    "ANY",
-    "DATA_SHEET",
-    "INF",
-    "MOUNTING",
-    "NAN",
-    "SIDES",
-    "SIDEWAYS",
-    "STAMPS",
-    "WARTHOG_RUNS",
-    "WHEELED",
-    "AddedEffect",
-    "BodyEffect",
-    "Column",
-    "CommandEffect",
-    "DriveEffect",
-    "Effect",
-    "Excitation",
-    "KinematicEffect",
-    "Late",
-    "Least",
-    "LinearEffect",
-    "Parameter",
-    "Part",
-    "Place",
-    "Plausible",
-    "ReportEffect",
-    "Search",
-    "Spread",
-    "find_late",
-]
 
 INF = math.inf
 NAN = math.nan
@@ -121,6 +78,9 @@ class Effect(ABC):
         parts: numbers of other effects under which it is searched; found together, they are named as it.
         late: what it makes late, where its only number is a delay.
         price: share of the held-out error that it must take away before it counts.
+        motion: what the vehicle does, with numbers as `{name}`; of the first one also `{size}`, its absolute
+            value in units of which SI has `size_in`, `{way}`, of `ways` the one for its sign, and `{share}`,
+            how much less or more than one `share_of` makes of it (a constant, and what it is multiplied by).
         python: its step in the exported function, numbers as `{name}`; None where there is none.
         python_state: names that its step carries on to the next one; zero at the start.
         readings: what it is if its numbers prove to be the vehicle's, the ground's or a run's own, where one
@@ -143,6 +103,10 @@ class Effect(ABC):
     parts: tuple[Part, ...] = ()
     late: Late | None = None
     price: float = 0.0
+    motion: str = ""
+    ways: tuple[str, str] = ("left", "right")
+    size_in: float = 1.0
+    share_of: tuple[float, float] = (0.0, 1.0)
     python: str | None = None
     python_state: tuple[str, ...] = ()
     readings: tuple[Reading, ...] = ()
@@ -202,29 +166,30 @@ class Effect(ABC):
         )
 
     def describe_motion(self, vehicle: Vehicle) -> str:
-        """What the vehicle does, with numbers; by default what the docstring begins with."""
-        del vehicle
+        """What the vehicle does, with numbers; without a `motion` what the docstring begins with."""
+        if self.motion:
+            first, *_ = self.values.values()
+            base, slope = self.share_of
+            words = {"size": abs(first) * self.size_in, "way": self.ways[first < 0.0]}
+            words["share"] = describe_share(base + slope * first)
+            return self.motion.format(**self.values, **words)
         summary = (type(self).__doc__ or self.id).strip().splitlines()[0].rstrip(".")
         return summary.partition(": ")[2] or summary
 
     def choose_python(self, kind: str) -> str | None:
         """Its step in the exported function on a kind of vehicle; see `python`."""
-        del kind
         return self.python
 
     def can_show(self, evidence: Evidence) -> bool:
         """Whether sensors and driving let it be told at all."""
-        del evidence
         return True
 
     def is_degenerate(self, evidence: Evidence) -> bool:
         """Whether it is, with these numbers, nothing in these runs or another effect in disguise."""
-        del evidence
         return False
 
     def is_equivalent(self, evidence: Evidence) -> bool:
         """Whether nothing in these runs tells it from those that it is equivalent to."""
-        del evidence
         return True
 
     def collapse(self) -> Effect | None:
@@ -233,12 +198,10 @@ class Effect(ABC):
 
     def list_softer(self, largest: Largest) -> tuple[Effect, ...]:
         """Effects that bend where this one breaks, to be tried as such though they have more numbers."""
-        del largest
         return ()
 
     def depends_on(self, other: Effect) -> bool:
         """Whether one motion shows only the ratio of its number to that of another effect."""
-        del other
         return False
 
     def is_used(self, parameter: Parameter) -> bool:

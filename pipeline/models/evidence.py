@@ -1,14 +1,10 @@
 """What recordings can show of an effect: what was asked for, and which sensors tell of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
+from pipeline.core.arrays import Floats
 
-Floats = NDArray[np.float64]
 Relative = Literal["", "speed", "turn", "wheel", "duration"]
 
 # Of poses, headings and encoders against each other [s]: below it they are stamped no better.

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from pipeline.models.model_file import ModelFile
     from pipeline.models.target import Current, Target
 
-__all__ = ["export_model", "find_target", "list_targets", "read_current", "require_errors"]
-
 
 @functools.cache
 def list_targets() -> tuple[Target, ...]:

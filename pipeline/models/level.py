@@ -1,7 +1,5 @@
 """Whose a number is: the vehicle's, the ground's, or a run's own. One run cannot tell; several can."""
 
-from __future__ import annotations
-
 import enum
 from dataclasses import dataclass
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.core.errors import shorten
+from pipeline.core.errors import SlipError, shorten
 from pipeline.core.toml import TomlError, parse_toml, require_finite
 from pipeline.models.catalogue import find_effect, run_effects
 from pipeline.models.formula.formula_effect import CHANNELS, FormulaEffect, make_parameter
@@ -198,30 +198,28 @@ class _Reader:
         """The whole file."""
         for key in self.tree:
             if key not in _SECTIONS:
-                raise self._error(
-                    "unknown_key", f"unknown key {key!r}", f"Known are: {', '.join(_SECTIONS)}.", None, key
-                )
+                known = f"Known are: {', '.join(_SECTIONS)}."
+                raise self._error(f"unknown key {key!r}", known, None, key, code="unknown_key")
         if self.tree.get("format", FORMAT) != FORMAT:
-            raise self._error(
-                "model_too_new",
+            what, hint = (
                 f"format {self.tree['format']!r} is not known",
                 f"This version reads format {FORMAT}.",
-                None,
-                "format",
             )
+            raise self._error(what, hint, None, "format", code="model_too_new")
         self._load_own()
         vehicle = self._vehicle()
         tables = self.tree.get("effect", [])
         if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
-            raise self._error(
-                "model_invalid", "effects are written as [[effect]]", "Double the brackets.", None, "effect"
-            )
+            raise self._error("effects are written as [[effect]]", "Double the brackets.", None, "effect")
         effects: list[Effect] = []
         for number, table in enumerate(tables):
             effect = self._effect(number, table)
             if effect is not None:
                 effects.append(effect)
-                self._check_composition(number, vehicle, effects)
+                try:
+                    Model(vehicle, tuple(effects))
+                except MotionError as error:
+                    raise self._repeat(error, ("effect", number), "id") from error
         fit = self.tree.get("fit", {})
         return ModelFile(
             model=Model(vehicle, tuple(effects)),
@@ -247,8 +245,7 @@ class _Reader:
                 else:
                     self.untrusted.append(name)
             except MotionError as error:
-                where = f"{name!r}: {error.what}"
-                raise self._error(error.code, where, error.hint, None, "effects") from error
+                raise self._repeat(error, None, "effects", f"{name!r}: ") from error
 
     def _warn(self) -> tuple[str, ...]:
         if not self.untrusted:
@@ -261,39 +258,25 @@ class _Reader:
     def _vehicle(self) -> Vehicle:
         table = self.tree.get("vehicle")
         if not isinstance(table, dict):
-            raise self._error(
-                "vehicle_unknown",
-                "the model says no vehicle",
-                'Write [vehicle] and preset = "husky_a200", or kind and geometry.',
-                None,
-                "vehicle",
-            )
+            hint = 'Write [vehicle] and preset = "husky_a200", or kind and geometry.'
+            raise self._error("the model says no vehicle", hint, None, "vehicle", code="vehicle_unknown")
         try:
             require_finite({"vehicle": table})
             section = msgspec.convert(table, VehicleSection)
             return resolve_vehicle(section, recorded=None, where=str(self.path))
         except (msgspec.ValidationError, TomlError) as error:
-            raise self._error(
-                "vehicle_invalid",
-                f"the vehicle is not valid: {error}",
-                "The handbook, Configuration, lists the keys.",
-                ("vehicle", 0),
-                error.key.rpartition(".")[2] if isinstance(error, TomlError) else "",
-            ) from None
+            key = error.key.rpartition(".")[2] if isinstance(error, TomlError) else ""
+            what, hint = f"the vehicle is not valid: {error}", "The handbook, Configuration, lists the keys."
+            raise self._error(what, hint, ("vehicle", 0), key, code="vehicle_invalid") from None
         except ConfigurationError as error:
-            raise self._error(error.code, error.what, error.hint, ("vehicle", 0), "preset") from None
+            raise self._repeat(error, ("vehicle", 0), "preset") from None
 
     def _effect(self, number: int, table: Table) -> Effect | None:
         at = ("effect", number)
         name = table.get("id")
         if not isinstance(name, str) or not name:
-            raise self._error(
-                "model_invalid",
-                "an effect needs an id",
-                "Write id = and one of those that `slip effects` lists.",
-                at,
-                "",
-            )
+            hint = "Write id = and one of those that `slip effects` lists."
+            raise self._error("an effect needs an id", hint, at, "")
         self._check_names(at, name, table)
         formulas = {key: table[key] for key in CHANNELS if isinstance(table.get(key), str)}
         numbers = {key: value for key, value in table.items() if key not in {"id", "note", *formulas}}
@@ -313,32 +296,19 @@ class _Reader:
             if self.untrusted:
                 self.left_out.append(name)
                 return None
-            raise self._error(error.code, error.what, error.hint, at, "id") from error
+            raise self._repeat(error, at, "id") from error
         for key, said in numbers.items():
             self._check_parameter(at, effect(), key, said, values.get(key))
-        return self._make(effect, fixed, values)
+        return effect().change(**values).fix(*fixed)
 
     def _check_names(self, at: tuple[str, int], name: str, table: Table) -> None:
         if not _ID.fullmatch(name):
-            raise self._error(
-                "model_invalid",
-                f"{name[:80]!r} cannot be the id of an effect",
-                "Use letters, digits, _ and -, a letter first, at most 64.",
-                at,
-                "id",
-            )
+            hint = "Use letters, digits, _ and -, a letter first, at most 64."
+            raise self._error(f"{name[:80]!r} cannot be the id of an effect", hint, at, "id")
         for key in table:
             if not (key.isidentifier() and unicodedata.is_normalized("NFKC", key)):
-                raise self._error(
-                    "model_invalid",
-                    f"{name}: {key[:80]!r} cannot be the name of a parameter",
-                    "Use letters, digits and _, a letter first.",
-                    at,
-                    key,
-                )
-
-    def _make(self, effect: EffectClass, fixed: list[str], values: dict[str, float]) -> Effect:
-        return effect().change(**values).fix(*fixed)
+                what = f"{name}: {key[:80]!r} cannot be the name of a parameter"
+                raise self._error(what, "Use letters, digits and _, a letter first.", at, key)
 
     def _check_parameter(
         self, at: tuple[str, int], effect: Effect, key: str, said: object, value: float | None
@@ -349,15 +319,10 @@ class _Reader:
             if value is not None:
                 effect.change(**{key: value})
         except MotionError as error:
-            raise self._error(error.code, f"{effect.id}: {error.what}", error.hint, at, key) from error
+            raise self._repeat(error, at, key, f"{effect.id}: ") from error
         if isinstance(said, dict) and said.get("unit", declared.unit) != declared.unit:
-            raise self._error(
-                "wrong_units",
-                f"{effect.id}.{key} is in {declared.unit}, not in {said['unit']}",
-                "Convert the value.",
-                at,
-                key,
-            )
+            what = f"{effect.id}.{key} is in {declared.unit}, not in {said['unit']}"
+            raise self._error(what, "Convert the value.", at, key, code="wrong_units")
 
     def _formula(
         self,
@@ -374,22 +339,10 @@ class _Reader:
             bounds = table.get("bounds", [-math.inf, math.inf])
             good = isinstance(bounds, list) and len(bounds) == 2 and all(_is_number(b) for b in bounds)  # noqa: PLR2004
             if not good or not bounds[0] < bounds[1]:
-                raise self._error(
-                    "model_invalid",
-                    f"bounds of {key} must be two numbers",
-                    "Write bounds = [-1, 1].",
-                    at,
-                    key,
-                )
+                raise self._error(f"bounds of {key} must be two numbers", "Write bounds = [-1, 1].", at, key)
             neutral = table.get("neutral", 0.0)
             if not _is_number(neutral) or not math.isfinite(neutral):
-                raise self._error(
-                    "model_invalid",
-                    f"neutral of {key} is no finite number",
-                    "Write neutral = 1.0.",
-                    at,
-                    key,
-                )
+                raise self._error(f"neutral of {key} is no finite number", "Write neutral = 1.0.", at, key)
             unit = str(table.get("unit", "1"))
             low, high = (float(bound) for bound in bounds)
             parameters.append(make_parameter(key, unit, (low, high), neutral=float(neutral)))
@@ -413,13 +366,8 @@ class _Reader:
             return float(raw), False  # type: ignore[arg-type]
         if not isinstance(raw, dict) or set(raw) - _NUMBER_KEYS:
             more = "" if formula else " (a formula is written v_x, v_y or v_w)"
-            raise self._error(
-                "model_invalid",
-                f"{effect}.{key} is no parameter{more}",
-                f"Write a number, or a table of {', '.join(sorted(_NUMBER_KEYS))}.",
-                at,
-                key,
-            )
+            hint = f"Write a number, or a table of {', '.join(sorted(_NUMBER_KEYS))}."
+            raise self._error(f"{effect}.{key} is no parameter{more}", hint, at, key)
         label = f"{effect}.{key}"
         if raw.get("per_run"):
             self.per_run.append(label)
@@ -427,33 +375,27 @@ class _Reader:
             self.intervals[label] = (float(raw["low"]), float(raw["high"]))
         value = raw.get("value")
         if value is not None and not _is_number(value):
-            raise self._error(
-                "model_invalid", f"the value of {label} is no number", "Write value = 1.5.", at, key
-            )
+            raise self._error(f"the value of {label} is no number", "Write value = 1.5.", at, key)
         return (None if value is None else float(value)), bool(raw.get("fixed", False))
-
-    def _check_composition(self, number: int, vehicle: Vehicle, effects: list[Effect]) -> None:
-        try:
-            Model(vehicle, tuple(effects))
-        except MotionError as error:
-            raise self._error(error.code, error.what, error.hint, ("effect", number), "id") from error
 
     @property
     def files(self) -> tuple[str, ...]:
         """Files of Python that the model names."""
         value = self.tree.get("effects", [])
         if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-            raise self._error(
-                "model_invalid",
-                "effects is a list of file names",
-                'Write effects = ["a.py"].',
-                None,
-                "effects",
-            )
+            raise self._error("effects is a list of file names", 'Write effects = ["a.py"].', None, "effects")
         return tuple(value)
 
-    def _error(self, code: str, what: str, hint: str, at: tuple[str, int] | None, key: str) -> MotionError:
+    def _error(
+        self, what: str, hint: str, at: tuple[str, int] | None, key: str, *, code: str = "model_invalid"
+    ) -> MotionError:
         return MotionError(code, shorten(what), where=self._place(at, key), hint=hint)
+
+    def _repeat(
+        self, error: SlipError, at: tuple[str, int] | None, key: str, prefix: str = ""
+    ) -> MotionError:
+        """Somebody else's error, with its place in this file."""
+        return self._error(f"{prefix}{error.what}", error.hint, at, key, code=error.code)
 
     def _place(self, at: tuple[str, int] | None, key: str) -> str:
         return f"{self.path}:{find_line(self.lines, at, key)}"

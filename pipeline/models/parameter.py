@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -48,9 +48,16 @@ class Least:
         sampled: whether sampling the wheels does too: then its delay is the least.
     """
 
+    STAMPS: ClassVar[str] = "stamps are off by as much"
+    MOUNTING: ClassVar[str] = "sensors are mounted no better"
+    DATA_SHEET: ClassVar[str] = "a data sheet allows as much"
+
     size: float
     reason: str
     sampled: bool = False
+
+
+WARTHOG_RUNS = "nine runs of a Warthog on five grounds"
 
 
 @dataclass(frozen=True)
@@ -63,15 +70,11 @@ class Spread:
     """
 
     size: float
-    source: str
+    source: str = WARTHOG_RUNS
 
 
-WARTHOG_RUNS = "nine runs of a Warthog on five grounds"
 USUAL_SPREAD = 0.25
 """Standard deviation between runs of a ground, over the usual size of a number, where none was measured."""
-STAMPS = "stamps are off by as much"
-MOUNTING = "sensors are mounted no better"
-DATA_SHEET = "a data sheet allows as much"
 
 
 @dataclass(frozen=True)

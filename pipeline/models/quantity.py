@@ -4,13 +4,9 @@ An effect says which quantities its numbers are (`Parameter.quantities`), a targ
 takes which quantity; neither knows the other.
 """
 
-from __future__ import annotations
-
 import enum
 import math
 from collections.abc import Callable, Iterable
-
-__all__ = ["Quantity"]
 
 Joined = Callable[[Iterable[float]], float]
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import operator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from pipeline.models.bounds import stands_at_bound
 from pipeline.models.catalogue import is_own
 from pipeline.models.formula.formula_effect import FormulaEffect
+from pipeline.models.quantity import Quantity
 from pipeline.runs.errors import MotionError
 
 if TYPE_CHECKING:
@@ -16,10 +18,7 @@ if TYPE_CHECKING:
 
     from pipeline.models.effect import Effect, Parameter
     from pipeline.models.model_file import ModelFile
-    from pipeline.models.quantity import Quantity
     from pipeline.models.target import Target
-
-__all__ = ["Amount", "Facts", "Setting", "Sheet", "combine", "start_sheet"]
 
 
 @dataclass(frozen=True)
@@ -35,6 +34,9 @@ class Amount:
     value: float
     sources: tuple[str, ...] = ()
     effects: frozenset[str] = frozenset()
+
+    def __neg__(self) -> Amount:
+        return self.change(operator.neg)
 
     @property
     def is_known(self) -> bool:
@@ -114,7 +116,7 @@ class Sheet:
 
 
 class Facts:
-    """What a model file says of the quantities of its vehicle.
+    """What a model file says of its vehicle: quantities, and out of them delays and limits of its body.
 
     Attributes:
         file: the model file.
@@ -143,6 +145,55 @@ class Facts:
         value = getattr(self.vehicle, name)
         return Amount(math.nan if value is None else value, (f"vehicle {self.vehicle.id}: {name}",))
 
+    def find_radius(self) -> Amount:
+        """Effective wheel radius [m]."""
+        return combine(operator.mul, self.measure("wheel_radius_m"), self.take(Quantity.RADIUS))
+
+    def find_track(self) -> Amount:
+        """Effective track width [m]."""
+        return combine(operator.mul, self.measure("track_width_m"), self.take(Quantity.TRACK))
+
+    def find_largest_steering(self) -> Amount:
+        """Steering angle that the largest command gives [rad]."""
+        return combine(operator.mul, self.measure("max_steering_rad"), self.take(Quantity.STEERING_GAIN))
+
+    def find_turning_radius(self) -> Amount:
+        """Radius of the narrowest turn that a car drives to both sides [m]."""
+        gain, offset = self.take(Quantity.STEERING_GAIN), self.take(Quantity.STEERING_OFFSET)
+        angle = self.measure("max_steering_rad").change(lambda a, g, o: g * a - abs(o), gain, offset)
+        return self.measure("wheelbase_m").change(_find_circle, angle)
+
+    def find_speed_delay(self) -> Amount:
+        """How late the speed follows a smooth command [s]: dead time and time constants add up."""
+        return combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(Quantity.SPEED_LAG))
+
+    def find_turn_delay(self) -> Amount:
+        """How late turning follows a smooth command [s]; on a car it is the steering that is late."""
+        lag = Quantity.TURN_LAG if self.vehicle.kind == "differential" else Quantity.STEERING_LAG
+        return combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(lag))
+
+    def find_speed_limit(self) -> Amount:
+        """Largest speed [m/s]: of the body command, or of the wheels driving straight."""
+        wheels = self.take(Quantity.WHEEL_SPEED_LIMIT).change(operator.mul, self.find_radius())
+        return _take_least(self.take(Quantity.SPEED_LIMIT), wheels)
+
+    def find_turn_limit(self) -> Amount:
+        """Largest yaw rate [rad/s]: of the body command, or of the wheels turning on the spot."""
+        return _take_least(self.take(Quantity.TURN_LIMIT), self._spin(Quantity.WHEEL_SPEED_LIMIT))
+
+    def find_speed_acceleration(self) -> Amount:
+        """Largest acceleration [m/s^2] driving straight."""
+        return self.take(Quantity.WHEEL_ACCELERATION_LIMIT).change(operator.mul, self.find_radius())
+
+    def find_turn_acceleration(self) -> Amount:
+        """Largest yaw acceleration [rad/s^2] turning on the spot; unknown for a car."""
+        return self._spin(Quantity.WHEEL_ACCELERATION_LIMIT)
+
+    def find_deadband(self) -> tuple[Amount, Amount]:
+        """Speed [m/s] driving straight and yaw rate [rad/s] turning on the spot below which nothing moves."""
+        rim = self.take(Quantity.DEADBAND).change(operator.mul, self.take(Quantity.RADIUS))
+        return rim, self._turn(rim)
+
     def list_unmapped(self, sheet: Sheet) -> list[str]:
         """Effects that no parameter of a sheet stands for, a line each with their numbers."""
         used = frozenset[str]().union(*(setting.effects for setting in sheet.settings))
@@ -159,6 +210,15 @@ class Facts:
             [str(run.get("run")) for run in runs if isinstance(run, dict)] if isinstance(runs, list) else []
         )
         return f"Fitted on the {self.file.fit.get('input')} input of {', '.join(names)}." if names else ""
+
+    def _spin(self, quantity: Quantity) -> Amount:
+        return self._turn(self.take(quantity).change(operator.mul, self.find_radius()))
+
+    def _turn(self, rim: Amount) -> Amount:
+        """Yaw rate of a vehicle whose sides run at a speed against each other; unknown for a car."""
+        if self.vehicle.kind != "differential":
+            return Amount(math.nan)
+        return rim.change(lambda speed, track: 2.0 * speed / track, self.find_track())
 
     def _list_numbers(self) -> Iterator[tuple[Effect, Parameter]]:
         for effect in self.file.model:
@@ -210,3 +270,13 @@ def _join(quantity: Quantity, values: list[float]) -> float:
 
 def _round(value: float) -> float:
     return float(f"{value:.5g}")
+
+
+def _find_circle(wheelbase_m: float, angle_rad: float) -> float:
+    """Radius that the rear axle drives; none where the car steers to one side only."""
+    return wheelbase_m / math.tan(angle_rad) if angle_rad > 0.0 else math.inf
+
+
+def _take_least(*amounts: Amount) -> Amount:
+    known = [amount for amount in amounts if amount.is_known]
+    return combine(min, *known) if len(known) > 1 else (known or [Amount(math.inf)])[0]

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
     from pipeline.models.settings import Facts, Sheet
 
-__all__ = ["list_comments", "make_plain", "write_yaml"]
 
 _INDENT = 2
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pipeline.models.model_file import ModelFile
 
-__all__ = ["Current", "Target"]
 
 Current = Mapping[str, float]
 

@@ -4,8 +4,6 @@ Trust is a list of SHA-256 hashes in the user's configuration folder. What is ha
 bytes are read once, and nothing that Python keeps beside a file (`__pycache__`) is looked at.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -1,7 +1,5 @@
 """Words that the sentences of effects share."""
 
-from __future__ import annotations
-
 
 def name_side(value: float) -> str:
     """The side that a number is on which counts to the left."""

@@ -3,5 +3,3 @@
 from pipeline.runs.errors import MotionError
 from pipeline.runs.heading import HeadingSource
 from pipeline.runs.recording import MotionRun, load_run
-
-__all__ = ["HeadingSource", "MotionError", "MotionRun", "load_run"]

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats, Ints
 from pipeline.runs.signals import Commands, Signal, Wheels
 
 if TYPE_CHECKING:
     from pipeline.runs.recording import DriveSeries, MotionRun
 
 Number = TypeVar("Number", np.float64, np.int64)
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _SHORTEST_HOLE = 0.3
 _SHORTEST_SPAN = 0.5
@@ -39,12 +38,12 @@ class Grid:
 
     step_s: float
     times: Floats
-    span: Integers
-    first: Integers
+    span: Ints
+    first: Ints
     starts: Floats
     ends: Floats
 
-    def find_span(self, at: Floats) -> Integers:
+    def find_span(self, at: Floats) -> Ints:
         """Number of the span that holds each time, -1 in a hole."""
         span = np.searchsorted(self.starts, at, side="right") - 1
         inside = (span >= 0) & (at <= self.ends[np.maximum(span, 0)])

@@ -12,16 +12,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.core import timegrid
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.runs.recording import GyroFit
 
 if TYPE_CHECKING:
     from pipeline.runs.grid import Grid
     from pipeline.runs.recording import MotionRun, Track
 
-Floats = NDArray[np.float64]
 
 _WINDOW_S = 0.5
 _LARGEST_DELAY = 0.7
@@ -80,9 +79,7 @@ def choose_heading(run: MotionRun, cells: Grid, source: HeadingSource) -> Headin
     return Heading(fit, edges, offset)
 
 
-def align_heading(
-    track: Track, difference: Floats, good: NDArray[np.bool_], span: NDArray[np.int64] | None = None
-) -> Floats:
+def align_heading(track: Track, difference: Floats, good: Flags, span: Ints | None = None) -> Floats:
     """Slow part of the difference between two headings, within segments and spans [rad], shape (n,).
 
     Args:
@@ -189,7 +186,7 @@ def _measure_cover(times: Floats, at: Floats) -> float:
     return float(np.mean(nearest < _SILENT_S))
 
 
-def _pair_up(track: Track, run: MotionRun) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _pair_up(track: Track, run: MotionRun) -> tuple[Ints, Ints]:
     """Poses half a second apart in one segment, outside bad stretches."""
     second = np.searchsorted(track.times, track.times + _WINDOW_S - 0.02)
     first = np.arange(track.times.size)
@@ -202,13 +199,13 @@ def _pair_up(track: Track, run: MotionRun) -> tuple[NDArray[np.int64], NDArray[n
     return first[kept], second[kept]
 
 
-def has_barred(barred: Floats, start: Floats, end: Floats) -> NDArray[np.bool_]:
+def has_barred(barred: Floats, start: Floats, end: Floats) -> Flags:
     """Whether a barred sample lies in each closed interval."""
-    inside: NDArray[np.bool_] = np.searchsorted(barred, end + 1e-9) > np.searchsorted(barred, start - 1e-9)
+    inside: Flags = np.searchsorted(barred, end + 1e-9) > np.searchsorted(barred, start - 1e-9)
     return inside
 
 
-def mark_barred(run: MotionRun, times: Floats) -> NDArray[np.bool_]:
+def mark_barred(run: MotionRun, times: Floats) -> Flags:
     """Whether a barred sample lies beside each time."""
     return has_barred(run.barred, times - 0.05, times + 0.05)
 
@@ -232,13 +229,13 @@ def fit_turning(gyro: Floats, span: Floats, turned: Floats) -> tuple[float, floa
     return float(scale), float(bias), spread
 
 
-def _find_pieces(segment: NDArray[np.int64], span: NDArray[np.int64]) -> list[tuple[int, int]]:
+def _find_pieces(segment: Ints, span: Ints) -> list[tuple[int, int]]:
     edges = np.flatnonzero((np.diff(segment) != 0) | (np.diff(span) != 0)) + 1
     bounds = [0, *edges.tolist(), segment.size]
     return list(itertools.pairwise(bounds))
 
 
-def _smooth(times: Floats, values: Floats, good: NDArray[np.bool_]) -> Floats:
+def _smooth(times: Floats, values: Floats, good: Flags) -> Floats:
     """Running mean over six seconds of the good values."""
     known = times[good]
     total = np.concatenate(([0.0], np.cumsum(values[good])))

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.core import rigid, segments, timegrid
+from pipeline.core.arrays import Complex, Flags, Floats, Ints
 from pipeline.runs.errors import MotionError
 from pipeline.runs.signals import find_fastest_wheel
 
@@ -24,9 +24,6 @@ if TYPE_CHECKING:
 
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 
 _DEAD = 1e-9
 _LONGEST_WAIT = 1.5
@@ -76,8 +73,8 @@ class Track:
     """
 
     times: Floats
-    segment: Integers
-    path: NDArray[np.complex128]
+    segment: Ints
+    path: Complex
     heading: Floats
     attitude: Floats
     place: Floats

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,10 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from pipeline.runs.recording import DriveSeries
     from pipeline.vehicles import Vehicle
+
+    Drive: TypeAlias = "Commands | DriveSeries | Wheels"
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -86,26 +89,6 @@ class Wheels:
         states = split_wheels(Wheels(start[:, 0], start[:, 1], np.zeros(0), sideways))
         changed = [change(*wheel) for wheel in zip(split_wheels(self), states, strict=True)]
         return replace(self, **_join_wheels(changed))
-
-
-class Drive(Protocol):
-    """Commands, measured wheels, or the drivetrain's output."""
-
-    @property
-    def left(self) -> Floats:
-        """Speed of the left wheels [rad/s]; on a car the rear axle's."""
-
-    @property
-    def right(self) -> Floats:
-        """Speed of the right wheels [rad/s]; on a car the rear axle's."""
-
-    @property
-    def steering(self) -> Floats:
-        """Steering angle [rad]."""
-
-    @property
-    def sideways(self) -> Floats | None:
-        """Speed that moves the vehicle to the left [rad/s]; None on one that cannot."""
 
 
 def split_wheels(drive: Drive) -> list[Floats]:

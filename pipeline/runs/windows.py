@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.runs.heading import has_barred
 
 if TYPE_CHECKING:
@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from pipeline.runs.recording import MotionRun, Track
     from pipeline.runs.signals import Signal
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 
 WINDOW_S = 0.5
 HORIZON_S = 2.0
@@ -46,11 +43,11 @@ class Nodes:
         piece: number of the stretch without segment end or hole, shape (n,).
     """
 
-    poses: Integers
-    first: Integers
-    count: Integers
+    poses: Ints
+    first: Ints
+    count: Ints
     times: Floats
-    piece: Integers
+    piece: Ints
 
     def average(self, values: Signal) -> Signal:
         """Mean over each group of values at `poses`."""
@@ -71,10 +68,10 @@ class Windows:
         times: start and end [s], shape (n, 2).
     """
 
-    start: Integers
-    end: Integers
+    start: Ints
+    end: Ints
     span_s: Floats
-    block: Integers
+    block: Ints
     times: Floats
 
 
@@ -90,10 +87,10 @@ class Horizons:
         times: start of the prediction and its end, shape (n, 2).
     """
 
-    origin: Integers
-    node: Integers
-    number: Integers
-    block: Integers
+    origin: Ints
+    node: Ints
+    number: Ints
+    block: Ints
     times: Floats
 
 
@@ -196,9 +193,7 @@ def join_horizons(run: MotionRun, cells: Grid, nodes: Nodes, lead_s: float) -> H
     return Horizons(origins, node, number, block, times)
 
 
-def _is_clean(
-    run: MotionRun, cells: Grid, nodes: Nodes, ends: tuple[Integers, Integers], lead_s: float
-) -> Flags:
+def _is_clean(run: MotionRun, cells: Grid, nodes: Nodes, ends: tuple[Ints, Ints], lead_s: float) -> Flags:
     """Whether a stretch stays in one piece, clear of what is barred and of its span's first moments."""
     start, end = ends
     begin, stop = nodes.times[start], nodes.times[end]

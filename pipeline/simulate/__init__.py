@@ -4,8 +4,6 @@ A `Scenario` says everything about a run; `simulate_run` drives it and `write_lo
 physics is written here a second time, independently: nothing is shared with the models that are fitted.
 """
 
-from __future__ import annotations
-
 from pipeline.simulate.case_table import Case
 from pipeline.simulate.cases import (
     find_case,
@@ -35,41 +33,3 @@ from pipeline.simulate.scenario import (
     State,
 )
 from pipeline.simulate.vehicles import VEHICLES, Vehicle, find_vehicle
-
-__all__ = [
-    "LAYOUTS",
-    "MACHINES",
-    "PLATFORMS",
-    "VEHICLES",
-    "Case",
-    "Clock",
-    "CommandTopic",
-    "Disturbance",
-    "Drive",
-    "Encoders",
-    "Ground",
-    "Imu",
-    "Layout",
-    "Platform",
-    "PoseSensor",
-    "PoseTopic",
-    "Program",
-    "Recording",
-    "Scenario",
-    "SimulateError",
-    "SimulatedRun",
-    "SkidSteer",
-    "State",
-    "Vehicle",
-    "WheelTopic",
-    "find_case",
-    "find_vehicle",
-    "list_cases",
-    "list_effects",
-    "make_scenario",
-    "simulate_case",
-    "simulate_run",
-    "simulate_skid_steer",
-    "write_log",
-    "write_samples",
-]

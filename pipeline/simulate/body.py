@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.simulate.drivetrain import move_by_corners
 from pipeline.simulate.signals import filter_pole, integrate_cells, lag_signal, make_coloured_noise
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from pipeline.simulate.scenario import Disturbance
     from pipeline.simulate.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
 
 _TURNING_MPS = 0.01
 

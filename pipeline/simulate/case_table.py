@@ -1,19 +1,15 @@
 """The named scenarios: what ``cases.toml`` says, on the bases here."""
 
-from __future__ import annotations
-
 import math
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass, replace
 from importlib import resources
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer
 from pipeline.simulate.scenario import Disturbance, PoseSensor, Program, Scenario, State
 from pipeline.simulate.vehicles import VEHICLES
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 Made = TypeVar("Made")
 

@@ -1,10 +1,10 @@
 """Named scenarios with changes: what the command line asks for, made into a log."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, get_args
+from pathlib import Path
+from typing import TypedDict, Unpack, get_args
 
 from pipeline.simulate.case_table import CASES, Case
 from pipeline.simulate.effects import CATALOGUE, EffectSpec, resolve_effects
@@ -18,13 +18,29 @@ from pipeline.simulate.run import simulate_run
 from pipeline.simulate.scenario import Ground, ProgramName, Scenario
 from pipeline.simulate.vehicles import find_vehicle
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
 _BY_NAME = {case.name: case for case in CASES}
 _SAMPLES = ("husky_tile", "warthog_ice", "ackermann_gravel")
 _LESSON_SLOPE_RAD = math.radians(8.0)
+
+
+class Changes(TypedDict, total=False):
+    """What is otherwise than in a case; None keeps what it has.
+
+    Attributes:
+        seed: of all random numbers.
+        duration_s: length of the run.
+        vehicle: a name of `VEHICLES`; brings its usual layout along.
+        layout: a name of `LAYOUTS`.
+        program: what is driven.
+        platform: a name of `PLATFORMS`; brings its vehicle and topics along.
+    """
+
+    seed: int | None
+    duration_s: float | None
+    vehicle: str | None
+    layout: str | None
+    program: str | None
+    platform: str | None
 
 
 def list_cases() -> tuple[Case, ...]:
@@ -53,13 +69,8 @@ def simulate_case(
     effects: Mapping[str, Mapping[str, float] | float] | None = None,
     *,
     out: Path,
-    seed: int | None = None,
-    duration_s: float | None = None,
-    vehicle: str | None = None,
-    layout: str | None = None,
-    program: str | None = None,
-    platform: str | None = None,
     play: Path | None = None,
+    **changes: Unpack[Changes],
 ) -> Path:
     """Simulate a named case, or a plain one, with changes, and write its log.
 
@@ -68,13 +79,8 @@ def simulate_case(
         effects: added to the case's own, or in place of them where the id is the same. An empty mapping means
             the effect's usual size.
         out: file to write, or a folder, which gets ``<case>.mcap``.
-        seed: in place of the case's; None keeps it, as with all that follow.
-        duration_s: length of the run.
-        vehicle: a name of `VEHICLES`; brings its usual layout along.
-        layout: a name of `LAYOUTS`.
-        program: what is driven.
-        platform: a name of `PLATFORMS`; brings its vehicle and topics along.
         play: a recording of commands that are driven in place of a program, for as long as they last.
+        changes: see `Changes`.
 
     Returns:
         The file that was written.
@@ -83,16 +89,7 @@ def simulate_case(
         SimulateError: an unknown case, effect, parameter, vehicle, layout or program, an impossible value or
             combination, or a folder that cannot be written.
     """
-    scenario = make_scenario(
-        name,
-        effects,
-        seed=seed,
-        duration_s=duration_s,
-        vehicle=vehicle,
-        layout=layout,
-        program=program,
-        platform=platform,
-    )
+    scenario = make_scenario(name, effects, **changes)
     if play is not None:
         scenario = _play(scenario, play, name)
     target = out / f"{name or 'simulated'}.mcap" if out.is_dir() else out
@@ -113,15 +110,15 @@ def simulate_case(
 
 def _play(scenario: Scenario, path: Path, name: str | None) -> Scenario:
     """The scenario driven with the commands of a recording."""
-    if name is not None and find_case(name).machine is not None:
-        raise SimulateError(
-            "wrong_vehicle",
-            "a case of rigid bodies drives its own program",
-            where=name,
-            hint="Leave --play out or choose another case",
-        )
+    _refuse_machine(name, "drives its own program", "Leave --play out")
     played = read_played(path, scenario.vehicle)
     return replace(scenario, played=played, duration_s=max(float(played.time_s[-1]) + 0.5, 1.0))
+
+
+def _refuse_machine(name: str | None, why: str, hint: str) -> None:
+    if name is not None and find_case(name).machine is not None:
+        what, hint = f"a case of rigid bodies {why}", f"{hint} or choose another case"
+        raise SimulateError("wrong_vehicle", what, where=name, hint=hint)
 
 
 def make_scenario(
@@ -135,15 +132,10 @@ def make_scenario(
     program: str | None = None,
     platform: str | None = None,
 ) -> Scenario:
-    """The scenario of a named case with changes; see `simulate_case`."""
+    """The scenario of a named case with changes; see `Changes`."""
     scenario = Scenario() if name is None else find_case(name).scenario
-    if (vehicle or platform) and name is not None and find_case(name).machine is not None:
-        raise SimulateError(
-            "wrong_vehicle",
-            "a case of rigid bodies keeps its own vehicle",
-            where=name,
-            hint="Leave the vehicle out or choose another case",
-        )
+    if vehicle or platform:
+        _refuse_machine(name, "keeps its own vehicle", "Leave the vehicle out")
     if vehicle is not None:
         usual = replace(scenario.recording, layout="usual")
         scenario = replace(scenario, vehicle=find_vehicle(vehicle), recording=usual)

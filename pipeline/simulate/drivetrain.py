@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.simulate.programs import Commands
 from pipeline.simulate.signals import follow, hold_on_grid, integrate_cells, lag_signal, limit_rate
 
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from pipeline.simulate.effects import Effects
     from pipeline.simulate.vehicles import Vehicle
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -126,8 +124,7 @@ def drive_wheels(
             wheel = _rest_at_reversal(wheel, effects.value("reversal_pause", "d"), step_s)
         if effects.is_active("acceleration_limit"):
             wheel = limit_rate(wheel, per_second=effects.value("acceleration_limit", "limit"), step_s=step_s)
-        if effects.is_active("drive_lag"):
-            wheel = lag_signal(wheel, tau_s=effects.value("drive_lag", "tau"), step_s=step_s)
+        wheel = lag_signal(wheel, tau_s=effects.value("drive_lag", "tau"), step_s=step_s)
         return _brake(wheel, effects, step_s) if effects.is_active("brake_lag") else wheel
 
     if vehicle.moves_sideways:
@@ -175,8 +172,7 @@ def _join_corners(corners: dict[str, Floats], effects: Effects, step_s: float) -
     left, right = _couple_sides(sides[0], sides[1], effects, step_s)
     rest = {place: corners[place] - sides[place.endswith("right")] for place in CORNERS}
     slow = effects.value("turn_lag", "tau_mean")
-    if slow > 0.0:
-        rest = {place: lag_signal(part, tau_s=slow, step_s=step_s) for place, part in rest.items()}
+    rest = {place: lag_signal(part, tau_s=slow, step_s=step_s) for place, part in rest.items()}
     coupled = {place: (right if place.endswith("right") else left) + rest[place] for place in CORNERS}
     return Drive(step_s, left, right, np.zeros_like(left), coupled)
 
@@ -211,15 +207,12 @@ def _couple_sides(left: Floats, right: Floats, effects: Effects, step_s: float) 
     if not any(map(effects.is_active, ("turn_lag", "side_lag", "turn_droop"))):
         return left, right
     mean, difference = 0.5 * (left + right), right - left
-    tau_mean, tau_difference = effects.value("turn_lag", "tau_mean"), effects.value("turn_lag", "tau_diff")
-    if tau_mean > 0.0:
-        mean = lag_signal(mean, tau_s=tau_mean, step_s=step_s)
-    if tau_difference > 0.0:
-        difference = lag_signal(difference, tau_s=tau_difference, step_s=step_s)
+    mean = lag_signal(mean, tau_s=effects.value("turn_lag", "tau_mean"), step_s=step_s)
+    difference = lag_signal(difference, tau_s=effects.value("turn_lag", "tau_diff"), step_s=step_s)
     weak = [effects.value("side_lag", name) for name in ("tau_left", "tau_right")]
     if max(weak) > 0.0:
         sides = [
-            lag_signal(side, tau_s=tau, step_s=step_s) if tau > 0.0 else side
+            lag_signal(side, tau_s=tau, step_s=step_s)
             for side, tau in zip((mean - 0.5 * difference, mean + 0.5 * difference), weak, strict=True)
         ]
         mean, difference = 0.5 * (sides[0] + sides[1]), sides[1] - sides[0]
@@ -232,8 +225,7 @@ def _couple_sides(left: Floats, right: Floats, effects: Effects, step_s: float) 
 
 def _steer(asked: Floats, effects: Effects, step_s: float) -> Floats:
     angle = effects.value("steering_gain", "g") * asked
-    if effects.is_active("steering_lag"):
-        angle = lag_signal(angle, tau_s=effects.value("steering_lag", "tau"), step_s=step_s)
+    angle = lag_signal(angle, tau_s=effects.value("steering_lag", "tau"), step_s=step_s)
     if effects.is_active("steering_play"):
         half = effects.value("steering_play", "g")
         angle = follow(angle, lambda now, asked: min(max(now, asked - half), asked + half))

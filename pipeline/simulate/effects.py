@@ -100,12 +100,8 @@ def resolve_effects(asked: Mapping[str, Mapping[str, float] | float], kind: Kind
         if spec is None:
             raise unknown_name("effect", name, sorted(CATALOGUE))
         if kind not in spec.kinds:
-            raise SimulateError(
-                "wrong_vehicle",
-                f"{name} exists on {' or '.join(spec.kinds)} vehicles only, this one is {kind}",
-                where=name,
-                hint="Choose another vehicle or another effect",
-            )
+            what = f"{name} exists on {' or '.join(spec.kinds)} vehicles only, this one is {kind}"
+            raise _refuse("wrong_vehicle", what, name, "Choose another vehicle or another effect")
         values[name] = _check_parameters(spec, given)
     return Effects(values)
 
@@ -114,22 +110,14 @@ def _check_parameters(spec: EffectSpec, given: Mapping[str, float] | float) -> d
     names = [item.name for item in spec.parameters]
     if not isinstance(given, Mapping):
         if len(names) > 1:
-            raise SimulateError(
-                "parameter_needed",
-                "one number is not enough for an effect with several parameters",
-                where=spec.id,
-                hint=f"Name them: {', '.join(names)}",
-            )
+            what = "one number is not enough for an effect with several parameters"
+            raise _refuse("parameter_needed", what, spec.id, f"Name them: {', '.join(names)}")
         given = {names[0]: given}
     for name, value in given.items():
         if name not in names:
             known = ", ".join(f"{item.name} [{item.unit}]" for item in spec.parameters)
-            raise SimulateError(
-                "unknown_parameter",
-                f"{spec.id} has no parameter '{name}'",
-                where=spec.id,
-                hint=f"Its parameters are {known}",
-            )
+            what = f"{spec.id} has no parameter '{name}'"
+            raise _refuse("unknown_parameter", what, spec.id, f"Its parameters are {known}")
         _check_value(spec.id, name, float(value))
     return {name: float(value) for name, value in given.items()}
 
@@ -146,9 +134,9 @@ def _check_value(effect: str, name: str, value: float) -> None:
     elif name == "k" and effect in _SCALES:
         low = _SCALES[effect]
     if math.isnan(value) or value < low or (math.isinf(value) and name != "limit"):
-        raise SimulateError(
-            "bad_value",
-            f"{effect}.{name} = {value} is not possible",
-            where=effect,
-            hint=f"Give a finite number{'' if low == -_INF else f' of at least {low:g}'}",
-        )
+        hint = f"Give a finite number{'' if low == -_INF else f' of at least {low:g}'}"
+        raise _refuse("bad_value", f"{effect}.{name} = {value} is not possible", effect, hint)
+
+
+def _refuse(code: str, what: str, effect: str, hint: str) -> SimulateError:
+    return SimulateError(code, what, where=effect, hint=hint)

@@ -1,11 +1,8 @@
 """Where on Earth a place of the simulated world is: WGS84, the world's origin being a field in Quebec."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Floats
 
 ORIGIN_DEG = (46.78, -71.27)
 _ALTITUDE_M = 90.0

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.core.rigid import (
     interpolate_poses,
     multiply_quaternions,
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from pipeline.simulate.path import Path
     from pipeline.simulate.scenario import PoseSensor
 
-Floats = NDArray[np.float64]
 
 _DRIFT_STEP_S = 0.1
 _STRETCH_S = 2.0
@@ -197,12 +196,4 @@ def _drop_out(sensor: PoseSensor, poses: Poses, duration_s: float, seed: int) ->
     )
     for start in starts.tolist():
         kept &= (poses.stamp_s < start) | (poses.stamp_s >= start + sensor.dropout_s)
-    return Poses(
-        poses.sampled_s[kept],
-        poses.stamp_s[kept],
-        poses.log_s[kept],
-        poses.position[kept],
-        poses.quaternion[kept],
-        poses.correction_yaw[kept],
-        poses.correction[kept],
-    )
+    return Poses(**{name: series[kept] for name, series in vars(poses).items()})

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.core.rigid import quaternions_from_yaw
 from pipeline.simulate.drivetrain import CORNERS, apply_ideal_model, invert_ideal_model
 from pipeline.simulate.programs import Commands, make_commands
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from pipeline.simulate.layouts import CommandTopic, Layout, PoseTopic, WheelTopic
     from pipeline.simulate.run import SimulatedRun
 
-Floats = NDArray[np.float64]
 Field = Floats | float | str | list[str]
 
 _LATE_S = 0.002

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.core.rigid import invert_quaternions, multiply_quaternions, rotate, rotation_vectors
 from pipeline.simulate.body import BodyMotion
 from pipeline.simulate.drivetrain import Drive, apply_ideal_model, drive_wheels
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from pipeline.simulate.scenario import Scenario
     from pipeline.simulate.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
 
 _STEP_S = 0.002
 _SETTLE_STEPS = 500

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.core.rigid import multiply_quaternions, quaternions_from_euler, quaternions_from_yaw, rotate
 from pipeline.simulate.scenario import ExtraPhysics, Ground, State
 from pipeline.simulate.signals import integrate_cells
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from pipeline.simulate.drivetrain import Drive
     from pipeline.simulate.effects import Effects
 
-Floats = NDArray[np.float64]
 
 _SLOW_STEP_S = 0.005
 
@@ -184,18 +183,10 @@ class _Forces:
         self._gain_w = effects.value("terrain_change", "k_w")
         self._odd = walk.extra
         self._state = State(dt=walk.step_s)
-        self._signals = tuple(
-            signal.tolist()
-            for signal in (
-                walk.v0,
-                walk.w0,
-                walk.left,
-                walk.right,
-                walk.left_angle[:-1],
-                walk.right_angle[:-1],
-                walk.steering,
-            )
-        )
+        signals = {"v0": walk.v0, "w0": walk.w0, "left_speed": walk.left, "right_speed": walk.right}
+        signals |= {"left_angle": walk.left_angle[:-1], "right_angle": walk.right_angle[:-1]}
+        signals["steering"] = walk.steering
+        self._signals = {name: signal.tolist() for name, signal in signals.items()}
         self._turning = walk.turning.tolist()
 
     def push(
@@ -213,15 +204,8 @@ class _Forces:
             state.t = (index + 0.5) * self._walk.step_s
             state.x, state.y = place
             state.roll, state.pitch, state.yaw = attitude
-            (
-                state.v0,
-                state.w0,
-                state.left_speed,
-                state.right_speed,
-                state.left_angle,
-                state.right_angle,
-                state.steering,
-            ) = (signal[index] for signal in self._signals)
+            for name, signal in self._signals.items():
+                setattr(state, name, signal[index])
             odd = self._odd(state)
             d_x, d_y, d_w = d_x + odd[0], d_y + odd[1], d_w + odd[2]
         return d_x, d_y, d_w

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.simulate.errors import SimulateError, unknown_name
 from pipeline.simulate.signals import make_coloured_noise
 
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from pipeline.simulate.scenario import Program
     from pipeline.simulate.vehicles import Vehicle
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

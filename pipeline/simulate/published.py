@@ -7,15 +7,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.core.rigid import (
-    interpolate_poses,
-    invert_quaternions,
-    multiply_quaternions,
-    quaternions_from_yaw,
-    rotate,
-)
+from pipeline.core import rigid
+from pipeline.core.arrays import Floats
 from pipeline.simulate.drivetrain import apply_ideal_model, invert_ideal_model
 from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.geodesy import to_earth
@@ -31,7 +25,6 @@ if TYPE_CHECKING:
     from pipeline.simulate.messages import Field
     from pipeline.simulate.run import SimulatedRun
 
-Floats = NDArray[np.float64]
 Series = dict[str, Floats]
 Source = Literal[
     "command",
@@ -197,7 +190,7 @@ def _of_odometry(run: SimulatedRun, *, gyro: bool = False) -> tuple[Floats, Floa
     along = (series["speed"] * cosine - aside * sine, series["speed"] * sine + aside * cosine)
     way = [integrate_cells(rates, step_s=step)[:-1] for rates in along]
     position = np.stack((*way, np.zeros_like(stamp)), axis=1)
-    named = _name(position, quaternions_from_yaw(heading[:-1]))
+    named = _name(position, rigid.quaternions_from_yaw(heading[:-1]))
     return stamp, log, named | {"speed": series["speed"], "yaw_rate": rate, "sideways": aside}
 
 
@@ -207,9 +200,9 @@ def _of_filter(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
 
 def _of_localization(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     position, quaternion = run.poses.in_map()
-    ned = multiply_quaternions(
+    ned = rigid.multiply_quaternions(
         np.broadcast_to(_ENU_IN_NED, quaternion.shape),
-        multiply_quaternions(quaternion, np.broadcast_to(_FRD_IN_FLU, quaternion.shape)),
+        rigid.multiply_quaternions(quaternion, np.broadcast_to(_FRD_IN_FLU, quaternion.shape)),
     )
     series = _name(position, quaternion) | {f"ned_q{axis}": ned[:, i] for i, axis in enumerate("xyzw")}
     return run.poses.stamp_s, run.poses.log_s, series
@@ -223,9 +216,9 @@ def _of_satellites(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     if sensor.child_frame != "base_link":
         arm = np.array([sensor.mount_x_m, sensor.mount_y_m, 0.0])
     before, after = (
-        place + rotate(turn, np.broadcast_to(arm, place.shape))
+        place + rigid.rotate(turn, np.broadcast_to(arm, place.shape))
         for place, turn in (
-            interpolate_poses(poses.sampled_s + by, path.time_s, path.position, path.quaternion)
+            rigid.interpolate_poses(poses.sampled_s + by, path.time_s, path.position, path.quaternion)
             for by in (-_DOPPLER_S, _DOPPLER_S)
         )
     )
@@ -242,12 +235,12 @@ def _of_correction(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     position, quaternion = run.poses.in_map()
     at = np.clip(stamp, run.poses.stamp_s[0], run.poses.stamp_s[-1])
     order = np.argsort(run.poses.stamp_s, kind="stable")
-    there, turned = interpolate_poses(at, run.poses.stamp_s[order], position[order], quaternion[order])
+    there, turned = rigid.interpolate_poses(at, run.poses.stamp_s[order], position[order], quaternion[order])
     place = np.stack([drift[axis] for axis in "xyz"], axis=1)
-    turn = multiply_quaternions(
-        turned, invert_quaternions(np.stack([drift[f"q{axis}"] for axis in "xyzw"], axis=1))
+    turn = rigid.multiply_quaternions(
+        turned, rigid.invert_quaternions(np.stack([drift[f"q{axis}"] for axis in "xyzw"], axis=1))
     )
-    series = _name(there - rotate(turn, place), turn)
+    series = _name(there - rigid.rotate(turn, place), turn)
     return stamp, stamp + run.scenario.pose.latency_s, series
 
 
@@ -257,9 +250,9 @@ def _of_imu(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     series = {f"rate_{axis}": run.imu.rates[:, i] for i, axis in enumerate("xyz")}
     series |= {f"force_{axis}": run.imu.accelerations[:, i] for i, axis in enumerate("xyz")}
     path = run.truth.path
-    _, turn = interpolate_poses(run.imu.time_s, path.time_s, path.position, path.quaternion)
-    start = np.broadcast_to(quaternions_from_yaw(np.array([_COMPASS_OFF_RAD])), turn.shape)
-    turn = multiply_quaternions(start, turn)
+    _, turn = rigid.interpolate_poses(run.imu.time_s, path.time_s, path.position, path.quaternion)
+    start = np.broadcast_to(rigid.quaternions_from_yaw(np.array([_COMPASS_OFF_RAD])), turn.shape)
+    turn = rigid.multiply_quaternions(start, turn)
     series |= {f"attitude_{axis}": turn[:, i] for i, axis in enumerate("xyzw")}
     return run.imu.time_s, run.imu.time_s + _LATE_S, series
 

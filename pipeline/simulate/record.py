@@ -6,25 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
+from pipeline.simulate import messages
 from pipeline.simulate.layouts import find_layout
-from pipeline.simulate.messages import (
-    command_sheets,
-    cut_gaps,
-    decoy_sheets,
-    imu_sheets,
-    pose_sheets,
-    state_sheets,
-    static_sheets,
-    wheel_sheets,
-)
 from pipeline.simulate.protobuf import is_protobuf, write_protobuf
 from pipeline.simulate.published import publish
 from pipeline.simulate.stamps import stamp_headers, stamp_times
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from pipeline.simulate.messages import Field
     from pipeline.simulate.run import SimulatedRun
@@ -51,20 +41,20 @@ def write_log(run: SimulatedRun, path: Path) -> None:
         publish(run, layout.topics)
         if layout.topics
         else [
-            *command_sheets(run, layout),
-            *wheel_sheets(run, layout),
-            *pose_sheets(run, layout.pose),
-            *static_sheets(run, layout),
-            *imu_sheets(run, layout),
-            *state_sheets(run),
-            *decoy_sheets(run),
+            *messages.command_sheets(run, layout),
+            *messages.wheel_sheets(run, layout),
+            *messages.pose_sheets(run, layout.pose),
+            *messages.static_sheets(run, layout),
+            *messages.imu_sheets(run, layout),
+            *messages.state_sheets(run),
+            *messages.decoy_sheets(run),
         ]
     )
     if layout.topics and all(is_protobuf(topic.type_name) for topic in layout.topics):
-        write_protobuf(cut_gaps(run, sheets), scenario.clock, path)
+        write_protobuf(messages.cut_gaps(run, sheets), scenario.clock, path)
         return
     with LogWriter(path) as writer:
-        for sheet in cut_gaps(run, sheets):
+        for sheet in messages.cut_gaps(run, sheets):
             header = None if sheet.header_s is None else stamp_headers(scenario.clock, sheet.header_s)
             if header is not None and sheet.topic in scenario.recording.zero_stamps:
                 header = np.zeros_like(header)
@@ -84,7 +74,7 @@ def write_log(run: SimulatedRun, path: Path) -> None:
             )
 
 
-def _write_stamp(field: str, stamps: NDArray[np.int64], start_ns: int) -> dict[str, Field]:
+def _write_stamp(field: str, stamps: Ints, start_ns: int) -> dict[str, Field]:
     """Fields of a stamp [ns] outside a header; a counter of microseconds began some time before the run."""
     if field.startswith("timestamp"):
         return {field: ((stamps - start_ns + _BOOTED_NS) // 1000).astype(np.float64)}

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.core.rigid import quaternions_from_yaw
 from pipeline.simulate.body import BodyMotion, move_body
@@ -24,8 +23,6 @@ from pipeline.simulate.streams import open_stream
 if TYPE_CHECKING:
     from pipeline.simulate.scenario import Scenario
     from pipeline.simulate.vehicles import Vehicle
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core.rigid import (
-    invert_quaternions,
-    multiply_quaternions,
-    quaternions_from_euler,
-    rotate,
-    rotation_vectors,
-)
+from pipeline.core import rigid
+from pipeline.core.arrays import Floats
 from pipeline.simulate.drivetrain import move_by_corners
 from pipeline.simulate.signals import integrate_cells
 from pipeline.simulate.streams import open_stream
@@ -27,7 +22,6 @@ if TYPE_CHECKING:
     from pipeline.simulate.scenario import Encoders, Imu
     from pipeline.simulate.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
 
 _GRAVITY_MPS2 = 9.80665
 _GYRO_WINDOW_S = 0.01
@@ -113,12 +107,12 @@ def read_imu(imu: Imu, path: Path, *, duration_s: float, seed: int) -> ImuReadin
     """Sample angular velocity and specific force with the sensor's errors."""
     step = float(path.time_s[1] - path.time_s[0])
     time = np.arange(0.61 / imu.rate_hz, duration_s, 1.0 / imu.rate_hz)
-    mounting = quaternions_from_euler(
+    mounting = rigid.quaternions_from_euler(
         np.array([imu.tilt_roll_rad]), np.array([imu.tilt_pitch_rad]), np.array([0.0])
     )
-    to_sensor = np.broadcast_to(invert_quaternions(mounting), (time.size, 4))
-    rates = rotate(to_sensor, _turn_rates(path, time, step))
-    forces = rotate(to_sensor, _specific_forces(path, time, step))
+    to_sensor = np.broadcast_to(rigid.invert_quaternions(mounting), (time.size, 4))
+    rates = rigid.rotate(to_sensor, _turn_rates(path, time, step))
+    forces = rigid.rotate(to_sensor, _specific_forces(path, time, step))
     rates[:, 2] = imu.sign * (imu.scale * rates[:, 2] + imu.bias_radps)
     rates += open_stream(seed, "gyro").standard_normal(rates.shape) * imu.noise_radps
     forces += open_stream(seed, "accelerometer").standard_normal(forces.shape) * imu.noise_mps2
@@ -134,8 +128,10 @@ def _turn_rates(path: Path, time: Floats, step: float) -> Floats:
     last = path.time_s.size - 1
     centre = _nearest(time, step, last)
     before, after = np.maximum(centre - half, 0), np.minimum(centre + half, last)
-    turned = multiply_quaternions(invert_quaternions(path.quaternion[before]), path.quaternion[after])
-    rates: Floats = rotation_vectors(turned) / ((after - before) * step)[:, None]
+    turned = rigid.multiply_quaternions(
+        rigid.invert_quaternions(path.quaternion[before]), path.quaternion[after]
+    )
+    rates: Floats = rigid.rotation_vectors(turned) / ((after - before) * step)[:, None]
     return rates
 
 
@@ -147,8 +143,8 @@ def _specific_forces(path: Path, time: Floats, step: float) -> Floats:
     change = (path.velocity[after] - path.velocity[before]) / ((after - before) * step)[:, None]
     v_x, v_y, v_w = path.velocity[centre].T
     upright = np.broadcast_to(np.array([0.0, 0.0, _GRAVITY_MPS2]), (time.size, 3))
-    forces: Floats = rotate(
-        invert_quaternions(path.quaternion[_nearest(time, step, path.time_s.size - 1)]), upright
+    forces: Floats = rigid.rotate(
+        rigid.invert_quaternions(path.quaternion[_nearest(time, step, path.time_s.size - 1)]), upright
     )
     forces[:, 0] += change[:, 0] - v_w * v_y
     forces[:, 1] += change[:, 1] + v_w * v_x

@@ -3,17 +3,11 @@
 A signal lives on cells of ``step`` seconds: entry k is its mean over [k step, (k+1) step].
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Floats
 
 
 def hold_on_grid(event_s: Floats, values: Floats, *, delay_s: float, step_s: float, cells: int) -> Floats:
@@ -46,7 +40,12 @@ def hold_on_grid(event_s: Floats, values: Floats, *, delay_s: float, step_s: flo
 
 
 def lag_signal(signal: Floats, *, tau_s: float, step_s: float) -> Floats:
-    """First-order lag from rest, exact for a signal constant in each cell: tau dy/dt = u - y."""
+    """First-order lag from rest, exact for a signal constant in each cell: tau dy/dt = u - y.
+
+    Without a time constant it is the signal itself.
+    """
+    if tau_s <= 0.0:
+        return signal
     decay = float(np.exp(-step_s / tau_s))
     at_end = filter_pole(signal * (1.0 - decay), decay)
     means: Floats = 0.5 * (at_end + np.concatenate(([0.0], at_end[:-1])))

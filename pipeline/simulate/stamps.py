@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from pipeline.core.arrays import Floats, Ints
 
 if TYPE_CHECKING:
     from pipeline.simulate.scenario import Clock
 
-Floats = NDArray[np.float64]
-Stamps = NDArray[np.int64]
+Stamps = Ints
 
 _SWING_S = 7.0
 _SHORTEST_BUNCH = 0.1

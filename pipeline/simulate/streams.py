@@ -1,13 +1,10 @@
 """Independent streams of random numbers, one a purpose, all from one seed."""
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Floats
 
 
 def open_stream(seed: int, purpose: str) -> np.random.Generator:

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.core.rigid import quaternions_from_euler, rotate
 
 if TYPE_CHECKING:
     from pipeline.simulate.scenario import Ground
 
-Floats = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 _WAVES = 6

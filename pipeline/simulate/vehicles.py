@@ -3,8 +3,6 @@
 Radii, tracks and speeds are those of the vendors' data sheets and of the published DRIVE recordings.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -6,5 +6,3 @@ writes a file.
 
 from pipeline.stages.errors import StageError
 from pipeline.stages.finding import Finding
-
-__all__ = ["Finding", "StageError"]

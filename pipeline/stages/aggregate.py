@@ -6,12 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
 
 _SUBSETS = pl.Enum(["all", "transitory", "steady"])
 _ROUGHNESS_S = 1.0

@@ -9,13 +9,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats, Ints
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.stages.delays import estimate_delay
 from pipeline.stages.finding import Finding
-from pipeline.stages.samples import Samples, gather_samples
 from pipeline.stages.scale import check_scale
 from pipeline.stages.trust import check_live_commands
 from pipeline.stages.wiring import check_wiring
@@ -23,11 +22,9 @@ from pipeline.stages.wiring import check_wiring
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from pipeline.stages.samples import Samples
     from pipeline.vehicles import Vehicle
 
-__all__ = ["gather_samples", "run_checks"]
-
-Floats = NDArray[np.float64]
 
 _GAIN_OF_NO_MOTION = 0.05
 _NET_OF_NO_MOTION = 0.5
@@ -165,7 +162,7 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
 
 
 def _delay_of(
-    signal: Floats, reference: Floats, places: NDArray[np.int64], samples: Samples
+    signal: Floats, reference: Floats, places: Ints, samples: Samples
 ) -> tuple[float, float] | None:
     """Delay and standard deviation [s] of a signal against a reference; None where they do not correlate."""
     times = samples.times[places]

@@ -1,13 +1,10 @@
 """How late one signal is against another, by the lag of their best correlation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Floats
 
 _STEP = 0.02
 _FEWEST = 50

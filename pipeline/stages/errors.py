@@ -1,7 +1,5 @@
 """What can keep a stage from its work."""
 
-from __future__ import annotations
-
 from pipeline.core.errors import SlipError
 
 

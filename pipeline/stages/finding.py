@@ -1,14 +1,10 @@
 """Findings: what a stage noticed, with an id that stays the same for scripts."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import polars as pl
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 Severity = Literal["info", "warning", "error"]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.core import timegrid
+from pipeline.core.arrays import Floats
 from pipeline.stages.finding import Finding
 
 if TYPE_CHECKING:
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
     from pipeline.runs.recording import Alignment, GyroFit
 
-Floats = NDArray[np.float64]
 
 _LEAST_TURNING = 0.03
 _SCALE_FORGIVEN = 0.05

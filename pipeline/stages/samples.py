@@ -9,12 +9,12 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.stages.slip import Ideal, Steps
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Samples:
 
     times: Floats
     segment: NDArray[np.int32]
-    steady: NDArray[np.bool_]
+    steady: Flags
     step: NDArray[np.int32]
     position: Floats
     yaw: Floats

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.stages.finding import Finding
 from pipeline.vehicles import list_factors
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from pipeline.stages.samples import Samples
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
 
 _UNIT_NEAR: Final = 0.2
 """A gain within so much of a unit's is taken for it; slip of ground and a radius differ less."""

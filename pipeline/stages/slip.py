@@ -10,6 +10,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import timegrid
+from pipeline.core.arrays import Flags, Floats
 from pipeline.runs.recording import read_wheel_times
 from pipeline.stages import steps
 from pipeline.stages.errors import StageError
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 
     from pipeline.vehicles import Configuration, Vehicle
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 WINDOW_S = 2.0
 PUBLISHED_SAMPLES = 40

@@ -1,12 +1,9 @@
 """Command steps: stretches of one command, and the transitory span that follows each change."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from pipeline.core.arrays import Flags, Floats
 
 _SHARE_OF_RANGE = 0.02
 _SMALLEST_CHANGE = 0.02

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.core import segments, timegrid
+from pipeline.core.arrays import Flags, Floats
 from pipeline.core.robust import fit_robustly
 from pipeline.stages.finding import Finding
 
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from pipeline.stages.samples import Samples
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 _LIVE = 0.02
 _FEWEST = 100

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from pipeline.core import rigid, segments, timegrid
 from pipeline.stages.errors import StageError
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from pipeline.runs.recording import GyroFit
     from pipeline.vehicles.configuration import VelocitySection
 
-Floats = NDArray[np.float64]
 
 _SHORTEST_SPAN = 0.5
 

@@ -11,8 +11,8 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.core.robust import fit_robustly
 from pipeline.stages.finding import Finding
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pipeline.stages.samples import Samples
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
 
 FAULTS: Final = ("sides_exchanged", "wheel_sign", "pose_mirrored", "wheel_dead")
 """Findings of which one makes every fit meaningless."""

@@ -14,21 +14,3 @@ from pipeline.store.notes import LOG_NOTES
 from pipeline.store.partitions import Partition
 from pipeline.store.results import Store
 from pipeline.store.verification import Examination, Problem
-
-__all__ = [
-    "JSON",
-    "LOG_NOTES",
-    "STEPS",
-    "Examination",
-    "Generation",
-    "LogIdentities",
-    "LogSighting",
-    "Manifest",
-    "Mirror",
-    "Partition",
-    "Problem",
-    "Store",
-    "StoreError",
-    "TableReport",
-    "see_log",
-]

@@ -1,18 +1,14 @@
 """Files that are there whole or not at all, and stay there when the power goes."""
 
-from __future__ import annotations
-
 import errno
 import os
 import secrets
 import shutil
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from typing import TYPE_CHECKING, BinaryIO
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
+from pathlib import Path
+from typing import BinaryIO
 
 TEMPORARY = ".tmp-"
 """How the names of unfinished files and folders begin; no reader looks at them."""

@@ -141,12 +141,8 @@ class Generation:
             StoreError: ``no_such_table``, it was neither written nor taken over so far.
         """
         if name not in self._tables:
-            raise StoreError(
-                "no_such_table",
-                f"the generation holds no {name!r} so far",
-                where=self.run,
-                hint="Run the stage before, or analyze the whole log",
-            )
+            what = f"the generation holds no {name!r} so far"
+            raise self._refuse("no_such_table", what, "Run the stage before, or analyze the whole log")
         return read_parquet(self._folder / self._tables[name].file)
 
     def write_text(self, name: str, text: str) -> None:
@@ -177,7 +173,7 @@ class Generation:
 
         previous = self._require_previous(name)
         if name not in previous.tables:
-            raise _nothing_to_reuse(self.run, name)
+            raise self._nothing_to_reuse(name)
         entry = previous.tables[name]
         self._link(entry.file, entry.sha256)
         broken = f"{QUARANTINE}{name}.parquet"
@@ -195,7 +191,7 @@ class Generation:
         """
         previous = self._require_previous(name)
         if name not in previous.files:
-            raise _nothing_to_reuse(self.run, name)
+            raise self._nothing_to_reuse(name)
         self._link(name, previous.files[name].sha256)
         self._files[name] = previous.files[name]
 
@@ -292,34 +288,24 @@ class Generation:
 
     def _require_open(self) -> None:
         if not self._is_open:
-            raise StoreError(
-                "generation_closed",
-                f"the generation {self.key} is closed",
-                where=self.run,
-                hint="Open a new one; a generation never changes after its commit",
-            )
+            hint = "Open a new one; a generation never changes after its commit"
+            raise self._refuse("generation_closed", f"the generation {self.key} is closed", hint)
 
     def _require_new(self, name: str) -> None:
         self._require_open()
         taken = {entry.file for entry in self._tables.values()} | set(self._files)
         if name in taken:
-            raise StoreError(
-                "written_twice",
-                f"{name} was written already",
-                where=self.run,
-                hint="Write each table and file of a generation once",
-            )
+            hint = "Write each table and file of a generation once"
+            raise self._refuse("written_twice", f"{name} was written already", hint)
 
     def _require_previous(self, name: str) -> Manifest:
         if self.previous is None:
-            raise _nothing_to_reuse(self.run, name)
+            raise self._nothing_to_reuse(name)
         return self.previous
 
+    def _nothing_to_reuse(self, name: str) -> StoreError:
+        what = f"the results before hold no {name!r} to take over"
+        return self._refuse("no_such_table", what, "Compute it instead: analyze the log with --force")
 
-def _nothing_to_reuse(run: str, name: str) -> StoreError:
-    return StoreError(
-        "no_such_table",
-        f"the results before hold no {name!r} to take over",
-        where=run,
-        hint="Compute it instead: analyze the log with --force",
-    )
+    def _refuse(self, code: str, what: str, hint: str) -> StoreError:
+        return StoreError(code, what, where=self.run, hint=hint)

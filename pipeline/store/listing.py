@@ -13,14 +13,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from pipeline.core.paths import PathError, check_name
-from pipeline.store.files import (
-    draft_file,
-    make_folder,
-    replace_file,
-    sync_files,
-    sync_folder,
-    temporary_beside,
-)
+from pipeline.store import files
 from pipeline.store.manifest import MANIFEST, hash_bytes
 from pipeline.store.names import place_inside
 from pipeline.store.seals import seal, unseal
@@ -120,17 +113,17 @@ class Replacement:
         self._name = path.relative_to(root).as_posix()
         self._place = place_inside(root, entry_name(self._name))
         self._new = ABSENT if data is None else hash_bytes(data)
-        self._drafted = temporary_beside(path)
+        self._drafted = files.temporary_beside(path)
         self.folder = self._place.parent
 
     def draft(self) -> Path:
         """Write the entry for both contents beside the file; it has yet to be synced."""
-        make_folder(self.folder)
+        files.make_folder(self.folder)
         try:
             before = hash_bytes(self._path.read_bytes())
         except FileNotFoundError:
             before = ABSENT
-        draft_file(self._drafted, self._encode(self._new, before))
+        files.draft_file(self._drafted, self._encode(self._new, before))
         return self._drafted
 
     def announce(self) -> None:
@@ -142,13 +135,15 @@ class Replacement:
         if self._data is None:
             self._path.unlink(missing_ok=True)
         else:
-            replace_file(self._path, self._data, **({"when_written": when_written} if when_written else {}))
+            files.replace_file(
+                self._path, self._data, **({"when_written": when_written} if when_written else {})
+            )
         # Whether this is done or not, the list is right.
         with suppress(OSError):
             if self._data is None:
                 self._place.unlink()
             else:
-                draft_file(self._drafted, self._encode(self._new))
+                files.draft_file(self._drafted, self._encode(self._new))
                 self.announce()
 
     def discard(self) -> None:
@@ -168,9 +163,9 @@ def replace_listed(root: Path, path: Path, data: bytes | None, manifest: Manifes
     """
     replacement = Replacement(root, path, data, manifest)
     try:
-        sync_files([replacement.draft()])
+        files.sync_files([replacement.draft()])
         replacement.announce()
-        sync_folder(replacement.folder)
+        files.sync_folder(replacement.folder)
         replacement.replace()
     finally:
         replacement.discard()

@@ -1,17 +1,12 @@
 """One writer at a time: an advisory lock on a file, released by the system when its holder dies."""
 
-from __future__ import annotations
-
 import os
 import platform
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from pipeline.store.errors import StoreError, name_disk_errors
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 _RETRY_S = 0.02
 

@@ -1,18 +1,14 @@
 """The manifest's file: sealed JSON, strict in reading, the same bytes for the same manifest."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from pipeline.core.paths import PathError, resolve_inside
 from pipeline.store.errors import StoreError
 from pipeline.store.manifest import MANIFEST, FileEntry, Manifest, TableEntry
 from pipeline.store.names import is_file_name, is_key, place_inside
 from pipeline.store.seals import check_seal, seal, unseal
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 FORMAT = 1
 """Raised when an older version could not read what a newer one writes."""

@@ -14,7 +14,7 @@ import hashlib
 import os
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING
 
 from pipeline.store.errors import StoreError, name_disk_errors
 from pipeline.store.files import make_folder, replace_file
@@ -30,28 +30,14 @@ from pipeline.store.verification import Examination, examine_files
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
+    from fsspec import AbstractFileSystem
+
     from pipeline.store.manifest import Manifest
     from pipeline.store.verification import Problem
 
 _SEEN = "mirror.json"
 _TOGETHER = 200
 """Objects fetched by one call: bounds the memory that waits to be written."""
-
-
-class _Objects(Protocol):
-    """What is used of fsspec."""
-
-    def find(self, path: str, *, detail: bool) -> Mapping[str, Mapping[str, object]]: ...
-
-    def cat(self, path: list[str], *, on_error: str) -> Mapping[str, bytes | Exception]: ...
-
-    def cat_file(self, path: str) -> bytes: ...
-
-    def pipe_file(self, path: str, value: bytes) -> None: ...
-
-    def rm(self, path: list[str]) -> None: ...
-
-    def invalidate_cache(self) -> None: ...
 
 
 class Mirror:
@@ -227,9 +213,10 @@ class Mirror:
         """
         with self._name_errors():
             try:
-                return self._objects.cat_file(self._place(name))
+                found: bytes = self._objects.cat_file(self._place(name))
             except FileNotFoundError:
                 return None
+            return found
 
     def hash(self, name: str) -> str:
         """SHA-256 of an object in hexadecimal; empty when there is none.
@@ -382,11 +369,11 @@ def _default_folder(address: str) -> Path:
     return cache / "slip" / "results" / hashlib.sha256(address.encode()).hexdigest()[:16]
 
 
-def _open_objects(address: str) -> _Objects:
+def _open_objects(address: str) -> AbstractFileSystem:
     from pipeline.logs import LogError, open_store  # noqa: PLC0415 - only where results are on an object store
 
     try:
-        return cast("_Objects", open_store(address))
+        return open_store(address)
     except LogError as error:
         raise StoreError(
             "no_object_store",

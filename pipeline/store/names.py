@@ -5,19 +5,13 @@ find them; everything else is percent-encoded. Two different names never share a
 before a hash, `%` only before a code, and the text before the last slash becomes one part whatever it holds.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 import unicodedata
-from pathlib import PurePosixPath
-from typing import TYPE_CHECKING
+from pathlib import Path, PurePosixPath
 
 from pipeline.core.paths import PathError, may_lead_out, resolve_inside
 from pipeline.store.errors import StoreError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 LONGEST_PART = 120
 """Bytes of one part of a path; file systems allow 255, encrypted ones 143."""

@@ -7,15 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.store import files
 from pipeline.store.errors import StoreError, name_disk_errors
-from pipeline.store.files import (
-    make_folder,
-    remove_folder,
-    remove_leftovers,
-    replace_file,
-    temporary_beside,
-    write_new_file,
-)
 from pipeline.store.generation import Generation
 from pipeline.store.homes import point_latest, remove_orphans
 from pipeline.store.listing import LIST, encode_entry, entry_name, is_run_manifest, make_entry, replace_listed
@@ -137,7 +130,7 @@ class Store:
         with self._lock_run(run) as home:
             previous = self.manifest(run)
             with name_disk_errors(home):
-                remove_leftovers(home)
+                files.remove_leftovers(home)
                 remove_orphans(home, previous)
             generation = Generation(
                 run=run,
@@ -247,8 +240,8 @@ class Store:
         with self._lock(path.parent), name_disk_errors(path):
             manifest = load_manifest(path.parent) if is_run_manifest(name) else None
             entry = make_entry(name, hash_file(path), manifest=manifest)
-            make_folder(place_inside(self.root, LIST))
-            replace_file(place_inside(self.root, entry_name(name)), encode_entry(entry))
+            files.make_folder(place_inside(self.root, LIST))
+            files.replace_file(place_inside(self.root, entry_name(name)), encode_entry(entry))
 
     def remove(self, name: str) -> None:
         """Remove a file that nobody can use any more: a damaged manifest, entry or note.
@@ -305,8 +298,8 @@ class Store:
         check_file_name(name)
         path = place_inside(self.root, name)
         with self._lock(self.root), name_disk_errors(path):
-            make_folder(path.parent)
-            remove_leftovers(path.parent)
+            files.make_folder(path.parent)
+            files.remove_leftovers(path.parent)
             replace_listed(self.root, path, text.encode())
         return path
 
@@ -321,8 +314,8 @@ class Store:
             StoreError: ``read_only``, ``permission_denied``, ``disk_full``, ``locked``, ...
         """
         with self._lock(self.root), name_disk_errors(self.root):
-            probe = temporary_beside(self.root / "probe")
-            write_new_file(probe, b"may be written")
+            probe = files.temporary_beside(self.root / "probe")
+            files.write_new_file(probe, b"may be written")
             probe.unlink()
 
     @contextmanager
@@ -334,7 +327,7 @@ class Store:
         """
         folder = place_inside(self.root, CLAIMS)
         with name_disk_errors(folder):
-            make_folder(folder)
+            files.make_folder(folder)
         try:
             with hold_lock(folder / hash_bytes(name.encode())[:3], patience_s=0.0):
                 yield True
@@ -358,10 +351,10 @@ class Store:
     @contextmanager
     def _lock(self, folder: Path) -> Iterator[None]:
         with name_disk_errors(folder):
-            make_folder(folder)
+            files.make_folder(folder)
         with hold_lock(folder / LOCK, patience_s=self._patience_s):
             with name_disk_errors(folder):
-                remove_leftovers(folder)
+                files.remove_leftovers(folder)
             yield
 
     def _prune_run(self, run: str, home: Path, keep: int) -> list[Path]:
@@ -376,6 +369,6 @@ class Store:
             replace_listed(self.root, home / MANIFEST, encode_manifest(shorter), shorter)
             for folder in doomed:
                 if folder.exists():
-                    remove_folder(folder)
+                    files.remove_folder(folder)
             point_latest(home, manifest.folder.name)
         return doomed

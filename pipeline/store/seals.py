@@ -4,15 +4,10 @@ The checksum stands first and covers every other byte. Files of before there wer
 read as they are.
 """
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 from pipeline.store.manifest import hash_bytes
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 _START = b'{"checksum": "'
 _DIGITS = 64

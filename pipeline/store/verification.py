@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from pipeline.store.errors import StoreError
 from pipeline.store.listing import ABSENT, LIST, Entry, entry_name, is_run_manifest, parse_entry
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.store.manifest import Manifest
+    from pipeline.store.mirror import Mirror
 
 RUNS = "runs"
 _SEEN = "mirror.json"
@@ -61,22 +62,6 @@ class Examination:
     entries: Mapping[str, Entry]
 
 
-class Files(Protocol):
-    """The files of results, wherever they are."""
-
-    def names(self) -> Collection[str]:
-        """Every name in the results."""
-
-    def read(self, name: str) -> bytes | None:
-        """The content of a file; None when there is none."""
-
-    def hash(self, name: str) -> str:
-        """SHA-256 of a file in hexadecimal; `ABSENT` when there is none."""
-
-    def place(self, name: str) -> Path:
-        """The path to show."""
-
-
 class DiskFiles:
     """The files of a results folder.
 
@@ -88,7 +73,7 @@ class DiskFiles:
         self._root = root
 
     def names(self) -> Collection[str]:
-        """As in `Files`; links are not followed."""
+        """Every name in the results; links are not followed."""
         found = set()
         for folder, _, files in os.walk(self._root):
             start = os.path.relpath(folder, self._root)
@@ -96,7 +81,7 @@ class DiskFiles:
         return found
 
     def read(self, name: str) -> bytes | None:
-        """As in `Files`."""
+        """The content of a file; None when there is none."""
         path = self.place(name)
         try:
             return path.read_bytes() if path.is_file() else None
@@ -104,7 +89,7 @@ class DiskFiles:
             return None
 
     def hash(self, name: str) -> str:
-        """As in `Files`."""
+        """SHA-256 of a file in hexadecimal; `ABSENT` when there is none."""
         path = self.place(name)
         try:
             return ABSENT if path.is_symlink() or not path.is_file() else hash_file(path)
@@ -112,17 +97,17 @@ class DiskFiles:
             return ABSENT
 
     def place(self, name: str) -> Path:
-        """As in `Files`."""
+        """The path to show."""
         return self._root / name
 
 
-def examine_files(files: Files) -> Examination:
+def examine_files(files: DiskFiles | Mirror) -> Examination:
     """Read all results again, and hold them against what says what they were."""
     return _Examiner(files).examine()
 
 
 class _Examiner:
-    def __init__(self, files: Files) -> None:
+    def __init__(self, files: DiskFiles | Mirror) -> None:
         self._files = files
         self._names = files.names()
         self._entries: dict[str, Entry] = {}

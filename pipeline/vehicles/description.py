@@ -6,23 +6,16 @@ speaks of such or of rollers. The radius is that of the wheel's cylinder, else t
 base_footprint.
 """
 
-from __future__ import annotations
-
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.core import rigid
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Floats
 
 _LONGEST = 8_000_000
 _LATERAL = 0.9

@@ -1,7 +1,5 @@
 """What can be wrong with a vehicle or a configuration."""
 
-from __future__ import annotations
-
 from pipeline.core.errors import SlipError
 
 

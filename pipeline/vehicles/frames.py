@@ -6,14 +6,13 @@ import re
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.logs import LogError
 
 if TYPE_CHECKING:
     from pipeline.logs import TransformBuffer
 
-Floats = NDArray[np.float64]
 
 _NO_WHEEL: Final = re.compile(r"caster|castor|swivel|cam|lidar|imu")
 _APART_M: Final = 0.02

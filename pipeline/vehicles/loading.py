@@ -1,11 +1,9 @@
 """Finding and merging configurations: presets < fleet.toml < run.toml < the command line."""
 
-from __future__ import annotations
-
 import fnmatch
 import os
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import msgspec
 
@@ -14,9 +12,6 @@ from pipeline.vehicles.complaints import check_preset, describe_fault, name_key
 from pipeline.vehicles.configuration import Configuration
 from pipeline.vehicles.errors import ConfigurationError
 from pipeline.vehicles.presets import find_preset
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 Tree = Mapping[str, object]
 

@@ -1,17 +1,13 @@
 """Geometry that a controller was given: its parameters, as parameter events or metadata record them."""
 
-from __future__ import annotations
-
 from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import msgspec
 
 from pipeline.vehicles.recognition import Recognized
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
 
 _QUANTITIES: Final = {
     "wheel_separation": "track_width_m",

@@ -1,7 +1,5 @@
 """Vehicles: presets found by being in the `presets` folder, and what a configuration makes of them."""
 
-from __future__ import annotations
-
 import functools
 import tomllib
 from importlib import resources

@@ -6,17 +6,12 @@ the same topics (``alice/cmd_vel``, ``alice/odom``, ``bob/cmd_vel``, ``bob/odom`
 ``controller`` beside ``mapping``, is one robot.
 """
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Iterable, Mapping
 
 from pipeline.vehicles.errors import ConfigurationError
 from pipeline.vehicles.presets import find_preset
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping
 
 _NUMBERED = re.compile(r"\d+|_[a-d]$")
 _FUNCTION = re.compile(

@@ -122,11 +122,9 @@ class _Chooser:
         """A configured signal, or an error when its topic is not in the log."""
         signal = Signal.parse(text)
         if signal.topic not in self.types:
-            raise ConfigurationError(
-                "topic_not_found",
-                f"the topic {signal.topic!r} configured as {role} is not in the log (or is empty)",
-                where=self.where,
-                hint=f"It has: {', '.join(sorted(self.types)) or 'no topics'}.",
+            what = f"the topic {signal.topic!r} configured as {role} is not in the log (or is empty)"
+            raise self._bad(
+                what, f"It has: {', '.join(sorted(self.types)) or 'no topics'}.", "topic_not_found"
             )
         return signal
 
@@ -138,12 +136,11 @@ class _Chooser:
         return name
 
     def _unusable(self, topic: str, role: str, kind: str) -> ConfigurationError:
-        return ConfigurationError(
-            "type_not_usable",
-            f"the topic {topic!r} of type {self.types[topic]} cannot serve as {role}",
-            where=self.where,
-            hint=f"Use a topic of type {kind}.",
-        )
+        what = f"the topic {topic!r} of type {self.types[topic]} cannot serve as {role}"
+        return self._bad(what, f"Use a topic of type {kind}.")
+
+    def _bad(self, what: str, hint: str, code: str = "type_not_usable") -> ConfigurationError:
+        return ConfigurationError(code, what, where=self.where, hint=hint)
 
     def require_number(self, text: str, role: str) -> Signal:
         """A configured signal that must come to one number."""
@@ -153,12 +150,9 @@ class _Chooser:
         number = find_type(self.types[signal.topic]).number
         if number is not None:
             return Signal(signal.topic, number.field, number.unit, number.sign, number.per_turn)
-        raise ConfigurationError(
-            "field_needed",
-            f"the topic {signal.topic!r} configured as {role} is of type {self.types[signal.topic]}",
-            where=self.where,
-            hint=f"Name the field: {signal.topic}.field or {signal.topic}.array[0].",
-        )
+        what = f"the topic {signal.topic!r} configured as {role} is of type {self.types[signal.topic]}"
+        hint = f"Name the field: {signal.topic}.field or {signal.topic}.array[0]."
+        raise self._bad(what, hint, "field_needed")
 
     def choose_drive(self, section: DriveSection, *, commanded: bool) -> DriveSource | None:
         """Commands (or measured wheels) by configuration, else by type and name."""
@@ -192,12 +186,8 @@ class _Chooser:
                 for _, source in topics.list_drives(commanded=commanded, steered=steered)
             ]
             if not found or (role == "command" and find_type(self.types[signal.topic]).pose is not None):
-                raise ConfigurationError(
-                    "type_not_usable",
-                    f"the topic {signal.topic!r} ({self.types[signal.topic]}) cannot serve as {role} alone",
-                    where=self.where,
-                    hint=f"Give {role}.left_topic and {role}.right_topic with field paths.",
-                )
+                what = f"the topic {signal.topic!r} ({self.types[signal.topic]}) cannot serve as {role} alone"
+                raise self._bad(what, f"Give {role}.left_topic and {role}.right_topic with field paths.")
             return DriveSource(found[0].form, found[0].signals, reason, found[0].name)
         return None
 
@@ -207,12 +197,8 @@ class _Chooser:
         transforms = self._dynamic_transforms(is_configured=bool(frames))
         if frames:
             if not transforms:
-                raise ConfigurationError(
-                    "topic_not_found",
-                    "pose.frames is configured, but the log has no transforms",
-                    where=self.where,
-                    hint="Configure pose.topic.",
-                )
+                what = "pose.frames is configured, but the log has no transforms"
+                raise self._bad(what, "Configure pose.topic.", "topic_not_found")
             return PoseSource(transforms, CONFIGURED, from_transforms=True, frames=(frames[0], frames[1]))
         if topic:
             name = self.require(topic, "pose").topic
@@ -223,12 +209,9 @@ class _Chooser:
                 return PoseSource(name, CONFIGURED, name=section.name or "")
             if kind.fix is not None or kind.ground_velocity is not None:
                 return self._by_satellites(name, CONFIGURED)
-            raise ConfigurationError(
-                "type_not_usable",
-                f"the topic {name!r} of type {self.types[name]} cannot serve as pose",
-                where=self.where,
-                hint=f"Use one of: {', '.join((*list_types('pose'), *list_types('fix')))}; or pose.frames.",
-            )
+            what = f"the topic {name!r} of type {self.types[name]} cannot serve as pose"
+            usable = ", ".join((*list_types("pose"), *list_types("fix")))
+            raise self._bad(what, f"Use one of: {usable}; or pose.frames.")
         candidates = [
             (ranked[0], replace(ranked[1], name=section.name or ""))
             for name in self.with_part("pose")
@@ -292,12 +275,9 @@ class _Chooser:
         sections: list[IntervalSection] = configuration.interval
         configured = sorted({section.topic for section in sections if section.topic})
         if len(configured) > 1:
-            raise ConfigurationError(
-                "intervals_disagree",
-                f"the intervals name several topics: {', '.join(configured)}",
-                where=self.where,
-                hint="Give one state topic; it may have several [[interval]] with different `equals`.",
-            )
+            what = f"the intervals name several topics: {', '.join(configured)}"
+            hint = "Give one state topic; it may have several [[interval]] with different `equals`."
+            raise self._bad(what, hint, "intervals_disagree")
         if configured:
             return TopicSource(self._require_type(configured[0], "interval", STRING_TYPE), CONFIGURED)
         topic, value = DEFAULT_INTERVAL

@@ -17,7 +17,6 @@ from object_store import BUCKET, upload
 
 from pipeline.logs import LogError, LogWriter, RemotePath, Wanted, open_log, read_topics
 from pipeline.logs import buckets as bucket_room
-from pipeline.logs import remote as remote_room
 from pipeline.store import Store
 
 if TYPE_CHECKING:
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
 
     import fsspec
 
-    from pipeline.logs.buckets import FileSystem, Info
+    from pipeline.logs.buckets import Info
 
 ADDRESS = f"{BUCKET}/log.mcap"
 ROWS = 600
@@ -60,18 +59,24 @@ def read_numbers(path: object) -> set[float]:
 
 def act_before_range(monkeypatch: pytest.MonkeyPatch, number: int, act: Callable[[], None]) -> list[int]:
     """Do something right before the range of that number is fetched; the ranges so far."""
-    original = remote_room.fetch_range
+    original = bucket_room.fetch_range
     fetched: list[int] = []
 
     def fetch(
-        store: FileSystem, url: str, start: int, end: int, *, known: Info, look: Callable[[], Info]
+        store: fsspec.AbstractFileSystem,
+        url: str,
+        start: int,
+        end: int,
+        *,
+        known: Info,
+        look: Callable[[], Info],
     ) -> bytes:
         if len(fetched) == number:
             act()
         fetched.append(end - start)
         return original(store, url, start, end, known=known, look=look)
 
-    monkeypatch.setattr(remote_room, "fetch_range", fetch)
+    monkeypatch.setattr(bucket_room, "fetch_range", fetch)
     return fetched
 
 

@@ -31,7 +31,7 @@ def test_every_real_number_has_a_unit(contract: Contract) -> None:
 @pytest.mark.parametrize("contract", CONTRACTS, ids=lambda contract: contract.name)
 def test_a_table_is_a_plural_noun_with_a_version_and_knows_its_run(contract: Contract) -> None:
     assert contract.version >= 1
-    assert contract.name == contract.schema.NAME
+    assert contract.name == contract.schema.__name__.lower()
     assert {"run", "dataset", "vehicle", "terrain"} <= set(contract.schema.columns())
 
 

@@ -23,8 +23,9 @@ from pipeline.simulate import (
     write_log,
 )
 from pipeline.stages.align import Aligned, align_tables
-from pipeline.stages.checks import gather_samples, run_checks
+from pipeline.stages.checks import run_checks
 from pipeline.stages.extract import Extracted, extract_tables, list_wanted
+from pipeline.stages.samples import gather_samples
 from pipeline.stages.slip import SlipResult, compute_slip
 from pipeline.stages.velocity import VelocityResult, compute_velocities
 from pipeline.vehicles import Configuration, DriveForm, Sources, choose_sources, resolve_vehicle

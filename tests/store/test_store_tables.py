@@ -24,7 +24,6 @@ HERE = Path(__file__).parent
 class Everything(Table):
     """One column of every type."""
 
-    NAME = "everything"
     VERSION = 7
 
     flag = dy.Bool(nullable=True)
@@ -48,7 +47,7 @@ class Everything(Table):
     pair = dy.Struct({"a": dy.Float64(nullable=True), "b": dy.List(dy.Int64())}, nullable=True)
 
 
-EVERYTHING = Contract(Everything.NAME, Everything.VERSION, Everything)
+EVERYTHING = Contract("everything", Everything.VERSION, Everything)
 
 
 def make_everything() -> pl.DataFrame:

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from pipeline.batch.work import Report, Task
 
-__all__ = ["Blame", "Executor", "Settings", "find_executor"]
-
 
 @dataclass(frozen=True)
 class Settings:
@@ -57,13 +55,10 @@ class Blame:
 class Executor(Protocol):
     """Workers."""
 
-    @property
-    def depth(self) -> int:
-        """Tasks that it likes to have at once, waiting ones included."""
-
-    @property
-    def spreads_blame(self) -> bool:
-        """Whether a worker that dies may make innocent tasks look guilty; suspects are then tried alone."""
+    depth: int
+    """Tasks that it likes to have at once, waiting ones included."""
+    spreads_blame: bool
+    """Whether a worker that dies may make innocent tasks look guilty; suspects are then tried alone."""
 
     def expect(self, tasks: int) -> None:
         """Get ready for so many tasks, which are certain to come."""

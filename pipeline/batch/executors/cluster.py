@@ -131,7 +131,14 @@ class SchedulerLostError(Exception):
 
 
 class ClusterExecutor:
-    """The workers of a dask cluster."""
+    """The workers of a dask cluster.
+
+    Attributes:
+        depth: threads of all workers, which may come and go.
+    """
+
+    # Tasks that wait for a worker are blamed for its death, too.
+    spreads_blame = True
 
     def __init__(self, client: Client, settings: Settings, *, address: str, owns_cluster: bool) -> None:
         self._client = client
@@ -142,23 +149,13 @@ class ClusterExecutor:
         self._work = partial(
             run_guarded, settings.work, timeout_s=settings.timeout_s, memory_bytes=settings.memory_bytes
         )
-        self._threads = 1
+        self.depth = 1
         self._waiting: set[Future[Report]] = set()
         self._closing = threading.Event()
         self._is_lost = False
         # What goes wrong is told by this program; dask would tell it as well, in many lines.
         logging.disable(logging.CRITICAL)
         threading.Thread(target=self._look_after_scheduler, name="scheduler", daemon=True).start()
-
-    @property
-    def spreads_blame(self) -> bool:
-        """Tasks that wait for a worker are blamed for its death, too."""
-        return True
-
-    @property
-    def depth(self) -> int:
-        """Threads of all workers, which may come and go."""
-        return max(1, self._threads)
 
     def expect(self, tasks: int) -> None:
         """The workers are there already."""
@@ -208,7 +205,7 @@ class ClusterExecutor:
         answered = time.monotonic()
         while not self._closing.is_set():
             try:
-                self._threads = count_threads(self._address)
+                self.depth = max(1, count_threads(self._address))
                 answered = time.monotonic()
             except Exception:  # noqa: BLE001 - no answer, for whatever reason
                 self._is_lost = time.monotonic() - answered > _LOST_S

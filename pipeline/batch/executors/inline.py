@@ -29,18 +29,12 @@ def open_executor(word: str, settings: Settings) -> InlineExecutor:
 class InlineExecutor:
     """Works on a task as soon as it is submitted."""
 
+    depth = 1
+    # Nobody is left to blame.
+    spreads_blame = False
+
     def __init__(self, settings: Settings) -> None:
         self._work = settings.work
-
-    @property
-    def depth(self) -> int:
-        """One."""
-        return 1
-
-    @property
-    def spreads_blame(self) -> bool:
-        """Nobody is left to blame."""
-        return False
 
     def expect(self, tasks: int) -> None:
         """Nothing has to be made ready."""

@@ -59,8 +59,12 @@ def open_executor(word: str, settings: Settings) -> LocalExecutor:
 class LocalExecutor:
     """Worker processes, spawned so that nothing of this process leaks into them."""
 
+    # A process has one task.
+    spreads_blame = False
+
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
+        self.depth = settings.jobs
         # Spawned processes take the environment over; more threads than cores only get in each other's way.
         for variable in THREAD_VARIABLES:
             os.environ.setdefault(variable, "1")
@@ -72,16 +76,6 @@ class LocalExecutor:
         self._closing = threading.Event()
         self._supervisor = threading.Thread(target=self._look_after_workers, name="supervisor", daemon=True)
         self._supervisor.start()
-
-    @property
-    def depth(self) -> int:
-        """A task for each process."""
-        return self._settings.jobs
-
-    @property
-    def spreads_blame(self) -> bool:
-        """A process has one task."""
-        return False
 
     def expect(self, tasks: int) -> None:
         """Start the processes, which load their libraries while it is still being planned what they do.

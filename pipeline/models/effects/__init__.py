@@ -5,5 +5,3 @@ formula, and run the shared test of all effects.
 """
 
 from pipeline.models.catalogue import find_effect, list_effects
-
-__all__ = ["find_effect", "list_effects"]

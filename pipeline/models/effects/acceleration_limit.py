@@ -18,7 +18,6 @@ from pipeline.models.quantity import Quantity
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence, Largest
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 # A limit that the largest wheel speed is reached under in less shows in no pose.
 _LEAST_RAMP_S = 0.08
@@ -44,6 +43,7 @@ class AccelerationLimit(DriveEffect):
             quantities=(Quantity.WHEEL_ACCELERATION_LIMIT,),
         ),
     )
+    motion = "changes no wheel's speed faster than {limit:.3g} rad/s^2"
     needs = (Excitation.CHANGES, Excitation.LARGE)
     confused_with = ("drive_lag", "body_inertia")
     python_state = ("limited",)
@@ -52,11 +52,6 @@ class AccelerationLimit(DriveEffect):
         wheels = split(left, right, sideways)
         limited = [approach(was, wheel, most) for was, wheel in zip(limited or [0.0] * 4, wheels)]
         left, right, sideways = join(limited)"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"changes no wheel's speed faster than {self.values['limit']:.3g} rad/s^2"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

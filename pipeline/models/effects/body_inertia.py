@@ -15,18 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import (
-    STAMPS,
-    WARTHOG_RUNS,
-    BodyEffect,
-    Excitation,
-    Late,
-    Least,
-    Parameter,
-    Plausible,
-    Search,
-    Spread,
-)
+from pipeline.models.effect import BodyEffect, Excitation, Late, Least, Parameter, Plausible, Search, Spread
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Velocity
@@ -34,7 +23,6 @@ from pipeline.runs.signals import Velocity
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import Rolling, RunContext
-    from pipeline.vehicles import Vehicle
 
 
 class BodyInertia(BodyEffect):
@@ -52,12 +40,13 @@ class BodyInertia(BodyEffect):
             search=Search.STARTS,
             starts=(0.15, 0.4, 0.9, 1.6),
             step=5e-3,
-            least=Least(0.02, STAMPS),
+            least=Least(0.02, Least.STAMPS),
             plausible=Plausible(0.0, 3.0, "wider than the 0.2 to 1 s of ice"),
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
-            between_runs=Spread(0.034, WARTHOG_RUNS),
+            between_runs=Spread(0.034),
         ),
     )
+    motion = "slides on for {tau:.2f} s before it follows its wheels"
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("lateral_skid", "drive_lag", "acceleration_limit", "heading_skew")
     equivalent_to = ("drive_lag",)
@@ -72,11 +61,6 @@ class BodyInertia(BodyEffect):
         slide_x = ahead * math.cos(turn) + aside * math.sin(turn)
         slide_y = aside * math.cos(turn) - ahead * math.sin(turn)
         v_x, v_y, v_w = slide_x, slide_y, slide_w"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"slides on for {self.values['tau']:.2f} s before it follows its wheels"
 
     def move_body(self, rolling: Rolling, around: RunContext) -> Velocity:
         """See the formula above."""

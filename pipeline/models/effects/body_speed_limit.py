@@ -19,7 +19,6 @@ from pipeline.models.quantity import Quantity
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import Commands, RunContext
-    from pipeline.vehicles import Vehicle
 
 
 class BodySpeedLimit(CommandEffect):
@@ -42,17 +41,13 @@ class BodySpeedLimit(CommandEffect):
             quantities=(Quantity.SPEED_LIMIT,),
         ),
     )
+    motion = "drives no faster than {limit:.3g} m/s, whatever is asked"
     needs = (Excitation.LARGE, Excitation.SPEED_SPREAD)
     confused_with = ("wheel_speed_limit", "speed_slip")
     python = """
         asked = R * (left + right) / 2.0
         excess = (asked - max(-{limit}, min({limit}, asked))) / R
         left, right = left - excess, right - excess"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"drives no faster than {self.values['limit']:.3g} m/s, whatever is asked"
 
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""

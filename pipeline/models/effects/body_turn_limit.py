@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from pipeline.models.effect import Effect
     from pipeline.models.evidence import Evidence, Largest
     from pipeline.runs.signals import Commands, RunContext
-    from pipeline.vehicles import Vehicle
 
 _ON_A_CAR = """
         moving = max(abs(R * (left + right) / 2.0), 1e-9)
@@ -51,17 +50,13 @@ class BodyTurnLimit(CommandEffect):
             quantities=(Quantity.TURN_LIMIT,),
         ),
     )
+    motion = "turns no faster than {limit:.3g} rad/s, whatever is asked"
     needs = (Excitation.LARGE, Excitation.TURNING)
     confused_with = ("wheel_speed_limit", "turn_droop")
     python = """
         asked = (right - left) * R / (B * MULTIPLIER)
         excess = (asked - max(-{limit}, min({limit}, asked))) * B * MULTIPLIER / (2.0 * R)
         left, right = left + excess, right - excess"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"turns no faster than {self.values['limit']:.3g} rad/s, whatever is asked"
 
     def choose_python(self, kind: str) -> str | None:
         """On a car it is the steering angle that is held back."""

@@ -18,7 +18,6 @@ from pipeline.models.filters import lag_unevenly
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 
 class BrakeLag(TwoLags):
@@ -32,6 +31,7 @@ class BrakeLag(TwoLags):
         time_constant("tau_drive", "time constant of speeding up", 0.6, (0.5,)),
         time_constant("tau_brake", "time constant of slowing down", 0.2, (0.2,)),
     )
+    motion = "speeds its wheels up {tau_drive:.2f} s late, and slows them down {tau_brake:.2f} s late"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "acceleration_limit")
     # Where ground disturbs the wheels a second time constant always helps a little.
@@ -43,12 +43,6 @@ class BrakeLag(TwoLags):
         keeps = [math.exp(-step_s / tau) if tau > 0.0 else 0.0 for tau in ({tau_drive}, {tau_brake})]
         braked = [wheel + (was - wheel) * keeps[slow] for was, wheel, slow in zip(braked, wheels, slows)]
         left, right, sideways = join(braked)"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        up, down = self.taus
-        return f"speeds its wheels up {up:.2f} s late, and slows them down {down:.2f} s late"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

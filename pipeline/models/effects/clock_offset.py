@@ -14,25 +14,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    STAMPS,
-    WARTHOG_RUNS,
-    Excitation,
-    Late,
-    Least,
-    Parameter,
-    Plausible,
-    ReportEffect,
-    Search,
-    Spread,
-)
+from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect, Search, Spread
 from pipeline.models.evidence import LEAST_DELAY_S
 from pipeline.models.level import Level, Reading
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class ClockOffset(ReportEffect):
@@ -51,11 +39,14 @@ class ClockOffset(ReportEffect):
             search=Search.STARTS,
             starts=(-0.3, -0.1, 0.1, 0.3),
             step=5e-3,
-            least=Least(LEAST_DELAY_S, STAMPS, sampled=True),
+            least=Least(LEAST_DELAY_S, Least.STAMPS, sampled=True),
             plausible=Plausible(-0.8, 0.8, "wider than the clocks of the DRIVE recordings"),
-            between_runs=Spread(0.14, WARTHOG_RUNS),
+            between_runs=Spread(0.14),
         ),
     )
+    motion = "stamps its poses {size:.0f} ms {way}"
+    ways = ("late", "early")
+    size_in = 1e3
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "body_inertia")
     equivalent_to = ("transport_delay",)
@@ -67,16 +58,8 @@ class ClockOffset(ReportEffect):
         Reading(Level.RUN, "clock_offset", "clocks set anew"),
     )
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        late = self.values["d"]
-        way = "late" if late >= 0.0 else "early"
-        return f"stamps its poses {abs(late) * 1e3:.0f} ms {way}"
-
     def report(self, velocity: Velocity, around: RunContext) -> Velocity:
         """See the formula above."""
-        del around
         return velocity
 
     def delay_s(self) -> float:

@@ -19,7 +19,6 @@ from pipeline.models.quantity import Quantity
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence, Largest
     from pipeline.runs.signals import Commands, RunContext
-    from pipeline.vehicles import Vehicle
 
 # Of the largest speed: less is passed through in one step of a command.
 _LEAST_SHARE = 0.02
@@ -45,16 +44,12 @@ class Deadband(CommandEffect):
             quantities=(Quantity.DEADBAND,),
         ),
     )
+    motion = "does not move a wheel for less than {d:.2g} m/s at its rim"
     needs = (Excitation.SMALL,)
     confused_with = ("turn_droop",)
     python = """
         wheels = split(left, right, sideways)
         left, right, sideways = join([0.0 if R * abs(wheel) < {d} else wheel for wheel in wheels])"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"does not move a wheel for less than {self.values['d']:.2g} m/s at its rim"
 
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""

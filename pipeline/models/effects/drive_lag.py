@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
-from pipeline.models.effect import STAMPS, DriveEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from pipeline.models.effect import Effect
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 
 class DriveLag(DriveEffect):
@@ -39,11 +38,12 @@ class DriveLag(DriveEffect):
             search=Search.STARTS,
             starts=(0.1, 0.3, 0.7, 1.4),
             step=5e-3,
-            least=Least(0.015, STAMPS, sampled=True),
+            least=Least(0.015, Least.STAMPS, sampled=True),
             plausible=Plausible(0.0, 3.0, "wider than the 0.55 to 1.2 s of Husky and Warthog"),
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
         ),
     )
+    motion = "follows its commands {tau:.2f} s late, gradually"
     needs = (Excitation.CHANGES,)
     confused_with = ("transport_delay", "turn_lag", "acceleration_limit")
     equivalent_to = ("body_inertia",)
@@ -56,11 +56,6 @@ class DriveLag(DriveEffect):
         lag_right = right + (lag_right - right) * keep
         lag_sideways = sideways + (lag_sideways - sideways) * keep
         left, right, sideways = lag_left, lag_right, lag_sideways"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"follows its commands {self.values['tau']:.2f} s late, gradually"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -12,17 +12,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    DATA_SHEET,
-    SIDES,
-    WARTHOG_RUNS,
-    Excitation,
-    KinematicEffect,
-    Least,
-    Parameter,
-    Plausible,
-    Spread,
-)
+from pipeline.models.effect import SIDES, Excitation, KinematicEffect, Least, Parameter, Plausible, Spread
 from pipeline.models.effects.wheel_radius import WheelRadius
 from pipeline.models.level import Level, Reading
 from pipeline.models.quantity import Quantity
@@ -47,10 +37,10 @@ class EffectiveTrack(KinematicEffect):
             1.0,
             "effective over nominal track",
             1.8,
-            least=Least(0.01, DATA_SHEET),
+            least=Least(0.01, Least.DATA_SHEET),
             plausible=Plausible(0.7, 4.0, "wider than the 1.8 and 1.9 of Warthog and Husky"),
             quantities=(Quantity.TRACK,),
-            between_runs=Spread(0.023, WARTHOG_RUNS),
+            between_runs=Spread(0.023),
         ),
     )
     needs = (Excitation.TURNING,)
@@ -72,7 +62,6 @@ class EffectiveTrack(KinematicEffect):
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
-        del around
         return rolling.scale(1.0, 1.0 / self.values["k"])
 
     def depends_on(self, other: Effect) -> bool:

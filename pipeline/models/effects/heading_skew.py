@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import STAMPS, Excitation, Late, Least, Parameter, Plausible, ReportEffect
+from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect
 from pipeline.models.evidence import LEAST_DELAY_S
 from pipeline.models.level import Level, Reading
 from pipeline.runs.signals import earlier_in_span
@@ -23,7 +23,6 @@ from pipeline.runs.signals import earlier_in_span
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class HeadingSkew(ReportEffect):
@@ -41,11 +40,14 @@ class HeadingSkew(ReportEffect):
             "age of the heading against the position",
             0.1,
             step=1e-3,
-            least=Least(LEAST_DELAY_S, STAMPS),
+            least=Least(LEAST_DELAY_S, Least.STAMPS),
             plausible=Plausible(-0.3, 0.4, "wider than the 0.1 s of the DRIVE recordings"),
             one_sign=True,
         ),
     )
+    motion = "reports a heading {size:.0f} ms {way} than the position beside it"
+    ways = ("older", "newer")
+    size_in = 1e3
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("lateral_skid", "body_inertia", "icr_offset")
     late = Late.HEADING
@@ -54,13 +56,6 @@ class HeadingSkew(ReportEffect):
         Reading(Level.TERRAIN, "lateral_skid", "sliding outward in turns on this ground"),
         Reading(Level.RUN, "heading_skew", "clocks set anew"),
     )
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        late = self.values["d"]
-        way = "older" if late >= 0.0 else "newer"
-        return f"reports a heading {abs(late) * 1e3:.0f} ms {way} than the position beside it"
 
     def report(self, velocity: Velocity, around: RunContext) -> Velocity:
         """See the formula above."""
@@ -84,7 +79,6 @@ class HeadingSkew(ReportEffect):
 
     def report_gyro(self, velocity: Velocity, around: RunContext) -> Velocity:
         """The gyro's heading has no skew: nothing but the delay of the position is left."""
-        del around
         return velocity
 
     def can_show(self, evidence: Evidence) -> bool:

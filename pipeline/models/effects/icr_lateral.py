@@ -11,15 +11,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import MOUNTING, Excitation, Least, LinearEffect, Parameter, Place, Plausible
-from pipeline.models.wording import name_side
+from pipeline.models.effect import Excitation, Least, LinearEffect, Parameter, Place, Plausible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class IcrLateral(LinearEffect):
@@ -35,10 +33,12 @@ class IcrLateral(LinearEffect):
             0.0,
             "centre of rotation left of base_link",
             0.08,
-            least=Least(0.004, MOUNTING),
+            least=Least(0.004, Least.MOUNTING),
             plausible=Plausible(-0.5, 0.5, "further out it lies beside the wheels of a Warthog"),
         ),
     )
+    motion = "turns about a point {size:.2g} cm to the {way} of its middle"
+    size_in = 100.0
     needs = (Excitation.TURNING,)
     confused_with = ("wheel_asymmetry",)
     equivalent_to = ("lever_arm",)
@@ -46,13 +46,6 @@ class IcrLateral(LinearEffect):
     python = """
         v_x = v_x + {y_icr} * v_w"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        offset = self.values["y_icr"]
-        return f"turns about a point {abs(offset) * 100.0:.2g} cm to the {name_side(offset)} of its middle"
-
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del rolling, around
         return {"y_icr": (velocity.w, 0.0, 0.0)}

@@ -13,24 +13,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    MOUNTING,
-    WARTHOG_RUNS,
-    Excitation,
-    Least,
-    LinearEffect,
-    Parameter,
-    Place,
-    Plausible,
-    Spread,
-)
+from pipeline.models.effect import Excitation, Least, LinearEffect, Parameter, Place, Plausible, Spread
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class IcrOffset(LinearEffect):
@@ -46,15 +35,18 @@ class IcrOffset(LinearEffect):
             0.0,
             "centre of rotation ahead of base_link",
             0.12,
-            least=Least(0.004, MOUNTING),
+            least=Least(0.004, Least.MOUNTING),
             plausible=Plausible(
                 -1.6,
                 0.6,
                 "wider than -0.08 to 0.24 m; the middle of a sedan is 1.35 m ahead of its rear axle",
             ),
-            between_runs=Spread(0.013, WARTHOG_RUNS),
+            between_runs=Spread(0.013),
         ),
     )
+    motion = "turns about a point {size:.2g} cm {way} its middle"
+    ways = ("ahead of", "behind")
+    size_in = 100.0
     needs = (Excitation.TURNING,)
     confused_with = ("lateral_skid", "heading_skew")
     equivalent_to = ("lever_arm",)
@@ -62,14 +54,6 @@ class IcrOffset(LinearEffect):
     python = """
         v_y = v_y - {x_icr} * v_w"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        offset = self.values["x_icr"]
-        way = "ahead of" if offset >= 0.0 else "behind"
-        return f"turns about a point {abs(offset) * 100.0:.2g} cm {way} its middle"
-
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del rolling, around
         return {"x_icr": (0.0, -velocity.w, 0.0)}

@@ -12,7 +12,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.models.effect import Excitation, LinearEffect, Parameter
-from pipeline.models.wording import name_side
 from pipeline.runs.signals import find_turning
 
 if TYPE_CHECKING:
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class LateralDrift(LinearEffect):
@@ -28,18 +26,12 @@ class LateralDrift(LinearEffect):
 
     id = "lateral_drift"
     parameters = (Parameter("c", "m/s", (-0.5, 0.5), 0.0, "speed to the left", 0.05),)
+    motion = "drifts to the {way} at {size:.2g} m/s while its wheels turn"
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("yaw_misalignment", "slope_drift")
     python = """
         v_y = v_y + {c} * turning"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        speed = self.values["c"]
-        return f"drifts to the {name_side(speed)} at {abs(speed):.2g} m/s while its wheels turn"
-
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity
         return {"c": (0.0, find_turning(rolling.wheels, around), 0.0)}

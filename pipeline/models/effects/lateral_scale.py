@@ -14,22 +14,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    DATA_SHEET,
-    SIDEWAYS,
-    Excitation,
-    KinematicEffect,
-    Least,
-    Parameter,
-    Plausible,
-)
+from pipeline.models.effect import SIDEWAYS, Excitation, KinematicEffect, Least, Parameter, Plausible
 from pipeline.models.effects.wheel_radius import WheelRadius
-from pipeline.models.wording import describe_share
 
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
     from pipeline.runs.signals import Rolling, RunContext
-    from pipeline.vehicles import Vehicle
 
 
 class LateralScale(KinematicEffect):
@@ -46,25 +36,20 @@ class LateralScale(KinematicEffect):
             1.0,
             "sideways speed over that of ideal rollers",
             0.8,
-            least=Least(0.01, DATA_SHEET),
+            least=Least(0.01, Least.DATA_SHEET),
             plausible=Plausible(
                 0.3, 1.2, "wider than the lateral multipliers of 1 to 2 of competition robots"
             ),
         ),
     )
+    motion = "travels {share} sideways than its wheels turn"
     needs = (Excitation.SIDEWAYS,)
     confused_with = ("roller_slip", "wheel_radius")
     python = """
         s0 = {k} * s0"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"travels {describe_share(self.values['k'])} sideways than its wheels turn"
-
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
-        del around
         return replace(rolling, s0=self.values["k"] * rolling.s0)
 
     def depends_on(self, other: Effect) -> bool:

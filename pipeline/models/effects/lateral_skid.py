@@ -13,16 +13,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    STAMPS,
-    WARTHOG_RUNS,
-    Excitation,
-    Least,
-    LinearEffect,
-    Parameter,
-    Plausible,
-    Spread,
-)
+from pipeline.models.effect import Excitation, Least, LinearEffect, Parameter, Plausible, Spread
 from pipeline.models.evidence import LEAST_DELAY_S
 
 if TYPE_CHECKING:
@@ -30,7 +21,6 @@ if TYPE_CHECKING:
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class LateralSkid(LinearEffect):
@@ -45,26 +35,20 @@ class LateralSkid(LinearEffect):
             0.0,
             "outward slip per centripetal acceleration",
             0.1,
-            least=Least(LEAST_DELAY_S, STAMPS),
+            least=Least(LEAST_DELAY_S, Least.STAMPS),
             plausible=Plausible(-0.02, 0.4, "wider than 0.02 on tile and 0.15 on ice"),
             one_sign=True,
-            between_runs=Spread(0.064, WARTHOG_RUNS),
+            between_runs=Spread(0.064),
         ),
     )
+    motion = "slides {way} at {size:.2g} m/s in a turn of 1 rad/s at 1 m/s"
+    ways = ("outward", "inward")
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("icr_offset", "body_inertia", "heading_skew", "drive_lag")
     python = """
         v_x = v_x + {c} * s0 * w0
         v_y = v_y - {c} * v0 * w0"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        slide, at = self.values["c"], 1.0
-        way = "outward" if slide >= 0.0 else "inward"
-        return f"slides {way} at {abs(slide) * at:.2g} m/s in a turn of 1 rad/s at 1 m/s"
-
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity, around
         return {"c": (rolling.s0 * rolling.w0, -rolling.v0 * rolling.w0, 0.0)}

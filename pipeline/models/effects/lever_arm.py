@@ -40,7 +40,6 @@ class LeverArm(LinearEffect):
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""
-        del vehicle
         ahead, left = self.values["l_x"], self.values["l_y"]
         way = "ahead of" if ahead >= 0.0 else "behind"
         aside = f"{abs(left) * 100.0:.2g} cm to the {name_side(left)}"
@@ -48,5 +47,4 @@ class LeverArm(LinearEffect):
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del rolling, around
         return {"l_x": (0.0, velocity.w, 0.0), "l_y": (-velocity.w, 0.0, 0.0)}

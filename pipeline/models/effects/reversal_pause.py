@@ -14,21 +14,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import (
-    STAMPS,
-    WHEELED,
-    DriveEffect,
-    Excitation,
-    Least,
-    Parameter,
-    Plausible,
-    Search,
-)
+from pipeline.models.effect import WHEELED, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.filters import wait_at_reversal
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 
 class ReversalPause(DriveEffect):
@@ -48,10 +38,11 @@ class ReversalPause(DriveEffect):
             search=Search.STARTS,
             starts=(0.15, 0.5),
             step=1e-2,
-            least=Least(0.03, STAMPS, sampled=True),
+            least=Least(0.03, Least.STAMPS, sampled=True),
             plausible=Plausible(0.0, 1.5, "longer than controllers wait"),
         ),
     )
+    motion = "lets a wheel stand for {d:.2f} s before it reverses"
     needs = (Excitation.BOTH_SIGNS, Excitation.CHANGES)
     confused_with = ("acceleration_limit", "drive_lag", "transport_delay", "deadband")
     python_state = ("ways", "waited")
@@ -60,11 +51,6 @@ class ReversalPause(DriveEffect):
         waited = [0.0 if was * wheel < 0.0 else s + step_s for was, wheel, s in zip(ways, wheels, waited)]
         ways = [sign(wheel) or was for was, wheel in zip(ways, wheels)]
         left, right, sideways = join([wheel if s >= {d} else 0.0 for wheel, s in zip(wheels, waited)])"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"lets a wheel stand for {self.values['d']:.2f} s before it reverses"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -15,14 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.models.effect import SIDEWAYS, Excitation, LinearEffect, Parameter, Plausible
-from pipeline.models.wording import describe_share
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class RollerSlip(LinearEffect):
@@ -42,18 +40,13 @@ class RollerSlip(LinearEffect):
             one_sign=True,
         ),
     )
+    motion = "travels {share} sideways than its wheels turn at 0.5 m/s, more so with speed"
+    share_of = (1.0, -0.5)
     needs = (Excitation.SIDEWAYS, Excitation.SPEED_SPREAD)
     confused_with = ("lateral_scale",)
     python = """
         v_y = v_y - {k} * s0 * abs(s0)"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        share = describe_share(1.0 - 0.5 * self.values["k"])
-        return f"travels {share} sideways than its wheels turn at 0.5 m/s, more so with speed"
-
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity, around
         return {"k": (0.0, -rolling.s0 * np.abs(rolling.s0), 0.0)}

@@ -19,7 +19,6 @@ from pipeline.models.filters import lag_signal
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 
 class SideLag(TwoLags):
@@ -33,6 +32,7 @@ class SideLag(TwoLags):
         time_constant("tau_left", "time constant of the left side", 0.5, (0.4,)),
         time_constant("tau_right", "time constant of the right side", 0.2, (0.4,)),
     )
+    motion = "follows its commands {tau_left:.2f} s late on the left and {tau_right:.2f} s on the right"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "icr_lateral")
     # Where ground disturbs the wheels a second time constant always helps a little.
@@ -43,12 +43,6 @@ class SideLag(TwoLags):
         left = weak_left = left + (weak_left - left) * keep
         keep = math.exp(-step_s / {tau_right}) if {tau_right} > 0.0 else 0.0
         right = weak_right = right + (weak_right - right) * keep"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        left, right = self.taus
-        return f"follows its commands {left:.2f} s late on the left and {right:.2f} s on the right"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

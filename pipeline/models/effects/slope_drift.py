@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class SlopeDrift(LinearEffect):
@@ -42,22 +41,17 @@ class SlopeDrift(LinearEffect):
             one_sign=True,
         ),
     )
+    motion = "slides {way} at {size:.2g} m/s on a slope of 10 degrees"
+    ways = ("downhill", "uphill")
+    size_in = math.sin(math.radians(10.0))
     needs = (Excitation.SLOPE,)
     confused_with = ("lateral_drift",)
     python = """
         v_x = v_x + {k} * math.sin(pitch) * turning
         v_y = v_y - {k} * math.cos(pitch) * math.sin(roll) * turning"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        speed = self.values["k"] * math.sin(math.radians(10.0))
-        way = "downhill" if speed >= 0.0 else "uphill"
-        return f"slides {way} at {abs(speed):.2g} m/s on a slope of 10 degrees"
-
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity
         turning = find_turning(rolling.wheels, around)
         roll, pitch = around.attitude[:, 0], around.attitude[:, 1]
         return {"k": (np.sin(pitch) * turning, -np.cos(pitch) * np.sin(roll) * turning, 0.0)}

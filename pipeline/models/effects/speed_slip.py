@@ -14,14 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.models.effect import Excitation, LinearEffect, Parameter, Plausible
-from pipeline.models.wording import describe_share
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class SpeedSlip(LinearEffect):
@@ -40,18 +38,13 @@ class SpeedSlip(LinearEffect):
             one_sign=True,
         ),
     )
+    motion = "travels {share} than its wheels turn at 1 m/s, more so with speed"
+    share_of = (1.0, -1.0)
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("wheel_radius", "turning_resistance")
     python = """
         v_x = v_x - {k} * v0 * abs(v0)"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        share = describe_share(1.0 - self.values["k"])
-        return f"travels {share} than its wheels turn at 1 m/s, more so with speed"
-
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity, around
         return {"k": (-rolling.v0 * np.abs(rolling.v0), 0.0, 0.0)}

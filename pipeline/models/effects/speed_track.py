@@ -15,15 +15,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import DATA_SHEET, SIDES, Excitation, Least, LinearEffect, Parameter, Plausible
-from pipeline.models.wording import describe_share
+from pipeline.models.effect import SIDES, Excitation, Least, LinearEffect, Parameter, Plausible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class SpeedTrack(LinearEffect):
@@ -39,23 +37,17 @@ class SpeedTrack(LinearEffect):
             0.0,
             "share of turning gained per speed",
             0.05,
-            least=Least(0.01, DATA_SHEET),
+            least=Least(0.01, Least.DATA_SHEET),
             plausible=Plausible(-0.3, 0.3, "wider than the 0.035 to 0.053 of a Warthog on asphalt"),
         ),
     )
+    motion = "turns {share} at 1 m/s than on the spot, for the same wheels"
+    share_of = (1.0, 1.0)
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("effective_track", "turn_lag")
     python = """
         v_w = v_w + {k} * abs(v0) * w0"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return (
-            f"turns {describe_share(1.0 + self.values['k'])} at 1 m/s than on the spot, for the same wheels"
-        )
-
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity, around
         return {"k": (0.0, 0.0, np.abs(rolling.v0) * rolling.w0)}

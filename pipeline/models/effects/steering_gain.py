@@ -12,12 +12,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter, Plausible
+from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Plausible
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 
 class SteeringGain(DriveEffect):
@@ -34,22 +33,17 @@ class SteeringGain(DriveEffect):
             1.0,
             "steered over asked angle",
             0.85,
-            least=Least(0.01, DATA_SHEET),
+            least=Least(0.01, Least.DATA_SHEET),
             plausible=Plausible(0.5, 1.5, "wider than the 0.85 of a worn linkage"),
             quantities=(Quantity.STEERING_GAIN,),
         ),
     )
+    motion = "steers {g:.2f} times what is asked"
     needs = (Excitation.STEERING,)
     confused_with = ("understeer",)
     python = """
         steering = {g} * steering"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"steers {self.values['g']:.2f} times what is asked"
-
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
-        del around
         return replace(wheels, steering=self.values["g"] * wheels.steering)

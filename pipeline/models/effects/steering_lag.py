@@ -12,13 +12,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import ACKERMANN, STAMPS, DriveEffect, Excitation, Least, Parameter, Search
+from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Search
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 
 class SteeringLag(DriveEffect):
@@ -38,10 +37,11 @@ class SteeringLag(DriveEffect):
             search=Search.STARTS,
             starts=(0.1, 0.3, 0.7, 1.4),
             step=5e-3,
-            least=Least(0.015, STAMPS, sampled=True),
+            least=Least(0.015, Least.STAMPS, sampled=True),
             quantities=(Quantity.STEERING_LAG,),
         ),
     )
+    motion = "follows its steering commands {tau:.2f} s late, gradually"
     needs = (Excitation.CHANGES, Excitation.STEERING)
     confused_with = ("transport_delay",)
     python_state = ("lag_steering",)
@@ -49,11 +49,6 @@ class SteeringLag(DriveEffect):
         keep = math.exp(-step_s / {tau}) if {tau} > 0.0 else 0.0
         lag_steering = steering + (lag_steering - steering) * keep
         steering = lag_steering"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"follows its steering commands {self.values['tau']:.2f} s late, gradually"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -12,14 +12,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import ACKERMANN, DATA_SHEET, DriveEffect, Excitation, Least, Parameter
+from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter
 from pipeline.models.quantity import Quantity
-from pipeline.models.wording import name_side
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 
 class SteeringOffset(DriveEffect):
@@ -36,10 +34,11 @@ class SteeringOffset(DriveEffect):
             0.0,
             "angle at which straight ahead is asked",
             0.04,
-            least=Least(0.002, DATA_SHEET),
+            least=Least(0.002, Least.DATA_SHEET),
             quantities=(Quantity.STEERING_OFFSET,),
         ),
     )
+    motion = "steers {size:.2g} rad to the {way} when straight ahead is asked"
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("yaw_drift",)
     equivalent_to = ("steering_sensor_offset",)
@@ -47,15 +46,8 @@ class SteeringOffset(DriveEffect):
     python = """
         steering = steering + {o}"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        angle = self.values["o"]
-        return f"steers {abs(angle):.2g} rad to the {name_side(angle)} when straight ahead is asked"
-
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
-        del around
         return replace(wheels, steering=wheels.steering + self.values["o"])
 
     def is_equivalent(self, evidence: Evidence) -> bool:

@@ -13,21 +13,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    ACKERMANN,
-    DATA_SHEET,
-    DriveEffect,
-    Excitation,
-    Least,
-    Parameter,
-    Plausible,
-    Search,
-)
+from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.filters import follow_with_play
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 
 class SteeringPlay(DriveEffect):
@@ -47,22 +37,17 @@ class SteeringPlay(DriveEffect):
             search=Search.STARTS,
             starts=(0.02, 0.06),
             step=1e-3,
-            least=Least(0.004, DATA_SHEET),
+            least=Least(0.004, Least.DATA_SHEET),
             plausible=Plausible(0.0, 0.15, "three times a worn linkage"),
         ),
     )
+    motion = "does not steer before its steering has moved by {size:.2g} rad the other way"
+    size_in = 2.0
     needs = (Excitation.STEERING, Excitation.CHANGES)
     confused_with = ("steering_gain", "steering_lag")
     python_state = ("played",)
     python = """
         steering = played = min(max(played, steering - {g}), steering + {g})"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return (
-            f"does not steer before its steering has moved by {2.0 * self.values['g']:.2g} rad the other way"
-        )
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -16,14 +16,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import ACKERMANN, DATA_SHEET, Excitation, KinematicEffect, Least, Parameter
+from pipeline.models.effect import ACKERMANN, Excitation, KinematicEffect, Least, Parameter
 from pipeline.models.quantity import Quantity
-from pipeline.models.wording import name_side
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import Rolling, RunContext
-    from pipeline.vehicles import Vehicle
 
 
 class SteeringSensorOffset(KinematicEffect):
@@ -41,10 +39,11 @@ class SteeringSensorOffset(KinematicEffect):
             0.0,
             "steering of the tyres less that of the sensor",
             0.02,
-            least=Least(0.002, DATA_SHEET),
+            least=Least(0.002, Least.DATA_SHEET),
             quantities=(Quantity.STEERING_OFFSET,),
         ),
     )
+    motion = "steers {size:.2g} rad to the {way} of what its steering sensor reads"
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("yaw_drift",)
     equivalent_to = ("steering_offset",)
@@ -52,12 +51,6 @@ class SteeringSensorOffset(KinematicEffect):
 
     python = """
         w0 = w0 + v0 * (math.tan(steering + {o}) - math.tan(steering)) / WHEELBASE"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        angle = self.values["o"]
-        return f"steers {abs(angle):.2g} rad to the {name_side(angle)} of what its steering sensor reads"
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

@@ -16,23 +16,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import (
-    DATA_SHEET,
-    NAN,
-    Excitation,
-    KinematicEffect,
-    Least,
-    Parameter,
-    Plausible,
-    Search,
-)
+from pipeline.models.effect import NAN, Excitation, KinematicEffect, Least, Parameter, Plausible, Search
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import Rolling, RunContext
     from pipeline.vehicles import Vehicle
 
-_LEAST = Least(0.03, DATA_SHEET)
+_LEAST = Least(0.03, Least.DATA_SHEET)
 _PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")
 
 
@@ -78,14 +69,12 @@ class TerrainChange(KinematicEffect):
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""
-        del vehicle
         at_x, at_s = self.values["at_x"], self.values["at_s"]
         where = f"beyond x = {at_x:.3g} m" if math.isfinite(at_x) else f"from {at_s:.0f} s on"
         return f"travels {self.values['k_v']:.0%} and turns {self.values['k_w']:.0%} of before {where}"
 
     def choose_python(self, kind: str) -> str | None:
         """The place of the change where it is given, else its time."""
-        del kind
         beyond = "x > {at_x}" if math.isfinite(self.values["at_x"]) else "t >= {at_s}"
         return f"""
         if {beyond}:

@@ -11,12 +11,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import DATA_SHEET, Excitation, KinematicEffect, Least, Parameter, Plausible
-from pipeline.models.wording import describe_share
+from pipeline.models.effect import Excitation, KinematicEffect, Least, Parameter, Plausible
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import Rolling, RunContext
-    from pipeline.vehicles import Vehicle
 
 
 class TimeDrift(KinematicEffect):
@@ -32,21 +30,17 @@ class TimeDrift(KinematicEffect):
             0.0,
             "share lost at the end of the run",
             0.1,
-            least=Least(0.015, DATA_SHEET),
+            least=Least(0.015, Least.DATA_SHEET),
             plausible=Plausible(-0.4, 0.4, "wider than the 10 % of long deployments"),
         ),
     )
+    motion = "travels and turns {share} at the end of the run than at its start"
+    share_of = (1.0, -1.0)
     needs = (Excitation.LONG,)
     confused_with = ("terrain_change", "wheel_radius")
     python = """
         fade = 1.0 - {k} * t / until_s
         v0, s0, w0 = fade * v0, fade * s0, fade * w0"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        share = describe_share(1.0 - self.values["k"])
-        return f"travels and turns {share} at the end of the run than at its start"
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

@@ -13,14 +13,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import STAMPS, CommandEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import CommandEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.evidence import LEAST_DELAY_S
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import Commands, RunContext
-    from pipeline.vehicles import Vehicle
 
 
 class TransportDelay(CommandEffect):
@@ -39,11 +38,12 @@ class TransportDelay(CommandEffect):
             search=Search.STARTS,
             starts=(0.05, 0.15, 0.3, 0.5),
             step=5e-3,
-            least=Least(LEAST_DELAY_S, STAMPS, sampled=True),
+            least=Least(LEAST_DELAY_S, Least.STAMPS, sampled=True),
             plausible=Plausible(0.0, 0.8, "wider than the 0.5 s after which a ros2_control drive stops"),
             quantities=(Quantity.COMMAND_DELAY,),
         ),
     )
+    motion = "does what was asked {d:.2f} s ago"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "body_inertia")
     equivalent_to = ("clock_offset",)
@@ -51,14 +51,8 @@ class TransportDelay(CommandEffect):
 
     python = ""  # the exported function looks commands up that much earlier
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"does what was asked {self.values['d']:.2f} s ago"
-
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""
-        del around
         return replace(commands, times=commands.times + self.values["d"])
 
     def is_equivalent(self, evidence: Evidence) -> bool:

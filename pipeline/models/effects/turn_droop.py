@@ -15,22 +15,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import (
-    DATA_SHEET,
-    NAN,
-    SIDES,
-    DriveEffect,
-    Excitation,
-    Least,
-    Parameter,
-    Plausible,
-    Search,
-)
+from pipeline.models.effect import NAN, SIDES, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence, Largest
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 # Of the largest difference that was asked for: a lower threshold makes a wider track, a higher one nothing.
 _THRESHOLDS = (0.1, 0.99)
@@ -64,10 +53,11 @@ class TurnDroop(DriveEffect):
             1.0,
             "share of the excess that is reached",
             0.4,
-            least=Least(0.03, DATA_SHEET),
+            least=Least(0.03, Least.DATA_SHEET),
             plausible=Plausible(0.0, 0.97, "with all of it reached nothing droops"),
         ),
     )
+    motion = "reaches {gain:.0%} of what is asked of turning beyond {threshold:.2g} rad/s between its wheels"
     needs = (Excitation.LARGE, Excitation.TURNING)
     confused_with = ("effective_track", "wheel_speed_limit", "body_turn_limit")
     contains = ("effective_track",)
@@ -75,17 +65,8 @@ class TurnDroop(DriveEffect):
         lost = (1.0 - {gain}) * (right - left - max(-{threshold}, min({threshold}, right - left)))
         left, right = left + lost / 2.0, right - lost / 2.0"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        threshold, gain = self.values["threshold"], self.values["gain"]
-        return (
-            f"reaches {gain:.0%} of what is asked of turning beyond {threshold:.2g} rad/s between its wheels"
-        )
-
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
-        del around
         gain = self.values["gain"]
         threshold = float(np.nan_to_num(self.values["threshold"]))
         difference = wheels.right - wheels.left

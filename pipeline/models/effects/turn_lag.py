@@ -15,14 +15,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import SIDES, WARTHOG_RUNS, Excitation, Spread
+from pipeline.models.effect import SIDES, Excitation, Spread
 from pipeline.models.effects.drive_lag import TwoLags, time_constant
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Wheels
-    from pipeline.vehicles import Vehicle
 
 _SEEN = "wider than the 0.1 to 1.6 s of Husky and Warthog"
 
@@ -38,14 +37,15 @@ class TurnLag(TwoLags):
         replace(
             time_constant("tau_mean", "time constant of the mean", 0.3, (0.1, 0.4), _SEEN),
             quantities=(Quantity.SPEED_LAG,),
-            between_runs=Spread(0.12, WARTHOG_RUNS),
+            between_runs=Spread(0.12),
         ),
         replace(
             time_constant("tau_diff", "time constant of the difference", 1.0, (0.3, 1.2), _SEEN),
             quantities=(Quantity.TURN_LAG,),
-            between_runs=Spread(0.24, WARTHOG_RUNS),
+            between_runs=Spread(0.24),
         ),
     )
+    motion = "follows commanded turning {tau_diff:.2f} s late, and speed {tau_mean:.2f} s"
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("drive_lag", "transport_delay", "turn_droop")
     same_in_one_motion = ("drive_lag",)
@@ -57,12 +57,6 @@ class TurnLag(TwoLags):
         keep = math.exp(-step_s / {tau_diff}) if {tau_diff} > 0.0 else 0.0
         lag_difference = right - left + (lag_difference - (right - left)) * keep
         left, right = lag_mean - lag_difference / 2.0, lag_mean + lag_difference / 2.0"""
-
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        mean, difference = self.taus
-        return f"follows commanded turning {difference:.2f} s late, and speed {mean:.2f} s"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -13,20 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import (
-    Excitation,
-    LinearEffect,
-    Parameter,
-    Plausible,
-)
-from pipeline.models.wording import describe_share
+from pipeline.models.effect import Excitation, LinearEffect, Parameter, Plausible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class TurningResistance(LinearEffect):
@@ -45,18 +38,13 @@ class TurningResistance(LinearEffect):
             one_sign=True,
         ),
     )
+    motion = "travels {share} when it turns at 1 rad/s than when it drives straight"
+    share_of = (1.0, -1.0)
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("speed_slip", "wheel_radius")
     python = """
         v_x = v_x - {k} * v0 * abs(w0)"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        share = describe_share(1.0 - self.values["k"])
-        return f"travels {share} when it turns at 1 rad/s than when it drives straight"
-
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity, around
         return {"k": (-rolling.v0 * np.abs(rolling.w0), 0.0, 0.0)}

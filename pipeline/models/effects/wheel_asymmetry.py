@@ -12,16 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    DATA_SHEET,
-    WARTHOG_RUNS,
-    Excitation,
-    KinematicEffect,
-    Least,
-    Parameter,
-    Plausible,
-    Spread,
-)
+from pipeline.models.effect import Excitation, KinematicEffect, Least, Parameter, Plausible, Spread
 from pipeline.models.quantity import Quantity
 from pipeline.models.wording import name_side
 
@@ -44,10 +35,10 @@ class WheelAsymmetry(KinematicEffect):
             0.0,
             "right radius less left radius over their mean",
             0.04,
-            least=Least(0.003, DATA_SHEET),
+            least=Least(0.003, Least.DATA_SHEET),
             plausible=Plausible(-0.2, 0.2, "wider than the 8 % of one soft side"),
             quantities=(Quantity.RADIUS_DIFFERENCE,),
-            between_runs=Spread(0.016, WARTHOG_RUNS),
+            between_runs=Spread(0.016),
         ),
     )
     needs = (Excitation.BOTH_SIGNS, Excitation.SPEED_SPREAD)
@@ -57,7 +48,6 @@ class WheelAsymmetry(KinematicEffect):
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""
-        del vehicle
         share = self.values["e"]
         return f"rolls on {name_side(-share)} wheels {abs(share):.1%} larger than those on the other side"
 

@@ -11,23 +11,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import (
-    DATA_SHEET,
-    WARTHOG_RUNS,
-    Excitation,
-    KinematicEffect,
-    Least,
-    Parameter,
-    Plausible,
-    Spread,
-)
+from pipeline.models.effect import Excitation, KinematicEffect, Least, Parameter, Plausible, Spread
 from pipeline.models.level import Level, Reading
 from pipeline.models.quantity import Quantity
-from pipeline.models.wording import describe_share
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import Rolling, RunContext
-    from pipeline.vehicles import Vehicle
 
 
 class WheelRadius(KinematicEffect):
@@ -43,12 +32,13 @@ class WheelRadius(KinematicEffect):
             1.0,
             "true over nominal radius",
             0.92,
-            least=Least(0.004, DATA_SHEET),
+            least=Least(0.004, Least.DATA_SHEET),
             plausible=Plausible(0.4, 1.3, "radii are off by 2 to 25 %, wheels slip by half on loose ground"),
             quantities=(Quantity.RADIUS,),
-            between_runs=Spread(0.019, WARTHOG_RUNS),
+            between_runs=Spread(0.019),
         ),
     )
+    motion = "travels {share} than its wheels turn"
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("speed_slip", "effective_track")
     python = """
@@ -59,12 +49,6 @@ class WheelRadius(KinematicEffect):
         Reading(Level.RUN, "wheel_radius", "another tyre pressure or load"),
     )
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"travels {describe_share(self.values['k'])} than its wheels turn"
-
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""
-        del around
         return rolling.scale(self.values["k"], self.values["k"])

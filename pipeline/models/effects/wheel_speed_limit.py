@@ -13,22 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import (
-    INF,
-    WARTHOG_RUNS,
-    WHEELED,
-    CommandEffect,
-    Excitation,
-    Parameter,
-    Search,
-    Spread,
-)
+from pipeline.models.effect import INF, WHEELED, CommandEffect, Excitation, Parameter, Search, Spread
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import Commands, RunContext
-    from pipeline.vehicles import Vehicle
 
 
 class WheelSpeedLimit(CommandEffect):
@@ -50,23 +40,18 @@ class WheelSpeedLimit(CommandEffect):
             relative_to="wheel",
             step=1e-2,
             quantities=(Quantity.WHEEL_SPEED_LIMIT,),
-            between_runs=Spread(0.2, WARTHOG_RUNS),
+            between_runs=Spread(0.2),
         ),
     )
+    motion = "turns no wheel faster than {limit:.3g} rad/s"
     needs = (Excitation.LARGE,)
     confused_with = ("body_speed_limit", "body_turn_limit")
     python = """
         wheels = split(left, right, sideways)
         left, right, sideways = join([max(-{limit}, min({limit}, wheel)) for wheel in wheels])"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        return f"turns no wheel faster than {self.values['limit']:.3g} rad/s"
-
     def change_commands(self, commands: Commands, around: RunContext) -> Commands:
         """See the formula above."""
-        del around
         limit = self.values["limit"]
         if self.is_neutral:
             return commands

@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.models.effect import Excitation, LinearEffect, Parameter
-from pipeline.models.wording import name_side
 from pipeline.runs.signals import find_turning
 
 if TYPE_CHECKING:
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 
     from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class YawDrift(LinearEffect):
@@ -29,18 +27,12 @@ class YawDrift(LinearEffect):
 
     id = "yaw_drift"
     parameters = (Parameter("c", "rad/s", (-0.5, 0.5), 0.0, "yaw rate to the left", 0.06),)
+    motion = "turns to the {way} at {size:.2g} rad/s by itself while its wheels turn"
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("wheel_asymmetry", "steering_offset")
     python = """
         v_w = v_w + {c} * turning"""
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        rate = self.values["c"]
-        return f"turns to the {name_side(rate)} at {abs(rate):.2g} rad/s by itself while its wheels turn"
-
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        del velocity
         return {"c": (0.0, 0.0, find_turning(rolling.wheels, around))}

@@ -14,13 +14,11 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import MOUNTING, Excitation, Least, Parameter, Plausible, ReportEffect
+from pipeline.models.effect import Excitation, Least, Parameter, Plausible, ReportEffect
 from pipeline.models.level import Level, Reading
-from pipeline.models.wording import name_side
 
 if TYPE_CHECKING:
     from pipeline.runs.signals import RunContext, Velocity
-    from pipeline.vehicles import Vehicle
 
 
 class YawMisalignment(ReportEffect):
@@ -36,10 +34,12 @@ class YawMisalignment(ReportEffect):
             0.0,
             "reported less true heading",
             0.05,
-            least=Least(0.003, MOUNTING),
+            least=Least(0.003, Least.MOUNTING),
             plausible=Plausible(-0.35, 0.35, "wider than the 1 to 5 degrees that were seen"),
         ),
     )
+    motion = "reports a heading {size:.2g} degrees too far {way}, or crabs as much"
+    size_in = math.degrees(1.0)
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("lateral_drift",)
     readings = (
@@ -48,15 +48,8 @@ class YawMisalignment(ReportEffect):
         Reading(Level.RUN, "yaw_misalignment", "a sensor mounted anew"),
     )
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """The effect as what the vehicle does."""
-        del vehicle
-        angle = math.degrees(self.values["psi"])
-        return f"reports a heading {abs(angle):.2g} degrees too far {name_side(angle)}, or crabs as much"
-
     def report(self, velocity: Velocity, around: RunContext) -> Velocity:
         """See the formula above."""
-        del around
         sine, cosine = math.sin(self.values["psi"]), math.cos(self.values["psi"])
         return replace(
             velocity, x=cosine * velocity.x + sine * velocity.y, y=cosine * velocity.y - sine * velocity.x

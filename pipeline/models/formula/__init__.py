@@ -7,5 +7,3 @@ that of the velocity it adds to.
 from pipeline.models.formula.expression import parse_expression
 from pipeline.models.formula.formula_effect import SIGNAL_UNITS, FormulaEffect
 from pipeline.models.formula.units import Unit, parse_unit
-
-__all__ = ["SIGNAL_UNITS", "FormulaEffect", "Unit", "parse_expression", "parse_unit"]

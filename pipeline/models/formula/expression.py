@@ -1,7 +1,5 @@
 """Parsing formulas: Python's grammar gives the tree, and only arithmetic in it is let through."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Callable, Mapping
@@ -9,12 +7,11 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.models.formula.units import PLAIN, Unit
 from pipeline.runs.errors import MotionError
 
-Floats = NDArray[np.float64]
 Values = Mapping[str, "Floats | float"]
 Evaluate = Callable[[Values], "Floats | float"]
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from pipeline.core.arrays import Floats
 from pipeline.models.effect import AddedEffect, Excitation, Parameter
 from pipeline.models.formula.expression import Expression, parse_expression
 from pipeline.models.formula.units import parse_unit
@@ -19,8 +20,6 @@ from pipeline.runs.signals import roll_ideally
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
-
-    from numpy.typing import NDArray
 
     from pipeline.models.formula.units import Unit
     from pipeline.runs.signals import Rolling, RunContext, Velocity
@@ -66,6 +65,9 @@ class FormulaEffect(AddedEffect):
         where: file and line, for error messages.
         values: of the parameters.
 
+    Attributes:
+        expressions: the parsed formulas by channel.
+
     Raises:
         MotionError: a formula that cannot be parsed, knows a name that does not exist, has another unit than
             its channel, or does not vanish at the parameters' neutral values.
@@ -88,15 +90,10 @@ class FormulaEffect(AddedEffect):
         self.formulas = dict(formulas)
         self._where = where or name
         self._check_names()
-        self._expressions = {channel: self._parse(channel, text) for channel, text in self.formulas.items()}
+        self.expressions = {channel: self._parse(channel, text) for channel, text in self.formulas.items()}
         self._check_parameters()
         super().__init__(fixed=fixed, **values)
         self._check_neutral()
-
-    @property
-    def expressions(self) -> Mapping[str, Expression]:
-        """The parsed formulas by channel."""
-        return self._expressions
 
     @property
     def key(self) -> tuple[object, ...]:
@@ -111,16 +108,14 @@ class FormulaEffect(AddedEffect):
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The formulas themselves."""
-        del vehicle
         return "moves by " + ", ".join(f"{channel} += {text}" for channel, text in self.formulas.items())
 
     def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
         """Add the formulas' values."""
-        del velocity
         signals = _Signals(rolling, around)
         added = {}
-        for channel, expression in self._expressions.items():
-            known: dict[str, NDArray[np.float64] | float] = {
+        for channel, expression in self.expressions.items():
+            known: dict[str, Floats | float] = {
                 name: self.values[name] if name in self.values else signals.read(name)
                 for name in expression.names
             }
@@ -139,12 +134,8 @@ class FormulaEffect(AddedEffect):
         expression = parse_expression(text, {**_parse_signal_units(), **own}, self._where)
         wanted = parse_unit(CHANNELS[channel], self._where)
         if expression.unit != wanted:
-            raise MotionError(
-                "wrong_units",
-                f"{channel} = {text!r} is in {expression.unit}, not in {wanted}",
-                where=self._where,
-                hint="Mend the formula or the unit of a parameter.",
-            )
+            what = f"{channel} = {text!r} is in {expression.unit}, not in {wanted}"
+            raise self._refuse("wrong_units", what, "Mend the formula or the unit of a parameter.")
         return expression
 
     def _check_names(self) -> None:
@@ -153,38 +144,30 @@ class FormulaEffect(AddedEffect):
             if proper and name not in {*SIGNAL_UNITS, *CHANNELS, *_TAKEN} and not keyword.iskeyword(name):
                 continue
             what = "is taken" if proper else "is no name"
-            raise MotionError(
-                "name_taken",
-                f"the parameter {name[:80]!r} cannot be called so: the name {what}",
-                where=self._where,
-                hint="Choose another name, of letters, digits and _.",
-            )
+            text = f"the parameter {name[:80]!r} cannot be called so: the name {what}"
+            raise self._refuse("name_taken", text, "Choose another name, of letters, digits and _.")
 
     def _check_parameters(self) -> None:
-        used = frozenset[str]().union(*(e.names for e in self._expressions.values()))
+        used = frozenset[str]().union(*(e.names for e in self.expressions.values()))
         for parameter in self.parameters:
             if parameter.name not in used:
-                raise MotionError(
-                    "unused_parameter",
-                    f"the parameter {parameter.name!r} stands in no formula",
-                    where=self._where,
-                    hint="Use it or drop it.",
-                )
+                what = f"the parameter {parameter.name!r} stands in no formula"
+                raise self._refuse("unused_parameter", what, "Use it or drop it.")
 
     def _check_neutral(self) -> None:
         """The effect must change nothing at neutral values: the ladder compares with its absence."""
         generator = np.random.default_rng(1)
         signals = {name: generator.uniform(0.1, 1.0, 8) for name in SIGNAL_UNITS}
         neutral = {p.name: p.neutral for p in self.parameters}
-        for channel, expression in self._expressions.items():
+        for channel, expression in self.expressions.items():
             value = np.asarray(expression.evaluate({**signals, **neutral}))
             if not np.allclose(value, 0.0, atol=1e-12):
-                raise MotionError(
-                    "not_neutral",
-                    f"{channel} = {expression.text!r} is not zero at the parameters' neutral values",
-                    where=self._where,
-                    hint="Give `neutral` to a parameter so that the formula vanishes there, or add a factor.",
-                )
+                what = f"{channel} = {expression.text!r} is not zero at the parameters' neutral values"
+                hint = "Give `neutral` to a parameter so that the formula vanishes there, or add a factor."
+                raise self._refuse("not_neutral", what, hint)
+
+    def _refuse(self, code: str, what: str, hint: str) -> MotionError:
+        return MotionError(code, what, where=self._where, hint=hint)
 
 
 @functools.cache
@@ -198,7 +181,7 @@ class _Signals:
     def __init__(self, rolling: Rolling, around: RunContext) -> None:
         ideal = roll_ideally(rolling.wheels, around)
         self._around = around
-        self._makers: Mapping[str, Callable[[], NDArray[np.float64]]] = {
+        self._makers: Mapping[str, Callable[[], Floats]] = {
             "v0": lambda: rolling.v0,
             "w0": lambda: rolling.w0,
             "s0": lambda: rolling.velocity.y,
@@ -215,7 +198,7 @@ class _Signals:
             "t": lambda: around.times,
         }
 
-    def read(self, name: str) -> NDArray[np.float64]:
+    def read(self, name: str) -> Floats:
         """A signal on the cells."""
         if name in self._makers:
             return self._makers[name]()

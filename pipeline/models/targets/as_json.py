@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 def write(file: ModelFile, current: Current) -> str:
     """The model with values, intervals and units; numbers that are not finite are null."""
-    del current
     vehicle = file.model.vehicle
     effects = []
     for effect in file.model:

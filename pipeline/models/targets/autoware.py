@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.body_limits import find_radius, find_speed_acceleration, find_speed_limit, negate
 from pipeline.models.quantity import Quantity
 from pipeline.models.settings import Facts, start_sheet
 from pipeline.models.settings_text import write_yaml
@@ -28,9 +27,8 @@ def write(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    del current
     facts, sheet = start_sheet(file, TARGET, "ackermann")
-    sheet.add(f"{_ALL}.wheel_radius", find_radius(facts), _INFO)
+    sheet.add(f"{_ALL}.wheel_radius", facts.find_radius(), _INFO)
     sheet.add(f"{_ALL}.wheel_base", facts.measure("wheelbase_m"), _INFO)
     sheet.add(f"{_ALL}.wheel_tread", facts.measure("track_width_m"), _INFO)
     sheet.add(f"{_ALL}.max_steer_angle", facts.measure("max_steering_rad"), _INFO)
@@ -42,8 +40,8 @@ def write(file: ModelFile, current: Current) -> str:
     sheet.add(f"{_ALL}.vel_time_constant", facts.take(Quantity.SPEED_LAG), _SIMULATOR)
     sheet.add(f"{_ALL}.steer_time_delay", delay, _SIMULATOR)
     sheet.add(f"{_ALL}.steer_time_constant", lag, _SIMULATOR)
-    sheet.add(f"{_ALL}.vel_lim", find_speed_limit(facts), _SIMULATOR)
-    sheet.add(f"{_ALL}.vel_rate_lim", find_speed_acceleration(facts), _SIMULATOR)
+    sheet.add(f"{_ALL}.vel_lim", facts.find_speed_limit(), _SIMULATOR)
+    sheet.add(f"{_ALL}.vel_rate_lim", facts.find_speed_acceleration(), _SIMULATOR)
     _add_offset(facts, sheet)
     return write_yaml(facts, sheet)
 
@@ -51,7 +49,7 @@ def write(file: ModelFile, current: Current) -> str:
 def _add_offset(facts: Facts, sheet: Sheet) -> None:
     offset = facts.take(Quantity.STEERING_OFFSET)
     sign = "measured less true angle: what is steered of itself to the left is a negative bias"
-    sheet.add(f"{_ALL}.steer_bias", negate(offset), f"{_SIMULATOR}; {sign}")
+    sheet.add(f"{_ALL}.steer_bias", -offset, f"{_SIMULATOR}; {sign}")
     if offset.is_known:
         sheet.head.append(
             f"steer_offset = {offset.value:.5g} rad, true less measured angle as in steer_offset_estimator; "

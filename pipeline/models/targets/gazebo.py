@@ -6,15 +6,6 @@ import operator
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
-from pipeline.models.body_limits import (
-    find_radius,
-    find_speed_acceleration,
-    find_speed_limit,
-    find_track,
-    find_turn_acceleration,
-    find_turn_limit,
-    negate,
-)
 from pipeline.models.quantity import Quantity
 from pipeline.models.settings import Facts, start_sheet
 from pipeline.models.settings_text import list_comments, make_plain
@@ -37,12 +28,11 @@ def write(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    del current
     facts, sheet = start_sheet(file, TARGET, *_SYSTEMS)
-    sheet.add("plugin.wheel_radius", find_radius(facts))
+    sheet.add("plugin.wheel_radius", facts.find_radius())
     if facts.vehicle.kind == "differential":
         note = "for a simulated ground on which the wheels skid as on the real one"
-        sheet.add("plugin.wheel_separation", find_track(facts), note)
+        sheet.add("plugin.wheel_separation", facts.find_track(), note)
     else:
         sheet.add("plugin.wheel_separation", facts.measure("track_width_m"))
         sheet.add("plugin.wheel_base", facts.measure("wheelbase_m"))
@@ -55,16 +45,16 @@ def write(file: ModelFile, current: Current) -> str:
 def _add_limits(facts: Facts, sheet: Sheet) -> None:
     linear = "linear_" if facts.vehicle.kind == "differential" else ""
     limits = [
-        (f"{linear}velocity", find_speed_limit(facts)),
-        (f"{linear}acceleration", find_speed_acceleration(facts)),
+        (f"{linear}velocity", facts.find_speed_limit()),
+        (f"{linear}acceleration", facts.find_speed_acceleration()),
     ]
     if facts.vehicle.kind == "differential":
         limits += [
-            ("angular_velocity", find_turn_limit(facts)),
-            ("angular_acceleration", find_turn_acceleration(facts)),
+            ("angular_velocity", facts.find_turn_limit()),
+            ("angular_acceleration", facts.find_turn_acceleration()),
         ]
     for name, limit in limits:
-        sheet.add(f"plugin.min_{name}", negate(limit))
+        sheet.add(f"plugin.min_{name}", -limit)
         sheet.add(f"plugin.max_{name}", limit)
 
 

@@ -4,17 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.body_limits import (
-    find_deadband,
-    find_speed_acceleration,
-    find_speed_delay,
-    find_speed_limit,
-    find_turn_acceleration,
-    find_turn_delay,
-    find_turn_limit,
-    find_turning_radius,
-    negate,
-)
 from pipeline.models.settings import Facts, start_sheet
 from pipeline.models.settings_text import write_yaml
 from pipeline.models.target import Target
@@ -37,45 +26,44 @@ def write(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    del current
     facts, sheet = start_sheet(file, TARGET, "differential", "ackermann")
-    sheet.add(f"{_CONTROLLER}.model_delay_vx", find_speed_delay(facts), _DELAY)
-    sheet.add(f"{_CONTROLLER}.model_delay_wz", find_turn_delay(facts), _DELAY)
+    sheet.add(f"{_CONTROLLER}.model_delay_vx", facts.find_speed_delay(), _DELAY)
+    sheet.add(f"{_CONTROLLER}.model_delay_wz", facts.find_turn_delay(), _DELAY)
     _add_limits(facts, sheet)
     if facts.vehicle.kind == "ackermann":
         place = f"{_CONTROLLER}.ackermann.min_turning_r"
-        sheet.add(place, find_turning_radius(facts), "MPPI with motion_model: ackermann")
+        sheet.add(place, facts.find_turning_radius(), "MPPI with motion_model: ackermann")
     return write_yaml(facts, sheet)
 
 
 def _add_limits(facts: Facts, sheet: Sheet) -> None:
-    speed, turn = find_speed_limit(facts), find_turn_limit(facts)
-    acceleration, turning = find_speed_acceleration(facts), find_turn_acceleration(facts)
+    speed, turn = facts.find_speed_limit(), facts.find_turn_limit()
+    acceleration, turning = facts.find_speed_acceleration(), facts.find_turn_acceleration()
     sheet.add(f"{_CONTROLLER}.vx_max", speed, "MPPI")
-    sheet.add(f"{_CONTROLLER}.vx_min", negate(speed), "MPPI")
+    sheet.add(f"{_CONTROLLER}.vx_min", -speed, "MPPI")
     sheet.add(f"{_CONTROLLER}.wz_max", turn, "MPPI")
     sheet.add(f"{_CONTROLLER}.ax_max", acceleration, "MPPI")
-    sheet.add(f"{_CONTROLLER}.ax_min", negate(acceleration), "MPPI")
+    sheet.add(f"{_CONTROLLER}.ax_min", -acceleration, "MPPI")
     sheet.add(f"{_CONTROLLER}.az_max", turning, "MPPI")
     sheet.add_row(
         f"{_CONTROLLER}.VelocityDeadbandCritic.deadband_velocities",
-        (find_deadband(facts)[0], 0.0, find_deadband(facts)[1]),
+        (facts.find_deadband()[0], 0.0, facts.find_deadband()[1]),
         "MPPI with VelocityDeadbandCritic among its critics",
     )
     pursuit = "regulated pure pursuit"
     sheet.add(f"{_CONTROLLER}.max_linear_vel", speed, f"{pursuit}; desired_linear_vel up to Kilted")
-    sheet.add(f"{_CONTROLLER}.min_linear_vel", negate(speed), pursuit)
+    sheet.add(f"{_CONTROLLER}.min_linear_vel", -speed, pursuit)
     sheet.add(f"{_CONTROLLER}.max_angular_vel", turn, pursuit)
-    sheet.add(f"{_CONTROLLER}.min_angular_vel", negate(turn), pursuit)
+    sheet.add(f"{_CONTROLLER}.min_angular_vel", -turn, pursuit)
     sheet.add(f"{_CONTROLLER}.max_linear_accel", acceleration, pursuit)
-    sheet.add(f"{_CONTROLLER}.max_linear_decel", negate(acceleration), pursuit)
+    sheet.add(f"{_CONTROLLER}.max_linear_decel", -acceleration, pursuit)
     sheet.add(f"{_CONTROLLER}.max_angular_accel", turning, pursuit)
-    sheet.add(f"{_CONTROLLER}.max_angular_decel", negate(turning), pursuit)
+    sheet.add(f"{_CONTROLLER}.max_angular_decel", -turning, pursuit)
     # The smoother takes a limit for every axis or none.
     sheet.add_row(f"{_SMOOTHER}.max_velocity", (speed, 0.0, turn))
-    sheet.add_row(f"{_SMOOTHER}.min_velocity", (negate(speed), 0.0, negate(turn)))
+    sheet.add_row(f"{_SMOOTHER}.min_velocity", (-speed, 0.0, -turn))
     sheet.add_row(f"{_SMOOTHER}.max_accel", (acceleration, 0.0, turning))
-    sheet.add_row(f"{_SMOOTHER}.max_decel", (negate(acceleration), 0.0, negate(turning)))
+    sheet.add_row(f"{_SMOOTHER}.max_decel", (-acceleration, 0.0, -turning))
 
 
 TARGET = Target(

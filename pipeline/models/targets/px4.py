@@ -8,14 +8,6 @@ import math
 import operator
 from typing import TYPE_CHECKING
 
-from pipeline.models.body_limits import (
-    find_largest_steering,
-    find_radius,
-    find_speed_acceleration,
-    find_speed_limit,
-    find_turn_acceleration,
-    find_turn_limit,
-)
 from pipeline.models.quantity import Quantity
 from pipeline.models.settings import Amount, Facts, combine, start_sheet
 from pipeline.models.settings_text import list_comments, make_plain
@@ -49,7 +41,7 @@ def write(file: ModelFile, current: Current) -> str:
         sheet.add("RO_YAW_RATE_CORR", facts.take(Quantity.TRACK))
     else:
         sheet.add("RA_WHEEL_BASE", facts.measure("wheelbase_m"))
-        sheet.add("RA_MAX_STR_ANG", find_largest_steering(facts))
+        sheet.add("RA_MAX_STR_ANG", facts.find_largest_steering())
     sheet.add(_FULL_SPEED, _find_full_speed(facts, current))
     _add_limits(facts, sheet)
     return _write_lines(facts, sheet)
@@ -79,7 +71,7 @@ def read_current(text: str) -> Current:
 
 
 def _find_full_speed(facts: Facts, current: Current) -> Amount:
-    wheels = facts.take(Quantity.WHEEL_SPEED_LIMIT).change(operator.mul, find_radius(facts))
+    wheels = facts.take(Quantity.WHEEL_SPEED_LIMIT).change(operator.mul, facts.find_radius())
     if wheels.is_known or _FULL_SPEED not in current:
         return wheels
     used = Amount(current[_FULL_SPEED], (f"{_FULL_SPEED} = {current[_FULL_SPEED]:g} in use",))
@@ -87,11 +79,11 @@ def _find_full_speed(facts: Facts, current: Current) -> Amount:
 
 
 def _add_limits(facts: Facts, sheet: Sheet) -> None:
-    acceleration = find_speed_acceleration(facts)
+    acceleration = facts.find_speed_acceleration()
     turn, turning = (
-        amount.change(math.degrees) for amount in (find_turn_limit(facts), find_turn_acceleration(facts))
+        amount.change(math.degrees) for amount in (facts.find_turn_limit(), facts.find_turn_acceleration())
     )
-    sheet.add("RO_SPEED_LIM", find_speed_limit(facts))
+    sheet.add("RO_SPEED_LIM", facts.find_speed_limit())
     sheet.add("RO_YAW_RATE_LIM", turn, "in deg/s")
     sheet.add("RO_ACCEL_LIM", acceleration)
     sheet.add("RO_DECEL_LIM", acceleration)

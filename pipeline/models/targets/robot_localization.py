@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.models.body_limits import find_speed_acceleration, find_turn_acceleration
 from pipeline.models.effect import Place
 from pipeline.models.quantity import Quantity
 from pipeline.models.settings import Amount, Setting, start_sheet
@@ -49,7 +48,6 @@ def write(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``; ``not_fitted``, the file has no ladder.
     """
-    del current
     facts, sheet = start_sheet(file, TARGET, *_CONTROLLERS)
     controller, known = _CONTROLLERS[facts.vehicle.kind]
     step = _find_step(file, known)
@@ -61,7 +59,7 @@ def write(file: ModelFile, current: Current) -> str:
     # Of an error that is known to some per cent more digits would only say from where a fit set out.
     x, y, w = (Amount(float(f"{error * error:.3g}"), sources) for error in step.velocity_rms)
     sheet.settings.append(Setting(f"{_FILTER}.odom0_config", _FUSED, ("vx, vy and the yaw rate of odom0",)))
-    acceleration, turning = find_speed_acceleration(facts), find_turn_acceleration(facts)
+    acceleration, turning = facts.find_speed_acceleration(), facts.find_turn_acceleration()
     for name in ("acceleration_limits", "deceleration_limits"):
         limits = (acceleration, 0.0, 0.0, 0.0, 0.0, turning)
         sheet.add_row(f"{_FILTER}.{name}", limits, "with use_control: true")

@@ -4,14 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.body_limits import (
-    find_radius,
-    find_speed_acceleration,
-    find_speed_limit,
-    find_turn_acceleration,
-    find_turn_limit,
-    negate,
-)
 from pipeline.models.quantity import Quantity
 from pipeline.models.settings import Facts, combine, start_sheet
 from pipeline.models.settings_text import write_yaml
@@ -29,7 +21,6 @@ def write(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    del current
     facts, sheet = start_sheet(file, TARGET, "differential", "ackermann")
     if facts.vehicle.kind == "differential":
         _add_differential(facts, sheet)
@@ -50,13 +41,13 @@ def _add_differential(facts: Facts, sheet: Sheet) -> None:
     sheet.add(f"{node}.left_wheel_radius_multiplier", left)
     sheet.add(f"{node}.right_wheel_radius_multiplier", right)
     for axis, limit, acceleration in (
-        ("linear.x", find_speed_limit(facts), find_speed_acceleration(facts)),
-        ("angular.z", find_turn_limit(facts), find_turn_acceleration(facts)),
+        ("linear.x", facts.find_speed_limit(), facts.find_speed_acceleration()),
+        ("angular.z", facts.find_turn_limit(), facts.find_turn_acceleration()),
     ):
         sheet.add(f"{node}.{axis}.max_velocity", limit)
-        sheet.add(f"{node}.{axis}.min_velocity", negate(limit))
+        sheet.add(f"{node}.{axis}.min_velocity", -limit)
         sheet.add(f"{node}.{axis}.max_acceleration", acceleration)
-        sheet.add(f"{node}.{axis}.max_deceleration", negate(acceleration))
+        sheet.add(f"{node}.{axis}.max_deceleration", -acceleration)
     sheet.head.append("On Humble limits also need has_velocity_limits and has_acceleration_limits.")
 
 
@@ -64,7 +55,7 @@ def _add_ackermann(facts: Facts, sheet: Sheet) -> None:
     node = "ackermann_steering_controller.ros__parameters"
     sheet.add(f"{node}.wheelbase", facts.measure("wheelbase_m"))
     sheet.add(f"{node}.traction_track_width", facts.measure("track_width_m"))
-    sheet.add(f"{node}.traction_wheels_radius", find_radius(facts))
+    sheet.add(f"{node}.traction_wheels_radius", facts.find_radius())
     sheet.head.append(
         "On Humble traction_track_width is rear_wheel_track, traction_wheels_radius rear_wheels_radius."
     )

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import yaml
 
-from pipeline.models.body_limits import find_speed_acceleration
 from pipeline.models.quantity import Quantity
 from pipeline.models.settings import Amount, Facts, combine, start_sheet
 from pipeline.models.settings_text import write_yaml
@@ -46,7 +45,7 @@ def write(file: ModelFile, current: Current) -> str:
     straight = combine(lambda c, s, g, o: c - s * o / g, centre, servo, gain, offset)
     sheet.add(f"{_ALL}.{_STEERING_OFFSET}", straight)
     sheet.add("vesc_to_odom_node.ros__parameters.wheelbase", facts.measure("wheelbase_m"))
-    limit = find_speed_acceleration(facts)
+    limit = facts.find_speed_acceleration()
     sheet.add("throttle_interpolator.ros__parameters.max_acceleration", limit)
     return write_yaml(facts, sheet)
 

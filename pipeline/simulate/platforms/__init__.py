@@ -7,6 +7,7 @@ A platform is one file here: its vehicle, and its topics. A topic is one of the 
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from typing import TYPE_CHECKING, Any
@@ -16,9 +17,6 @@ from pipeline.simulate.errors import unknown_name
 from pipeline.simulate.layouts import Layout, PoseTopic
 from pipeline.simulate.published import Json, Published, Q, Source, Value
 from pipeline.simulate.vehicles import Vehicle, find_vehicle
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
 
 _XYZ, _XYZW = "xyz", "xyzw"
 

@@ -6,5 +6,3 @@ reads the run reads it corrected.
 """
 
 from pipeline.stages.align.align import Aligned, align_tables
-
-__all__ = ["Aligned", "align_tables"]

@@ -11,6 +11,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import timegrid
+from pipeline.core.arrays import Flags, Floats
 from pipeline.runs.errors import MotionError
 from pipeline.runs.heading import fit_gyro
 from pipeline.runs.recording import Alignment, MotionRun, make_run, tabulate_alignment
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
 
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 _BESIDE = 0.6
 # Alignment looks at a run on a grid of its own, so that no setting of the later stages changes it.

@@ -6,16 +6,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.stages.finding import Finding
 
 if TYPE_CHECKING:
     from pipeline.stages.samples import Samples
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 _LIVE = 0.02
 _FEWEST_STEPS = 6
@@ -107,7 +105,7 @@ def _is_multiplied(ratio: float, vehicle: Vehicle) -> bool:
     return bool(abs(np.log(ratio)) >= _SCALED and np.log(multiplier) > -_SCALED)
 
 
-def _average(samples: Samples, counts: Flags, label: NDArray[np.int64]) -> Floats:
+def _average(samples: Samples, counts: Flags, label: Ints) -> Floats:
     """Means over stretches of one label, in their order.
 
     Args:

@@ -12,9 +12,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.core import timegrid
+from pipeline.core.arrays import Floats, Ints
 from pipeline.runs.heading import align_heading, has_barred, mark_barred
 from pipeline.runs.signals import name_inputs
 
@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from pipeline.runs.recording import DriveSeries, MotionRun
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 
 _WINDOW_S = 0.5
 _LONGEST_S = 1.2
@@ -72,7 +69,7 @@ def _fill(begin: Floats, end: Floats, origin: float) -> Floats:
     return times
 
 
-def _pair_up(run: MotionRun) -> tuple[Integers, Integers]:
+def _pair_up(run: MotionRun) -> tuple[Ints, Ints]:
     """Poses of one segment half a second apart, and those on both sides of a longer wait."""
     times = run.track.times
     first = np.arange(times.size)
@@ -85,9 +82,7 @@ def _pair_up(run: MotionRun) -> tuple[Integers, Integers]:
     return first[kept], last[kept]
 
 
-def _measure_misfit(
-    run: MotionRun, wheels: DriveSeries, vehicle: Vehicle, first: Integers, last: Integers
-) -> Floats:
+def _measure_misfit(run: MotionRun, wheels: DriveSeries, vehicle: Vehicle, first: Ints, last: Ints) -> Floats:
     """How far each displacement is from the robust model; one is as far as is just believed, shape (n,)."""
     track = run.track
     heading, delay = _choose_heading(run)

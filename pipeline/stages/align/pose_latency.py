@@ -12,15 +12,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats
 from pipeline.runs.heading import align_heading, fit_gyro, mark_barred
 
 if TYPE_CHECKING:
     from pipeline.runs.recording import GyroFit, MotionRun, Track
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 _ROUNDS = 3
 _FEWEST = 200

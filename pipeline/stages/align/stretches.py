@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.core.arrays import Complex, Flags, Floats, Ints
 from pipeline.stages.finding import Finding
 
 if TYPE_CHECKING:
@@ -22,10 +23,6 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-Vectors = NDArray[np.complex128]
-"""Velocities in the plane, x + iy."""
 
 _FEWEST = 8
 _LEAST_PATH = 0.5
@@ -104,7 +101,7 @@ def _describe(times: Floats, faults: Mapping[str, Flags], suspect: Flags, tested
 
 
 def _judge(
-    label: NDArray[np.int64], velocities: pl.DataFrame, ideal: Floats, times: Floats, cut: _Cut
+    label: Ints, velocities: pl.DataFrame, ideal: Floats, times: Floats, cut: _Cut
 ) -> dict[str, Flags] | None:
     """Faults of the samples of every stretch; None where too few stretches tell what is usual."""
     sums = _sum_stretches(label, velocities, ideal, times, cut.span)
@@ -116,8 +113,8 @@ def _judge(
     if gain < _LEAST_GAIN:
         return None
     # Lateral motion in turns is what slip is about: the direction is judged against what turning explains.
-    usual = _fit_angle(sums.turned[tested], sums.direction[tested])
-    off = np.abs(_wrap(sums.direction - usual(sums.turned)))
+    slope, offset = _fit_angle(sums.turned[tested], sums.direction[tested])
+    off = np.abs(_wrap(sums.direction - (slope * sums.turned + offset)))
     ratio = length / np.maximum(gain * driven, 1e-9)
     right_length = (ratio > _SHORTEST) & (ratio < _LONGEST)
     # A sliding vehicle turns its direction of travel on the way; a wrong heading is wrong by one angle.
@@ -131,9 +128,7 @@ def _judge(
     return {name: flags[label] for name, flags in found.items()}
 
 
-def _label_stretches(
-    times: Floats, segment: NDArray[np.int32], step: NDArray[np.int32], cut: _Cut
-) -> NDArray[np.int64]:
+def _label_stretches(times: Floats, segment: NDArray[np.int32], step: NDArray[np.int32], cut: _Cut) -> Ints:
     """Number of the stretch of each sample, counted from its step's start, or through its segment."""
     whole = step if cut.phase is None else segment
     starts = np.concatenate(([True], np.diff(whole) != 0))
@@ -166,9 +161,7 @@ class _Sums:
     whole: Flags
 
 
-def _sum_stretches(
-    label: NDArray[np.int64], velocities: pl.DataFrame, ideal: Floats, times: Floats, span: float
-) -> _Sums:
+def _sum_stretches(label: Ints, velocities: pl.DataFrame, ideal: Floats, times: Floats, span: float) -> _Sums:
     """Path, direction and turning of every stretch."""
     count = int(label[-1]) + 1
     period = float(np.median(np.diff(times))) if times.size > 1 else 0.0
@@ -192,13 +185,13 @@ def _sum_stretches(
     )
 
 
-def _find_direction(asked: Vectors) -> Vectors:
+def _find_direction(asked: Complex) -> Complex:
     """Unit vectors along some vectors, zero where they are."""
     size = np.abs(asked)
     return asked / np.where(size > 0.0, size, 1.0)
 
 
-def _is_settled(label: NDArray[np.int64], asked: Vectors, samples: NDArray[np.int64], times: Floats) -> Flags:
+def _is_settled(label: Ints, asked: Complex, samples: Ints, times: Floats) -> Flags:
     """Whether the drive hardly changed in a stretch and in the one right before it."""
     count = samples.size
     mean = _sum_vectors_by(label, asked, count) / np.maximum(samples, 1)
@@ -213,29 +206,21 @@ def _is_settled(label: NDArray[np.int64], asked: Vectors, samples: NDArray[np.in
     return settled
 
 
-def _sum_by(label: NDArray[np.int64], values: Floats, count: int) -> Floats:
+def _sum_by(label: Ints, values: Floats, count: int) -> Floats:
     """Sums of values with equal labels."""
     return np.bincount(label, values, count).astype(np.float64)
 
 
-def _sum_vectors_by(label: NDArray[np.int64], values: Vectors, count: int) -> Vectors:
+def _sum_vectors_by(label: Ints, values: Complex, count: int) -> Complex:
     """Sums of vectors with equal labels."""
     return _sum_by(label, values.real, count) + 1j * _sum_by(label, values.imag, count)
 
 
-class _AngleLine:
-    """Usual direction of travel as a line over the turning of a stretch."""
+def _fit_angle(turned: Floats, angle: Floats) -> tuple[float, float]:
+    """Slope and offset of the usual direction of travel over the turning of a stretch.
 
-    def __init__(self, slope: float, offset: float) -> None:
-        self.slope = slope
-        self.offset = offset
-
-    def __call__(self, turned: Floats) -> Floats:
-        return self.slope * turned + self.offset
-
-
-def _fit_angle(turned: Floats, angle: Floats) -> _AngleLine:
-    """Robust line (iteratively reweighted, Cauchy weights)."""
+    A robust line (iteratively reweighted, Cauchy weights).
+    """
     slope = offset = 0.0
     weight = np.ones(angle.size)
     design = np.column_stack((turned, np.ones(angle.size)))
@@ -244,7 +229,7 @@ def _fit_angle(turned: Floats, angle: Floats) -> _AngleLine:
         residual = angle - design @ np.array([slope, offset])
         scale = max(1.4826 * float(np.median(np.abs(residual))), 0.02)
         weight = np.sqrt(1.0 / (1.0 + (residual / (2.0 * scale)) ** 2))
-    return _AngleLine(float(slope), float(offset))
+    return float(slope), float(offset)
 
 
 def _wrap(angle: Floats) -> Floats:

@@ -6,18 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.arrays import Floats
 from pipeline.stages.delays import estimate_delay
 from pipeline.stages.gyro import smooth_gyro
 from pipeline.stages.slip import interpolate_wheels
 
 if TYPE_CHECKING:
     import polars as pl
-    from numpy.typing import NDArray
 
     from pipeline.runs.recording import GyroFit
     from pipeline.vehicles import Vehicle
 
-    Floats = NDArray[np.float64]
 
 # Below it, reading the wheels now and then feigns as much.
 _LEAST_S = 0.05

@@ -2,5 +2,3 @@
 
 from pipeline.stages.extract.reading import list_wanted
 from pipeline.stages.extract.tables import Extracted, extract_tables
-
-__all__ = ["Extracted", "extract_tables", "list_wanted"]

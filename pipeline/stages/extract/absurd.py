@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.arrays import Flags
 from pipeline.logs import Ragged
 from pipeline.stages.finding import Finding
 
@@ -51,7 +52,7 @@ def remove_absurd(topics: Sequence[TopicColumns]) -> tuple[tuple[TopicColumns, .
     return tuple(cleaned), findings
 
 
-def _without(values: NDArray[np.generic], wrong: NDArray[np.bool_]) -> NDArray[np.generic]:
+def _without(values: NDArray[np.generic], wrong: Flags) -> NDArray[np.generic]:
     good = values.copy()
     good[wrong] = np.nan
     return good

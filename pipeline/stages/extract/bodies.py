@@ -6,8 +6,8 @@ import re
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.logs import Ragged, RaggedStrings
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract.reading import PoseArrays, axis_fields, first_text
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from pipeline.vehicles import Vehicle
     from pipeline.vehicles.message_types import PoseFields
 
-Floats = NDArray[np.float64]
 
 _BASE: Final = re.compile(r"(::|/)base(_link|_footprint)?$")
 _MOVES_M: Final = 0.5

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from pipeline.core import rigid, timegrid
+from pipeline.core.arrays import Floats
 from pipeline.core.errors import SlipError
 from pipeline.stages.extract.course import estimate_noise
 from pipeline.stages.extract.drive import read_speed
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from pipeline.stages.finding import Finding
     from pipeline.vehicles import Configuration, Sources, Vehicle
 
-Floats = NDArray[np.float64]
 
 _FIXED_FRAME: Final = re.compile(
     r"(^|/)(map|world|earth|utm|enu|global|camera_init|mocap|vicon)$|lidar|slam|gps|gnss|local_origin"

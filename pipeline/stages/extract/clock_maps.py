@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Stamps = NDArray[np.int64]
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Floats, Ints
+
+Stamps = Ints
 
 _FEWEST_KNOTS = 5
 _RATES = 25

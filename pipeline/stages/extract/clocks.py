@@ -5,30 +5,20 @@ preferred, since recording delays do not reach them. A clock that jumps while th
 right again through the log time; the place is remembered, so that no segment crosses it.
 """
 
-from __future__ import annotations
-
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Ints
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
-from pipeline.stages.extract.clock_maps import (
-    ClockMap,
-    find_held_up_s,
-    map_clock,
-    measure_drift,
-    spread_bunches,
-)
+from pipeline.stages.extract import clock_maps
 from pipeline.stages.finding import Finding
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-Stamps = NDArray[np.int64]
+Stamps = Ints
 
 DAY_NS = 86_400 * 10**9
 _JUMP_NS = 500_000_000
@@ -80,7 +70,7 @@ class TopicClock:
     topic: str
     clock: str
     stamp: Stamps
-    usable: NDArray[np.bool_]
+    usable: Flags
     breaks: tuple[int, ...] = ()
     latency_s: float = 0.0
     findings: tuple[Finding, ...] = field(default=())
@@ -126,13 +116,13 @@ def _follow_simulated_time(
         key=lambda times: -times.log_time.size,
     )
     for leading in stamped:
-        found = map_clock(leading.log_time, cast("Stamps", leading.header_time))
+        found = clock_maps.map_clock(leading.log_time, cast("Stamps", leading.header_time))
         if found is not None and _is_simulated(found):
             return _follow(recorded, found, leading.topic)
     return recorded, []
 
 
-def _is_simulated(found: ClockMap) -> bool:
+def _is_simulated(found: clock_maps.ClockMap) -> bool:
     """Whether stamps pass at another rate than the recorder's time, or unevenly and from another start."""
     rate, span = found.usual_rate, float(found.log[-1] - found.log[0])
     if abs(rate - 1.0) >= _OTHER_RATE and abs(rate - 1.0) * span >= _JUMP_NS:
@@ -142,7 +132,7 @@ def _is_simulated(found: ClockMap) -> bool:
 
 
 def _follow(
-    recorded: Mapping[str, Recorded], found: ClockMap, leading: str
+    recorded: Mapping[str, Recorded], found: clock_maps.ClockMap, leading: str
 ) -> tuple[Mapping[str, Recorded], list[Finding]]:
     mapped, real = {}, []
     for key, times in recorded.items():
@@ -177,7 +167,7 @@ def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
         for key, header in headers.items()
     }
     drifts = {
-        key: measure_drift(recorded[key].log_time[counts[key]], header[counts[key]])
+        key: clock_maps.measure_drift(recorded[key].log_time[counts[key]], header[counts[key]])
         for key, header in headers.items()
     }
     known = [drift for drift in drifts.values() if drift.is_certain]
@@ -208,11 +198,11 @@ def _spread_bunches(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
     for key, times in recorded.items():
         if times.clock is not None or (times.header_time is not None and times.header_time.any()):
             continue
-        log = spread_bunches(times.log_time)
+        log = clock_maps.spread_bunches(times.log_time)
         if log is times.log_time:
             continue
         even[key] = replace(times, log_time=log)
-        late = find_held_up_s(times.log_time, log)
+        late = clock_maps.find_held_up_s(times.log_time, log)
         text = (
             f"{times.topic} has no stamps and was recorded in bunches, up to {late * 1e3:.0f} ms late: its "
             "messages were put back to the pace of their sender"
@@ -249,7 +239,7 @@ def _read_clock(times: Recorded) -> TopicClock:
     return TopicClock(times.topic, "header", stamp, usable, breaks, latency, tuple(found))
 
 
-def _flag_unset(topic: str, unset: NDArray[np.bool_]) -> list[Finding]:
+def _flag_unset(topic: str, unset: Flags) -> list[Finding]:
     count = int(unset.sum())
     if not count:
         return []
@@ -266,8 +256,8 @@ def _flag_placed(topic: str, count: int) -> Finding:
 
 
 def _mend_jumps(
-    topic: str, header: Stamps, log_time: Stamps, log_known: NDArray[np.bool_]
-) -> tuple[Stamps, NDArray[np.bool_], tuple[int, ...], list[Finding]]:
+    topic: str, header: Stamps, log_time: Stamps, log_known: Flags
+) -> tuple[Stamps, Flags, tuple[int, ...], list[Finding]]:
     """Shift each stretch of constant clock offset onto the longest one."""
     offset = np.where(log_known, header - log_time, 0)
     usable = np.where(log_known, np.ones(header.size, dtype=bool), header > DAY_NS)
@@ -407,7 +397,7 @@ def leave_out_twice_told(
     return single, [Finding("clock_jump", "warning", text, where="recorder", value=seconds, count=1)]
 
 
-def _count_messages(stamp: Stamps) -> tuple[Stamps, NDArray[np.int64]]:
+def _count_messages(stamp: Stamps) -> tuple[Stamps, Ints]:
     """Numbers of the bins of half a second that hold messages, and how many each holds."""
     places, sizes = np.unique(stamp // _BIN_NS, return_counts=True)
     return places, sizes.astype(np.int64)

@@ -5,23 +5,18 @@ from, and the course over ground gives that: the two are put together over a min
 course is the heading: unknown while the vehicle stands, and blind to sideways slip.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import rigid, timegrid
+from pipeline.core.arrays import Flags, Floats
 from pipeline.runs.heading import fit_turning
 from pipeline.stages.finding import Finding
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 T = TypeVar("T", np.float64, np.complex128)
 
 _WINDOW_S: Final = 1.0

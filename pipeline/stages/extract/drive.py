@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec import structs
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats, Ints
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract import reading
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-Floats = NDArray[np.float64]
 
 _LEFT = re.compile(r"left|(^|[_/])(l|lf|fl|rl|bl|ml|lb)([_/\d]|$)")
 _RIGHT = re.compile(r"right|(^|[_/])(r|rf|fr|rr|br|mr|rb)([_/\d]|$)")
@@ -74,7 +73,7 @@ class Drive:
         """Names of the signals, in the order of the tables' columns."""
         return tuple(name for name in cls.__dataclass_fields__ if name != "findings")
 
-    def take(self, order: NDArray[np.int64]) -> Drive:
+    def take(self, order: Ints) -> Drive:
         """The signals in another order."""
         series = {name: getattr(self, name) for name in self.list_signals()}
         taken = {name: None if values is None else values[order] for name, values in series.items()}

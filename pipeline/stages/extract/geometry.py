@@ -1,20 +1,14 @@
 """Geometry of a vehicle that nothing names: as its poses show it, and as its controller drives with."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping
+from typing import Final
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from pipeline.core import timegrid
+from pipeline.core.arrays import Floats
 from pipeline.stages.extract.choice import split_chords, yaw_of
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-Floats = NDArray[np.float64]
 
 _SPAN_S: Final = 0.5
 _ASKED_SPAN_S: Final = 2.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats
 from pipeline.stages.errors import StageError
 from pipeline.vehicles import DEFAULT_INTERVAL
 
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
     from pipeline.vehicles.configuration import IntervalSection
 
-Floats = NDArray[np.float64]
 Span = tuple[float, float]
 
 
@@ -67,7 +66,7 @@ def find_spans_given(sections: Sequence[IntervalSection], where: str) -> list[Sp
     return spans
 
 
-def is_inside(times: Floats, spans: Sequence[Span] | None) -> NDArray[np.bool_]:
+def is_inside(times: Floats, spans: Sequence[Span] | None) -> Flags:
     """Whether each time lies in any of the spans; everything does when there are no spans at all (None)."""
     if spans is None:
         return np.ones(times.size, dtype=bool)

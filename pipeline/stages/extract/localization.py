@@ -7,16 +7,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.core import rigid, segments
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.stages.finding import Finding
 
 if TYPE_CHECKING:
     from pipeline.vehicles.configuration import VelocitySection
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 _UNIT_FORGIVEN = 1e-3
 _FASTEST = 60.0
@@ -38,7 +36,7 @@ class Track:
     quaternion: Floats
     valid: Flags
     held: Flags
-    segment: NDArray[np.int64]
+    segment: Ints
     findings: tuple[Finding, ...] = field(default=())
 
 

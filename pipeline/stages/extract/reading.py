@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.core import rigid
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.logs import Strings, TopicColumns, Wanted, wanted_transforms
 from pipeline.stages.errors import StageError
 from pipeline.vehicles import DriveForm, DriveSource, PoseContent, PoseSource, Signal, Sources
 from pipeline.vehicles.message_types import find_type, plain_type
 from pipeline.vehicles.topics import TRANSFORM_TYPES
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-Floats = NDArray[np.float64]
 
 _LONGEST_NAME = 200
 _SIDEWAYS_MPS = 0.02
@@ -239,7 +234,7 @@ class PoseArrays:
     parent: str
     child: str
 
-    def take(self, rows: NDArray[np.int64]) -> PoseArrays:
+    def take(self, rows: Ints) -> PoseArrays:
         """Some of them, in that order."""
         return replace(self, position=self.position[rows], quaternion=self.quaternion[rows])
 
@@ -248,12 +243,7 @@ def read_pose_topic(columns: TopicColumns) -> PoseArrays:
     """Poses of a topic whose type has a pose, axes ahead, left, up."""
     pose = find_type(columns.type_name).pose
     if pose is None:
-        raise StageError(
-            "no_pose",
-            f"{columns.type_name} holds no pose",
-            where=columns.topic,
-            hint="Name another pose.topic.",
-        )
+        raise _holds_no("pose", columns, "pose")
     arrays = PoseArrays(
         np.stack([numbers(columns, name) for name in axis_fields(pose.position, "xyz")], axis=-1),
         np.stack([numbers(columns, name) for name in axis_fields(pose.orientation, "xyzw")], axis=-1),
@@ -263,16 +253,11 @@ def read_pose_topic(columns: TopicColumns) -> PoseArrays:
     return _turn_axes(arrays) if pose.convention == "ned_frd" else arrays
 
 
-def read_fixes(columns: TopicColumns) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+def read_fixes(columns: TopicColumns) -> tuple[Floats, Floats, Floats, Flags]:
     """Latitude and longitude [deg], altitude [m] and whether there is a fix at all, each (n,)."""
     fix = find_type(columns.type_name).fix
     if fix is None:
-        raise StageError(
-            "no_pose",
-            f"{columns.type_name} holds no fix",
-            where=columns.topic,
-            hint="Name another pose.topic.",
-        )
+        raise _holds_no("fix", columns, "pose")
     latitude, longitude, altitude, status = (
         numbers(columns, name) for name in (fix.latitude, fix.longitude, fix.altitude, fix.status)
     )
@@ -317,18 +302,18 @@ def read_imu(columns: TopicColumns) -> tuple[Floats, Floats]:
     """Angular velocity [rad/s] and specific force [m/s^2] of an IMU topic, each (n, 3)."""
     imu = find_type(columns.type_name).imu
     if imu is None:
-        raise StageError(
-            "no_imu",
-            f"{columns.type_name} holds no gyro",
-            where=columns.topic,
-            hint="Name another imu.topic.",
-        )
+        raise _holds_no("gyro", columns, "imu")
     signs = np.array([1.0, -1.0, -1.0]) if imu.convention == "ned_frd" else np.ones(3)
     rates, forces = (
         signs * np.stack([numbers(columns, name) for name in axis_fields(fields, "xyz")], axis=-1)
         for fields in (imu.rate, imu.force)
     )
     return rates, forces
+
+
+def _holds_no(what: str, columns: TopicColumns, role: str) -> StageError:
+    said, hint = f"{columns.type_name} holds no {what}", f"Name another {role}.topic."
+    return StageError(f"no_{role}", said, where=columns.topic, hint=hint)
 
 
 def numbers(columns: TopicColumns, name: str) -> Floats:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.core import rigid, timegrid
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.stages.extract import reading
 from pipeline.stages.extract.course import (
     Turning,
@@ -28,8 +28,6 @@ from pipeline.vehicles.message_types import find_type
 if TYPE_CHECKING:
     from pipeline.logs import TopicColumns
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 _SEMI_MAJOR_M: Final = 6378137.0
 _FLATTENING: Final = 1.0 / 298.257223563
@@ -85,7 +83,7 @@ class Receiver:
 
     columns: TopicColumns
     times: Floats
-    order: NDArray[np.int64]
+    order: Ints
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ class Located:
         findings: what was noticed.
     """
 
-    rows: NDArray[np.int64]
+    rows: Ints
     arrays: PoseArrays
     findings: tuple[Finding, ...]
 
@@ -153,7 +151,7 @@ def locate_vehicle(
 class _Track:
     """Where the antenna was [m], shape (n, 3), by which messages, and how fast it went if they say it."""
 
-    rows: NDArray[np.int64]
+    rows: Ints
     position: Floats
     velocity: Floats | None = None
     findings: tuple[Finding, ...] = ()

@@ -14,10 +14,11 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.errors import SlipError
 from pipeline.logs import join_channels
 from pipeline.stages.errors import StageError
-from pipeline.stages.extract import localization, reading
+from pipeline.stages.extract import localization, reading, transforms
 from pipeline.stages.extract.absurd import remove_absurd
 from pipeline.stages.extract.bodies import read_bodies
 from pipeline.stages.extract.clocks import Recorded, TopicClock, align_clocks
@@ -32,14 +33,6 @@ from pipeline.stages.extract.drive import (
 )
 from pipeline.stages.extract.intervals import Span, find_spans_given, find_spans_of_state, is_inside
 from pipeline.stages.extract.satellite import Receiver, locate_vehicle
-from pipeline.stages.extract.transforms import (
-    chain_poses,
-    describe_chain,
-    describe_frame,
-    find_antenna,
-    is_transforms,
-    to_base_link,
-)
 from pipeline.stages.finding import Finding
 from pipeline.vehicles import (
     DEFAULT_INTERVAL,
@@ -61,9 +54,7 @@ if TYPE_CHECKING:
 
     from pipeline.logs import LogData, TopicColumns
 
-Floats = NDArray[np.float64]
-Stamps = NDArray[np.int64]
-Flags = NDArray[np.bool_]
+Stamps = Ints
 
 _DEFAULT_SECTION = IntervalSection(topic=DEFAULT_INTERVAL[0], equals=DEFAULT_INTERVAL[1])
 
@@ -118,13 +109,13 @@ class _Extraction:
         self.vehicle = vehicle
         self.where = where
         self.frames = ("", "")
-        self._orders: dict[str, NDArray[np.int64]] = {}
+        self._orders: dict[str, Ints] = {}
         joined = map(self._join_channels, dict.fromkeys(columns.topic for columns in topics))
         stamped = [reading.with_stamps(columns) for columns in joined if columns is not None]
         # None of a topic's texts may be one that can be read.
         self.columns = {columns.topic: columns for columns in stamped if columns.log_time.size}
         pose = sources.pose
-        self.chain = chain_poses(topics, pose, where) if pose and pose.from_transforms else None
+        self.chain = transforms.chain_poses(topics, pose, where) if pose and pose.from_transforms else None
         self.clocks = self._align()
         self.start_ns = self._find_start()
 
@@ -164,7 +155,7 @@ class _Extraction:
                 topic, columns.log_time, columns.publish_time, columns.header_time, asked.get(topic)
             )
             for topic, columns in self.columns.items()
-            if not is_transforms(columns)
+            if not transforms.is_transforms(columns)
         }
         if self.chain is not None and self.sources.pose is not None:
             topic, times = self.sources.pose.topic, self.chain
@@ -196,7 +187,7 @@ class _Extraction:
     def _seconds(self, stamp: Stamps) -> Floats:
         return (stamp - self.start_ns).astype(np.float64) / 1e9
 
-    def _ordered(self, topic: str) -> tuple[TopicColumns, TopicClock, NDArray[np.int64]] | None:
+    def _ordered(self, topic: str) -> tuple[TopicColumns, TopicClock, Ints] | None:
         """A topic with its clock, and the order of its usable messages in time."""
         columns, clock = self.columns.get(topic), self.clocks.get(topic)
         if columns is None or clock is None:
@@ -205,7 +196,7 @@ class _Extraction:
             self._orders[topic] = self._order(clock)
         return columns, clock, self._orders[topic]
 
-    def _order(self, clock: TopicClock) -> NDArray[np.int64]:
+    def _order(self, clock: TopicClock) -> Ints:
         """Usable messages in the order of their stamps; disorder is noted."""
         usable = np.flatnonzero(clock.usable)
         stamp, topic = clock.stamp[usable], clock.topic
@@ -284,12 +275,12 @@ class _Extraction:
             chain, order = self.chain, self._order(clock)
             arrays = reading.PoseArrays(chain.position, chain.quaternion, chain.parent, chain.child)
             arrays, log_times = arrays.take(order), chain.log_time
-            self.findings += describe_chain(chain, topic)
+            self.findings += transforms.describe_chain(chain, topic)
         elif columns is None:
             raise self._nothing("pose", topic)
         elif source.content is PoseContent.POSE:
             arrays, log_times = self._read_poses(source, columns), columns.log_time
-            self.findings += describe_frame(topic, arrays.parent)
+            self.findings += transforms.describe_frame(topic, arrays.parent)
             order = self._order(clock)
             arrays = arrays.take(order)
         else:
@@ -301,7 +292,7 @@ class _Extraction:
         for jump in clock.breaks:
             breaks[np.flatnonzero(log_time >= jump)[:1]] = True
         if self.chain is None and source.content is PoseContent.POSE:
-            arrays, more = to_base_link(arrays, self.data.topics, topic)
+            arrays, more = transforms.to_base_link(arrays, self.data.topics, topic)
             self.findings += more
         return stamp, log_time, arrays, breaks
 
@@ -314,7 +305,7 @@ class _Extraction:
         self.findings.append(Finding("body_chosen", "info", text, where=source.topic))
         return arrays
 
-    def _locate_vehicle(self, source: PoseSource) -> tuple[NDArray[np.int64], reading.PoseArrays]:
+    def _locate_vehicle(self, source: PoseSource) -> tuple[Ints, reading.PoseArrays]:
         """Messages of a receiver of satellites that give a pose, in time, and these poses."""
         receiver, beside, imu = (
             self._timed(topic)
@@ -324,7 +315,9 @@ class _Extraction:
             raise self._nothing("pose", source.topic)
         drives = (read_speed(table, self.vehicle) for table in (self._wheels, self._commands))
         ahead = next((drive for drive in drives if drive is not None), None)
-        lever, more = find_antenna(self.data.topics, reading.frame_of(receiver.columns), source.topic)
+        lever, more = transforms.find_antenna(
+            self.data.topics, reading.frame_of(receiver.columns), source.topic
+        )
         made = locate_vehicle(receiver, beside, imu, ahead, lever)
         self.findings += [*more, *made.findings]
         if not made.rows.size:
@@ -405,7 +398,7 @@ class _Extraction:
             self.findings.append(Finding("no_measured_wheels", "info", text, where=str(source)))
             return pl.DataFrame()
 
-    def _require(self, topic: str, *, held: bool) -> tuple[TopicColumns, TopicClock, NDArray[np.int64]]:
+    def _require(self, topic: str, *, held: bool) -> tuple[TopicColumns, TopicClock, Ints]:
         found = self._ordered(topic)
         if found is None:
             raise self._nothing("command" if held else "wheels", topic)

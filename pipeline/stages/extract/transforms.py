@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import rigid
+from pipeline.core.arrays import Floats
 from pipeline.logs import LogError, TopicColumns, TransformBuffer, TransformSeries
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract.localization import move_to_base, normalize_quaternions
@@ -18,8 +19,6 @@ from pipeline.vehicles.topics import TRANSFORM_TYPES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
     from pipeline.vehicles import PoseSource
 
@@ -137,9 +136,7 @@ def to_base_link(
     return moved, [Finding("child_frame", "info", text, where=topic)]
 
 
-def find_antenna(
-    topics: Sequence[TopicColumns], frame: str, topic: str
-) -> tuple[NDArray[np.float64], list[Finding]]:
+def find_antenna(topics: Sequence[TopicColumns], frame: str, topic: str) -> tuple[Floats, list[Finding]]:
     """Place of an antenna in base_link [m], shape (3,); zero where no static transform says it.
 
     Args:

@@ -14,8 +14,6 @@ of
 ``pairs`` lists topics that belong together by name.
 """
 
-from __future__ import annotations
-
 import functools
 import tomllib
 from importlib import resources
