@@ -60,13 +60,16 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
         ]
         alike = _list_alike(selection, without, final, effect)
         # Rivals may have become the same simpler effect.
-        by_name = {name: rival for rival in reversed(rivals) for name in rival.ids if name not in final.ids}
-        names = dict.fromkeys([*reversed(by_name), *alike])
+        by_name: dict[str, CandidateModel] = {}
+        for rival, name in ((rival, name) for rival in rivals for name in rival.ids):
+            if name not in final.ids:
+                by_name.setdefault(name, rival)
+        names = dict.fromkeys([*by_name, *alike])
         simple = [name for name in names if name in alike or not _is_larger(selection, name, effect)]
         if simple:
             rest = [c() for c in selection.candidates if c.id in names]
-            numbers = {name: _read_numbers(selection, by_name[name], name) for name in by_name}
-            numbers[effect.id] = _read_numbers(selection, final, effect.id)
+            models = {effect.id: final, **by_name}
+            numbers = {name: _read_numbers(selection, model, name) for name, model in models.items()}
             found.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest), numbers))
     return found
 
