@@ -319,8 +319,8 @@ def _moved(push: Callable[[Motion], tuple[Floats | float, Floats | float, Floats
         seen, rate = (imu[name].to_numpy() for name in ("t", "rate_z"))
         behind, sign = _match(seen, rate, spans, turns)
         speed = np.interp(seen + behind - late, moments, driven)
-        _, _, w = push(Motion(speed, sign * rate, np.interp(seen + behind, times, looked_at)))
-        felt = rate + sign * w
+        more = push(Motion(speed, sign * rate, np.interp(seen + behind, times, looked_at)))[2]
+        felt = rate + sign * more
         return {**tables, "poses": moved, "imu": imu.with_columns(pl.Series("rate_z", felt))}
 
     return change

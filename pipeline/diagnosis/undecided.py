@@ -61,8 +61,8 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
         alike = _list_alike(selection, without, final, effect)
         # Rivals may have become the same simpler effect.
         by_name: dict[str, CandidateModel] = {}
-        for rival, name in ((rival, name) for rival in rivals for name in rival.ids):
-            if name not in final.ids:
+        for rival in rivals:
+            for name in (name for name in rival.ids if name not in final.ids):
                 by_name.setdefault(name, rival)
         names = dict.fromkeys([*by_name, *alike])
         simple = [name for name in names if name in alike or not _is_larger(selection, name, effect)]
