@@ -37,6 +37,7 @@ class Injection:
         findings: any of them tells of the fault; empty where none is expected.
         numbers: by ``effect.parameter`` the number that must be named, from that of the unchanged recording
             (or from the neutral one); of several effects, which are one to first order, any will do.
+        beside: by such a number one that multiplies it where it is named, and is part of it where it is not.
         same: the answer must stay what it was.
         both: needs the way from command to wheels.
     """
@@ -45,6 +46,7 @@ class Injection:
     change: Change
     findings: tuple[str, ...] = ()
     numbers: Mapping[str, Callable[[float], float]] = field(default_factory=dict)
+    beside: Mapping[str, str] = field(default_factory=dict)
     same: bool = False
     both: bool = False
 
@@ -118,6 +120,7 @@ def list_injections() -> list[Injection]:
         Injection(
             "gains .8 and .7 half-way", _moved(_half_way), (),
             {"terrain_change.k_v": lambda k: 0.8 * k, "terrain_change.k_w": lambda k: 0.7 * k},
+            {"terrain_change.k_v": "wheel_radius.k"},
         ),
     ]  # fmt: skip
 

@@ -156,3 +156,14 @@ def test_what_an_effect_cancels_is_not_named() -> None:
     sliding = Answer({"lateral_skid.c": (-0.1, 0.01)})
     assert judge(skid, sliding, Answer({}, detectable={"lateral_skid.c": 0.03}))[0] == "recovered"
     assert judge(skid, Answer({}), Answer({}, detectable={"lateral_skid.c": 0.03}))[0] == "missed"
+    # Of what the unchanged recording did not speak silence recovers nothing.
+    unsure = Answer({}, estimates={"lateral_skid.c": (-0.1, 0.01)})
+    assert judge(skid, unsure, Answer({}, detectable={"lateral_skid.c": 0.03}))[0] == "missed"
+
+
+def test_a_gain_holds_the_one_that_is_not_named_beside_it() -> None:
+    half_way = BY_NAME["gains .8 and .7 half-way"]
+    plain = Answer({}, estimates={"wheel_radius.k": (0.9, 0.01)})
+    gains = {"terrain_change.k_v": (0.72, 0.01), "terrain_change.k_w": (0.7, 0.01)}
+    assert judge(half_way, plain, Answer(gains))[0] == "recovered"
+    assert judge(half_way, plain, Answer({**gains, "wheel_radius.k": (0.9, 0.01)}))[0] == "number"
