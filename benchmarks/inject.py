@@ -184,19 +184,23 @@ def is_recovered(injection: Injection, label: str, before: Answer, after: Answer
 
     Where the two cancel nothing is left to be named.
     """
+    effect, parameter = label.split(".")
+    neutral, change = find_effect(effect)().parameter(parameter).neutral, injection.numbers[label]
     value, half = before.find_number(label)
-    expected = (injection.numbers[label](value), half)
-    found = after.find_told(label)
     gain = injection.beside.get(label)
+    if gain is not None and label not in before.numbers:
+        # A change that is one explanation of several is one at another moment.
+        value, half = neutral, 0.0
+    expected = (change(value), abs(change(value + half) - change(value)))
     if gain is not None and gain not in after.numbers:
         # What the changed recording does not name stands in the number.
         share, unsure = before.find_number(gain)
-        expected = (expected[0] * share, math.hypot(half * share, expected[0] * unsure))
+        expected = (expected[0] * share, math.hypot(expected[1] * share, expected[0] * unsure))
+    found = after.find_told(label)
     if found is None:
-        effect, parameter = label.split(".")
-        neutral, least = find_effect(effect)().parameter(parameter).neutral, after.detectable.get(label, 0.0)
         was_there = before.find_told(label) and abs(value - neutral) > max(half, abs(expected[0] - neutral))
-        return bool(was_there) and is_close(expected, (neutral, least)) and effect not in after.mentioned
+        unseen = (neutral, after.detectable.get(label, 0.0))
+        return bool(was_there) and is_close(expected, unseen) and effect not in after.mentioned
     # Of what the unchanged recording does not speak it knows as much as the changed one.
     return is_close(expected if before.knows(label) else (expected[0], max(expected[1], found[1])), found)
 
