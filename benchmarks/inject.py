@@ -33,7 +33,7 @@ from pipeline.models import find_effect
 from pipeline.stages.extract import extract_tables
 
 if TYPE_CHECKING:
-    from pipeline.diagnosis.diagnosis import Named
+    from pipeline.diagnosis.diagnosis import Named, Value
     from pipeline.logs import LogData
     from pipeline.stages.extract import Extracted
     from pipeline.vehicles import Vehicle
@@ -45,7 +45,7 @@ STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96
 # Relative change of a finding's number that is news.
 _OTHER = 0.02
-_VERDICTS = ("recovered", "told", "undecided", "cannot", "number", "missed")
+_VERDICTS = ("recovered", "told", "one of", "undecided", "cannot", "number", "missed")
 Number = tuple[float, float]
 _UNCHANGED = Injection("nothing", lambda tables, _: tables)
 Json = dict[str, Any]
@@ -63,6 +63,7 @@ class Answer:
         immaterial: numbers of effects that are listed as too small to be felt.
         estimates: numbers of effects that were not named.
         detectable: how large numbers would have had to be to be seen.
+        rivals: numbers of effects that are one explanation of several, each in the place of the others.
     """
 
     numbers: Mapping[str, Number]
@@ -72,6 +73,7 @@ class Answer:
     immaterial: Mapping[str, Number] = field(default_factory=dict)
     estimates: Mapping[str, Number] = field(default_factory=dict)
     detectable: Mapping[str, float] = field(default_factory=dict)
+    rivals: Mapping[str, Number] = field(default_factory=dict)
 
     @property
     def names(self) -> set[str]:
@@ -80,18 +82,22 @@ class Answer:
 
     def knows(self, label: str) -> bool:
         """Whether it says anything of a number."""
-        return any(label in known for known in (self.numbers, self.immaterial, self.estimates))
+        return label in self.estimates or self.find_told(label) is not None
 
     @property
     def mentioned(self) -> set[str]:
         """Ids of the effects that are named, one explanation of several, or too small to be felt."""
         return {label.split(".")[0] for label in (*self.numbers, *self.immaterial)} | {*self.undecided}
 
+    def find_told(self, label: str) -> Number | None:
+        """A number that is told: of an effect that is named, too small to be felt, or one of several."""
+        return self.numbers.get(label) or self.immaterial.get(label) or self.rivals.get(label)
+
     def find_number(self, label: str) -> Number:
-        """What is known of a number: as named, as estimated, or that it is less than would have been seen."""
+        """What is known of a number: as told, as estimated, or that it is less than would have been seen."""
         effect, parameter = label.split(".")
         neutral = (find_effect(effect)().parameter(parameter).neutral, self.detectable.get(label, 0.0))
-        return self.numbers.get(label) or self.immaterial.get(label) or self.estimates.get(label, neutral)
+        return self.find_told(label) or self.estimates.get(label, neutral)
 
 
 def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
@@ -121,14 +127,19 @@ def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
             for one in sorted(told.estimates, key=lambda one: one.input)
         },
         {f"{one.id}.{one.parameter}": one.size for one in told.detectable},
+        _list_values(pair for item in told.undecided for pair in item.numbers.items()),
     )
 
 
 def _list_numbers(effects: Iterable[Named]) -> dict[str, Number]:
+    return _list_values((effect.id, effect.parameters) for effect in effects)
+
+
+def _list_values(told: Iterable[tuple[str, Mapping[str, Value]]]) -> dict[str, Number]:
     return {
-        f"{effect.id}.{name}": (value.value, 0.5 * (value.high - value.low))
-        for effect in effects
-        for name, value in effect.parameters.items()
+        f"{effect}.{name}": (value.value, 0.5 * (value.high - value.low))
+        for effect, values in told
+        for name, value in values.items()
     }
 
 
@@ -146,7 +157,7 @@ def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, lis
     for effect in effects:
         labels = [label for label in injection.numbers if label.split(".")[0] == effect]
         if all(is_recovered(injection, label, before, after) for label in labels):
-            return "recovered", extra
+            return ("one of" if effect in after.undecided else "recovered"), extra
     unseen = {
         label.split(".")[0]
         for label, change in injection.numbers.items()
@@ -173,16 +184,25 @@ def is_recovered(injection: Injection, label: str, before: Answer, after: Answer
 
     Where the two cancel nothing is left to be named.
     """
+    effect, parameter = label.split(".")
+    neutral, change = find_effect(effect)().parameter(parameter).neutral, injection.numbers[label]
     value, half = before.find_number(label)
-    expected = (injection.numbers[label](value), half)
-    found = after.numbers.get(label) or after.immaterial.get(label)
+    gain = injection.beside.get(label)
+    if gain is not None and label not in before.numbers:
+        # A change that is one explanation of several is one at another moment.
+        value, half = neutral, 0.0
+    expected = (change(value), abs(change(value + half) - change(value)))
+    if gain is not None and gain not in after.numbers:
+        # What the changed recording does not name stands in the number.
+        share, unsure = before.find_number(gain)
+        expected = (expected[0] * share, math.hypot(expected[1] * share, expected[0] * unsure))
+    found = after.find_told(label)
     if found is None:
-        effect, parameter = label.split(".")
-        neutral, least = find_effect(effect)().parameter(parameter).neutral, after.detectable.get(label, 0.0)
-        was_there = abs(value - neutral) > max(half, abs(expected[0] - neutral))
-        return was_there and is_close(expected, (neutral, least)) and effect not in after.names
+        was_there = before.find_told(label) and abs(value - neutral) > max(half, abs(expected[0] - neutral))
+        unseen = (neutral, after.detectable.get(label, 0.0))
+        return bool(was_there) and is_close(expected, unseen) and effect not in after.mentioned
     # Of what the unchanged recording does not speak it knows as much as the changed one.
-    return is_close(expected if before.knows(label) else (expected[0], found[1]), found)
+    return is_close(expected if before.knows(label) else (expected[0], max(expected[1], found[1])), found)
 
 
 def shared(before: Answer, after: Answer) -> list[str]:
@@ -246,7 +266,8 @@ def describe(rows: Iterable[Json]) -> str:
     lines += [
         f"{right} of {asked} recovered or told ({right / asked:.0%}),",
         f"{right} of the {can} of which the log is not said not to tell ({right / can:.0%});",
-        f"{total['undecided']} told less, as one of several explanations;",
+        f"{total['one of']} told as one of several explanations, with the number that was put in",
+        f"({(right + total['one of']) / asked:.0%} with them); {total['undecided']} so with another number;",
         f"{total['number']} named with another number; {total['missed']} missed;",
         f"a name that the unchanged recording lacks in {total['extra']} ({total['extra'] / asked:.0%}),",
         f"that no recording of the vehicle has in {foreign} ({foreign / asked:.0%}).",
@@ -272,7 +293,7 @@ def note(injection: Injection, before: Answer, after: Answer) -> str:
     parts = []
     for label in dict.fromkeys(labels):
         one, two = (
-            ("{:.3g} +- {:.2g}" if label in answer.numbers else "({:.3g} +- {:.2g})").format(
+            ("{:.3g} +- {:.2g}" if answer.find_told(label) else "({:.3g} +- {:.2g})").format(
                 *answer.find_number(label)
             )
             for answer in (before, after)

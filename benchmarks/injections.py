@@ -37,6 +37,7 @@ class Injection:
         findings: any of them tells of the fault; empty where none is expected.
         numbers: by ``effect.parameter`` the number that must be named, from that of the unchanged recording
             (or from the neutral one); of several effects, which are one to first order, any will do.
+        beside: by such a number one that multiplies it where it is named, and is part of it where it is not.
         same: the answer must stay what it was.
         both: needs the way from command to wheels.
     """
@@ -45,6 +46,7 @@ class Injection:
     change: Change
     findings: tuple[str, ...] = ()
     numbers: Mapping[str, Callable[[float], float]] = field(default_factory=dict)
+    beside: Mapping[str, str] = field(default_factory=dict)
     same: bool = False
     both: bool = False
 
@@ -118,17 +120,18 @@ def list_injections() -> list[Injection]:
         Injection(
             "gains .8 and .7 half-way", _moved(_half_way), (),
             {"terrain_change.k_v": lambda k: 0.8 * k, "terrain_change.k_w": lambda k: 0.7 * k},
+            {"terrain_change.k_v": "wheel_radius.k"},
         ),
     ]  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What an effect acts on, between each pose and the next, each of shape (n,).
+    """What an effect acts on, between each pose and the next or at each sample of the gyro, of shape (n,).
 
     Attributes:
         v: forward speed of the ideal vehicle by its measured wheels [m/s].
-        w: yaw rate of the poses [rad/s].
+        w: yaw rate of poses or gyro [rad/s].
         done: share of the run that is over, of what is looked at of it.
     """
 
@@ -275,29 +278,33 @@ def _half_way(motion: Motion) -> tuple[Floats, float, Floats]:
 
 
 def _moved(push: Callable[[Motion], tuple[Floats | float, Floats | float, Floats | float]]) -> Change:
-    """A body velocity v_x, v_y, v_w added to the motion: poses are integrated again, the gyro follows."""
+    """A body velocity v_x, v_y, v_w added to the motion: poses are integrated again, the gyro follows.
+
+    Poses and gyro are each changed by their own turning, because the latency of poses varies; the wheels'
+    speed is taken as much earlier as their turning comes before that of poses, or of the gyro.
+    """
 
     def change(tables: Tables, drive: Drive) -> Tables:
         poses, wheels = tables["poses"], tables["wheels"]
         times, yaw = poses["t"].to_numpy(), _read_yaw(poses)
         place = poses["x"].to_numpy() + 1j * poses["y"].to_numpy()
-        moments, speed = wheels["t"].to_numpy(), np.zeros(0)
-        speed = 0.5 * drive.radius_m * (wheels["left"].to_numpy() + wheels["right"].to_numpy())
+        moments, left, right = (wheels[name].to_numpy() for name in ("t", "left", "right"))
         looked_at = np.cumsum(poses["active"].to_numpy()) / poses["active"].sum()
-        turned, new_place = np.zeros(times.size), place.copy()
-        rates: list[tuple[Floats, Floats]] = []
-        for rows in _list_segments(poses):
-            # Between two poses that are new: those between them repeat the one before.
-            held = poses["held"].to_numpy()[rows]
-            fresh = rows[np.flatnonzero(~held | (np.arange(rows.size) == 0))]
-            step = np.diff(times[fresh])
-            angle = np.unwrap(yaw[fresh])
-            middle = 0.5 * (times[fresh][1:] + times[fresh][:-1])
-            motion = Motion(
-                np.interp(middle, moments, speed),
-                np.diff(angle) / step,
-                np.interp(middle, times, looked_at),
-            )
+        # Between two poses that are new: those between them repeat the one before.
+        held = poses["held"].to_numpy()
+        segments = [(rows, rows[~held[rows] | (np.arange(rows.size) == 0)]) for rows in _list_segments(poses)]
+        spans = np.concatenate([np.column_stack((times[new][:-1], times[new][1:])) for _, new in segments])
+        turns = np.concatenate([np.diff(np.unwrap(yaw[new])) for _, new in segments])
+        late, _ = _match(moments, right - left, spans, turns)
+        driven = 0.5 * drive.radius_m * (left + right)
+        speed = np.interp(spans.mean(axis=1) - late, moments, driven)
+        turned, new_place, first = np.zeros(times.size), place.copy(), 0
+        for rows, fresh in segments:
+            mine = slice(first, first + fresh.size - 1)
+            first = mine.stop
+            step, angle = np.diff(times[fresh]), np.unwrap(yaw[fresh])
+            done = np.interp(spans[mine].mean(axis=1), times, looked_at)
+            motion = Motion(speed[mine], turns[mine] / step, done)
             x, y, w = (np.broadcast_to(np.asarray(part, dtype=float), step.shape) for part in push(motion))
             own = np.diff(place[fresh]) * np.exp(-1j * 0.5 * (angle[1:] + angle[:-1]))
             added = np.concatenate(([0.0], np.cumsum(w * step)))
@@ -306,27 +313,39 @@ def _moved(push: Callable[[Motion], tuple[Floats | float, Floats | float, Floats
             path = place[fresh[0]] + np.concatenate(([0.0], np.cumsum(walked)))
             owner = np.searchsorted(fresh, rows, side="right") - 1
             turned[rows], new_place[rows] = added[owner], path[owner]
-            rates.append((middle, w))
         moved = _turn(poses, turned, in_map=True).with_columns(
             pl.Series("x", new_place.real), pl.Series("y", new_place.imag)
         )
         if "imu" not in tables or tables["imu"].is_empty():
             return {**tables, "poses": moved}
-        middle, w = (np.concatenate(columns) for columns in zip(*rates, strict=True))
         imu = tables["imu"]
-        ratio = _measure_gyro_sign(imu, times, yaw)
-        felt = imu["rate_z"].to_numpy() + ratio * np.interp(imu["t"].to_numpy(), middle, w)
+        seen, rate = (imu[name].to_numpy() for name in ("t", "rate_z"))
+        behind, sign = _match(seen, rate, spans, turns)
+        speed = np.interp(seen + behind - late, moments, driven)
+        more = push(Motion(speed, sign * rate, np.interp(seen + behind, times, looked_at)))[2]
+        felt = rate + sign * more
         return {**tables, "poses": moved, "imu": imu.with_columns(pl.Series("rate_z", felt))}
 
     return change
 
 
-def _measure_gyro_sign(imu: pl.DataFrame, times: Floats, yaw: Floats) -> float:
-    """Which way the gyro is mounted: the sign of its correlation with the turning of the poses."""
-    rate = np.gradient(np.unwrap(yaw), times)
-    rate = np.convolve(np.clip(rate, -3.0, 3.0), np.ones(20) / 20.0, "same")
-    seen = np.interp(times, imu["t"].to_numpy(), imu["rate_z"].to_numpy())
-    return float(np.sign(np.sum(np.convolve(seen, np.ones(20) / 20.0, "same") * rate)))
+def _match(times: Floats, rate: Floats, spans: Floats, turns: Floats) -> tuple[float, float]:
+    """How much later than a yaw rate the turning of poses is stamped [s], and the rate's sign in it.
+
+    Args:
+        times, rate: of wheels or gyro, shape (m,); any multiple of the yaw rate will do.
+        spans: stamps of each pose and the next, shape (n, 2).
+        turns: by which the heading differs between them, shape (n,).
+    """
+    angle = np.concatenate(([0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(times))))
+    step = np.diff(spans)[:, 0]
+    wanted = np.clip(turns / step, -3.0, 3.0)
+    lags = np.arange(-0.2, 1.2, 0.01)
+    alike = [
+        np.corrcoef(np.diff(np.interp(spans - lag, times, angle))[:, 0] / step, wanted)[0, 1] for lag in lags
+    ]
+    best = int(np.argmax(np.abs(alike)))
+    return float(lags[best]), float(np.sign(alike[best]))
 
 
 def _list_segments(poses: pl.DataFrame) -> list[NDArray[np.int64]]:

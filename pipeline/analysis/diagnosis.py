@@ -28,7 +28,7 @@ LINES = "lines"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 10
+VERSION = 11
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
 
 

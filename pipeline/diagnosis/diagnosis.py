@@ -54,6 +54,16 @@ class Value:
             another_run=(low + change, high + change),
         )  # fmt: skip
 
+    def to_json(self) -> dict[str, Json]:
+        """What this run says."""
+        return {
+            "value": _clean(self.value),
+            "low": _clean(self.low),
+            "high": _clean(self.high),
+            "unit": self.unit,
+            "at_bound": self.at_bound,
+        }
+
 
 @dataclass(frozen=True)
 class Named:
@@ -116,15 +126,9 @@ class Named:
             "id": self.id,
             "sentence": self.sentence,
             "parameters": {
-                name: {
-                    "value": _clean(v.value),
-                    "low": _clean(v.low),
-                    "high": _clean(v.high),
-                    "unit": v.unit,
-                    "at_bound": v.at_bound,
-                    "another_run": dict(zip(("low", "high"), map(_clean, v.another_run), strict=True)),
-                }
-                for name, v in self.parameters.items()
+                name: value.to_json()
+                | {"another_run": dict(zip(("low", "high"), map(_clean, value.another_run), strict=True))}
+                for name, value in self.parameters.items()
             },
             "gain": _clean(self.gain),
             "equivalent_to": list(self.equivalent_to),
@@ -284,6 +288,10 @@ class RunDiagnosis:
                     "candidates": list(item.candidates),
                     "separate_by": item.separate_by,
                     "in_model": self.find_held(item),
+                    "parameters": {
+                        effect: {name: value.to_json() for name, value in values.items()}
+                        for effect, values in item.numbers.items()
+                    },
                 }
                 for item in self.undecided
             ],

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.diagnosis.verdict import LEAST_STRETCHES, SHORT_S
+from pipeline.diagnosis.verdict import LEAST_STRETCHES, SHORT_S, measure_repeated
 from pipeline.identification.columns import weigh_columns
 from pipeline.models.effect import Excitation, Search
 
@@ -136,9 +136,15 @@ def _evidence(selection: Selection, final: CandidateModel, shift: Floats) -> tup
         rows = weigh_columns(fit.jacobian, factor)
         solution = np.linalg.lstsq(rows, column.reshape(-1), rcond=1e-8)[0]
         beside = (column.reshape(-1) - rows @ solution).reshape(column.shape)
-    rest = weights.weigh(fit.residual)
-    noise = _inflation(rest, selection)
-    return tuple(float(np.sqrt(np.sum(c**2) / noise)) for c in (column, beside))  # type: ignore[return-value]
+    repeated = measure_repeated(selection.part, weights.weigh(fit.residual))
+    alone, left = (_weigh_noise((one**2).sum(axis=0), repeated) for one in (column, beside))
+    return alone, left
+
+
+def _weigh_noise(information: Floats, repeated: Floats) -> float:
+    """Standard errors of what has this information in each channel, were their residuals independent."""
+    total = float(information.sum())
+    return total / math.sqrt(float(information @ repeated)) if total > 0.0 else 0.0
 
 
 def _count_stretches(selection: Selection, shift: Floats) -> float:
@@ -148,15 +154,3 @@ def _count_stretches(selection: Selection, shift: Floats) -> float:
     action = np.bincount(stretch, moved)
     power = float(np.sum(action**2))
     return float(action.sum()) ** 2 / power if power > 0.0 else 0.0
-
-
-def _inflation(rest: Floats, selection: Selection) -> float:
-    """Variance of weighted residuals times the number of neighbours that repeat them."""
-    largest = 0.0
-    for channel in selection.part.channels:
-        values = np.clip(rest[selection.part.live, channel], -3.0, 3.0)
-        total = float(np.mean(values**2))
-        for lag in range(1, 8):
-            total += 2.0 * max(float(np.mean(values[lag:] * values[:-lag])), 0.0)
-        largest = max(largest, total)
-    return max(largest, 1e-12)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.diagnosis.excitation import suggest_manoeuvre
+from pipeline.diagnosis.values import list_values
+from pipeline.identification.intervals import estimate_part
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.diagnosis.diagnosis import Value
     from pipeline.diagnosis.selection import CandidateModel, Selection
     from pipeline.models.effect import Effect
 
@@ -31,10 +36,12 @@ class Undecided:
     Attributes:
         candidates: ids, the chosen one first.
         separate_by: what to drive to tell them apart.
+        numbers: what each of them would be in the place of the others, in the first run, by id and parameter.
     """
 
     candidates: tuple[str, ...]
     separate_by: str
+    numbers: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
 
 
 def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecided]:
@@ -53,13 +60,24 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
         ]
         alike = _list_alike(selection, without, final, effect)
         # Rivals may have become the same simpler effect.
-        names = dict.fromkeys(name for rival in rivals for name in rival.ids if name not in final.ids)
-        names |= dict.fromkeys(alike)
+        by_name: dict[str, CandidateModel] = {}
+        for rival in rivals:
+            for name in (name for name in rival.ids if name not in final.ids):
+                by_name.setdefault(name, rival)
+        names = dict.fromkeys([*by_name, *alike])
         simple = [name for name in names if name in alike or not _is_larger(selection, name, effect)]
         if simple:
             rest = [c() for c in selection.candidates if c.id in names]
-            found.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest)))
+            models = {effect.id: final, **by_name}
+            numbers = {name: _read_numbers(selection, model, name) for name, model in models.items()}
+            found.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest), numbers))
     return found
+
+
+def _read_numbers(selection: Selection, model: CandidateModel, name: str) -> Mapping[str, Value]:
+    """Numbers of an effect of a model as they act in the first run, with their intervals."""
+    effect = next(one for one in model.state.effects_of(0) if one.id == name)
+    return list_values(effect, estimate_part(selection.part, model.fit).choose_run(0))
 
 
 def _list_alike(

@@ -34,6 +34,7 @@ _RARE_Z = 3.0
 _RARE_T = 1.5
 LEAST_STRETCHES = 1.7
 _LAGS = 8
+_NO_NOISE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -65,9 +66,11 @@ def compare(part: Part, weights: Weights, before: Floats, after: Floats) -> Verd
     """Judge held-out residuals of two models under one weights."""
     old, new = weights.cost(before), weights.cost(after)
     gain = 1.0 - float(new.sum()) / max(float(old.sum()), 1e-12)
-    moved = (((before - after) / weights.scale) ** 2).sum(axis=1)
+    shift = ((before - after) / weights.scale) ** 2
+    moved = shift.sum(axis=1)
     stretch = part.number_stretches(SHORT_S)
-    z = _normal_t(part, after / weights.scale, _add_up(stretch, old - new), _add_up(stretch, moved))
+    deviation = 2.0 * float(np.sqrt(shift.sum(axis=0) @ measure_repeated(part, after / weights.scale)))
+    z = _normal_t(_add_up(stretch, old - new), _add_up(stretch, moved), deviation)
     return Verdict(gain, _find_t(part.unit, stretch, old, new, moved), z)
 
 
@@ -120,20 +123,26 @@ def _ratio_t(difference: Floats, action: Floats) -> float:
     return float(difference.sum()) / spread if spread > 0.0 else 0.0
 
 
-def _normal_t(part: Part, rest: Floats, difference: Floats, action: Floats) -> float:
+def _normal_t(difference: Floats, action: Floats, deviation: float) -> float:
     """Loss taken away over its deviation if the better model's residuals were all the noise there is."""
     total = float(action.sum())
     if total <= 0.0 or total**2 / float(np.sum(action**2)) < LEAST_STRETCHES:
         return 0.0
-    noise = 0.0
+    return float(difference.sum()) / deviation
+
+
+def measure_repeated(part: Part, rest: Floats) -> Floats:
+    """Variance of weighted residuals times how often neighbours repeat them, by channel, shape (3,).
+
+    The variance of a sum of such residuals is that of its terms' squares times these.
+    """
+    repeated = np.full(rest.shape[1], _NO_NOISE)
     for channel in part.channels:
         clipped = np.clip(rest[part.live, channel], -3.0, 3.0)
-        power = float(np.mean(clipped**2))
-        spread = power
+        repeated[channel] = float(np.mean(clipped**2))
         for lag in range(1, _LAGS):
-            spread += 2.0 * max(float(np.mean(clipped[lag:] * clipped[:-lag])), 0.0)
-        noise = max(noise, spread)
-    return float(difference.sum()) / (2.0 * float(np.sqrt(noise * total)))
+            repeated[channel] += 2.0 * max(float(np.mean(clipped[lag:] * clipped[:-lag])), 0.0)
+    return repeated
 
 
 def _block_t(values: Floats) -> float:

@@ -120,6 +120,8 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
         held = diagnosis.find_held(item)
         fall = f"  {falls[held]}" if held in falls else ""
         rows.append(f"{'undecided':<20}{' or '.join(item.candidates)}{fall}")
+        numbers = ((name, item.numbers[name]) for name in item.candidates if name in item.numbers)
+        rows += [f"{'':<20}as {name} {_list_numbers(values)}" for name, values in numbers]
         text = f"{held} stands for them in the model; {item.separate_by}" if held else item.separate_by
         rows.append(f"{'':<20}{text}")
     if diagnosis.unexplained is not None:

@@ -138,10 +138,18 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
     return Estimates(items, correlation, min(one.blocks for one in made))
 
 
-def estimate_part(part: Part, fit: PartFit) -> Estimates:
-    """Intervals of the free numbers of one part, the others as they are."""
+def estimate_part(part: Part, fit: PartFit, step: Floats | None = None) -> Estimates:
+    """Intervals of the free numbers of one part, the others as they are.
+
+    Args:
+        part: of the way.
+        fit: a converged fit of it, or one that a step leads to its minimum.
+        step: that step of the free numbers, shape (p,).
+    """
     count = len(fit.free)
-    blocks = sum_blocks(part, fit)
+    blocks, moved = sum_blocks(part, fit), np.zeros(count)
+    if step is not None:
+        blocks, moved = blocks.move(step), step
     total, rows, size = _find_observable(part, fit, blocks)
     freedom = _count_freedom(part, blocks.count)
     correlation = np.full((count, count), np.nan)
@@ -157,7 +165,7 @@ def estimate_part(part: Part, fit: PartFit) -> Estimates:
     errors = np.hypot(errors, carried)
     items = []
     for index, number in enumerate(fit.free):
-        value = fit.state.get(number)
+        value = fit.state.get(number) + float(moved[index])
         half = wide * float(errors[index]) if number.is_smooth else _widen(part, fit, number)
         items.append(
             Estimate(

@@ -58,23 +58,12 @@ def _estimate_added(part: Part, fit: PartFit, effect: Effect) -> list[Estimate]:
         fit.weights,
         fit.loss,
     )
-    made = {item.free: item for item in estimate_part(part, grown).items}
+    step, _ = solve_step(grown.jacobian, grown.residual, grown.weights)
+    made = {item.free: item for item in estimate_part(part, grown, step).items}
     if not all(made[number].observable for number in new):
         return []
-    step, _ = solve_step(grown.jacobian, grown.residual, grown.weights)
-    shifts = dict(zip(grown.free, step.tolist(), strict=True))
-    items = []
-    for number in new:
-        item, shift = made[number], float(shifts[number])
-        low, high = number.bounds
-        if item.high - item.low <= high - low:
-            items.append(
-                replace(
-                    item,
-                    value=item.value + shift,
-                    low=item.low + shift,
-                    high=item.high + shift,
-                    at_bound=False,
-                )
-            )
-    return items
+    return [
+        replace(made[number], at_bound=False)
+        for number in new
+        if made[number].high - made[number].low <= number.bounds[1] - number.bounds[0]
+    ]

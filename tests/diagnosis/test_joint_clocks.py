@@ -117,8 +117,9 @@ def test_one_run_has_one_clock_and_runs_with_gyros_are_dated_by_them(tmp_path: P
         assert all(part.clocks == clocks for part in problem.parts)
 
 
-def test_undecided_repeats_no_name() -> None:
+def test_undecided_repeats_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two rivals that have become the same simpler effect are one."""
+    monkeypatch.setattr("pipeline.diagnosis.undecided._read_numbers", lambda *_: {})
     effect, rival = find_effect("transport_delay")(d=0.2), find_effect("drive_lag")
 
     class Selection(SimpleNamespace):

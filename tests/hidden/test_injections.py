@@ -78,6 +78,27 @@ def test_poses_move_as_the_effect_says(name: str, velocity: complex, turning: fl
     assert felt == pytest.approx(-turning, abs=5e-3)
 
 
+def test_a_gyro_ahead_of_the_poses_stays_ahead(tables: Tables) -> None:
+    """Poses are stamped .4 s late, wheels and gyro are not: each turns as the effect says."""
+    times, late = tables["poses"]["t"].to_numpy(), 0.4
+    rate = np.interp(times, np.arange(-5.0, 30.0), np.random.default_rng(1).normal(0.0, 0.5, 35))
+    yaw = np.interp(times - late, times, np.cumsum(rate) * 0.05)
+    poses = tables["poses"].with_columns(
+        pl.Series("q_z", np.sin(0.5 * yaw)), pl.Series("q_w", np.cos(0.5 * yaw))
+    )
+    imu = tables["imu"].with_columns(pl.Series("rate_z", -rate))
+    wheels = tables["wheels"].with_columns(pl.Series("left", 10.0 - rate), pl.Series("right", 10.0 + rate))
+    moving = {**tables, "poses": poses, "imu": imu, "wheels": wheels}
+    changed = BY_NAME["track x 1.2"].change(moving, DRIVE)
+    assert changed["imu"]["rate_z"].to_numpy() == pytest.approx(-rate / 1.2, abs=1e-9)
+    turned = np.unwrap(
+        2.0 * np.arctan2(changed["poses"]["q_z"].to_numpy(), changed["poses"]["q_w"].to_numpy())
+    )
+    assert turned - turned[0] == pytest.approx((yaw - yaw[0]) / 1.2, abs=1e-6)
+    half = BY_NAME["gains .8 and .7 half-way"].change(moving, DRIVE)["imu"]["rate_z"].to_numpy()
+    assert half[-100:] == pytest.approx(-0.7 * rate[-100:], abs=1e-9)
+
+
 def test_the_rest_changes_one_table_alone(tables: Tables) -> None:
     for name, table in (
         ("sides of the wheels swapped", "wheels"),
@@ -114,6 +135,9 @@ def test_answers_are_judged() -> None:
     assert judge(track, plain, name(1.8, speed_slip=0.1)) == ("recovered", ["speed_slip"])
     assert judge(track, replace(plain, undecided=("speed_slip",)), name(1.8, speed_slip=0.1))[1] == []
     assert judge(track, plain, Answer({}, undecided=("effective_track",)))[0] == "undecided"
+    one = Answer({}, undecided=("effective_track",), rivals={"effective_track.k": (1.81, 0.01)})
+    assert judge(track, plain, one)[0] == "one of"
+    assert judge(track, plain, replace(one, rivals={"effective_track.k": (1.5, 0.01)}))[0] == "undecided"
     assert judge(track, plain, Answer({}, unobservable=("effective_track",)))[0] == "cannot"
     assert judge(track, plain, Answer({}, detectable={"effective_track.k": 0.5}))[0] == "cannot"
     told = Injection("f", lambda tables, _: tables, ("wheel_dead",))
@@ -132,3 +156,14 @@ def test_what_an_effect_cancels_is_not_named() -> None:
     sliding = Answer({"lateral_skid.c": (-0.1, 0.01)})
     assert judge(skid, sliding, Answer({}, detectable={"lateral_skid.c": 0.03}))[0] == "recovered"
     assert judge(skid, Answer({}), Answer({}, detectable={"lateral_skid.c": 0.03}))[0] == "missed"
+    # Of what the unchanged recording did not speak silence recovers nothing.
+    unsure = Answer({}, estimates={"lateral_skid.c": (-0.1, 0.01)})
+    assert judge(skid, unsure, Answer({}, detectable={"lateral_skid.c": 0.03}))[0] == "missed"
+
+
+def test_a_gain_holds_the_one_that_is_not_named_beside_it() -> None:
+    half_way = BY_NAME["gains .8 and .7 half-way"]
+    plain = Answer({}, estimates={"wheel_radius.k": (0.9, 0.01)})
+    gains = {"terrain_change.k_v": (0.72, 0.01), "terrain_change.k_w": (0.7, 0.01)}
+    assert judge(half_way, plain, Answer(gains))[0] == "recovered"
+    assert judge(half_way, plain, Answer({**gains, "wheel_radius.k": (0.9, 0.01)}))[0] == "number"

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_runs import simulate, vehicle_of
 
-from pipeline.identification import Fitted, Input, Problem, fit_model
+from pipeline.identification import Fitted, Input, Problem, estimate_intervals, fit_model
 from pipeline.identification.apportion import QUANTITIES, apportion, jackknife_ratio, list_subsets, share_out
 from pipeline.identification.judgement import Judgement, judge_model
 from pipeline.identification.unnamed import estimate_unnamed
@@ -118,9 +118,10 @@ def test_few_stretches_have_a_share_and_no_interval() -> None:
 def test_effects_that_were_not_named_have_numbers_that_hold_the_truth() -> None:
     vehicle = vehicle_of("husky_a200")
 
-    def fit(seed: int) -> Fitted:
+    def fit(seed: int, *more: str) -> Fitted:
         problem = Problem([simulate(TRUE, seed=seed)], vehicle, Input.MEASURED)
-        return fit_model(problem, Model(vehicle, (find_effect("effective_track")(),)), exact=True)
+        effects = tuple(find_effect(name)() for name in ("effective_track", *more))
+        return fit_model(problem, Model(vehicle, effects), exact=True)
 
     rivals = [find_effect(name)() for name in ("lateral_skid", "wheel_radius", "body_speed_limit")]
     for seed in (1, 2):
@@ -130,3 +131,7 @@ def test_effects_that_were_not_named_have_numbers_that_hold_the_truth() -> None:
         assert found["lateral_skid.c"].value == pytest.approx(0.08, abs=0.02)
         assert found["lateral_skid.c"].low < 0.08 < found["lateral_skid.c"].high
         assert found["wheel_radius.k"].low < 1.0 < found["wheel_radius.k"].high
+        # It is known as well as it is where it was named.
+        with_skid = fit(seed, "lateral_skid")
+        named = estimate_intervals(with_skid.problem, with_skid).find("lateral_skid.c")
+        assert found["lateral_skid.c"].standard_error == pytest.approx(named.standard_error, rel=0.2)
