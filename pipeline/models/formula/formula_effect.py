@@ -88,10 +88,22 @@ class FormulaEffect(AddedEffect):
         self.formulas = dict(formulas)
         self._where = where or name
         self._check_names()
-        self._expressions = {channel: self._parse(channel, text) for channel, text in self.formulas.items()}
+        self._expressions = self._parse_all()
         self._check_parameters()
         super().__init__(fixed=fixed, **values)
         self._check_neutral()
+
+    def __getstate__(self) -> dict[str, object]:
+        """All but the parsed formulas."""
+        return {name: value for name, value in vars(self).items() if name != "_expressions"}
+
+    def __setstate__(self, state: Mapping[str, object]) -> None:
+        """The same with the formulas parsed again."""
+        vars(self).update(state)
+        self._expressions = self._parse_all()
+
+    def _parse_all(self) -> dict[str, Expression]:
+        return {channel: self._parse(channel, text) for channel, text in self.formulas.items()}
 
     @property
     def expressions(self) -> Mapping[str, Expression]:

@@ -1,0 +1,188 @@
+"""Independent computations on two cores, with the same results in the same order as one after the other.
+
+Within `both_cores` a process that was forked from this one works beside it: it has in memory all that this
+one had. Where there can be none (one core, no Linux, a worker, a thread of a server) all is done here.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import io
+import multiprocessing
+import os
+import pickle
+import signal
+import struct
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, Pipe
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_NUMBER = struct.Struct("Q")
+_END = 2**64 - 1
+_DIE_WITH_PARENT = 1
+
+
+@dataclass
+class _Beside:
+    """The other process: its number, the line to it, and a pipe of which both take what is next."""
+
+    pid: int
+    line: Connection
+    waiting: int
+    numbers: int
+    shared: Sequence[object]
+
+    def end(self) -> None:
+        _at_hand.clear()
+        _spent_s[:] = [sum(_spent_s), 0.0]
+        self.line.close()
+        os.kill(self.pid, signal.SIGKILL)
+        os.waitpid(self.pid, 0)
+        os.close(self.waiting)
+        os.close(self.numbers)
+
+
+_at_hand: list[_Beside] = []
+_spent_s = [0.0, 0.0]
+
+
+def measure_cpu() -> float:
+    """CPU time of this process and of those beside it [s]."""
+    return time.process_time() + sum(_spent_s)
+
+
+@contextmanager
+def both_cores(shared: Sequence[object]) -> Iterator[None]:
+    """Let `map_parallel` work in two processes.
+
+    Libraries compute on one thread meanwhile: how they split sums would depend on how many cores there are.
+
+    Args:
+        shared: large objects that functions, items and results refer to: they are not copied.
+    """
+    from threadpoolctl import threadpool_limits  # noqa: PLC0415 - heavy
+
+    with threadpool_limits(limits=1, user_api="blas"):
+        beside = _fork(shared) if _may_fork() else None
+        try:
+            yield
+        finally:
+            if beside is not None and beside in _at_hand:
+                beside.end()
+
+
+def _may_fork() -> bool:
+    return (
+        sys.platform == "linux"
+        and not _at_hand
+        and len(os.sched_getaffinity(0)) > 1
+        and multiprocessing.parent_process() is None
+        and threading.current_thread() is threading.main_thread()
+    )
+
+
+def _fork(shared: Sequence[object]) -> _Beside:
+    waiting, numbers = os.pipe()
+    line, theirs = Pipe()
+    parent = os.getpid()
+    pid = os.fork()
+    if pid == 0:
+        try:
+            line.close()
+            ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
+            while os.getppid() == parent:
+                function, items = _unpack(theirs.recv_bytes(), shared)
+                found = dict(_take(function, items, waiting))
+                theirs.send_bytes(_pack((found, time.process_time()), shared))
+        finally:
+            os._exit(0)
+    theirs.close()
+    _at_hand.append(_Beside(pid, line, waiting, numbers, shared))
+    return _at_hand[0]
+
+
+def map_parallel(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """The function of every item.
+
+    Args:
+        function: without side effects that matter; one that can be pickled, else all is done here.
+        items: what it is called with; whichever process is free takes the next.
+    """
+    found = _share(_at_hand[0], function, items) if _at_hand and len(items) > 1 else {}
+    # What failed beside is done here, where its error is seen.
+    return [found[n] if n in found else function(item) for n, item in enumerate(items)]
+
+
+def _share(beside: _Beside, function: Callable[[Item], Result], items: Sequence[Item]) -> dict[int, Result]:
+    """Results by number; none, and no other process from now on, where anything failed."""
+    try:
+        request = _pack((function, items), beside.shared)
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return {}
+    _at_hand.clear()
+    try:
+        os.write(beside.numbers, b"".join(map(_NUMBER.pack, (*range(len(items)), _END, _END))))
+        beside.line.send_bytes(request)
+        found = dict(_take(function, items, beside.waiting))
+        theirs, _spent_s[1] = _unpack(beside.line.recv_bytes(), beside.shared)
+    except BaseException as error:
+        beside.end()
+        if isinstance(error, Exception):
+            return {}
+        raise
+    _at_hand.append(beside)
+    return found | theirs
+
+
+def _take(
+    function: Callable[[Item], Result], items: Sequence[Item], waiting: int
+) -> Iterator[tuple[int, Result]]:
+    while (number := _NUMBER.unpack(os.read(waiting, _NUMBER.size))[0]) != _END:
+        yield number, function(items[number])
+
+
+class _Pickler(pickle.Pickler):
+    known: dict[int, int]
+
+    def persistent_id(self, one: object) -> int | None:
+        return self.known.get(id(one))
+
+    def reducer_override(self, one: object) -> Any:  # noqa: ANN401 - as its base
+        if type(one) is not np.ndarray or one.flags.forc:
+            return NotImplemented
+        # Axes lie in memory as they did: sums over them are the same to the last bit.
+        order = np.argsort(one.strides, kind="stable")[::-1]
+        return np.transpose, (np.ascontiguousarray(one.transpose(order)), np.argsort(order).tolist())
+
+
+def _pack(content: object, shared: Sequence[object]) -> bytes:
+    stream = io.BytesIO()
+    pickler = _Pickler(stream, protocol=5)
+    pickler.known = {id(one): place for place, one in enumerate(shared)}
+    pickler.dump(content)
+    return stream.getvalue()
+
+
+class _Unpickler(pickle.Unpickler):
+    shared: Sequence[object]
+
+    def persistent_load(self, place: int) -> object:
+        return self.shared[place]
+
+
+def _unpack(content: bytes, shared: Sequence[object]) -> Any:  # noqa: ANN401 - whatever was packed
+    unpickler = _Unpickler(io.BytesIO(content))
+    unpickler.shared = shared
+    return unpickler.load()
