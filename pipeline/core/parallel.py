@@ -31,6 +31,8 @@ Result = TypeVar("Result")
 
 _NUMBER = struct.Struct("Q")
 _END = 2**64 - 1
+_PIECES = 1000
+"""As many numbers fit into a pipe that nobody reads yet."""
 _DIE_WITH_PARENT = 1
 
 
@@ -133,9 +135,11 @@ def _share(beside: _Beside, function: Callable[[Item], Result], items: Sequence[
         return {}
     _at_hand.clear()
     try:
-        os.write(beside.numbers, b"".join(map(_NUMBER.pack, (*range(len(items)), _END, _END))))
+        numbers = (*range(min(len(items), _PIECES)), _END, _END)
+        os.write(beside.numbers, b"".join(map(_NUMBER.pack, numbers)))
         beside.line.send_bytes(request)
         found = dict(_take(function, items, beside.waiting))
+        theirs: dict[int, Result]
         theirs, _spent_s[1] = _unpack(beside.line.recv_bytes(), beside.shared)
     except BaseException as error:
         beside.end()
@@ -150,7 +154,8 @@ def _take(
     function: Callable[[Item], Result], items: Sequence[Item], waiting: int
 ) -> Iterator[tuple[int, Result]]:
     while (number := _NUMBER.unpack(os.read(waiting, _NUMBER.size))[0]) != _END:
-        yield number, function(items[number])
+        for n in range(number, len(items), _PIECES):
+            yield n, function(items[n])
 
 
 class _Pickler(pickle.Pickler):
