@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import io
-import multiprocessing
 import os
 import pickle
 import signal
@@ -18,13 +17,15 @@ import threading
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, Pipe
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+    from multiprocessing.connection import Connection
+
+    from numpy.typing import NDArray
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -47,16 +48,21 @@ class _Beside:
     shared: Sequence[object]
 
     def end(self) -> None:
+        """Once and for all."""
+        pid, self.pid = self.pid, 0
+        if not pid:
+            return
         _at_hand.clear()
         _spent_s[:] = [sum(_spent_s), 0.0]
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
         self.line.close()
-        os.kill(self.pid, signal.SIGKILL)
-        os.waitpid(self.pid, 0)
         os.close(self.waiting)
         os.close(self.numbers)
 
 
 _at_hand: list[_Beside] = []
+_depth = [0]
 _spent_s = [0.0, 0.0]
 
 
@@ -78,30 +84,41 @@ def both_cores(shared: Sequence[object]) -> Iterator[None]:
 
     with threadpool_limits(limits=1, user_api="blas"):
         beside = _fork(shared) if _may_fork() else None
+        _depth[0] += 1
         try:
             yield
         finally:
-            if beside is not None and beside in _at_hand:
+            _depth[0] -= 1
+            if beside is not None:
                 beside.end()
 
 
 def _may_fork() -> bool:
+    from multiprocessing import parent_process  # noqa: PLC0415 - few need it
+
     return (
         sys.platform == "linux"
-        and not _at_hand
+        and _depth[0] == 0
         and len(os.sched_getaffinity(0)) > 1
-        and multiprocessing.parent_process() is None
+        and parent_process() is None
         and threading.current_thread() is threading.main_thread()
     )
 
 
-def _fork(shared: Sequence[object]) -> _Beside:
+def _fork(shared: Sequence[object]) -> _Beside | None:
+    from multiprocessing.connection import Pipe  # noqa: PLC0415 - few need it
+
     waiting, numbers = os.pipe()
     line, theirs = Pipe()
     parent = os.getpid()
-    pid = os.fork()
+    try:
+        pid = os.fork()
+    except OSError:
+        # A machine without room for another process.
+        return None
     if pid == 0:
         try:
+            _depth[0] = 1
             line.close()
             ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
             while os.getppid() == parent:
@@ -158,36 +175,24 @@ def _take(
             yield n, function(items[n])
 
 
-class _Pickler(pickle.Pickler):
-    known: dict[int, int]
-
-    def persistent_id(self, one: object) -> int | None:
-        return self.known.get(id(one))
-
-    def reducer_override(self, one: object) -> Any:  # noqa: ANN401 - as its base
-        if type(one) is not np.ndarray or one.flags.forc:
-            return NotImplemented
-        # Axes lie in memory as they did: sums over them are the same to the last bit.
-        order = np.argsort(one.strides, kind="stable")[::-1]
-        return np.transpose, (np.ascontiguousarray(one.transpose(order)), np.argsort(order).tolist())
-
-
 def _pack(content: object, shared: Sequence[object]) -> bytes:
-    stream = io.BytesIO()
-    pickler = _Pickler(stream, protocol=5)
-    pickler.known = {id(one): place for place, one in enumerate(shared)}
+    stream, places = io.BytesIO(), {id(one): place for place, one in enumerate(shared)}
+    pickler = pickle.Pickler(stream, protocol=5)
+    pickler.persistent_id = lambda one: places.get(id(one))  # type: ignore[method-assign]
+    pickler.dispatch_table = {np.ndarray: _reduce}
     pickler.dump(content)
     return stream.getvalue()
 
 
-class _Unpickler(pickle.Unpickler):
-    shared: Sequence[object]
-
-    def persistent_load(self, place: int) -> object:
-        return self.shared[place]
+def _reduce(values: NDArray[Any]) -> Any:  # noqa: ANN401 - as pickle has it
+    """Axes lie in memory as they did: sums over them are the same to the last bit."""
+    if values.flags.forc:
+        return values.__reduce_ex__(5)
+    order = np.argsort(values.strides, kind="stable")[::-1]
+    return np.transpose, (np.ascontiguousarray(values.transpose(order)), np.argsort(order).tolist())
 
 
 def _unpack(content: bytes, shared: Sequence[object]) -> Any:  # noqa: ANN401 - whatever was packed
-    unpickler = _Unpickler(io.BytesIO(content))
-    unpickler.shared = shared
+    unpickler = pickle.Unpickler(io.BytesIO(content))  # noqa: S301 - our own process packed it
+    unpickler.persistent_load = lambda place: shared[place]  # type: ignore[method-assign]
     return unpickler.load()
