@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from math import inf, nan, prod
 from typing import TYPE_CHECKING, Final
 
-from pipeline.core.parallel import map_parallel
 from pipeline.identification.fit import Fitted, fit_model
 from pipeline.identification.scoring import HeldOut, hold_out
 
@@ -169,23 +167,16 @@ def _take_best(
     """
     below = _scale_free(fitted)
     best: tuple[float, str, Fitted] | None = None
-    # Those of which nothing is known are tried in any case.
-    new = [name for name in hoped if hoped[name] == inf]
-    fits = dict(zip(new, map_parallel(partial(_try, problem, model, fitted, per_run), new), strict=True))
     for name in sorted(hoped, key=lambda one: -hoped[one]):
         if best is not None and best[0] >= hoped[name]:
             break
-        candidate = fits.get(name) or _try(problem, model, fitted, per_run, name)
+        candidate = fit_model(problem, fitted.model + model.effect(name), per_run=per_run, start=fitted)
         hoped[name] = below - _scale_free(candidate)
         if best is None or hoped[name] > best[0]:
             best = hoped[name], name, candidate
     if best is None:
         raise ValueError("no effect to take")
     return best[1], best[2]
-
-
-def _try(problem: Problem, model: Model, fitted: Fitted, per_run: Sequence[str], name: str) -> Fitted:
-    return fit_model(problem, fitted.model + model.effect(name), per_run=per_run, start=fitted)
 
 
 def list_rises(

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core.parallel import map_parallel
 from pipeline.identification.columns import make_columns
 from pipeline.identification.prior import NO_PRIOR, Prior
 from pipeline.identification.state import State
@@ -157,21 +156,17 @@ class Part(ABC):
             both_sides: from both sides, where bounds leave room: for the same end from every start.
         """
         columns = make_columns(residual.shape[0], len(free))
-        found = map_parallel(partial(self._differentiate, state, residual, both_sides), free)
-        for place, (number, column) in enumerate(zip(free, found, strict=True)):
-            columns[slice(None) if number.run is None else self.run == number.run, :, place] = column
+        for place, number in enumerate(free):
+            rows = slice(None) if number.run is None else self.run == number.run
+            value, (low, high) = state.get(number), number.bounds
+            above, below = value + number.step, value - number.step
+            if both_sides and low <= below and above <= high:
+                change = self._look(state, number, below) - self._look(state, number, above)
+                columns[rows, :, place] = change / (2.0 * number.step)
+            else:
+                at = above if above <= high else below
+                columns[rows, :, place] = (residual[rows] - self._look(state, number, at)) / (at - value)
         return columns
-
-    def _differentiate(self, state: State, residual: Floats, both_sides: bool, number: Free) -> Floats:  # noqa: FBT001
-        """Change of the prediction of the windows that a number acts on, shape (m, 3)."""
-        value, (low, high) = state.get(number), number.bounds
-        above, below = value + number.step, value - number.step
-        if both_sides and low <= below and above <= high:
-            change = self._look(state, number, below) - self._look(state, number, above)
-            return change / (2.0 * number.step)
-        at = above if above <= high else below
-        rows = slice(None) if number.run is None else self.run == number.run
-        return (residual[rows] - self._look(state, number, at)) / (at - value)
 
     def _look(self, state: State, number: Free, value: float) -> Floats:
         """Residuals with another value of a number: of its own run where it belongs to one."""
