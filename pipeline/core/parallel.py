@@ -6,6 +6,7 @@ one had. Where there can be none (one core, no Linux, a worker, a thread of a se
 
 from __future__ import annotations
 
+import copyreg
 import ctypes
 import io
 import os
@@ -15,7 +16,7 @@ import struct
 import sys
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -54,8 +55,9 @@ class _Beside:
             return
         _at_hand.clear()
         _spent_s[:] = [sum(_spent_s), 0.0]
-        os.kill(pid, signal.SIGKILL)
-        os.waitpid(pid, 0)
+        with suppress(ProcessLookupError, ChildProcessError):
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
         self.line.close()
         os.close(self.waiting)
         os.close(self.numbers)
@@ -179,7 +181,7 @@ def _pack(content: object, shared: Sequence[object]) -> bytes:
     stream, places = io.BytesIO(), {id(one): place for place, one in enumerate(shared)}
     pickler = pickle.Pickler(stream, protocol=5)
     pickler.persistent_id = lambda one: places.get(id(one))  # type: ignore[method-assign]
-    pickler.dispatch_table = {np.ndarray: _reduce}
+    pickler.dispatch_table = {**copyreg.dispatch_table, np.ndarray: _reduce}
     pickler.dump(content)
     return stream.getvalue()
 

@@ -195,7 +195,10 @@ class Selection:
         tried = self._try(base.ids, [proposal.state for proposal in hopeful])
         best = min((most, *(fit.loss for fit in tried)))
         self._finish(base.ids, [fit for fit in tried if fit.loss < _WORTH * best])
-        entered = [self._finished.get((base.ids, fit.state.ids)) or self._present(fit) for fit in tried]
+        entered = [
+            self._finished[base.ids, fit.state.ids] if fit.loss < _WORTH * best else self._present(fit)
+            for fit in tried
+        ]
         entered = [self._simplify(tested, base) for tested in entered]
         ranked = sorted((c for c in entered if self.is_sound(c)), key=lambda c: c.score)
         self._suggested[key] = ranked
