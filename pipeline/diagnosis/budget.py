@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from pipeline.core.parallel import measure_cpu
 from pipeline.diagnosis.errors import DiagnosisError
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ class Budget:
     """CPU time that a search may take; after it the best answer so far stands.
 
     Attributes:
-        seconds: of CPU time of this process.
+        seconds: of CPU time of this process and of what works beside it.
         tell: told what was found so far.
         was_cut: whether a search was ended by it.
     """
@@ -32,12 +32,12 @@ class Budget:
     seconds: float = math.inf
     tell: Callable[[str], None] | None = None
     was_cut: bool = False
-    _begun: float = field(default_factory=time.process_time)
+    _begun: float = field(default_factory=measure_cpu)
 
     @property
     def spent_s(self) -> float:
         """CPU time since it began [s]."""
-        return time.process_time() - self._begun
+        return measure_cpu() - self._begun
 
     def is_spent(self) -> bool:
         """Whether it is used up: whoever asks ends then."""

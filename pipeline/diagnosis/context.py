@@ -68,6 +68,14 @@ class Context:
         """Whether every run has a good gyro as heading and clock."""
         return all(comparison.has_gyro for comparison in self.problem.comparisons)
 
+    def list_shared(self) -> list[object]:
+        """Large objects that stay as they are throughout."""
+        problems = [self.problem, *([self.problem.behind_wheels] if self.has_encoders else [])]
+        return [
+            *problems,
+            *(one for problem in problems for one in (*vars(problem).values(), *problem.parts)),
+        ]
+
     @property
     def evidence(self) -> Evidence:
         """What the runs can show; every search looks at measured wheels where there are any."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.parallel import both_cores
 from pipeline.diagnosis import conclude
 from pipeline.diagnosis.budget import Budget, usual_budget
 from pipeline.diagnosis.context import prepare
@@ -95,8 +96,13 @@ def diagnose_runs(
     context = prepare(runs, vehicle, chosen.source)
     driven = sum(run.duration_s for run in runs)
     budget = Budget(usual_budget(driven) if budget_s is None else budget_s, tell)
-    ways, clocks = _explore(context, chosen.source, known, budget)
-    return _conclude(recordings, context, chosen, ways, clocks)
+    # Here once, not in each of two processes.
+    import scipy.signal  # noqa: F401, PLC0415 - heavy
+    import sklearn.ensemble  # noqa: F401, PLC0415 - heavy
+
+    with both_cores(context.list_shared()):
+        ways, clocks = _explore(context, chosen.source, known, budget)
+        return _conclude(recordings, context, chosen, ways, clocks)
 
 
 def _explore(

@@ -88,10 +88,7 @@ def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
     begun = current
     while True:
         smaller = []
-        for name in current.ids:
-            if name in selection.kept:
-                continue
-            without = selection.drop(current, [name])
+        for without in selection.drop_each(current, [[name] for name in _free(selection, current)]):
             larger = (current, begun)
             if not any(selection.prefers(without, more, price_of(more, without)) for more in larger):
                 smaller.append(without)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.core.parallel import map_parallel
 from pipeline.diagnosis.budget import Budget
 from pipeline.diagnosis.plausibility import is_nameable
 from pipeline.diagnosis.verdict import LEAST_GAIN, Verdict, compare
@@ -18,7 +20,7 @@ from pipeline.identification.proposals import propose, propose_pairs
 from pipeline.identification.weights import Weights, make_weights, measure_spread
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from pipeline.identification.folds import Fold
     from pipeline.identification.parts import Part
@@ -115,14 +117,22 @@ class Selection:
 
     def enter(self, start: State | PartFit) -> CandidateModel:
         """Fit a state, or a fit further, and hold it out."""
-        return self._present(fit_part(self.part, self.weights, start))
+        return self._enter_each([start])[0]
+
+    def _enter_each(self, starts: Sequence[State | PartFit]) -> list[CandidateModel]:
+        fitted = map_parallel(partial(_fit_held, self.part, self.weights, self.folds), starts)
+        return [CandidateModel(fit, held, self._score(held, fit.state)) for fit, held in fitted]
 
     def drop(self, current: CandidateModel, names: Iterable[str]) -> CandidateModel:
         """A model without some of its effects, fitted anew."""
-        state = current.state.drop(names)
-        if state.ids not in self._dropped:
-            self._dropped[state.ids] = self.enter(state)
-        return self._dropped[state.ids]
+        return self.drop_each(current, [names])[0]
+
+    def drop_each(self, current: CandidateModel, groups: Iterable[Iterable[str]]) -> list[CandidateModel]:
+        """A model without each group of its effects, fitted anew."""
+        states = [current.state.drop(names) for names in groups]
+        new = [state for state in states if state.ids not in self._dropped]
+        self._dropped.update(zip((state.ids for state in new), self._enter_each(new), strict=True))
+        return [self._dropped[state.ids] for state in states]
 
     def _present(self, fit: PartFit) -> CandidateModel:
         held = hold_out_part(fit, self.folds)
@@ -182,10 +192,12 @@ class Selection:
             proposals = propose_pairs(base.fit, proposals[: _count(proposals, _PAIRED)])
         hopeful = [one for one in proposals[: _count(proposals, count)] if one.loss < _HOPE * most]
         # A few steps tell which of them are worth fitting to the end.
-        tried = [self._try(base.ids, proposal.state) for proposal in hopeful]
+        tried = self._try(base.ids, [proposal.state for proposal in hopeful])
         best = min((most, *(fit.loss for fit in tried)))
+        self._finish(base.ids, [fit for fit in tried if fit.loss < _WORTH * best])
         entered = [
-            self._finish(base.ids, fit) if fit.loss < _WORTH * best else self._present(fit) for fit in tried
+            self._finished[base.ids, fit.state.ids] if fit.loss < _WORTH * best else self._present(fit)
+            for fit in tried
         ]
         entered = [self._simplify(tested, base) for tested in entered]
         ranked = sorted((c for c in entered if self.is_sound(c)), key=lambda c: c.score)
@@ -201,17 +213,16 @@ class Selection:
             self._proposed[key] = propose(self.part, base.fit, candidates, self.largest, self._columns)
         return self._proposed[key]
 
-    def _try(self, base: tuple[str, ...], state: State) -> PartFit:
-        key = (base, state.ids)
-        if key not in self._tried:
-            self._tried[key] = fit_part(self.part, self.weights, state, _FIRST_STEPS)
-        return self._tried[key]
+    def _try(self, base: tuple[str, ...], states: Sequence[State]) -> list[PartFit]:
+        new = [state for state in states if (base, state.ids) not in self._tried]
+        fits = map_parallel(partial(fit_part, self.part, self.weights, iterations=_FIRST_STEPS), new)
+        self._tried.update(zip(((base, state.ids) for state in new), fits, strict=True))
+        return [self._tried[base, state.ids] for state in states]
 
-    def _finish(self, base: tuple[str, ...], fit: PartFit) -> CandidateModel:
-        key = (base, fit.state.ids)
-        if key not in self._finished:
-            self._finished[key] = self.enter(fit)
-        return self._finished[key]
+    def _finish(self, base: tuple[str, ...], fits: Sequence[PartFit]) -> None:
+        new = [fit for fit in fits if (base, fit.state.ids) not in self._finished]
+        keys = [(base, fit.state.ids) for fit in new]
+        self._finished.update(zip(keys, self._enter_each(new), strict=True))
 
     def _simplify(self, tested: CandidateModel, base: CandidateModel) -> CandidateModel:
         """The model without what a new effect has taken the place of, or with what is left of it.
@@ -251,6 +262,14 @@ class Selection:
             delays = [one.delay for one in acting]
             acting.append(effect.of_delay(min(delays) - max(delays)))
         return any(is_nameable(one, self.evidence) for one in acting)
+
+
+def _fit_held(
+    part: Part, weights: Weights, folds: tuple[Fold, ...], start: State | PartFit
+) -> tuple[PartFit, Floats]:
+    """The fit from a start, and its held-out residuals."""
+    fit = fit_part(part, weights, start)
+    return fit, hold_out_part(fit, folds)
 
 
 def _count(proposals: list[Proposal], free: int) -> int:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.core.parallel import map_parallel
 from pipeline.diagnosis.library import is_term, list_terms, list_waves
 from pipeline.diagnosis.search import prune
 from pipeline.identification.folds import find_near
@@ -162,26 +164,32 @@ def measure_asked(selection: Selection) -> Floats:
 
 def _boost(part: Part, rest: Floats, features: Floats, channels: Sequence[int]) -> Floats:
     """What trees that have not seen a stretch predict of residuals there, shape (n, 3)."""
+    asked = [(fold, channel) for fold in range(_FOLDS) for channel in channels]
+    found = map_parallel(partial(_boost_fold, part, rest, features), asked)
+    stretch, predicted = part.number_stretches(_STRETCH_S), np.zeros(rest.shape)
+    for (fold, channel), values in zip(asked, found, strict=True):
+        predicted[stretch % _FOLDS == fold, channel] = values
+    return predicted
+
+
+def _boost_fold(part: Part, rest: Floats, features: Floats, asked: tuple[int, int]) -> Floats:
+    """What is predicted of one channel in one fold."""
     from sklearn.ensemble import HistGradientBoostingRegressor  # noqa: PLC0415 - heavy
     from threadpoolctl import threadpool_limits  # noqa: PLC0415 - heavy
 
-    stretch = part.number_stretches(_STRETCH_S)
-    predicted = np.zeros(rest.shape)
-    for fold in range(_FOLDS):
-        test = stretch % _FOLDS == fold
-        train = ~test & ~find_near(part, part, test)
-        if not test.any() or train.sum() < 50:  # noqa: PLR2004 - too few to learn from
-            continue
-        for channel in channels:
-            model = HistGradientBoostingRegressor(
-                max_iter=_TREES, learning_rate=0.1, max_leaf_nodes=10, min_samples_leaf=25,
-                l2_regularization=5.0, early_stopping=False, random_state=0,
-            )  # fmt: skip
-            # Threads that wait for each other on a busy machine cost ten times the work itself.
-            with threadpool_limits(limits=1, user_api="openmp"):
-                model.fit(features[train], rest[train, channel])
-                predicted[test, channel] = model.predict(features[test])
-    return predicted
+    fold, channel = asked
+    test = part.number_stretches(_STRETCH_S) % _FOLDS == fold
+    train = ~test & ~find_near(part, part, test)
+    if not test.any() or train.sum() < 50:  # noqa: PLR2004 - too few to learn from
+        return np.zeros(int(test.sum()))
+    model = HistGradientBoostingRegressor(
+        max_iter=_TREES, learning_rate=0.1, max_leaf_nodes=10, min_samples_leaf=25,
+        l2_regularization=5.0, early_stopping=False, random_state=0,
+    )  # fmt: skip
+    # Threads that wait for each other on a busy machine cost ten times the work itself.
+    with threadpool_limits(limits=1, user_api="openmp"):
+        model.fit(features[train], rest[train, channel])
+        return np.asarray(model.predict(features[test]), dtype=np.float64)
 
 
 def is_explainable(explainable: Explainable) -> bool:

@@ -7,11 +7,13 @@ stretch of ten seconds.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.core.parallel import map_parallel
 from pipeline.identification.parts import count_seconds
 
 if TYPE_CHECKING:
@@ -85,8 +87,13 @@ def grow_t(part: Part, weights: Weights, before: Floats, after: Floats) -> tuple
     stretch = part.number_stretches(SHORT_S)
     ends = np.flatnonzero(np.diff(stretch, append=-1)) + 1
     seconds = np.cumsum(count_seconds(part))[ends - 1]
-    t = [_find_t(part.unit[:n], stretch[:n], old[:n], new[:n], moved[:n]) for n in ends.tolist()]
+    t = map_parallel(partial(_find_t_until, (part.unit, stretch, old, new, moved)), ends.tolist())
     return seconds, np.array(t)
+
+
+def _find_t_until(known: tuple[Integers, Integers, Floats, Floats, Floats], end: int) -> float:
+    unit, stretch, old, new, moved = known
+    return _find_t(unit[:end], stretch[:end], old[:end], new[:end], moved[:end])
 
 
 def _add_up(label: Integers, values: Floats) -> Floats:

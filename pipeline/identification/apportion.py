@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 
 from pipeline.core.timegrid import nearest_indices
 from pipeline.identification.proposals import TERM
-from pipeline.identification.scoring import HeldOut, refit_folds, score_models
+from pipeline.identification.scoring import HeldOut, hold_out_models
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from pipeline.identification.judgement import Judgement
     from pipeline.identification.problem import Problem
-    from pipeline.identification.state import State
 
 Floats = NDArray[np.float64]
 Kind = Literal["effect", "disturbance", "localization_noise"]
@@ -99,20 +98,17 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
     players: dict[str, set[str]] = {}
     for name in fitted.model.ids:
         players.setdefault(UNEXPLAINED if name.startswith(TERM) else name, set()).add(name)
-    states = refit_folds(problem, fitted)
 
     def sum_stretches(held: HeldOut) -> Floats:
         return _sum_stretches(problem, held, length_scale_m)
-
-    def leave(state: State, present: Subset) -> State:
-        return state.drop([name for player in players if player not in present for name in players[player]])
 
     known = {frozenset(players): judgement.whole.held_out}
     known[frozenset()] = judgement.ladder.rungs[0].held_out
     # Models that begin alike follow each other: what they have in common is predicted once.
     asked = sorted(list_subsets(tuple(players)) - known.keys(), key=lambda one: [p in one for p in players])
-    models = [[leave(state, present) for present in asked] for state in states]
-    known |= dict(zip(asked, score_models(problem, models), strict=True))
+    dropped = [[n for player in players if player not in one for n in players[player]] for one in asked]
+    scored = hold_out_models(problem, fitted, dropped)
+    known |= dict(zip(asked, scored, strict=True))
     split = share_out(tuple(players), {one: sum_stretches(held) for one, held in known.items()})
     floor = judgement.floor
     x, y, w = floor.velocity_rms

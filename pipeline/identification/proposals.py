@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.core.parallel import map_parallel
 from pipeline.identification.columns import combine_columns, pick_columns, stack_columns, weigh_columns
 from pipeline.models.effect import Effect, Parameter, Search
 
@@ -96,24 +98,32 @@ def propose(
         largest: what relative starts are shares of.
         known: columns of formula terms: they hardly change with the rest of the model.
     """
-    found, base = [], _weigh(fit)
-    for candidate in candidates:
-        if fit.state.find(candidate.id) is not None:
-            continue
-        best: Proposal | None = None
-        if candidate.id in known:
-            trials = known[candidate.id]
-        else:
-            trials = list(list_trials(part, fit, candidate, largest))
-            if candidate.id.startswith(TERM):
-                known[candidate.id] = trials
-        for trial in trials:
-            proposal = _promise(base, (trial,))
-            if proposal is not None and (best is None or proposal.loss < best.loss):
-                best = proposal
+    waiting = [
+        (candidate, known.get(candidate.id))
+        for candidate in candidates
+        if fit.state.find(candidate.id) is None
+    ]
+    found = []
+    for best, trials in map_parallel(partial(_find_best, part, _weigh(fit), largest), waiting):
+        known |= trials
         if best is not None:
             found.append(best)
     return sorted(found, key=lambda proposal: (1.0 + proposal.trials[0].effect.price) * proposal.loss)
+
+
+def _find_best(
+    part: Part, base: _Base, largest: Largest, asked: tuple[Candidate, list[Trial] | None]
+) -> tuple[Proposal | None, dict[str, list[Trial]]]:
+    """The best start of a candidate, and its starts by id where they are worth keeping."""
+    candidate, trials = asked
+    kept: dict[str, list[Trial]] = {}
+    if trials is None:
+        trials = list(list_trials(part, base.fit, candidate, largest))
+        if candidate.id.startswith(TERM):
+            kept[candidate.id] = trials
+    proposals = (_promise(base, (trial,)) for trial in trials)
+    best = min((one for one in proposals if one is not None), key=lambda one: one.loss, default=None)
+    return best, kept
 
 
 def list_trials(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Iterator[Trial]:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.core.parallel import map_parallel
 from pipeline.core.timegrid import nearest_indices
 from pipeline.identification.folds import refit
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Collection, Iterator, Sequence
 
     from pipeline.identification.comparison import Comparison
     from pipeline.identification.fit import Fitted
@@ -79,57 +81,59 @@ def hold_out(problem: Problem, fitted: Fitted) -> HeldOut:
 
     Every free number, delays of the recording included, is fitted anew without the tested stretches.
     """
-    return score_folds(problem, refit_folds(problem, fitted))
+    return next(hold_out_models(problem, fitted, [()]))
 
 
-def refit_folds(problem: Problem, fitted: Fitted) -> tuple[State, ...]:
-    """The state of a fit repeated without each fold of the problem."""
-    states = []
-    for training in problem.training:
-        state = fitted.state
-        for part, fit, train in zip(problem.parts, fitted.fits, training, strict=True):
-            state = state.take_over(refit(part, fit, train), fit.free)
-        states.append(state)
-    return tuple(states)
-
-
-def score_folds(problem: Problem, states: Sequence[State]) -> HeldOut:
-    """Score the stretches of each fold under a state of its own.
+def hold_out_models(
+    problem: Problem, fitted: Fitted, dropped: Sequence[Collection[str]]
+) -> Iterator[HeldOut]:
+    """Score a fit without some of its effects, as `hold_out` does, for each of several such sets.
 
     Args:
         problem: the runs.
-        states: one a fold of the problem, made without its tested stretches.
+        fitted: the fit, repeated with all effects without each fold of the problem.
+        dropped: ids of effects that are then left out. A fold's models follow each other, so that what one
+            has in common with the one before is kept.
     """
-    return next(score_models(problem, [[state] for state in states]))
+    numbers = range(len(problem.training))
+    found = map_parallel(partial(_score_fold, problem, fitted, dropped), numbers)
+    for model in range(len(dropped)):
+        residuals = np.full((problem.whole.run.size, 3), np.nan)
+        reach = [np.full((2, c.horizons.number.size), np.nan) for c in problem.comparisons]
+        for fold, (rest, reached) in zip(problem.folds, found, strict=True):
+            residuals[fold.test] = rest[model]
+            for errors, (told, near) in zip(reach, reached, strict=True):
+                errors[:, told] = near[model]
+        yield summarize(problem, residuals, [one[0] for one in reach], [one[1] for one in reach])
 
 
-def score_models(problem: Problem, states: Sequence[Sequence[State]]) -> Iterator[HeldOut]:
-    """Score several models at once, as `score_folds` does each.
+def _score_fold(
+    problem: Problem, fitted: Fitted, dropped: Sequence[Collection[str]], number: int
+) -> tuple[Floats, list[tuple[Flags, Floats]]]:
+    """What the models err by in the tested stretches of a fold.
 
-    A fold's models follow each other, so that what one has in common with the one before is kept.
-
-    Args:
-        problem: the runs.
-        states: of each fold of the problem those of all models, in one order.
+    Returns:
+        Residuals of tested windows, shape (models, k, 3); of each run which predictions are tested, and their
+        errors of position and yaw, shape (models, 2, m).
     """
-    whole, count = problem.whole, len(states[0])
-    residuals = np.full((count, whole.run.size, 3), np.nan)
-    position = [np.full((count, c.horizons.number.size), np.nan) for c in problem.comparisons]
-    yaw = [np.full((count, c.horizons.number.size), np.nan) for c in problem.comparisons]
-    for fold, models in zip(problem.folds, states, strict=True):
-        for run, comparison in enumerate(problem.comparisons):
-            rows = whole.run == run
-            tested = fold.test[rows]
-            told = _find_tested(comparison, whole.times[rows], tested)
-            for model, state in enumerate(models):
-                if tested.any():
-                    residuals[model, rows & fold.test] = whole.find_run_residuals(state, run)[tested]
-                if told.any():
-                    reach = comparison.find_horizon_errors(state.effects_of(run), state.timing[run])
-                    position[run][model, told] = reach.position[told]
-                    yaw[run][model, told] = reach.yaw[told]
-    for model in range(count):
-        yield summarize(problem, residuals[model], [p[model] for p in position], [y[model] for y in yaw])
+    whole, fold, state = problem.whole, problem.folds[number], fitted.state
+    for part, fit, train in zip(problem.parts, fitted.fits, problem.training[number], strict=True):
+        state = state.take_over(refit(part, fit, train), fit.free)
+    models = [state.drop(names) for names in dropped]
+    residuals, reached = np.full((len(models), int(fold.test.sum()), 3), np.nan), []
+    for run, comparison in enumerate(problem.comparisons):
+        rows = whole.run == run
+        tested = fold.test[rows]
+        told = _find_tested(comparison, whole.times[rows], tested)
+        errors = np.full((len(models), 2, int(told.sum())), np.nan)
+        for place, model in enumerate(models):
+            if tested.any():
+                residuals[place, rows[fold.test]] = whole.find_run_residuals(model, run)[tested]
+            if told.any():
+                reach = comparison.find_horizon_errors(model.effects_of(run), model.timing[run])
+                errors[place] = reach.position[told], reach.yaw[told]
+        reached.append((told, errors))
+    return residuals, reached
 
 
 def _find_tested(comparison: Comparison, times: Floats, test: Flags) -> Flags:

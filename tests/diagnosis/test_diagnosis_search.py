@@ -119,8 +119,8 @@ class _Scores:
         self.sets = {tuple(name): _Set(tuple(name), score) for name, score in scores.items()}
         self.sets[()] = _Set((), 100.0)
 
-    def drop(self, current: _Set, names: list[str]) -> _Set:
-        return self.sets[tuple(name for name in current.ids if name not in names)]
+    def drop_each(self, current: _Set, groups: list[list[str]]) -> list[_Set]:
+        return [self.sets[tuple(name for name in current.ids if name not in names)] for names in groups]
 
     def prefers(self, before: _Set, after: _Set, least_gain: float) -> bool:
         assert least_gain >= 0.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 import keyword
 import math
@@ -54,6 +53,22 @@ _TAKEN = {"id", "note", "pi", "self", "name", "formulas", "parameters", "fixed",
 CHANNELS: Mapping[str, str] = {"v_x": "m/s", "v_y": "m/s", "v_w": "rad/s"}
 
 
+@functools.lru_cache(maxsize=1024)
+def _parse(channel: str, text: str, own: tuple[tuple[str, str], ...], where: str) -> Expression:
+    """A channel's formula with the names and units of its own numbers."""
+    units = {name: parse_unit(unit, where) for name, unit in own}
+    expression = parse_expression(text, {**_parse_signal_units(), **units}, where)
+    wanted = parse_unit(CHANNELS[channel], where)
+    if expression.unit != wanted:
+        raise MotionError(
+            "wrong_units",
+            f"{channel} = {text!r} is in {expression.unit}, not in {wanted}",
+            where=where,
+            hint="Mend the formula or the unit of a parameter.",
+        )
+    return expression
+
+
 class FormulaEffect(AddedEffect):
     """Adds formulas to the velocity, in parallel with the other ground effects.
 
@@ -90,10 +105,23 @@ class FormulaEffect(AddedEffect):
         self.formulas = dict(formulas)
         self._where = where or name
         self._check_names()
-        self.expressions = {channel: self._parse(channel, text) for channel, text in self.formulas.items()}
+        self.expressions = self._parse_all()
         self._check_parameters()
         super().__init__(fixed=fixed, **values)
         self._check_neutral()
+
+    def __getstate__(self) -> dict[str, object]:
+        """All but the parsed formulas."""
+        return {name: value for name, value in vars(self).items() if name != "expressions"}
+
+    def __setstate__(self, state: Mapping[str, object]) -> None:
+        """The same with the formulas parsed again."""
+        vars(self).update(state)
+        self.expressions = self._parse_all()
+
+    def _parse_all(self) -> dict[str, Expression]:
+        own = tuple((p.name, p.unit) for p in self.parameters)
+        return {channel: _parse(channel, text, own, self._where) for channel, text in self.formulas.items()}
 
     @property
     def key(self) -> tuple[object, ...]:
@@ -124,19 +152,11 @@ class FormulaEffect(AddedEffect):
 
     def _copy(self, values: Mapping[str, float], fixed: Iterable[str]) -> Self:
         # The formulas are parsed already: another value changes nothing about them.
-        other = copy.copy(self)
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
         other.values = self._complete(dict(values))
         other.fixed = frozenset(fixed)
         return other
-
-    def _parse(self, channel: str, text: str) -> Expression:
-        own = {p.name: parse_unit(p.unit, self._where) for p in self.parameters}
-        expression = parse_expression(text, {**_parse_signal_units(), **own}, self._where)
-        wanted = parse_unit(CHANNELS[channel], self._where)
-        if expression.unit != wanted:
-            what = f"{channel} = {text!r} is in {expression.unit}, not in {wanted}"
-            raise self._refuse("wrong_units", what, "Mend the formula or the unit of a parameter.")
-        return expression
 
     def _check_names(self) -> None:
         for name in (p.name for p in self.parameters):
