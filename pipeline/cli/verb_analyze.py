@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.analysis.options import FigureFormat, Options
 from pipeline.cli.choices import Choices, build_options, spell_choices
@@ -16,11 +16,6 @@ from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import Outcome
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(analyze)
 
 
 def analyze(  # noqa: D417 - the shared choices document themselves

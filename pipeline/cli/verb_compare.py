@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.analysis.options import FigureFormat
 from pipeline.cli.output import CLEAN, print_json, print_lines
@@ -15,11 +15,6 @@ if TYPE_CHECKING:
 
     from pipeline.analysis.compare import Answer
     from pipeline.store import Store
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(compare)
 
 
 def compare(  # noqa: D417 - arguments document themselves

@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.cli.output import CLEAN, print_json, print_lines
 
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(effects)
 
 
 def effects(  # noqa: D417 - the arguments document themselves

@@ -6,7 +6,7 @@ import json as encoder
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.cli.output import CLEAN, print_json, print_lines
 
@@ -14,11 +14,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.store import Manifest
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(explain)
 
 
 def explain(  # noqa: D417 - arguments document themselves

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.cli.model_trust import TrustCode, open_model
 from pipeline.cli.output import CLEAN, print_json, print_lines
@@ -21,11 +21,6 @@ _SUFFIXES = {
     "foxglove-layout": "_foxglove.json",
     "plotjuggler-layout": "_plotjuggler.xml",
 }
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(export)
 
 
 def export(

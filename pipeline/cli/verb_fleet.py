@@ -24,12 +24,12 @@ Results = Annotated[Path, Parameter(help="results folder")]
 Out = Annotated[Path | None, Parameter(help="the same as RESULTS")]
 
 
-def register(app: App) -> None:
-    """Add the verb and its own verbs."""
+def build() -> App:
+    """The verb and its own verbs."""
     fleet = App(name="fleet", help="Numbers of vehicles by level: the vehicle's, the ground's, a run's own.")
     for command in (fit, show):
         fleet.command(command)
-    app.command(fleet)
+    return fleet
 
 
 def fit(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.cli.choices import Choices, build_options
 from pipeline.cli.output import CLEAN, LOSSY, print_json, print_lines
@@ -20,11 +20,6 @@ if TYPE_CHECKING:
 _OTHER_CLOCK_S = 3600.0
 """Stamps further from the log time are of another clock: simulated time, time since boot, time never set."""
 _ROLES = ("command", "wheels", "pose", "imu", "interval")
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(inspect)
 
 
 def inspect(  # noqa: D417 - the shared choices document themselves

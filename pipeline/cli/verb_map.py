@@ -18,15 +18,15 @@ _OWN = Path("deployments.csv")
 _FEATURES_MEMORY = "2GB"
 
 
-def register(app: App) -> None:
-    """Add the verb and its two commands."""
+def build() -> App:
+    """The verb and its two commands."""
     verb = App(
         name="map", help="Draw deployments by kinetic energy and terrain complexity, own runs on them."
     )
     verb.default(draw)
     verb.command(add)
     verb.command(merge)
-    app.command(verb)
+    return verb
 
 
 def draw(  # noqa: D417 - arguments document themselves

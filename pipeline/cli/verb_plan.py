@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.choices import Choices, build_options
@@ -32,11 +32,6 @@ if TYPE_CHECKING:
     from pipeline.plan import Needed, Plan
     from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(plan)
 
 
 def plan(  # noqa: D417 - the runs document themselves

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.cli.output import CLEAN, print_json, print_lines
 
@@ -18,11 +18,6 @@ _WORDS = (
     ("t_mrmse_m", "error over 2 s", "m"),
     ("ideal_t_mrmse_m", "of the ideal model", "m"),
 )
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(predict)
 
 
 def predict(

@@ -5,14 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.cli.output import CLEAN, print_json, print_lines
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(share)
 
 
 def share(  # noqa: D417 - arguments document themselves

@@ -5,16 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.output import CLEAN, print_json, print_lines
 from pipeline.core.errors import SlipError
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(simulate)
 
 
 def simulate(  # noqa: D417 - arguments document themselves

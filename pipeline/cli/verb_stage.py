@@ -5,15 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.cli.choices import Choices, build_options
 from pipeline.cli.output import CLEAN, LOSSY, print_json, print_lines, show_progress
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(stage)
 
 
 def stage(  # noqa: D417 - the shared choices document themselves

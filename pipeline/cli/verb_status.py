@@ -6,7 +6,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.cli.output import CLEAN, FAILED, describe_error, print_json, print_lines
 from pipeline.cli.results_place import open_results
@@ -21,11 +21,6 @@ _WORDS = {
     "quarantined": "quarantined",
     "copy": "copies",
 }
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(status)
 
 
 def status(  # noqa: D417 - arguments document themselves

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 from cyclopts.types import NonNegativeFloat
 
 from pipeline.cli.output import CLEAN, print_json, print_lines
@@ -16,11 +16,6 @@ if TYPE_CHECKING:
     from pipeline.analysis.trend import Trend
 
 ALERT = 4
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(trend)
 
 
 def trend(  # noqa: D417 - arguments document themselves

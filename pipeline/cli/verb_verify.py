@@ -6,18 +6,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.cli.output import CLEAN, FAILED, print_json, print_lines, show_progress
 from pipeline.cli.results_place import open_results
 
 if TYPE_CHECKING:
     from pipeline.batch.verification import Verification
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(verify)
 
 
 def verify(  # noqa: D417 - arguments document themselves

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import altair as alt
 
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.scales import find_range
 from pipeline.report.words import say_number
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pipeline.report.scene import Scene
 
 
-def draw_modulus(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """One line an input; gaps are left open, stretches after a change of command shaded."""
     lines = scene.modulus_lines
     if lines is None:
@@ -43,7 +43,7 @@ def draw_modulus(scene: Scene) -> Drawing | None:
     )
 
 
-def describe_modulus(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """Median, highest value and its time for each input."""
     told = []
     for name, frame in scene.sound_slip.items():
@@ -55,12 +55,4 @@ def describe_modulus(scene: Scene) -> str:
     return "Slip modulus over time: " + "; ".join(told) + "."
 
 
-FIGURE = Figure(
-    id="modulus",
-    title="Slip over time",
-    section=Section.HOW_BAD,
-    order=10,
-    width=Width.FULL,
-    draw=draw_modulus,
-    describe=describe_modulus,
-)
+FIGURE = Figure("Slip over time", Section.HOW_BAD, draw, describe, order=10, width="full")
