@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from pipeline.analysis.compared_runs import ComparedRuns
     from pipeline.fleet.hierarchy import FleetModel, FleetNumber
-    from pipeline.fleet.statistics import Interval
+    from pipeline.fleet.statistics.intervals import Interval
     from pipeline.store import Store
 
 FLEET = "fleet.json"

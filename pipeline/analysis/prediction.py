@@ -13,9 +13,10 @@ import polars as pl
 from pipeline.analysis.diagnosis import read_length_scale
 from pipeline.analysis.errors import JobError
 from pipeline.analysis.fleet import find_estimates
-from pipeline.fleet import read_day
+from pipeline.fleet.datasets import read_day
 from pipeline.fleet.forecast import DRAWS, make_effects
-from pipeline.fleet.statistics import Interval, draw_run
+from pipeline.fleet.statistics.intervals import Interval
+from pipeline.fleet.statistics.posterior import draw_run
 from pipeline.identification.comparison import Comparison, Input
 from pipeline.identification.predict import predict_at_from, predict_from
 from pipeline.models.catalogue import find_effect

@@ -28,7 +28,7 @@ A name that begins with a dash goes behind --, after all options.
 
 
 def build_app() -> App:
-    """The program with every verb found in this folder; a verb is the function of its module's name, or what `build` makes."""
+    """The program with every verb of the folder: the function of the module's name, or what `build` makes."""
     app = App(
         name="slip",
         help=HELP,

@@ -104,6 +104,17 @@ def print_json(content: Mapping[str, object]) -> None:
     sys.stdout.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
+def print_result(
+    content: Mapping[str, object], lines: Iterable[str], *, json: bool, quiet: bool = False
+) -> int:
+    """Print what a verb found, as one JSON object or as lines for people; the exit code of success."""
+    if json:
+        print_json(content)
+    elif not quiet:
+        print_lines(lines)
+    return CLEAN
+
+
 def print_error(error: SlipError) -> None:
     """One line on stderr."""
     say(f"slip: {' '.join(str(error).split())}")

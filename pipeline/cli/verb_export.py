@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from pipeline.cli.model_trust import TrustCode, open_model
-from pipeline.cli.output import CLEAN, print_json, print_lines
+from pipeline.cli.output import print_result
 from pipeline.core.paths import resolve_inside
 
 if TYPE_CHECKING:
@@ -69,12 +69,10 @@ def export(
             "plotjuggler-layout": exports.write_plotjuggler_layout,
         }[to]
         written = [write(source, path)]
-    if json:
-        left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
-        print_json({"run": manifest.run, "to": to, "files": [str(each) for each in written], **left_out})
-    elif not quiet:
-        print_lines(str(each) for each in written)
-    return CLEAN
+    files = [str(each) for each in written]
+    left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
+    content = {"run": manifest.run, "to": to, "files": files, **left_out}
+    return print_result(content, files, json=json, quiet=quiet)
 
 
 def _find_named(manifest: Manifest) -> tuple[Model | None, str | None]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from pipeline.cli.choices import Choices, build_options
-from pipeline.cli.output import CLEAN, LOSSY, print_json, print_lines
+from pipeline.cli.output import CLEAN, LOSSY, print_result
 from pipeline.core.durations import say_duration
 
 if TYPE_CHECKING:
@@ -38,10 +38,7 @@ def inspect(  # noqa: D417 - the shared choices document themselves
 
     options = build_options(choices)
     seen = inspect_log(log, config=options.config, overrides=options.overrides)
-    if json:
-        print_json(_as_json(seen))
-    else:
-        print_lines(_describe(seen))
+    print_result(_as_json(seen), _describe(seen), json=json)
     return LOSSY if seen.losses else CLEAN
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from pipeline.cli.choices import Choices, build_options
-from pipeline.cli.output import CLEAN, LOSSY, print_json, print_lines, show_progress
+from pipeline.cli.output import CLEAN, LOSSY, print_result, show_progress
 
 
 def stage(  # noqa: D417 - the shared choices document themselves
@@ -37,11 +37,9 @@ def stage(  # noqa: D417 - the shared choices document themselves
     with show_progress(path.name, quiet=quiet or json) as progress:
         outcome = analyze_log(Path(path), options, progress)
     tables = {table: entry.rows for table, entry in sorted(outcome.manifest.tables.items())}
-    if json:
-        print_json({"run": outcome.manifest.run, "computed": list(outcome.computed), "rows": tables})
-    elif not quiet:
-        done = ", ".join(outcome.computed) or "nothing: all is as before"
-        print_lines([f"run       {outcome.manifest.run}", f"computed  {done}"])
-        print_lines(f"  {table:<12}{rows:>9} rows" for table, rows in tables.items())
-        print_lines([f"in        {outcome.manifest.folder}"])
+    content = {"run": outcome.manifest.run, "computed": list(outcome.computed), "rows": tables}
+    done = ", ".join(outcome.computed) or "nothing: all is as before"
+    lines = [f"run       {outcome.manifest.run}", f"computed  {done}"]
+    lines += [f"  {table:<12}{rows:>9} rows" for table, rows in tables.items()]
+    print_result(content, [*lines, f"in        {outcome.manifest.folder}"], json=json, quiet=quiet)
     return LOSSY if outcome.lossy else CLEAN

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from pipeline.cli.output import CLEAN, FAILED, describe_error, print_json, print_lines
+from pipeline.cli.output import CLEAN, FAILED, describe_error, print_result
 from pipeline.cli.results_place import open_results
 
 if TYPE_CHECKING:
@@ -38,10 +38,7 @@ def status(  # noqa: D417 - arguments document themselves
     from pipeline.batch.status import tell_status  # noqa: PLC0415 - only for this verb
 
     found = tell_status(open_results(results or out).open_store())
-    if json:
-        print_json(_as_json(found))
-    else:
-        print_lines(_describe(found))
+    print_result(_as_json(found), _describe(found), json=json)
     return FAILED if found.errors else CLEAN
 
 

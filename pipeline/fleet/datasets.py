@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.fleet.statistics import bound_typical
+from pipeline.fleet.statistics.intervals import bound_typical
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.fleet.statistics import Interval
+    from pipeline.fleet.statistics.intervals import Interval
 
 OVER_RUNS = "over runs"
 THIS_RUN = "this run only"

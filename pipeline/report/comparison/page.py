@@ -16,7 +16,9 @@ from pipeline.report.run import INPUT_WORDS
 from pipeline.report.words import MISSING, say_distance, say_number
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
+
+    from pipeline.fleet.tables import Answer
 
 _LEVEL = 0.05
 _ABOUT_PAIRS = (
@@ -47,68 +49,38 @@ _PAIRS = (
 )  # fmt: skip
 
 
-def render_comparison(
-    *,
-    datasets: pl.DataFrame,
-    comparisons: pl.DataFrame,
-    runs: pl.DataFrame,
-    intervals: pl.DataFrame,
-    windows: pl.DataFrame,
-    input_name: str,
-    quantity: str,
-    notes: Sequence[str],
-) -> str:
-    """The whole page as HTML.
-
-    Args:
-        datasets: table `datasets`.
-        comparisons: table `comparisons`.
-        runs: one row a run and input.
-        intervals: ``dataset``, ``value``, ``low``, ``high``, ``interval`` of what was compared.
-        windows: as of `spread_windows`.
-        input_name: what u was in the comparisons.
-        quantity: what was compared, a column of `datasets`.
-        notes: what must be known.
-    """
-    shown = datasets.filter(pl.col("input") == input_name)
+def render_comparison(answer: Answer) -> str:
+    """The whole page as HTML."""
+    shown = answer.datasets.filter(pl.col("input") == answer.input)
     facts = [
         f"{shown.height} datasets",
         f"{shown['runs'].sum()} runs",
-        f"slip {INPUT_WORDS[input_name]}",
-        "as published" if quantity == "published_norm" else "median modulus",
+        f"slip {INPUT_WORDS[answer.input]}",
+        "as published" if answer.quantity == "published_norm" else "median modulus",
     ]
     return render_figures(
         "report/templates/comparison.html",
-        list_pictures(runs, intervals, windows, input_name=input_name, quantity=quantity),
+        list_pictures(answer),
         title="Deployments compared",
         facts=facts,
-        verdict=_say_verdict(comparisons),
-        datasets=_tabulate_datasets(shown, input_name),
-        pairs=_tabulate_pairs(comparisons),
+        verdict=_say_verdict(answer.comparisons),
+        datasets=_tabulate_datasets(shown, answer.input),
+        pairs=_tabulate_pairs(answer.comparisons),
         difficulty=tabulate_difficulty(shown),
         swaps=list_contradictions(shown),
         measures=list(MEASURES.values()),
         orders=list(dict.fromkeys(one.text for one in compare_orders(shown))),
-        notes=notes,
+        notes=answer.notes,
         counted=shown.select("dataset", "keys").to_dicts(),
     )
 
 
-def list_pictures(
-    runs: pl.DataFrame, intervals: pl.DataFrame, windows: pl.DataFrame, *, input_name: str, quantity: str
-) -> list[Picture]:
-    """The published figure and the honest one.
-
-    Args:
-        runs: one row a run and input.
-        intervals: ``dataset``, ``value``, ``low``, ``high``, ``interval`` of what was compared.
-        windows: as of `spread_windows`.
-        input_name: what u was.
-        quantity: column of the run medians.
-    """
-    boxes = windows.filter(pl.col("input") == input_name)
-    own = runs.filter(pl.col("input") == input_name)
-    published = quantity == "published_norm"
+def list_pictures(answer: Answer) -> list[Picture]:
+    """The published figure and the honest one."""
+    input_name = answer.input
+    boxes = answer.windows.filter(pl.col("input") == input_name)
+    own = answer.runs.filter(pl.col("input") == input_name)
+    published = answer.quantity == "published_norm"
     pictures = []
     if not boxes.is_empty():
         words = "of the published chain" if published else INPUT_WORDS[input_name]
@@ -117,14 +89,14 @@ def list_pictures(
         pictures.append(
             Picture("window_norms_by_dataset", "The published figure", drawing, f"Medians in m/s: {told}.")
         )
-    rated = intervals.filter(pl.col("value").is_not_null()).sort("value")
+    rated = answer.intervals.filter(pl.col("value").is_not_null()).sort("value")
     if not rated.is_empty():
         title = (
             "window norm of the published chain [m/s]"
             if published
             else f"median slip modulus {INPUT_WORDS[input_name]} [m/s]"
         )
-        drawing = draw_runs(own, rated, value=quantity, title=title)
+        drawing = draw_runs(own, rated, value=answer.quantity, title=title)
         told = ", ".join(f"{row['dataset']} {row['value']:.3g}" for row in rated.iter_rows(named=True))
         pictures.append(Picture("run_medians_by_dataset", "The honest figure", drawing, f"In m/s: {told}."))
     return pictures
