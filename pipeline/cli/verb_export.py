@@ -52,21 +52,27 @@ def export(
         quiet: print nothing.
     """
     from pipeline.analysis.lookup import find_run  # noqa: PLC0415 - heavy
-    from pipeline.report import exports  # noqa: PLC0415 - heavy
+    from pipeline.report.exports.csv import write_csv  # noqa: PLC0415 - heavy
+    from pipeline.report.exports.derived import write_derived_log  # noqa: PLC0415
+    from pipeline.report.exports.layouts import (  # noqa: PLC0415
+        write_foxglove_layout,
+        write_plotjuggler_layout,
+    )
+    from pipeline.report.exports.source import ExportSource  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     manifest = find_run(run, Store(out))
     known = None if model is None else open_model(model, trust_code=trust_code)
     chosen, named_on = _find_named(manifest) if known is None else (known.model, None)
-    source = exports.ExportSource(manifest, chosen, input or named_on, frame)
+    source = ExportSource(manifest, chosen, input or named_on, frame)
     path = file or resolve_inside(Path(), manifest.run.replace("/", "_") + _SUFFIXES[to])
     if to == "csv":
-        written = exports.write_csv(source, path)
+        written = write_csv(source, path)
     else:
         write = {
-            "mcap": exports.write_derived_log,
-            "foxglove-layout": exports.write_foxglove_layout,
-            "plotjuggler-layout": exports.write_plotjuggler_layout,
+            "mcap": write_derived_log,
+            "foxglove-layout": write_foxglove_layout,
+            "plotjuggler-layout": write_plotjuggler_layout,
         }[to]
         written = [write(source, path)]
     files = [str(each) for each in written]

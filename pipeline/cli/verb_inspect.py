@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _OTHER_CLOCK_S = 3600.0
 """Stamps further from the log time are of another clock: simulated time, time since boot, time never set."""
+_LOSS = ("kind", "bytes", "chunks", "start_ns", "end_ns", "text")
 _ROLES = ("command", "wheels", "pose", "imu", "interval")
 
 
@@ -54,17 +55,7 @@ def _as_json(seen: Inspection) -> dict[str, object]:
         "chunks": index.chunk_count,
         "compressions": list(index.compressions),
         "complete": not seen.losses,
-        "losses": [
-            {
-                "kind": loss.kind,
-                "bytes": loss.bytes,
-                "chunks": loss.chunks,
-                "start_ns": loss.start_ns,
-                "end_ns": loss.end_ns,
-                "text": loss.text,
-            }
-            for loss in seen.losses
-        ],
+        "losses": [{name: getattr(loss, name) for name in _LOSS} for loss in seen.losses],
         "unchecked": seen.unchecked or None,
         "notes": list(seen.notes),
         "metadata": {name: dict(record) for name, record in index.metadata.items()},

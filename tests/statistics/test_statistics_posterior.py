@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.fleet.statistics.errors import StatisticsError
+from pipeline.fleet.statistics.arrays import StatisticsError
 from pipeline.fleet.statistics.posterior import draw_run
 
 GROUPS = ("asphalt", "gravel", "ice")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.fleet.measures import MEASURES
-from pipeline.fleet.statistics.orders import kendall_tau, list_swaps
+from pipeline.fleet.statistics.ranks import kendall_tau, list_swaps
 from pipeline.report.elements import Cell, Column, Table
 from pipeline.report.words import MISSING, say_number
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from pipeline.report.run import mapping_in
 
 if TYPE_CHECKING:
-    from pipeline.report.sections.page import Page
+    from pipeline.report.sections import Page
 
 
 def view_provenance(page: Page) -> dict[str, object]:
