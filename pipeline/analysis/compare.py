@@ -11,8 +11,7 @@ import polars as pl
 from pipeline.analysis.compared_runs import ComparedRuns, find_material, keep_runs
 from pipeline.analysis.errors import JobError
 from pipeline.analysis.samples import follow_published_runs, read_moduli, read_norms
-from pipeline.fleet.boxes import spread_windows
-from pipeline.fleet.datasets import OVER_RUNS, THIS_RUN, pool_runs
+from pipeline.fleet.datasets import OVER_RUNS, THIS_RUN, pool_runs, spread_windows
 from pipeline.fleet.pairs import Group, bound_run, compare_groups
 from pipeline.fleet.runs import add_measures, gather_runs, measure_difficulty
 from pipeline.fleet.statistics.intervals import bound_typical

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -50,9 +51,8 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         quiet: print no progress and no summary.
     """
     trust_named(model, wanted=trust_code)
-    options = build_options(
-        choices, report=report, diagnosis=diagnosis, figures=figures, force=force, model=model
-    )
+    options = build_options(choices)
+    options = replace(options, report=report, diagnosis=diagnosis, figures=figures, force=force, model=model)
     outcomes: list[Outcome] = []
     errors: list[dict[str, str]] = []
 

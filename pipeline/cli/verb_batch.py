@@ -86,7 +86,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
     if quota is not None and not prune:
         raise SlipError("quota_alone", "--quota does nothing by itself", hint="Add --prune, or leave it out")
     pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
-    options = build_options(choices, report=reports, diagnosis=diagnosis, force=force)
+    options = replace(build_options(choices), report=reports, diagnosis=diagnosis, force=force)
     place = open_results(choices.out)
     if not logs:
         place.open_store()

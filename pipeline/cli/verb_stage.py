@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -32,7 +33,7 @@ def stage(  # noqa: D417 - the shared choices document themselves
     from pipeline.analysis.analyze import analyze_log  # noqa: PLC0415 - heavy
     from pipeline.analysis.lookup import find_log  # noqa: PLC0415 - heavy
 
-    options = build_options(choices, force=force, through=name)
+    options = replace(build_options(choices), force=force, through=name)
     path = find_log(log, options.out)
     with show_progress(path.name, quiet=quiet or json) as progress:
         outcome = analyze_log(Path(path), options, progress)

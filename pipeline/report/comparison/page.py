@@ -8,7 +8,7 @@ import polars as pl
 
 from pipeline.core.durations import say_duration
 from pipeline.fleet.measures import MEASURES, compare_orders
-from pipeline.report.comparison.difficulty import list_contradictions, tabulate_difficulty
+from pipeline.fleet.statistics.ranks import kendall_tau, list_swaps
 from pipeline.report.comparison.figures import draw_boxes, draw_runs
 from pipeline.report.elements import Cell, Column, Picture, Table
 from pipeline.report.page import render_figures
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from pipeline.fleet.tables import Answer
 
 _LEVEL = 0.05
+_MOST_SWAPS = 4
+_FEWEST = 2
 _ABOUT_PAIRS = (
     "Whole runs are permuted where a side has several, blocks where each side is one run; p corrected over "
     "all pairs of the same unit"
@@ -179,3 +181,56 @@ def _say_ends(row: Mapping[str, object]) -> str:
     if not isinstance(low, float) or not isinstance(high, float):
         return MISSING
     return f"{say_number(low)}\u00a0to\u00a0{say_number(high)}"
+
+
+def tabulate_difficulty(shown: pl.DataFrame) -> Table:
+    """Values and ranks of every measure, and how far each agrees with the modulus.
+
+    Args:
+        shown: table `datasets` of one input.
+    """
+    rated = _rate(shown)
+    columns = [measure.column for measure in MEASURES.values()]
+    ranks = {column: rated[column].rank("min") for column in columns}
+    rows: list[list[str | Cell]] = [
+        [
+            str(row["dataset"]),
+            *(
+                Cell(
+                    say_number(row[column]),
+                    small=f"({int(ranks[column][i])})" if row[column] is not None else "",
+                )
+                for column in columns
+            ),
+        ]
+        for i, row in enumerate(rated.iter_rows(named=True))
+    ]
+    both = {column: rated.drop_nulls(column) for column in columns}
+    agreement = (
+        MISSING
+        if pair.height < _FEWEST
+        else f"{kendall_tau(pair['median_modulus'].to_numpy(), pair[column].to_numpy()):.2f}"
+        for column, pair in both.items()
+    )
+    rows.append([Cell("agreement with the modulus (Kendall)", tag="i"), *agreement])
+    head = [Column("dataset"), *(Column(one.name, one.unit, number=True) for one in MEASURES.values())]
+    return Table("Median over runs and, in brackets, the rank from easy to hard", head, rows)
+
+
+def list_contradictions(shown: pl.DataFrame) -> list[str]:
+    """Pairs of datasets that a measure orders otherwise than the modulus does, in words."""
+    told = []
+    for measure in MEASURES.values():
+        both = _rate(shown).drop_nulls(measure.column)
+        if both.height >= _FEWEST:
+            swaps = list_swaps(both["median_modulus"].to_numpy(), both[measure.column].to_numpy())
+            told += [
+                f"{both['dataset'][i]} slips more than {both['dataset'][j]} by modulus, "
+                f"but less by {measure.name}"
+                for i, j in swaps[:_MOST_SWAPS]
+            ]
+    return told
+
+
+def _rate(shown: pl.DataFrame) -> pl.DataFrame:
+    return shown.drop_nulls("median_modulus").sort("median_modulus")
