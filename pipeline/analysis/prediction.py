@@ -195,7 +195,11 @@ def _load_runs(store: Store, forecast: Forecast) -> list[_Driven]:
         JobError: ``nothing_to_drive``: no run has the input.
     """
     named = find_estimates(store).filter(pl.col("named"), pl.col("input").cast(pl.String) == forecast.input)
-    newest = [name for side in (forecast.here, forecast.elsewhere) for name in sorted(side, key=_date)[::-1]]
+    newest = [
+        name
+        for side in (forecast.here, forecast.elsewhere)
+        for name in sorted(side, key=lambda run: read_day(run) or "")[::-1]
+    ]
     runs: list[_Driven] = []
     for name in newest:
         manifest = store.manifest(name)
@@ -211,10 +215,6 @@ def _load_runs(store: Store, forecast: Forecast) -> list[_Driven]:
             hint="Choose the other input.",
         )
     return runs
-
-
-def _date(run: str) -> str:
-    return read_day(run) or ""
 
 
 def _load_run(manifest: Manifest, named: pl.DataFrame, source: Input) -> _Driven:

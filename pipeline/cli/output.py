@@ -10,6 +10,8 @@ import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from pipeline.analysis.options import STAGE_WORDS
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
@@ -20,16 +22,7 @@ FAILED = 1
 USAGE = 2
 LOSSY = 3
 
-_DOING = {
-    "read": "reading the log",
-    "extract": "extracting commands and poses",
-    "align": "putting clocks and scales right",
-    "velocity": "differentiating poses",
-    "slip": "computing slip",
-    "aggregate": "aggregating",
-    "diagnosis": "looking for missing effects",
-    "report": "drawing the report",
-}
+_DOING = {**STAGE_WORDS, "diagnosis": "looking for missing effects"}
 
 
 # Control characters, line ends, marks that turn the direction of writing, and bytes that are no text.

@@ -292,12 +292,9 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
             for one in checked.kept
         ]
         rows += [f"open      {text}" for text in checked.open]
-        print_lines([*(rows or ["the plan promised nothing"]), *_next_lines(diagnosis, following)])
+        rows = rows or ["the plan promised nothing"]
+        print_lines([*rows, f"next      {following}"] if diagnosis.undecided else rows)
     return LOSSY if lossy else CLEAN
-
-
-def _next_lines(diagnosis: RunDiagnosis, following: str) -> list[str]:
-    return [f"next      {following}"] if diagnosis.undecided else []
 
 
 def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path]) -> list[str]:

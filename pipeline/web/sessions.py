@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.batch.work import Report, Task
-    from pipeline.models.formula import FormulaEffect
     from pipeline.store import Manifest
     from pipeline.web.limits import Limits
     from pipeline.web.places import Places
@@ -132,7 +131,11 @@ class Sessions:
             "add_named": lambda: self._add_named(file, prepared, session, ask),
             "add_found": lambda: self._add_found(file, prepared, session, ask),
             "formula": lambda: actions.add_effect(
-                file, prepared, session, _read_formula(ask), anyway=ask.anyway
+                file,
+                prepared,
+                session,
+                make_formula(ask.effect, ask.channel, ask.formula, ask.parameters),
+                anyway=ask.anyway,
             ),
             "drop": lambda: actions.drop_effect(file, prepared, session, ask.effect),
             "switch": lambda: actions.switch_effect(file, prepared, session, ask.effect),
@@ -213,7 +216,3 @@ class Sessions:
                     self._figures.popitem(last=False)
             self._figures.move_to_end(key)
             return self._figures[key]
-
-
-def _read_formula(ask: Ask) -> FormulaEffect:
-    return make_formula(ask.effect, ask.channel, ask.formula, ask.parameters)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.report import theme
-from pipeline.report.errors import ReportError
+from pipeline.report.errors import writing_export
 from pipeline.report.exports import topics
 from pipeline.report.run import INPUT_WORDS
 
@@ -168,15 +168,8 @@ def write_text(path: Path, text: str) -> Path:
         ReportError: ``export_not_written``.
     """
     part = path.with_name(f".{path.name}.part")
-    try:
+    with writing_export(where=path):
         path.parent.mkdir(parents=True, exist_ok=True)
         part.write_text(text, encoding="utf-8")
         part.replace(path)
-    except OSError as error:
-        raise ReportError(
-            "export_not_written",
-            f"cannot be written: {error.strerror}",
-            where=str(path),
-            hint="Choose another place with --out.",
-        ) from error
     return path

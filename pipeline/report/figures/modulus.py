@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import altair as alt
-
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS
@@ -22,17 +20,8 @@ def draw(scene: Scene) -> Drawing | None:
     if lines is None:
         return None
     shown = find_range(lines.frame, lines.usual)
-    line = (
-        alt.Chart(alt.NamedData("modulus"))
-        .mark_line(clip=True, order=False)
-        .encode(
-            x=parts.time_axis(scene),
-            y=parts.value_axis(shown),
-            color=parts.series_colour(list(scene.slip), INPUT_WORDS),
-        )
-    )
-    chart = alt.layer(*parts.shade_spans(), line).properties(
-        width=parts.WIDTH,
+    colour = parts.series_colour(list(scene.slip), INPUT_WORDS)
+    chart = parts.draw_lines(scene, ["modulus"], shown, colour).properties(
         height=150,
         title=parts.title_panel("slip modulus", "m/s", shown),
         usermeta=parts.brush_over_time(),

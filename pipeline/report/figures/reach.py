@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import altair as alt
 import polars as pl
 
 from pipeline.report.figures import parts
@@ -25,17 +24,8 @@ def draw(scene: Scene) -> Drawing | None:
     rows = list_reach(scene)
     ends = usual_ends(motion.reach["ideal"], exact=False)
     shown = find_range(rows["reach"], (ends[0], ends[1]))
-    line = (
-        alt.Chart(alt.NamedData("reach"))
-        .mark_line(clip=True, order=False)
-        .encode(
-            x=parts.time_axis(scene),
-            y=parts.value_axis(shown),
-            color=parts.before_and_after(motion.input),
-        )
-    )
-    chart = alt.layer(*parts.shade_spans(), line).properties(
-        width=parts.WIDTH,
+    colour = parts.before_and_after(motion.input)
+    chart = parts.draw_lines(scene, ["reach"], shown, colour).properties(
         height=130,
         title=parts.title_panel("error of a 2 s prediction", "m", shown),
         usermeta=parts.brush_over_time(),

@@ -46,17 +46,9 @@ def _draw_panel(scene: Scene, component: str, lines: Thinned) -> Picture:
     last = component == COMPONENTS[-1]
     series = [*scene.slip, "velocity", *(["model"] if scene.report.motion else [])]
     names = [f"velocity_{component}", *([f"model_{component}"] if scene.report.motion else [])]
-    drawn = [
-        alt.Chart(alt.NamedData(name))
-        .mark_line(clip=True, order=False)
-        .encode(
-            x=parts.time_axis(scene) if last else parts.time_axis(scene, title=None),
-            y=parts.value_axis(shown),
-            color=parts.series_colour(series, parts.SERIES_WORDS),
-        )
-        for name in names
-    ]
-    return alt.layer(*parts.shade_spans(), *drawn).properties(width=parts.WIDTH, height=118, title=title)
+    colour = parts.series_colour(series, parts.SERIES_WORDS)
+    x = parts.time_axis(scene) if last else parts.time_axis(scene, title=None)
+    return parts.draw_lines(scene, names, shown, colour, x).properties(height=118, title=title)
 
 
 def model_rows(scene: Scene) -> dict[str, pl.DataFrame]:
