@@ -103,5 +103,5 @@ def trusted(*, json: bool = False) -> int:
 def _print(codes: dict[str, str], otherwise: str, *, json: bool) -> int:
     content = {"code": [{"sha256": code, "name": name} for code, name in codes.items()]}
     return print_result(
-        content, [f"{code}  {name}" for code, name in codes.items()] or [otherwise], json=json
+        content, lambda: [f"{code}  {name}" for code, name in codes.items()] or [otherwise], json=json
     )

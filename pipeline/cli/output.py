@@ -98,13 +98,13 @@ def print_json(content: Mapping[str, object]) -> None:
 
 
 def print_result(
-    content: Mapping[str, object], lines: Iterable[str], *, json: bool, quiet: bool = False
+    content: Mapping[str, object], describe: Callable[[], Iterable[str]], *, json: bool, quiet: bool = False
 ) -> int:
     """Print what a verb found, as one JSON object or as lines for people; the exit code of success."""
     if json:
         print_json(content)
     elif not quiet:
-        print_lines(lines)
+        print_lines(describe())
     return CLEAN
 
 

@@ -64,7 +64,7 @@ def compare(  # noqa: D417 - arguments document themselves
     answer = compare_results(store, Question(by=names, input=fed, as_published=as_published))
     written = write_answer(store, answer, figures)
     content = {**describe_answer(answer), "page": str(written["comparison.html"])}
-    return print_result(content, _describe(answer, written), json=json, quiet=quiet)
+    return print_result(content, lambda: _describe(answer, written), json=json, quiet=quiet)
 
 
 def _compare_causes(
@@ -96,7 +96,7 @@ def _compare_causes(
         lines += [str(one["sentence"]), *([f"  {one['note']}"] if one["note"] else [])]
     page = str(written["causes.html"])
     lines += ["", *(f"! {note}" for note in found.notes), f"page    {page}"]
-    return print_result({**content, "page": page}, lines, json=json, quiet=quiet)
+    return print_result({**content, "page": page}, lambda: lines, json=json, quiet=quiet)
 
 
 def _describe(answer: Answer, written: Mapping[str, Path]) -> list[str]:

@@ -31,7 +31,7 @@ def effects(  # noqa: D417 - the arguments document themselves
     chosen = list_effects() if effect is None else (find_effect(effect),)
     pages = list_pages(chosen) if effect is None else [describe_effect(chosen[0])]
     content = {"effects": [_as_json(item) for item in chosen]}
-    return print_result(content, "\n".join(pages).split("\n"), json=json, quiet=quiet)
+    return print_result(content, lambda: "\n".join(pages).split("\n"), json=json, quiet=quiet)
 
 
 def _as_json(effect: type[Effect]) -> dict[str, object]:

@@ -37,7 +37,7 @@ def explain(  # noqa: D417 - arguments document themselves
     about = _describe_column(column) if column else {}
     content = {"run": manifest.run, "key": manifest.key, **manifest.details, "column": about or None}
     told = ["", f"{column}: " + ", ".join(f"{key} {value}" for key, value in about.items())] if about else []
-    return print_result(content, [] if json else [*_describe(manifest), *told], json=json)
+    return print_result(content, lambda: [*_describe(manifest), *told], json=json)
 
 
 def _describe_column(column: str) -> dict[str, str]:

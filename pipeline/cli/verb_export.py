@@ -78,7 +78,7 @@ def export(
     files = [str(each) for each in written]
     left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
     content = {"run": manifest.run, "to": to, "files": files, **left_out}
-    return print_result(content, files, json=json, quiet=quiet)
+    return print_result(content, lambda: files, json=json, quiet=quiet)
 
 
 def _find_named(manifest: Manifest) -> tuple[Model | None, str | None]:

@@ -52,7 +52,7 @@ def fit(
     model, keys = fit_results(store)
     path = write_fleet(store, model, keys)
     content = {**describe_fleet(model), "file": str(path)}
-    return print_result(content, _describe(content), json=json, quiet=quiet)
+    return print_result(content, lambda: _describe(content), json=json, quiet=quiet)
 
 
 def show(
@@ -70,7 +70,7 @@ def show(
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     content = read_fleet(Store(out or results))
-    return print_result(content, _describe(content), json=json, quiet=quiet)
+    return print_result(content, lambda: _describe(content), json=json, quiet=quiet)
 
 
 def _describe(content: Mapping[str, object]) -> list[str]:

@@ -39,7 +39,7 @@ def inspect(  # noqa: D417 - the shared choices document themselves
 
     options = build_options(choices)
     seen = inspect_log(log, config=options.config, overrides=options.overrides)
-    print_result(_as_json(seen), _describe(seen), json=json)
+    print_result(_as_json(seen), lambda: _describe(seen), json=json)
     return LOSSY if seen.losses else CLEAN
 
 

@@ -85,7 +85,7 @@ def draw(  # noqa: D417 - arguments document themselves
     fed_words = drawn.input.replace("measured", "measured wheels")
     lines += [f"! {note}" for note in drawn.notes]
     lines.append(f"page    {page}    ({placed}; {drawn.measure.name} on {fed_words})")
-    return print_result(content, lines, json=json, quiet=quiet)
+    return print_result(content, lambda: lines, json=json, quiet=quiet)
 
 
 def _say(value: float | None, unit: str) -> str:
@@ -173,9 +173,9 @@ def _merge_features(first: Path, second: Path, to: Path, *, json: bool, quiet: b
     runs = merged["sha256"].n_unique()
     content = {"file": str(to), "runs": runs, "rows": merged.height, "twice": twice}
     line = f"{to}: {runs} runs, {merged.height} rows, {twice} stood twice"
-    return print_result(content, [line], json=json, quiet=quiet)
+    return print_result(content, lambda: [line], json=json, quiet=quiet)
 
 
 def _tell(table: pl.DataFrame, path: Path, *, json: bool, quiet: bool) -> int:
     content = {"table": str(path), "deployments": table.height, "keys": table["key"].to_list()}
-    return print_result(content, [f"{path}: {table.height} deployments"], json=json, quiet=quiet)
+    return print_result(content, lambda: [f"{path}: {table.height} deployments"], json=json, quiet=quiet)

@@ -61,7 +61,7 @@ def predict(
     if model is not None:
         write_model(make_model_file(prediction), model)
     content = {**describe_prediction(prediction), "model": None if model is None else str(model)}
-    return print_result(content, _describe(content), json=json, quiet=quiet)
+    return print_result(content, lambda: _describe(content), json=json, quiet=quiet)
 
 
 def _describe(content: Mapping[str, object]) -> list[str]:

@@ -36,4 +36,4 @@ def share(  # noqa: D417 - arguments document themselves
     runs = features["sha256"].n_unique()
     content = {"file": str(to), "runs": runs, "rows": features.height, "notes": list(notes)}
     lines = [f"{to}: {runs} runs, {features.height} rows", *(f"! {note}" for note in notes)]
-    return print_result(content, lines, json=json, quiet=quiet)
+    return print_result(content, lambda: lines, json=json, quiet=quiet)

@@ -70,7 +70,7 @@ def simulate(  # noqa: D417 - arguments document themselves
         platform=platform,
         play=play,
     )
-    return print_result({"path": str(path), "effects": effects}, [str(path)], json=json)
+    return print_result({"path": str(path), "effects": effects}, lambda: [str(path)], json=json)
 
 
 def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:
@@ -103,4 +103,4 @@ def _print_catalogue(
     for title, rows in lists.items():
         width = max(len(name) for name in rows)
         lines += [title, *(f"  {name:<{width}}  {text}" for name, text in rows.items())]
-    return print_result(lists, lines, json=json)
+    return print_result(lists, lambda: lines, json=json)

@@ -42,5 +42,5 @@ def stage(  # noqa: D417 - the shared choices document themselves
     done = ", ".join(outcome.computed) or "nothing: all is as before"
     lines = [f"run       {outcome.manifest.run}", f"computed  {done}"]
     lines += [f"  {table:<12}{rows:>9} rows" for table, rows in tables.items()]
-    print_result(content, [*lines, f"in        {outcome.manifest.folder}"], json=json, quiet=quiet)
+    print_result(content, lambda: [*lines, f"in        {outcome.manifest.folder}"], json=json, quiet=quiet)
     return LOSSY if outcome.lossy else CLEAN

@@ -38,7 +38,7 @@ def status(  # noqa: D417 - arguments document themselves
     from pipeline.batch.status import tell_status  # noqa: PLC0415 - only for this verb
 
     found = tell_status(open_results(results or out).open_store())
-    print_result(_as_json(found), _describe(found), json=json)
+    print_result(_as_json(found), lambda: _describe(found), json=json)
     return FAILED if found.errors else CLEAN
 
 

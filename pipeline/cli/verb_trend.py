@@ -55,7 +55,9 @@ def trend(  # noqa: D417 - arguments document themselves
     names = tuple(name.strip() for name in by.split(",") if name.strip())
     found = follow_trend(store, names, threshold=threshold, limits=dict(map(_read_limit, limit)))
     page = write_trend(store, found)
-    print_result({**describe_trend(found), "page": str(page)}, _describe(found, page), json=json, quiet=quiet)
+    print_result(
+        {**describe_trend(found), "page": str(page)}, lambda: _describe(found, page), json=json, quiet=quiet
+    )
     return ALERT if found.alerts else CLEAN
 
 

@@ -38,7 +38,7 @@ def verify(  # noqa: D417 - arguments document themselves
     place = open_results(results or out)
     with show_progress("verify", quiet=quiet or json) as tell:
         found = verify_results(place.open_store(), mirror=place.mirror, logs=logs, tell=tell, repair=repair)
-    print_result(_as_json(found, repair=repair), _describe(found), json=json, quiet=quiet)
+    print_result(_as_json(found, repair=repair), lambda: _describe(found), json=json, quiet=quiet)
     return CLEAN if found.is_clean else FAILED
 
 
