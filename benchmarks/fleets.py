@@ -30,7 +30,9 @@ from pipeline.diagnosis import diagnose_runs
 from pipeline.diagnosis.recording import Recording
 from pipeline.fleet.forecast import RUNS_SHARE, forecast_vehicle
 from pipeline.fleet.hierarchy import decide_level, fit_fleet
-from pipeline.fleet.statistics import Interval, draw_run, split_levels
+from pipeline.fleet.statistics.intervals import Interval
+from pipeline.fleet.statistics.levels import split_levels
+from pipeline.fleet.statistics.posterior import draw_run
 from pipeline.simulate import find_vehicle, simulate_run
 
 TERRAINS = ("asphalt", "gravel", "sand", "ice")

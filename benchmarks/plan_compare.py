@@ -32,17 +32,11 @@ from pipeline.identification.folds import hold_out_part, make_folds
 from pipeline.identification.growth import Curve, find_goal, last_until, narrow_intervals
 from pipeline.identification.parts import count_seconds
 from pipeline.models import Model, find_effect
-from pipeline.plan import (
-    Request,
-    ask_numbers,
-    assume,
-    choose_limits,
-    find_largest,
-    learn,
-    make_plan,
-    parse_area,
-)
+from pipeline.plan.ask import ask_numbers
+from pipeline.plan.knowledge import assume, learn
+from pipeline.plan.limits import choose_limits, parse_area
 from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ
+from pipeline.plan.plan import Request, find_largest, make_plan
 from pipeline.plan.questions import DECIDED_T, Question, Separation
 from pipeline.simulate import (
     Disturbance,
@@ -57,7 +51,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.identification.parts import Part
-    from pipeline.plan import Knowledge
+    from pipeline.plan.knowledge import Knowledge
     from pipeline.vehicles import Vehicle
 
 VEHICLES = ("husky", "jackal", "marmotte")

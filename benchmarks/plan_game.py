@@ -27,7 +27,10 @@ from pipeline.analysis.options import Options
 from pipeline.analysis.plan import ALL, Wish, plan_drive, study
 from pipeline.core.errors import SlipError
 from pipeline.diagnosis import Named, Recording, diagnose_runs
-from pipeline.plan import Plan, check_plan, parse_area, read_promises, write_plan
+from pipeline.plan.check import check_plan
+from pipeline.plan.files import read_promises, write_plan
+from pipeline.plan.limits import parse_area
+from pipeline.plan.plan import Plan  # noqa: TC001
 from pipeline.simulate import (
     Disturbance,
     PoseSensor,

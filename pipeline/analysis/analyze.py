@@ -112,8 +112,8 @@ def _ask_as_before(options: Options, damaged: Manifest) -> Options:
 
 def _find_twin(path: Path, sha256: str, current: Manifest | None) -> str:
     """The log that made the results there are, where it is another file of that content and still there."""
-    log = current.details.get("log") if current is not None else None
-    if not isinstance(log, dict) or log.get("sha256") != sha256:
+    log = current.part("log") if current is not None else {}
+    if log.get("sha256") != sha256:
         return ""
     recorded = to_location(str(log.get("path")))
     return str(recorded) if recorded != path.resolve() and recorded.exists() else ""
@@ -251,7 +251,8 @@ def update_datasets(store: Store) -> None:
     import polars as pl  # noqa: PLC0415 - heavy
 
     from pipeline.analysis.compared_runs import find_material  # noqa: PLC0415 - heavy
-    from pipeline.fleet import gather_runs, pool_runs  # noqa: PLC0415 - heavy
+    from pipeline.fleet.datasets import pool_runs  # noqa: PLC0415 - heavy
+    from pipeline.fleet.runs import gather_runs  # noqa: PLC0415 - heavy
     from pipeline.report.catalogue import render_catalogue  # noqa: PLC0415 - heavy
     from pipeline.report.pages import CATALOGUE, write_page  # noqa: PLC0415 - heavy
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import polars as pl
@@ -11,7 +10,7 @@ import polars as pl
 from pipeline.analysis.compared_runs import find_material, keep_runs
 from pipeline.analysis.errors import JobError
 from pipeline.analysis.fleet import fit_results
-from pipeline.fleet.causes import compare_causes
+from pipeline.fleet.causes import Causes, compare_causes
 from pipeline.fleet.tables import write_csv, write_latex
 
 if TYPE_CHECKING:
@@ -23,27 +22,6 @@ if TYPE_CHECKING:
     from pipeline.store import Store
 
 _EFFECT = "effect"
-
-
-@dataclass(frozen=True)
-class Causes:
-    """Deployments by cause.
-
-    Attributes:
-        budgets: of every dataset.
-        differences: of every two datasets.
-        input: what u is.
-        names: what effects are called by their level, where that is not their id and vehicles agree.
-        keys: run/generation of every run.
-        notes: what must be known.
-    """
-
-    budgets: tuple[Budget, ...]
-    differences: tuple[Difference, ...]
-    input: str
-    names: Mapping[str, str]
-    keys: tuple[str, ...]
-    notes: tuple[str, ...]
 
 
 def find_causes(store: Store, by: Sequence[str], chosen: str | None) -> Causes:
@@ -180,11 +158,7 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
         say_difference(one, causes.names) + (f" ({one.note})" if one.note else "")
         for one in causes.differences
     ]
-    page = render_causes(
-        causes.budgets, causes.differences, input_name=causes.input, sentences=sentences, names=causes.names,
-        notes=causes.notes, keys=causes.keys,
-    )  # fmt: skip
-    written["causes.html"] = write_page(store, "causes.html", page)
+    written["causes.html"] = write_page(store, "causes.html", render_causes(causes, sentences))
     if figures:
         from pipeline.report.export import write_pictures  # noqa: PLC0415 - heavy
 

@@ -11,25 +11,17 @@ import polars as pl
 from pipeline.analysis.compared_runs import ComparedRuns, find_material, keep_runs
 from pipeline.analysis.errors import JobError
 from pipeline.analysis.samples import follow_published_runs, read_moduli, read_norms
-from pipeline.fleet import (
-    Group,
-    add_measures,
-    bound_run,
-    compare_groups,
-    gather_runs,
-    measure_difficulty,
-    pool_runs,
-)
-from pipeline.fleet.boxes import spread_windows
-from pipeline.fleet.datasets import OVER_RUNS, THIS_RUN
-from pipeline.fleet.statistics import bound_typical
-from pipeline.fleet.tables import tabulate_pairs
+from pipeline.fleet.datasets import OVER_RUNS, THIS_RUN, pool_runs, spread_windows
+from pipeline.fleet.pairs import Group, bound_run, compare_groups
+from pipeline.fleet.runs import add_measures, gather_runs, measure_difficulty
+from pipeline.fleet.statistics.intervals import bound_typical
+from pipeline.fleet.tables import Answer, tabulate_pairs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.fleet import Pair, Samples
-    from pipeline.fleet.statistics import Interval
+    from pipeline.fleet.pairs import Pair, Samples
+    from pipeline.fleet.statistics.intervals import Interval
     from pipeline.store import Store
 
 _WINDOW_COLUMNS = {
@@ -57,31 +49,6 @@ class Question:
     by: tuple[str, ...] = ("dataset",)
     input: str | None = None
     as_published: bool = False
-
-
-@dataclass(frozen=True)
-class Answer:
-    """What came of it.
-
-    Attributes:
-        datasets: table `datasets`, both inputs.
-        comparisons: table `comparisons`.
-        runs: one row a run and input with all its numbers.
-        input: what u is in the comparisons.
-        quantity: what was compared.
-        intervals: ``dataset``, ``value``, ``low``, ``high``, ``interval`` of what was compared.
-        windows: box plot numbers of the window norms, as of `spread_windows`.
-        notes: what must be known: runs left out, pairs that cannot be told apart.
-    """
-
-    datasets: pl.DataFrame
-    comparisons: pl.DataFrame
-    runs: pl.DataFrame
-    input: str
-    quantity: str
-    intervals: pl.DataFrame
-    windows: pl.DataFrame
-    notes: tuple[str, ...]
 
 
 def compare_results(store: Store, question: Question) -> Answer:

@@ -12,8 +12,8 @@ from pipeline.fleet.tables import write_csv, write_latex
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.analysis.compare import Answer
     from pipeline.analysis.options import FigureFormat
+    from pipeline.fleet.tables import Answer
     from pipeline.store import Store
 
 
@@ -38,27 +38,11 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
         written[f"{name}.csv"] = store.write_results_text(f"{name}.csv", write_csv(frame))
         shown = frame.filter(pl.col("input") == answer.input)
         written[f"{name}.tex"] = store.write_results_text(f"{name}.tex", write_latex(name, shown))
-    page = render_comparison(
-        datasets=answer.datasets,
-        comparisons=answer.comparisons,
-        runs=answer.runs,
-        input_name=answer.input,
-        quantity=answer.quantity,
-        notes=answer.notes,
-        intervals=answer.intervals,
-        windows=answer.windows,
-    )
-    written["comparison.html"] = write_page(store, "comparison.html", page)
+    written["comparison.html"] = write_page(store, "comparison.html", render_comparison(answer))
     if figures:
         from pipeline.report.export import write_pictures  # noqa: PLC0415 - heavy
 
-        pictures = list_pictures(
-            answer.runs,
-            answer.intervals,
-            answer.windows,
-            input_name=answer.input,
-            quantity=answer.quantity,
-        )
+        pictures = list_pictures(answer)
         written |= {path.name: path for path in write_pictures(pictures, store.root / "figures", figures)}
     return written
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from pipeline.analysis.diagnosis import DIAGNOSED
-from pipeline.fleet import label_runs, read_day
+from pipeline.fleet.datasets import read_day
+from pipeline.fleet.runs import label_runs
 from pipeline.store.queries import scan_table
 from schemas import contract_of
 
@@ -169,9 +170,7 @@ def read_digest(manifest: Manifest) -> str:
 
 
 def _label_run(manifest: Manifest) -> dict[str, str | float | int | None]:
-    details = manifest.details
-    vehicle = details.get("vehicle")
-    facts = vehicle if isinstance(vehicle, dict) else {}
+    details, facts = manifest.details, manifest.part("vehicle")
     mass = facts.get("mass_kg")
     return {
         "run": manifest.run,
@@ -195,10 +194,7 @@ def _square_gyration(vehicle: Mapping[str, object]) -> float | None:
 
 def _read_start(manifest: Manifest) -> int | None:
     """Stamp of the log's first sample [ns]."""
-    stages = manifest.details.get("stages")
-    extract = stages.get("extract") if isinstance(stages, dict) else None
-    context = extract.get("context") if isinstance(extract, dict) else None
-    start = context.get("start_ns") if isinstance(context, dict) else None
+    start = manifest.part("stages", "extract", "context").get("start_ns")
     return start if isinstance(start, int) else None
 
 

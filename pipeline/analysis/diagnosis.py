@@ -43,9 +43,7 @@ def has_diagnosis(manifest: Manifest | None, key: str) -> bool:
     """Whether results hold this very diagnosis."""
     if manifest is None or DIAGNOSIS not in manifest.files:
         return False
-    stages = manifest.details.get("stages")
-    stored = stages.get(STAGE) if isinstance(stages, dict) else None
-    return isinstance(stored, dict) and stored.get("key") == key
+    return manifest.part("stages", STAGE).get("key") == key
 
 
 def diagnose_work(work: Work) -> dict[str, JSON] | None:
@@ -157,11 +155,10 @@ def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
     """
     from pipeline.report.motion_run import load_vehicle  # noqa: PLC0415 - heavy, and only for stored runs
 
-    log = manifest.details.get("log")
     recording = _make_recording(
         manifest.run,
         (manifest.tables, manifest.read),
-        log if isinstance(log, dict) else {},
+        manifest.part("log"),
         read_length_scale(manifest),
     )
     return load_vehicle(manifest), recording
@@ -194,7 +191,5 @@ def _make_recording(
 
 def read_length_scale(manifest: Manifest) -> float:
     """Length scale of the slip modulus that a run was analyzed with [m]."""
-    configuration = manifest.details.get("configuration")
-    slip = configuration.get("slip") if isinstance(configuration, dict) else None
-    scale = slip.get("length_scale_m") if isinstance(slip, dict) else None
+    scale = manifest.part("configuration", "slip").get("length_scale_m")
     return float(scale) if isinstance(scale, int | float) else 1.0

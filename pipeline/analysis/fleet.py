@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import polars as pl
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from pipeline.analysis.compared_runs import ComparedRuns
     from pipeline.fleet.hierarchy import FleetModel, FleetNumber
-    from pipeline.fleet.statistics import Interval
+    from pipeline.fleet.statistics.intervals import Interval
     from pipeline.store import Store
 
 FLEET = "fleet.json"
@@ -177,37 +177,15 @@ def tabulate_fleet(model: FleetModel, keys: tuple[str, ...]) -> pl.DataFrame:
 
     rows: list[Mapping[str, object]] = []
     for number in model.numbers:
-        fit = number.fit
-        common = {
-            "run": _EVERY,
-            "dataset": _EVERY,
-            "vehicle": number.vehicle,
-            "effect": number.effect,
-            "parameter": number.parameter,
-            "unit": number.unit,
-            "level": "open" if number.level is None else number.level.value,
-            "name": number.name,
-            "because": number.because,
-            "spread_terrain": _clean(fit.spread_group),
-            "spread_run": _clean(fit.spread_run),
-            "chi_square": _clean(fit.chi_square),
-            "p_terrain": _clean(fit.p_groups),
-            "keys": " ".join(keys),
-        }
-        rows.append({**common, "terrain": _EVERY, "value": fit.value, **_bounds(number, fit.interval),
-                     "runs": len(number.runs), "named": number.named})  # fmt: skip
-        rows += [
-            {
-                **common,
-                "terrain": name,
-                "value": mean.value,
-                **_bounds(number, mean.interval),
-                "runs": mean.runs,
-            }
-            for name, mean in fit.groups.items()
-        ]
+        told = _describe_number(number)
+        whose = {"run": _EVERY, "dataset": _EVERY, "terrain": _EVERY, "keys": " ".join(keys)}
+        rows.append({**told, **whose, "level": told["level"] or "open"})
+        terrains = cast("Mapping[str, Mapping[str, object]]", told["terrains"])
+        rows += [{**rows[-1], "named": None, "terrain": name, **mean} for name, mean in terrains.items()]
     empty = contract_of("fleet").schema.create_empty()
-    return pl.DataFrame(rows, schema=empty.schema, orient="row")
+    return pl.DataFrame(
+        [[row[name] for name in empty.schema] for row in rows], schema=empty.schema, orient="row"
+    )
 
 
 def _bounds(number: FleetNumber, interval: Interval | None) -> dict[str, float | None]:

@@ -62,13 +62,9 @@ def _list_differences(one: Vehicle, other: Vehicle) -> list[str]:
     found = ["kind"] if one.kind != other.kind else []
     for name in _LENGTHS:
         values = getattr(one, name), getattr(other, name)
-        if None not in values and not _is_same(*values):
+        if None not in values and not math.isclose(*values, rel_tol=_ROUNDING):
             found.append(name)
     return found
-
-
-def _is_same(one: float, other: float) -> bool:
-    return math.isclose(one, other, rel_tol=_ROUNDING)
 
 
 def _describe(vehicle: Vehicle, names: Sequence[str]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -104,10 +104,8 @@ def _measure_topic(
     latency = None
     if header_time is not None and header_time.any():
         latency = float(np.median(log_time - header_time)) / 1e9
-    return TopicHealth(
-        channel.topic,
-        channel.type_name,
-        channel.message_count,
+    return replace(
+        plain,
         rate_hz=1.0 / median if median > 0.0 else None,
         largest_gap_s=float(periods.max()),
         gaps=int((periods > max(_GAP_PERIODS * median, _SMALLEST_GAP_S)).sum()),

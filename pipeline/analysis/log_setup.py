@@ -118,15 +118,10 @@ def name_run(path: Path, sha256: str, store: Store) -> str:
     manifest = store.manifest(plain)
     if manifest is None:
         for known in store.survey().manifests:
-            if _log_of(known.details).get("sha256") == sha256:
+            if known.part("log").get("sha256") == sha256:
                 return known.run
         return plain
-    before = _log_of(manifest.details)
+    before = manifest.part("log")
     if before.get("sha256") == sha256 or before.get("path") == spell_location(absolute):
         return plain
     return f"{plain}-{sha256[:8]}"
-
-
-def _log_of(details: object) -> dict[str, object]:
-    log = details.get("log") if isinstance(details, dict) else None
-    return log if isinstance(log, dict) else {}

@@ -56,5 +56,4 @@ def find_log(text: str, out: Path) -> Path:
 
 def recorded_path(manifest: Manifest) -> str:
     """Path of the log that a run was made of."""
-    log = manifest.details.get("log")
-    return str(log.get("path", "")) if isinstance(log, dict) else ""
+    return str(manifest.part("log").get("path", ""))

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import polars as pl
 
 from pipeline.analysis.compare import choose_input, measure_runs
 from pipeline.analysis.compared_runs import find_material, read_digest
-from pipeline.fleet import pool_runs
+from pipeline.fleet.datasets import pool_runs
 from pipeline.fleet.deployments import find_own_table, read_deployments
-from pipeline.fleet.measures import MEASURES, Measure
-from pipeline.fleet.place import place_datasets, place_deployments
+from pipeline.fleet.measures import MEASURES
+from pipeline.fleet.place import DeploymentMap, place_datasets, place_deployments
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,29 +21,6 @@ if TYPE_CHECKING:
     from pipeline.store import Store
 
 _SHARED = " (shared)"
-
-
-@dataclass(frozen=True)
-class DeploymentMap:
-    """The map as tables.
-
-    Attributes:
-        deployments: the table of deployments.
-        points: those that can be placed.
-        own: own datasets that can be placed.
-        keys: run/generation of the runs of every own dataset.
-        notes: what is not on the map, and why.
-        input: what u is of the own datasets.
-        measure: what colours them.
-    """
-
-    deployments: pl.DataFrame
-    points: pl.DataFrame
-    own: pl.DataFrame
-    keys: tuple[str, ...]
-    notes: tuple[str, ...]
-    input: str
-    measure: Measure
 
 
 def draw_up_map(
@@ -118,19 +94,11 @@ def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None =
     from pipeline.report.deployments import picture_map, render_map  # noqa: PLC0415 - heavy
     from pipeline.report.pages import write_page  # noqa: PLC0415 - heavy
 
-    page = render_map(
-        drawn.deployments, drawn.points, drawn.own, drawn.measure, input_name=drawn.input, notes=drawn.notes,
-        keys=drawn.keys,
-    )  # fmt: skip
-    path = write_page(store, "map.html", page)
+    path = write_page(store, "map.html", render_map(drawn))
     if figures:
         from pipeline.report.export import write_pictures  # noqa: PLC0415 - heavy
 
-        write_pictures(
-            [picture_map(drawn.points, drawn.own, drawn.measure, drawn.input)],
-            store.root / "figures",
-            figures,
-        )
+        write_pictures([picture_map(drawn)], store.root / "figures", figures)
     return path
 
 

@@ -10,6 +10,17 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 INPUTS = ("command", "measured")
+STAGE_WORDS = {
+    "read": "reading the log",
+    "extract": "extracting commands and poses",
+    "align": "putting clocks and scales right",
+    "velocity": "differentiating poses",
+    "slip": "computing slip",
+    "aggregate": "aggregating",
+    "report": "drawing the report",
+}
+"""What is done in each stage, as people are told."""
+
 STAGES = ("extract", "align", "velocity", "slip", "aggregate")
 FigureFormat = Literal["svg", "pdf", "png"]
 FIGURES: tuple[FigureFormat, ...] = get_args(FigureFormat)

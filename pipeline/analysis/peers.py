@@ -45,7 +45,7 @@ def find_peers(store: Store, summary: Mapping[str, JSON]) -> dict[str, list[floa
         if manifest.details.get("dataset") != summary.get("dataset"):
             continue
         other = _read_summary(manifest)
-        sha256 = _find_hash(manifest)
+        sha256 = manifest.part("log").get("sha256")
         if (
             sha256 in seen
             or other.get("length_scale_m") != summary.get("length_scale_m")
@@ -69,11 +69,6 @@ def _read_summary(manifest: Manifest) -> Mapping[str, JSON]:
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
-
-
-def _find_hash(manifest: Manifest) -> object:
-    log = manifest.details.get("log")
-    return log.get("sha256") if isinstance(log, dict) else None
 
 
 def _is_doubtful(summary: Mapping[str, JSON]) -> bool:

@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 
     from pipeline.diagnosis import Recording, RunDiagnosis
     from pipeline.fleet.forecast import Forecast
-    from pipeline.plan import Knowledge, Limits, Plan
-    from pipeline.plan.limits import Area
+    from pipeline.plan.knowledge import Knowledge
+    from pipeline.plan.limits import Area, Limits
+    from pipeline.plan.plan import Plan
     from pipeline.plan.questions import Question
     from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
@@ -93,7 +94,8 @@ def plan_drive(
     Raises:
         SlipError: an effect is unknown, nobody knows how fast the vehicle may drive, or no drive fits.
     """
-    from pipeline.plan import Request, choose_limits, make_plan  # noqa: PLC0415 - heavy
+    from pipeline.plan.limits import choose_limits  # noqa: PLC0415 - heavy
+    from pipeline.plan.plan import Request, make_plan  # noqa: PLC0415 - heavy
 
     knowledge, diagnosis = studied.knowledge, studied.diagnosis
     limits = choose_limits(
@@ -142,7 +144,7 @@ def study(
     from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy
     from pipeline.diagnosis.recording import load_recording  # noqa: PLC0415 - heavy
     from pipeline.models import list_effects  # noqa: PLC0415 - heavy
-    from pipeline.plan import assume, learn  # noqa: PLC0415 - heavy
+    from pipeline.plan.knowledge import assume, learn  # noqa: PLC0415 - heavy
 
     diagnosis = diagnose_runs(recordings, vehicle).runs[0]
     if diagnosis.proposal is None:
@@ -174,7 +176,7 @@ def expect(vehicle: Vehicle, terrain: str | None, known: Path) -> Studied:
     Raises:
         SlipError: the results know nothing of the vehicle.
     """
-    from pipeline.plan import assume  # noqa: PLC0415 - heavy
+    from pipeline.plan.knowledge import assume  # noqa: PLC0415 - heavy
 
     if terrain is None:
         return Studied(None, assume(vehicle))
@@ -205,14 +207,8 @@ def ask(
     Raises:
         SlipError: an effect is unknown or does not exist on the vehicle.
     """
-    from pipeline.plan import (  # noqa: PLC0415
-        ask_apart,
-        ask_numbers,
-        ask_presence,
-        ask_undecided,
-        find_largest,
-        list_names,
-    )
+    from pipeline.plan.ask import ask_apart, ask_numbers, ask_presence, ask_undecided, list_names  # noqa: PLC0415
+    from pipeline.plan.plan import find_largest  # noqa: PLC0415
 
     questions: list[Question] = []
     names = [name for name in wanted if name not in {UNDECIDED, ALL}]

@@ -15,7 +15,7 @@ from pipeline.store.names import encode_run
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.plan import Plan
+    from pipeline.plan.plan import Plan
     from pipeline.store import Manifest, Store
 
 PREVIEW = "plan.json"
@@ -69,7 +69,7 @@ def write_drive(plan: Plan, folder: Path, results: Path) -> tuple[Path, ...]:
     Raises:
         PlanError: as `write_plan`.
     """
-    from pipeline.plan import write_plan  # noqa: PLC0415 - heavy
+    from pipeline.plan.files import write_plan  # noqa: PLC0415 - heavy
     from pipeline.report.plan import render_plan  # noqa: PLC0415 - heavy
 
     return write_plan(plan, folder, render_plan(plan, lead_to(results, folder))) if plan.manoeuvres else ()

@@ -13,9 +13,10 @@ import polars as pl
 from pipeline.analysis.diagnosis import read_length_scale
 from pipeline.analysis.errors import JobError
 from pipeline.analysis.fleet import find_estimates
-from pipeline.fleet import read_day
+from pipeline.fleet.datasets import read_day
 from pipeline.fleet.forecast import DRAWS, make_effects
-from pipeline.fleet.statistics import Interval, draw_run
+from pipeline.fleet.statistics.intervals import Interval
+from pipeline.fleet.statistics.posterior import draw_run
 from pipeline.identification.comparison import Comparison, Input
 from pipeline.identification.predict import predict_at_from, predict_from
 from pipeline.models.catalogue import find_effect
@@ -194,7 +195,11 @@ def _load_runs(store: Store, forecast: Forecast) -> list[_Driven]:
         JobError: ``nothing_to_drive``: no run has the input.
     """
     named = find_estimates(store).filter(pl.col("named"), pl.col("input").cast(pl.String) == forecast.input)
-    newest = [name for side in (forecast.here, forecast.elsewhere) for name in sorted(side, key=_date)[::-1]]
+    newest = [
+        name
+        for side in (forecast.here, forecast.elsewhere)
+        for name in sorted(side, key=lambda run: read_day(run) or "")[::-1]
+    ]
     runs: list[_Driven] = []
     for name in newest:
         manifest = store.manifest(name)
@@ -210,10 +215,6 @@ def _load_runs(store: Store, forecast: Forecast) -> list[_Driven]:
             hint="Choose the other input.",
         )
     return runs
-
-
-def _date(run: str) -> str:
-    return read_day(run) or ""
 
 
 def _load_run(manifest: Manifest, named: pl.DataFrame, source: Input) -> _Driven:

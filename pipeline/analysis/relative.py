@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.analysis.errors import JobError
-from pipeline.core.errors import SlipError
+from pipeline.core.errors import SlipError, naming_os_errors
 from pipeline.stages.finding import Finding
 
 if TYPE_CHECKING:
@@ -32,15 +32,11 @@ def hash_model(path: Path | None) -> str | None:
     """
     if path is None:
         return None
-    try:
+    hint = "Check the path; `slip model new` makes one."
+    with naming_os_errors(
+        JobError, "model_not_found", "the model file cannot be read", where=path, hint=hint
+    ):
         content = path.read_bytes()
-    except OSError as error:
-        raise JobError(
-            "model_not_found",
-            f"the model file cannot be read: {error.strerror}",
-            where=str(path),
-            hint="Check the path; `slip model new` makes one.",
-        ) from None
     from pipeline.models import read_model  # noqa: PLC0415 - heavy
 
     return hashlib.sha256(content + "".join(read_model(path).code).encode()).hexdigest()

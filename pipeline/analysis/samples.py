@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.fleet import Samples, follow_published, read_limits
-from pipeline.fleet.published import WINDOW_S
+from pipeline.fleet.pairs import Samples
+from pipeline.fleet.published import WINDOW_S, follow_published, read_limits
 
 if TYPE_CHECKING:
     from pipeline.analysis.compared_runs import ComparedRuns
@@ -68,12 +68,11 @@ def follow_published_runs(
     samples: dict[str, Samples] = {}
     notes: list[str] = []
     for run, manifest in compared.manifests.items():
-        vehicle = manifest.details.get("vehicle")
         findings = set(manifest.read("findings")["id"]) if "findings" in manifest.tables else set()
         found = follow_published(
             manifest.read("slip"),
             manifest.read("poses"),
-            limits=read_limits(vehicle if isinstance(vehicle, dict) else {}),
+            limits=read_limits(manifest.part("vehicle")),
             command_is_scaled="command_scale" in findings,
         )
         if found is None:

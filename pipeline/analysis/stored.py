@@ -19,7 +19,7 @@ from pipeline.analysis.options import INPUTS
 from pipeline.analysis.work import stored_contexts
 from pipeline.core.errors import SlipError
 from pipeline.logs import hash_log, list_files
-from pipeline.store import JSON, LogIdentities, Manifest, Store
+from pipeline.store import LogIdentities, Manifest, Store
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -101,11 +101,11 @@ def _find_stored(path: Path, store: Store) -> Manifest | None:
     if sha256 is None:
         size = sum(part.stat().st_size for part in (list_files(path) if path.is_dir() else [path]))
         # Hashing reads the whole log: only for one that may be known.
-        if all(_log_of(manifest).get("bytes") != size for manifest in store.survey().manifests):
+        if all(manifest.part("log").get("bytes") != size for manifest in store.survey().manifests):
             return None
         sha256 = hash_log(path)
     manifest = store.manifest(name_run(path, sha256, store))
-    if manifest is None or _log_of(manifest).get("sha256") != sha256 or SUMMARY not in manifest.files:
+    if manifest is None or manifest.part("log").get("sha256") != sha256 or SUMMARY not in manifest.files:
         return None
     return manifest
 
@@ -147,8 +147,3 @@ def _is_changed(path: Path, stored: Manifest, options: Options, *, asked: bool) 
         "inputs": options.inputs,
     }
     return any(stored.details.get(key) != value for key, value in json.loads(json.dumps(now)).items())
-
-
-def _log_of(manifest: Manifest) -> dict[str, JSON]:
-    log = manifest.details.get("log")
-    return log if isinstance(log, dict) else {}

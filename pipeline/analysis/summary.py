@@ -100,17 +100,10 @@ def _split(row: Mapping[str, float | None]) -> JSON:
 
 def _describe_topics(work: Work) -> dict[str, JSON]:
     sources = work.setup.sources
-    roles = {
-        "command": sources.command,
-        "wheels": sources.wheels,
-        "pose": sources.pose,
-        "imu": sources.imu,
-        "interval": sources.interval,
-    }
-    described: dict[str, JSON] = {
-        role: None if source is None else {"topic": str(source), "reason": source.reason}
-        for role, source in roles.items()
-    }
+    described: dict[str, JSON] = {}
+    for role in ("command", "wheels", "pose", "imu", "interval"):
+        source = getattr(sources, role)
+        described[role] = None if source is None else {"topic": str(source), "reason": source.reason}
     return {**described, "notes": list(sources.notes)}
 
 

@@ -5,20 +5,20 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import polars as pl
 
 from pipeline.analysis.compared_runs import ComparedRuns, find_material
 from pipeline.analysis.errors import JobError
-from pipeline.fleet import ComparisonError, gather_runs
+from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.parameter_trend import describe_parameter, find_latest, follow_parameters, say_power
+from pipeline.fleet.runs import gather_runs
 from pipeline.fleet.trend import (
     FEWEST_RUNS,
     LEVEL,
-    Alert,
     Series,
+    Trend,
     describe_step,
     follow_quantities,
     raise_alerts,
@@ -38,18 +38,6 @@ _SLIP = {
     "steady_median_modulus": "m/s",
     "transitory_median_modulus": "m/s",
 }
-
-
-@dataclass(frozen=True)
-class Trend:
-    """Series of groups, parameters of vehicles, what to look at, what must be known, what was asked."""
-
-    series: tuple[Series, ...]
-    parameters: tuple[ParameterTrend, ...]
-    alerts: tuple[Alert, ...]
-    keys: tuple[str, ...]
-    notes: tuple[str, ...]
-    asked: Mapping[str, object]
 
 
 def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: Mapping[str, float]) -> Trend:
@@ -138,8 +126,7 @@ def write_trend(store: Store, trend: Trend) -> Path:
     from pipeline.report.pages import write_page  # noqa: PLC0415 - heavy
     from pipeline.report.trend import render_trend  # noqa: PLC0415 - heavy
 
-    page = render_trend(trend.series, trend.parameters, trend.alerts, notes=trend.notes, keys=trend.keys)
-    return write_page(store, "trend.html", page)
+    return write_page(store, "trend.html", render_trend(trend))
 
 
 def update_trend(store: Store) -> None:

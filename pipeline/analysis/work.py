@@ -321,19 +321,14 @@ def describe_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:
 
 def stored_keys(manifest: Manifest | None) -> dict[str, str]:
     """Stage keys of the results there are."""
-    stages = manifest.details.get("stages") if manifest is not None else None
-    if not isinstance(stages, dict):
-        return {}
+    stages = manifest.part("stages") if manifest is not None else {}
     return {name: str(entry["key"]) for name, entry in stages.items() if isinstance(entry, dict)}
 
 
 def stored_contexts(manifest: Manifest) -> dict[str, Mapping[str, JSON]]:
     """Stage contexts of the results there are."""
-    stages = manifest.details.get("stages")
-    if not isinstance(stages, dict):
-        return {}
     return {
         name: entry["context"]
-        for name, entry in stages.items()
+        for name, entry in manifest.part("stages").items()
         if isinstance(entry, dict) and isinstance(entry.get("context"), dict)
     }

@@ -28,7 +28,7 @@ A name that begins with a dash goes behind --, after all options.
 
 
 def build_app() -> App:
-    """The program with every verb found in this folder; a verb is a module with a `register` function."""
+    """The program with every verb of the folder: the function of the module's name, or what `build` makes."""
     app = App(
         name="slip",
         help=HELP,
@@ -43,7 +43,8 @@ def build_app() -> App:
     )
     for module in sorted(pkgutil.iter_modules(pipeline.cli.__path__), key=lambda found: found.name):
         if module.name.startswith("verb_"):
-            importlib.import_module(f"pipeline.cli.{module.name}").register(app)
+            content = vars(importlib.import_module(f"pipeline.cli.{module.name}"))
+            app.command(content["build"]() if "build" in content else content[module.name[5:]])
     return app
 
 

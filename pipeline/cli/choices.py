@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline.analysis.options import INPUTS, FigureFormat, Options
+from pipeline.analysis.options import INPUTS, Options
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,28 +42,14 @@ class Choices:
     out: Annotated[Path, Parameter(help="results folder")] = Path("results")
 
 
-def build_options(
-    choices: Choices,
-    *,
-    report: bool = False,
-    diagnosis: bool = False,
-    figures: FigureFormat | None = None,
-    model: Path | None = None,
-    force: bool = False,
-    through: str = "aggregate",
-) -> Options:
-    """Options of a job from the choices on the command line."""
+def build_options(choices: Choices) -> Options:
+    """Options of a job from the choices on the command line, without a report."""
     return Options(
         out=choices.out,
         config=choices.config,
         overrides=_list_overrides(choices),
         inputs=INPUTS if choices.input == "both" else (choices.input,),
-        report=report,
-        diagnosis=diagnosis,
-        figures=figures,
-        model=model,
-        force=force,
-        through=through,
+        report=False,
     )
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from pipeline.cli.output import CLEAN, print_json, print_lines, say
+from pipeline.cli.output import print_result, say
 
 if TYPE_CHECKING:
     from pipeline.models.model_file import ModelFile
@@ -101,8 +101,7 @@ def trusted(*, json: bool = False) -> int:
 
 
 def _print(codes: dict[str, str], otherwise: str, *, json: bool) -> int:
-    if json:
-        print_json({"code": [{"sha256": code, "name": name} for code, name in codes.items()]})
-    else:
-        print_lines([f"{code}  {name}" for code, name in codes.items()] or [otherwise])
-    return CLEAN
+    content = {"code": [{"sha256": code, "name": name} for code, name in codes.items()]}
+    return print_result(
+        content, lambda: [f"{code}  {name}" for code, name in codes.items()] or [otherwise], json=json
+    )

@@ -10,6 +10,8 @@ import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from pipeline.analysis.options import STAGE_WORDS
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
@@ -20,16 +22,7 @@ FAILED = 1
 USAGE = 2
 LOSSY = 3
 
-_DOING = {
-    "read": "reading the log",
-    "extract": "extracting commands and poses",
-    "align": "putting clocks and scales right",
-    "velocity": "differentiating poses",
-    "slip": "computing slip",
-    "aggregate": "aggregating",
-    "diagnosis": "looking for missing effects",
-    "report": "drawing the report",
-}
+_DOING = {**STAGE_WORDS, "diagnosis": "looking for missing effects"}
 
 
 # Control characters, line ends, marks that turn the direction of writing, and bytes that are no text.
@@ -102,6 +95,17 @@ def _find_break(line: str, hang: int, width: int) -> int:
 def print_json(content: Mapping[str, object]) -> None:
     """One JSON object on stdout."""
     sys.stdout.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def print_result(
+    content: Mapping[str, object], describe: Callable[[], Iterable[str]], *, json: bool, quiet: bool = False
+) -> int:
+    """Print what a verb found, as one JSON object or as lines for people; the exit code of success."""
+    if json:
+        print_json(content)
+    elif not quiet:
+        print_lines(describe())
+    return CLEAN
 
 
 def print_error(error: SlipError) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.analysis.options import FigureFormat, Options
 from pipeline.cli.choices import Choices, build_options, spell_choices
@@ -16,11 +17,6 @@ from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import Outcome
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(analyze)
 
 
 def analyze(  # noqa: D417 - the shared choices document themselves
@@ -55,9 +51,8 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         quiet: print no progress and no summary.
     """
     trust_named(model, wanted=trust_code)
-    options = build_options(
-        choices, report=report, diagnosis=diagnosis, figures=figures, force=force, model=model
-    )
+    options = build_options(choices)
+    options = replace(options, report=report, diagnosis=diagnosis, figures=figures, force=force, model=model)
     outcomes: list[Outcome] = []
     errors: list[dict[str, str]] = []
 

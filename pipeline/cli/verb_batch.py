@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from pipeline.batch import Pruning, Request, count_cores, measure_memory, parse_shard, parse_size
@@ -32,11 +32,6 @@ _EXPLAINED = (
     ("growing", "being written"),
     ("skipped", "left out"),
 )
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(batch)
 
 
 def batch(  # noqa: D417 - the shared choices document themselves
@@ -91,7 +86,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
     if quota is not None and not prune:
         raise SlipError("quota_alone", "--quota does nothing by itself", hint="Add --prune, or leave it out")
     pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
-    options = build_options(choices, report=reports, diagnosis=diagnosis, force=force)
+    options = replace(build_options(choices), report=reports, diagnosis=diagnosis, force=force)
     place = open_results(choices.out)
     if not logs:
         place.open_store()

@@ -5,21 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.analysis.options import FigureFormat
-from pipeline.cli.output import CLEAN, print_json, print_lines
+from pipeline.cli.output import print_result
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.analysis.compare import Answer
+    from pipeline.fleet.tables import Answer
     from pipeline.store import Store
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(compare)
 
 
 def compare(  # noqa: D417 - arguments document themselves
@@ -65,15 +60,11 @@ def compare(  # noqa: D417 - arguments document themselves
     store = Store(out or results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
     if causes:
-        _compare_causes(store, names, fed, figures, json=json, quiet=quiet)
-        return CLEAN
+        return _compare_causes(store, names, fed, figures, json=json, quiet=quiet)
     answer = compare_results(store, Question(by=names, input=fed, as_published=as_published))
     written = write_answer(store, answer, figures)
-    if json:
-        print_json({**describe_answer(answer), "page": str(written["comparison.html"])})
-    elif not quiet:
-        print_lines(_describe(answer, written).split("\n"))
-    return CLEAN
+    content = {**describe_answer(answer), "page": str(written["comparison.html"])}
+    return print_result(content, lambda: _describe(answer, written), json=json, quiet=quiet)
 
 
 def _compare_causes(
@@ -84,34 +75,31 @@ def _compare_causes(
     *,
     json: bool,
     quiet: bool,
-) -> None:
+) -> int:
     from pipeline.analysis.causes import describe_causes, find_causes, write_causes  # noqa: PLC0415 - heavy
 
     found = find_causes(store, by, fed)
     written = write_causes(store, found, figures)
     content = describe_causes(found)
-    if json:
-        print_json({**content, "page": str(written["causes.html"])})
-    elif not quiet:
-        lines = [
-            f"slip on {found.input.replace('measured', 'measured wheels')} by cause, parts of its mean square"
+    lines = [
+        f"slip on {found.input.replace('measured', 'measured wheels')} by cause, parts of its mean square"
+    ]
+    for budget in found.budgets:
+        parts = ", ".join(f"{found.names.get(one.name, one.name)} {one.share:z.0%}" for one in budget.parts)
+        lines += [
+            "",
+            f"{budget.dataset}: {budget.total**0.5:.3g} m/s, {budget.runs} run{'s' * (budget.runs != 1)}",
+            f"  {parts}",
         ]
-        for budget in found.budgets:
-            parts = ", ".join(
-                f"{found.names.get(one.name, one.name)} {one.share:z.0%}" for one in budget.parts
-            )
-            lines += [
-                "",
-                f"{budget.dataset}: {budget.total**0.5:.3g} m/s, {budget.runs} run{'s' * (budget.runs != 1)}",
-                f"  {parts}",
-            ]
-        lines += [""] * bool(content["differences"])
-        for one in cast("Sequence[Mapping[str, object]]", content["differences"]):
-            lines += [str(one["sentence"]), *([f"  {one['note']}"] if one["note"] else [])]
-        print_lines([*lines, "", *(f"! {note}" for note in found.notes), f"page    {written['causes.html']}"])
+    lines += [""] * bool(content["differences"])
+    for one in cast("Sequence[Mapping[str, object]]", content["differences"]):
+        lines += [str(one["sentence"]), *([f"  {one['note']}"] if one["note"] else [])]
+    page = str(written["causes.html"])
+    lines += ["", *(f"! {note}" for note in found.notes), f"page    {page}"]
+    return print_result({**content, "page": page}, lambda: lines, json=json, quiet=quiet)
 
 
-def _describe(answer: Answer, written: Mapping[str, Path]) -> str:
+def _describe(answer: Answer, written: Mapping[str, Path]) -> list[str]:
     from pipeline.fleet.measures import MEASURES, compare_orders  # noqa: PLC0415 - heavy
 
     datasets = answer.datasets.filter(answer.datasets["input"] == answer.input).select(
@@ -130,8 +118,7 @@ def _describe(answer: Answer, written: Mapping[str, Path]) -> str:
     orders = compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
     told = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
     lines += [*([""] if told else []), *dict.fromkeys(told)]
-    lines += ["", *(f"! {note}" for note in answer.notes), f"page    {written['comparison.html']}"]
-    return "\n".join(lines)
+    return [*lines, "", *(f"! {note}" for note in answer.notes), f"page    {written['comparison.html']}"]
 
 
 def _describe_dataset(row: Mapping[str, object], width: int) -> str:

@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.cli.choices import Choices, build_options, spell_choices, spell_flags
 from pipeline.cli.memory_limit import limited_memory
@@ -28,11 +28,6 @@ if TYPE_CHECKING:
     from pipeline.diagnosis import Diagnosis, Recording
     from pipeline.models import ModelFile
     from pipeline.vehicles import Vehicle
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(diagnose)
 
 
 def diagnose(  # noqa: D417 - the shared choices document themselves

@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
-from pipeline.cli.output import CLEAN, print_json, print_lines
+from pipeline.cli.output import print_result
 
 if TYPE_CHECKING:
     from pipeline.models.effect import Effect
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(effects)
 
 
 def effects(  # noqa: D417 - the arguments document themselves
@@ -34,12 +29,9 @@ def effects(  # noqa: D417 - the arguments document themselves
     from pipeline.models.catalogue import find_effect, list_effects  # noqa: PLC0415 - heavy
 
     chosen = list_effects() if effect is None else (find_effect(effect),)
-    if json:
-        print_json({"effects": [_as_json(item) for item in chosen]})
-    elif not quiet:
-        lines = list_pages(chosen) if effect is None else [describe_effect(chosen[0])]
-        print_lines("\n".join(lines).split("\n"))
-    return CLEAN
+    pages = list_pages(chosen) if effect is None else [describe_effect(chosen[0])]
+    content = {"effects": [_as_json(item) for item in chosen]}
+    return print_result(content, lambda: "\n".join(pages).split("\n"), json=json, quiet=quiet)
 
 
 def _as_json(effect: type[Effect]) -> dict[str, object]:

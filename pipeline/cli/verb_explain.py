@@ -6,19 +6,14 @@ import json as encoder
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
-from pipeline.cli.output import CLEAN, print_json, print_lines
+from pipeline.cli.output import print_result
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.store import Manifest
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(explain)
 
 
 def explain(  # noqa: D417 - arguments document themselves
@@ -40,13 +35,9 @@ def explain(  # noqa: D417 - arguments document themselves
 
     manifest = find_run(run, Store(out))
     about = _describe_column(column) if column else {}
-    if json:
-        print_json({"run": manifest.run, "key": manifest.key, **manifest.details, "column": about or None})
-        return CLEAN
-    print_lines(_describe(manifest))
-    if about:
-        print_lines(["", f"{column}: " + ", ".join(f"{key} {value}" for key, value in about.items())])
-    return CLEAN
+    content = {"run": manifest.run, "key": manifest.key, **manifest.details, "column": about or None}
+    told = ["", f"{column}: " + ", ".join(f"{key} {value}" for key, value in about.items())] if about else []
+    return print_result(content, lambda: [*_describe(manifest), *told], json=json)
 
 
 def _describe_column(column: str) -> dict[str, str]:
@@ -68,17 +59,17 @@ def _describe_column(column: str) -> dict[str, str]:
 
 def _describe(manifest: Manifest) -> list[str]:
     details = manifest.details
-    log = _part(details, "log")
+    log = manifest.part("log")
     lines = [
         f"run            {manifest.run}",
         f"generation     {manifest.key}    {manifest.folder}",
         f"log            {log.get('path')}",
         f"sha256         {log.get('sha256')}",
-        f"vehicle        {_part(details, 'vehicle').get('name')}, dataset {details.get('dataset')}",
-        "versions       " + ", ".join(f"{name} {text}" for name, text in _part(details, "versions").items()),
+        f"vehicle        {manifest.part('vehicle').get('name')}, dataset {details.get('dataset')}",
+        "versions       " + ", ".join(f"{name} {text}" for name, text in manifest.part("versions").items()),
         "stages",
     ]
-    for stage, entry in _part(details, "stages").items():
+    for stage, entry in manifest.part("stages").items():
         key = entry.get("key") if isinstance(entry, dict) else ""
         lines.append(f"  {stage:<13}{key}")
     lines += _describe_alignment(manifest)
@@ -88,7 +79,7 @@ def _describe(manifest: Manifest) -> list[str]:
         contract = f"contract {stored.contract_version}"
         lines.append(f"  {table:<13}{stored.rows} rows{quarantined}    {contract}    {stored.sha256[:16]}")
     lines.append("configuration")
-    lines.append("  " + encoder.dumps(_without_defaults(_part(details, "configuration"))))
+    lines.append("  " + encoder.dumps(_without_defaults(manifest.part("configuration"))))
     return lines
 
 
@@ -112,11 +103,6 @@ def _describe_alignment(manifest: Manifest) -> list[str]:
                 f"  slip on {name:<12}{before:.4g} m/s as recorded, {now:.4g} m/s put right (medians)"
             )
     return lines
-
-
-def _part(content: Mapping[str, object], key: str) -> dict[str, object]:
-    found = content.get(key)
-    return dict(found) if isinstance(found, dict) else {}
 
 
 def _without_defaults(configuration: Mapping[str, object]) -> dict[str, object]:

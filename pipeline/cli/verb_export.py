@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.cli.model_trust import TrustCode, open_model
-from pipeline.cli.output import CLEAN, print_json, print_lines
+from pipeline.cli.output import print_result
 from pipeline.core.paths import resolve_inside
 
 if TYPE_CHECKING:
@@ -21,11 +21,6 @@ _SUFFIXES = {
     "foxglove-layout": "_foxglove.json",
     "plotjuggler-layout": "_plotjuggler.xml",
 }
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(export)
 
 
 def export(
@@ -57,29 +52,33 @@ def export(
         quiet: print nothing.
     """
     from pipeline.analysis.lookup import find_run  # noqa: PLC0415 - heavy
-    from pipeline.report import exports  # noqa: PLC0415 - heavy
+    from pipeline.report.exports.csv import write_csv  # noqa: PLC0415 - heavy
+    from pipeline.report.exports.derived import write_derived_log  # noqa: PLC0415
+    from pipeline.report.exports.layouts import (  # noqa: PLC0415
+        write_foxglove_layout,
+        write_plotjuggler_layout,
+    )
+    from pipeline.report.exports.source import ExportSource  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     manifest = find_run(run, Store(out))
     known = None if model is None else open_model(model, trust_code=trust_code)
     chosen, named_on = _find_named(manifest) if known is None else (known.model, None)
-    source = exports.ExportSource(manifest, chosen, input or named_on, frame)
+    source = ExportSource(manifest, chosen, input or named_on, frame)
     path = file or resolve_inside(Path(), manifest.run.replace("/", "_") + _SUFFIXES[to])
     if to == "csv":
-        written = exports.write_csv(source, path)
+        written = write_csv(source, path)
     else:
         write = {
-            "mcap": exports.write_derived_log,
-            "foxglove-layout": exports.write_foxglove_layout,
-            "plotjuggler-layout": exports.write_plotjuggler_layout,
+            "mcap": write_derived_log,
+            "foxglove-layout": write_foxglove_layout,
+            "plotjuggler-layout": write_plotjuggler_layout,
         }[to]
         written = [write(source, path)]
-    if json:
-        left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
-        print_json({"run": manifest.run, "to": to, "files": [str(each) for each in written], **left_out})
-    elif not quiet:
-        print_lines(str(each) for each in written)
-    return CLEAN
+    files = [str(each) for each in written]
+    left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
+    content = {"run": manifest.run, "to": to, "files": files, **left_out}
+    return print_result(content, lambda: files, json=json, quiet=quiet)
 
 
 def _find_named(manifest: Manifest) -> tuple[Model | None, str | None]:

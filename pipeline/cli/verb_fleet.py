@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.output import CLEAN, print_json, print_lines
+from pipeline.cli.output import print_result
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -24,12 +24,12 @@ Results = Annotated[Path, Parameter(help="results folder")]
 Out = Annotated[Path | None, Parameter(help="the same as RESULTS")]
 
 
-def register(app: App) -> None:
-    """Add the verb and its own verbs."""
+def build() -> App:
+    """The verb and its own verbs."""
     fleet = App(name="fleet", help="Numbers of vehicles by level: the vehicle's, the ground's, a run's own.")
     for command in (fit, show):
         fleet.command(command)
-    app.command(fleet)
+    return fleet
 
 
 def fit(
@@ -51,8 +51,8 @@ def fit(
     store = Store(out or results)
     model, keys = fit_results(store)
     path = write_fleet(store, model, keys)
-    _print({**describe_fleet(model), "file": str(path)}, json=json, quiet=quiet)
-    return CLEAN
+    content = {**describe_fleet(model), "file": str(path)}
+    return print_result(content, lambda: _describe(content), json=json, quiet=quiet)
 
 
 def show(
@@ -69,15 +69,8 @@ def show(
     from pipeline.analysis.fleet import read_fleet  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    _print(read_fleet(Store(out or results)), json=json, quiet=quiet)
-    return CLEAN
-
-
-def _print(content: Mapping[str, object], *, json: bool, quiet: bool) -> None:
-    if json:
-        print_json(content)
-    elif not quiet:
-        print_lines(_describe(content))
+    content = read_fleet(Store(out or results))
+    return print_result(content, lambda: _describe(content), json=json, quiet=quiet)
 
 
 def _describe(content: Mapping[str, object]) -> list[str]:

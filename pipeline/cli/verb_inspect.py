@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.cli.choices import Choices, build_options
-from pipeline.cli.output import CLEAN, LOSSY, print_json, print_lines
+from pipeline.cli.output import CLEAN, LOSSY, print_result
 from pipeline.core.durations import say_duration
 
 if TYPE_CHECKING:
@@ -19,12 +19,8 @@ if TYPE_CHECKING:
 
 _OTHER_CLOCK_S = 3600.0
 """Stamps further from the log time are of another clock: simulated time, time since boot, time never set."""
+_LOSS = ("kind", "bytes", "chunks", "start_ns", "end_ns", "text")
 _ROLES = ("command", "wheels", "pose", "imu", "interval")
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(inspect)
 
 
 def inspect(  # noqa: D417 - the shared choices document themselves
@@ -43,10 +39,7 @@ def inspect(  # noqa: D417 - the shared choices document themselves
 
     options = build_options(choices)
     seen = inspect_log(log, config=options.config, overrides=options.overrides)
-    if json:
-        print_json(_as_json(seen))
-    else:
-        print_lines(_describe(seen))
+    print_result(_as_json(seen), lambda: _describe(seen), json=json)
     return LOSSY if seen.losses else CLEAN
 
 
@@ -62,17 +55,7 @@ def _as_json(seen: Inspection) -> dict[str, object]:
         "chunks": index.chunk_count,
         "compressions": list(index.compressions),
         "complete": not seen.losses,
-        "losses": [
-            {
-                "kind": loss.kind,
-                "bytes": loss.bytes,
-                "chunks": loss.chunks,
-                "start_ns": loss.start_ns,
-                "end_ns": loss.end_ns,
-                "text": loss.text,
-            }
-            for loss in seen.losses
-        ],
+        "losses": [{name: getattr(loss, name) for name in _LOSS} for loss in seen.losses],
         "unchecked": seen.unchecked or None,
         "notes": list(seen.notes),
         "metadata": {name: dict(record) for name, record in index.metadata.items()},

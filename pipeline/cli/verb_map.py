@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from pipeline.analysis.options import FigureFormat
-from pipeline.cli.output import CLEAN, print_json, print_lines
+from pipeline.cli.output import print_result
 from pipeline.cli.results_place import open_results
 
 if TYPE_CHECKING:
@@ -18,15 +18,15 @@ _OWN = Path("deployments.csv")
 _FEATURES_MEMORY = "2GB"
 
 
-def register(app: App) -> None:
-    """Add the verb and its two commands."""
+def build() -> App:
+    """The verb and its two commands."""
     verb = App(
         name="map", help="Draw deployments by kinetic energy and terrain complexity, own runs on them."
     )
     verb.default(draw)
     verb.command(add)
     verb.command(merge)
-    app.command(verb)
+    return verb
 
 
 def draw(  # noqa: D417 - arguments document themselves
@@ -68,28 +68,24 @@ def draw(  # noqa: D417 - arguments document themselves
     features = None if shared is None else _read_features(shared)
     drawn = draw_up_map(store, deployments, fed=fed, show=show, shared=features)
     page = write_map(store, drawn, figures)
-    if json:
-        print_json(
-            {
-                "deployments": drawn.points.to_dicts(),
-                "datasets": drawn.own.to_dicts(),
-                "input": drawn.input,
-                "measure": vars(drawn.measure),
-                "notes": list(drawn.notes),
-                "page": str(page),
-            }
-        )
-    elif not quiet:
-        print_lines(
-            f"{row['dataset']:<26}{row['energy']:>9.3g} J   complexity {row['complexity']:.1f}   "
-            f"{drawn.measure.name} {_say(row['value'], drawn.measure.unit)}   {row['zone']} risk"
-            for row in drawn.own.sort("energy", descending=True).iter_rows(named=True)
-        )
-        print_lines(f"! {note}" for note in drawn.notes)
-        placed = f"{drawn.points.height} of {drawn.deployments.height} deployments placed"
-        fed_words = drawn.input.replace("measured", "measured wheels")
-        print_lines([f"page    {page}    ({placed}; {drawn.measure.name} on {fed_words})"])
-    return CLEAN
+    content = {
+        "deployments": drawn.points.to_dicts(),
+        "datasets": drawn.own.to_dicts(),
+        "input": drawn.input,
+        "measure": vars(drawn.measure),
+        "notes": list(drawn.notes),
+        "page": str(page),
+    }
+    lines = [
+        f"{row['dataset']:<26}{row['energy']:>9.3g} J   complexity {row['complexity']:.1f}   "
+        f"{drawn.measure.name} {_say(row['value'], drawn.measure.unit)}   {row['zone']} risk"
+        for row in drawn.own.sort("energy", descending=True).iter_rows(named=True)
+    ]
+    placed = f"{drawn.points.height} of {drawn.deployments.height} deployments placed"
+    fed_words = drawn.input.replace("measured", "measured wheels")
+    lines += [f"! {note}" for note in drawn.notes]
+    lines.append(f"page    {page}    ({placed}; {drawn.measure.name} on {fed_words})")
+    return print_result(content, lambda: lines, json=json, quiet=quiet)
 
 
 def _say(value: float | None, unit: str) -> str:
@@ -114,8 +110,7 @@ def add(  # noqa: D417 - arguments document themselves
 
     table = add_deployment(to, entry)
     write_deployments(table, to)
-    _tell(table, to, json=json, quiet=quiet)
-    return CLEAN
+    return _tell(table, to, json=json, quiet=quiet)
 
 
 def merge(  # noqa: D417 - arguments document themselves
@@ -139,15 +134,13 @@ def merge(  # noqa: D417 - arguments document themselves
         quiet: print nothing.
     """
     if _are_features(first, second):
-        _merge_features(first, second, to or Path("features.parquet"), json=json, quiet=quiet)
-        return CLEAN
+        return _merge_features(first, second, to or Path("features.parquet"), json=json, quiet=quiet)
     from pipeline.fleet.deployments import merge_deployments, write_deployments  # noqa: PLC0415 - heavy
 
     to = to or _OWN
     table = merge_deployments(first, second)
     write_deployments(table, to)
-    _tell(table, to, json=json, quiet=quiet)
-    return CLEAN
+    return _tell(table, to, json=json, quiet=quiet)
 
 
 def _are_features(*paths: Path) -> bool:
@@ -170,7 +163,7 @@ def _read_features(path: Path) -> pl.DataFrame:
         return read_features(path)
 
 
-def _merge_features(first: Path, second: Path, to: Path, *, json: bool, quiet: bool) -> None:
+def _merge_features(first: Path, second: Path, to: Path, *, json: bool, quiet: bool) -> int:
     from pipeline.fleet.features import merge_features, write_features  # noqa: PLC0415 - heavy
 
     merged, twice = merge_features(
@@ -178,14 +171,11 @@ def _merge_features(first: Path, second: Path, to: Path, *, json: bool, quiet: b
     )
     write_features(merged, to)
     runs = merged["sha256"].n_unique()
-    if json:
-        print_json({"file": str(to), "runs": runs, "rows": merged.height, "twice": twice})
-    elif not quiet:
-        print_lines([f"{to}: {runs} runs, {merged.height} rows, {twice} stood twice"])
+    content = {"file": str(to), "runs": runs, "rows": merged.height, "twice": twice}
+    line = f"{to}: {runs} runs, {merged.height} rows, {twice} stood twice"
+    return print_result(content, lambda: [line], json=json, quiet=quiet)
 
 
-def _tell(table: pl.DataFrame, path: Path, *, json: bool, quiet: bool) -> None:
-    if json:
-        print_json({"table": str(path), "deployments": table.height, "keys": table["key"].to_list()})
-    elif not quiet:
-        print_lines([f"{path}: {table.height} deployments"])
+def _tell(table: pl.DataFrame, path: Path, *, json: bool, quiet: bool) -> int:
+    content = {"table": str(path), "deployments": table.height, "keys": table["key"].to_list()}
+    return print_result(content, lambda: [f"{path}: {table.height} deployments"], json=json, quiet=quiet)

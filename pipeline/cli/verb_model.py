@@ -52,13 +52,13 @@ class On:
 Spoken = Annotated[On, Parameter(name="*")]
 
 
-def register(app: App) -> None:
-    """Add the verb and its own verbs."""
+def build() -> App:
+    """The verb and its own verbs."""
     model = App(name="model", help="Make, show, change, fit, compare and export a motion model.")
     for command in (new, show, add, fit, compare, export, trust, untrust, trusted):
         model.command(command)
     model.command(drop, name=("drop", "remove"))
-    app.command(model)
+    return model
 
 
 def new(

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.choices import Choices, build_options
@@ -29,14 +29,10 @@ if TYPE_CHECKING:
     from pipeline.analysis.options import Options
     from pipeline.diagnosis import Recording, RunDiagnosis
     from pipeline.fleet.forecast import Forecast
-    from pipeline.plan import Needed, Plan
+    from pipeline.plan.plan import Plan
+    from pipeline.plan.protocols import Needed
     from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(plan)
 
 
 def plan(  # noqa: D417 - the runs document themselves
@@ -99,8 +95,8 @@ def plan(  # noqa: D417 - the runs document themselves
             return _check(check, names, options, json=json, quiet=quiet)
         from pipeline.analysis.plan import Wish, expect, plan_drive, study  # noqa: PLC0415 - heavy
         from pipeline.analysis.planned import write_drive  # noqa: PLC0415 - heavy
-        from pipeline.plan import compare_protocols, parse_area, parse_protocols  # noqa: PLC0415 - heavy
-        from pipeline.plan.limits import parse_time  # noqa: PLC0415 - heavy
+        from pipeline.plan.limits import parse_area, parse_time  # noqa: PLC0415 - heavy
+        from pipeline.plan.protocols import compare_protocols, parse_protocols  # noqa: PLC0415 - heavy
 
         seconds = parse_time(time)
         protocols = () if compare is None else parse_protocols(compare)
@@ -263,7 +259,8 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
     """Promises against the joint diagnosis of the runs before and the drive."""
     from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy
     from pipeline.diagnosis.recording import load_recording  # noqa: PLC0415 - heavy
-    from pipeline.plan import check_plan, read_promises  # noqa: PLC0415 - heavy
+    from pipeline.plan.check import check_plan  # noqa: PLC0415 - heavy
+    from pipeline.plan.files import read_promises  # noqa: PLC0415 - heavy
     from pipeline.plan.playback import require_played  # noqa: PLC0415 - heavy
 
     promised = read_promises(path)
@@ -295,17 +292,14 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
             for one in checked.kept
         ]
         rows += [f"open      {text}" for text in checked.open]
-        print_lines([*(rows or ["the plan promised nothing"]), *_next_lines(diagnosis, following)])
+        rows = rows or ["the plan promised nothing"]
+        print_lines([*rows, f"next      {following}"] if diagnosis.undecided else rows)
     return LOSSY if lossy else CLEAN
-
-
-def _next_lines(diagnosis: RunDiagnosis, following: str) -> list[str]:
-    return [f"next      {following}"] if diagnosis.undecided else []
 
 
 def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path]) -> list[str]:
     """The plan on one screen."""
-    from pipeline.plan import SAFETY  # noqa: PLC0415 - heavy
+    from pipeline.plan.plan import SAFETY  # noqa: PLC0415 - heavy
 
     if not made.manoeuvres and not made.impossible:
         what = "" if diagnosis is None else ": what was found is decided, and driving narrows no number"

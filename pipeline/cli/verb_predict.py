@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
-from pipeline.cli.output import CLEAN, print_json, print_lines
+from pipeline.cli.output import print_result
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -18,11 +18,6 @@ _WORDS = (
     ("t_mrmse_m", "error over 2 s", "m"),
     ("ideal_t_mrmse_m", "of the ideal model", "m"),
 )
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(predict)
 
 
 def predict(
@@ -66,11 +61,7 @@ def predict(
     if model is not None:
         write_model(make_model_file(prediction), model)
     content = {**describe_prediction(prediction), "model": None if model is None else str(model)}
-    if json:
-        print_json(content)
-    elif not quiet:
-        print_lines(_describe(content))
-    return CLEAN
+    return print_result(content, lambda: _describe(content), json=json, quiet=quiet)
 
 
 def _describe(content: Mapping[str, object]) -> list[str]:

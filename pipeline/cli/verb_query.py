@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.cli.output import CLEAN, tidy_line
 from pipeline.cli.results_place import open_results
@@ -18,11 +18,6 @@ if TYPE_CHECKING:
     import polars as pl
 
 _WIDE = 200
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(query)
 
 
 def query(  # noqa: D417 - arguments document themselves

@@ -6,16 +6,11 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.batch.schedule import Nightly, System, parse_clock, print_units
 from pipeline.cli.output import CLEAN
 from pipeline.core.interpreter import slip_command
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(schedule)
 
 
 def schedule(  # noqa: D417 - arguments document themselves

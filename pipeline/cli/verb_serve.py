@@ -7,15 +7,10 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.output import CLEAN, print_json, say
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(serve)
 
 
 def serve(  # noqa: D417 - the hidden spelling of the folder documents itself

@@ -5,14 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
-from pipeline.cli.output import CLEAN, print_json, print_lines
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(share)
+from pipeline.cli.output import print_result
 
 
 def share(  # noqa: D417 - arguments document themselves
@@ -39,8 +34,6 @@ def share(  # noqa: D417 - arguments document themselves
     features, notes = gather_features(Store(out or results))
     write_features(features, to)
     runs = features["sha256"].n_unique()
-    if json:
-        print_json({"file": str(to), "runs": runs, "rows": features.height, "notes": list(notes)})
-    elif not quiet:
-        print_lines([f"{to}: {runs} runs, {features.height} rows", *(f"! {note}" for note in notes)])
-    return CLEAN
+    content = {"file": str(to), "runs": runs, "rows": features.height, "notes": list(notes)}
+    lines = [f"{to}: {runs} runs, {features.height} rows", *(f"! {note}" for note in notes)]
+    return print_result(content, lambda: lines, json=json, quiet=quiet)

@@ -5,16 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline.cli.output import CLEAN, print_json, print_lines
+from pipeline.cli.output import print_result
 from pipeline.core.errors import SlipError
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(simulate)
 
 
 def simulate(  # noqa: D417 - arguments document themselves
@@ -53,7 +48,7 @@ def simulate(  # noqa: D417 - arguments document themselves
     from pipeline.simulate import PLATFORMS, list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy
 
     if cases:
-        _print_catalogue(
+        return _print_catalogue(
             [(found.name, found.shows) for found in list_cases()],
             [(found.id, found.formula) for found in list_effects()],
             [
@@ -62,7 +57,6 @@ def simulate(  # noqa: D417 - arguments document themselves
             ],
             json=json,
         )
-        return CLEAN
     effects = dict(_parse_effect(text) for text in effect or [])
     path = simulate_case(
         case,
@@ -76,11 +70,7 @@ def simulate(  # noqa: D417 - arguments document themselves
         platform=platform,
         play=play,
     )
-    if json:
-        print_json({"path": str(path), "effects": effects})
-    else:
-        print_lines([str(path)])
-    return CLEAN
+    return print_result({"path": str(path), "effects": effects}, lambda: [str(path)], json=json)
 
 
 def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:
@@ -107,11 +97,10 @@ def _print_catalogue(
     platforms: list[tuple[str, str]],
     *,
     json: bool,
-) -> None:
-    if json:
-        print_json({"cases": dict(cases), "effects": dict(effects), "platforms": dict(platforms)})
-        return
-    for title, rows in (("cases", cases), ("effects", effects), ("platforms", platforms)):
-        print_lines([title])
-        width = max(len(name) for name, _ in rows)
-        print_lines(f"  {name:<{width}}  {text}" for name, text in rows)
+) -> int:
+    lists = {"cases": dict(cases), "effects": dict(effects), "platforms": dict(platforms)}
+    lines = []
+    for title, rows in lists.items():
+        width = max(len(name) for name in rows)
+        lines += [title, *(f"  {name:<{width}}  {text}" for name, text in rows.items())]
+    return print_result(lists, lambda: lines, json=json)

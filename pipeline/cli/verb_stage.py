@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline.cli.choices import Choices, build_options
-from pipeline.cli.output import CLEAN, LOSSY, print_json, print_lines, show_progress
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(stage)
+from pipeline.cli.output import CLEAN, LOSSY, print_result, show_progress
 
 
 def stage(  # noqa: D417 - the shared choices document themselves
@@ -37,16 +33,14 @@ def stage(  # noqa: D417 - the shared choices document themselves
     from pipeline.analysis.analyze import analyze_log  # noqa: PLC0415 - heavy
     from pipeline.analysis.lookup import find_log  # noqa: PLC0415 - heavy
 
-    options = build_options(choices, force=force, through=name)
+    options = replace(build_options(choices), force=force, through=name)
     path = find_log(log, options.out)
     with show_progress(path.name, quiet=quiet or json) as progress:
         outcome = analyze_log(Path(path), options, progress)
     tables = {table: entry.rows for table, entry in sorted(outcome.manifest.tables.items())}
-    if json:
-        print_json({"run": outcome.manifest.run, "computed": list(outcome.computed), "rows": tables})
-    elif not quiet:
-        done = ", ".join(outcome.computed) or "nothing: all is as before"
-        print_lines([f"run       {outcome.manifest.run}", f"computed  {done}"])
-        print_lines(f"  {table:<12}{rows:>9} rows" for table, rows in tables.items())
-        print_lines([f"in        {outcome.manifest.folder}"])
+    content = {"run": outcome.manifest.run, "computed": list(outcome.computed), "rows": tables}
+    done = ", ".join(outcome.computed) or "nothing: all is as before"
+    lines = [f"run       {outcome.manifest.run}", f"computed  {done}"]
+    lines += [f"  {table:<12}{rows:>9} rows" for table, rows in tables.items()]
+    print_result(content, lambda: [*lines, f"in        {outcome.manifest.folder}"], json=json, quiet=quiet)
     return LOSSY if outcome.lossy else CLEAN

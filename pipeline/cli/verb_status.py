@@ -6,9 +6,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
-from pipeline.cli.output import CLEAN, FAILED, describe_error, print_json, print_lines
+from pipeline.cli.output import CLEAN, FAILED, describe_error, print_result
 from pipeline.cli.results_place import open_results
 
 if TYPE_CHECKING:
@@ -21,11 +21,6 @@ _WORDS = {
     "quarantined": "quarantined",
     "copy": "copies",
 }
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(status)
 
 
 def status(  # noqa: D417 - arguments document themselves
@@ -43,10 +38,7 @@ def status(  # noqa: D417 - arguments document themselves
     from pipeline.batch.status import tell_status  # noqa: PLC0415 - only for this verb
 
     found = tell_status(open_results(results or out).open_store())
-    if json:
-        print_json(_as_json(found))
-    else:
-        print_lines(_describe(found))
+    print_result(_as_json(found), lambda: _describe(found), json=json)
     return FAILED if found.errors else CLEAN
 
 

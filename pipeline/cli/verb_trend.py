@@ -6,21 +6,16 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 from cyclopts.types import NonNegativeFloat
 
-from pipeline.cli.output import CLEAN, print_json, print_lines
+from pipeline.cli.output import CLEAN, print_result
 from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
-    from pipeline.analysis.trend import Trend
+    from pipeline.fleet.trend import Trend
 
 ALERT = 4
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(trend)
 
 
 def trend(  # noqa: D417 - arguments document themselves
@@ -60,10 +55,9 @@ def trend(  # noqa: D417 - arguments document themselves
     names = tuple(name.strip() for name in by.split(",") if name.strip())
     found = follow_trend(store, names, threshold=threshold, limits=dict(map(_read_limit, limit)))
     page = write_trend(store, found)
-    if json:
-        print_json({**describe_trend(found), "page": str(page)})
-    elif not quiet:
-        print_lines(_describe(found, page).split("\n"))
+    print_result(
+        {**describe_trend(found), "page": str(page)}, lambda: _describe(found, page), json=json, quiet=quiet
+    )
     return ALERT if found.alerts else CLEAN
 
 
@@ -80,7 +74,7 @@ def _read_limit(text: str) -> tuple[str, float]:
     return name.strip() or text, limit
 
 
-def _describe(found: Trend, page: Path) -> str:
+def _describe(found: Trend, page: Path) -> list[str]:
     from pipeline.fleet.parameter_trend import say_power  # noqa: PLC0415 - heavy
     from pipeline.fleet.trend import describe_quiet  # noqa: PLC0415 - heavy
 
@@ -100,5 +94,4 @@ def _describe(found: Trend, page: Path) -> str:
         runs = slip.points.height
         latest = f"{slip.quantity} latest {slip.latest:.3g} {slip.unit}"
         lines.append(f"{group:<34}{runs:>4} run{'s' * (runs != 1):<2} {latest}")
-    lines += [*(f"! {note}" for note in found.notes), f"page    {page}"]
-    return "\n".join(lines)
+    return [*lines, *(f"! {note}" for note in found.notes), f"page    {page}"]

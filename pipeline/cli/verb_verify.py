@@ -6,18 +6,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
-from pipeline.cli.output import CLEAN, FAILED, print_json, print_lines, show_progress
+from pipeline.cli.output import CLEAN, FAILED, print_result, show_progress
 from pipeline.cli.results_place import open_results
 
 if TYPE_CHECKING:
     from pipeline.batch.verification import Verification
-
-
-def register(app: App) -> None:
-    """Add the verb."""
-    app.command(verify)
 
 
 def verify(  # noqa: D417 - arguments document themselves
@@ -43,24 +38,17 @@ def verify(  # noqa: D417 - arguments document themselves
     place = open_results(results or out)
     with show_progress("verify", quiet=quiet or json) as tell:
         found = verify_results(place.open_store(), mirror=place.mirror, logs=logs, tell=tell, repair=repair)
-    if json:
-        print_json(_as_json(found, repair=repair))
-    elif not quiet:
-        print_lines(_describe(found))
+    print_result(_as_json(found, repair=repair), lambda: _describe(found), json=json, quiet=quiet)
     return CLEAN if found.is_clean else FAILED
 
 
 def _as_json(found: Verification, *, repair: bool) -> dict[str, object]:
-    files = [
-        {"run": problem.run, "path": str(problem.path), "code": problem.code, "message": problem.what}
-        for problem in found.files
-    ]
-    logs, gone = (
+    files, logs, gone = (
         [
-            {"run": problem.run, "path": problem.path, "code": problem.code, "message": problem.what}
+            {"run": problem.run, "path": str(problem.path), "code": problem.code, "message": problem.what}
             for problem in problems
         ]
-        for problems in (found.logs, found.gone)
+        for problems in (found.files, found.logs, found.gone)
     )
     answer = {
         "runs": found.checked,

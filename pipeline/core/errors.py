@@ -4,6 +4,9 @@ An error has a stable code for scripts, says what is wrong and where, and ends w
 Each room derives one class of its own.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 _READABLE = 300
 _LONGEST = 1000
 
@@ -47,3 +50,18 @@ def shorten(text: str, most: int = _READABLE) -> str:
 
 def _rebuild(kind: type[SlipError], code: str, what: str, where: str, hint: str) -> SlipError:
     return kind(code, what, where=where, hint=hint)
+
+
+@contextmanager
+def naming_os_errors(
+    make: type[SlipError], code: str, what: str, *, where: object, hint: str
+) -> Iterator[None]:
+    """Within it, what the operating system refuses is an error of the house: `what`, and the reason it gives.
+
+    Raises:
+        SlipError: of the class `make`.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise make(code, f"{what}: {error.strerror}", where=str(where), hint=hint) from error

@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.fleet.statistics import adjust_holm, bound_difference, permute_means, runs_needed
+from pipeline.fleet.statistics.families import adjust_holm, runs_needed
+from pipeline.fleet.statistics.intervals import bound_difference
+from pipeline.fleet.statistics.permutation import permute_means
 from pipeline.identification.apportion import jackknife_ratio
 
 if TYPE_CHECKING:
@@ -205,3 +207,24 @@ def _compare(a: _Group, b: _Group) -> Difference:
             f"{runs_needed(len(causes))} a side would do"
         )
     return Difference(a.name, b.name, roots[1] - roots[0], tuple(parts), BLOCKS if single else RUNS, note)
+
+
+@dataclass(frozen=True)
+class Causes:
+    """Deployments by cause.
+
+    Attributes:
+        budgets: of every dataset.
+        differences: of every two datasets.
+        input: what u is.
+        names: what effects are called by their level, where that is not their id and vehicles agree.
+        keys: run/generation of every run.
+        notes: what must be known.
+    """
+
+    budgets: tuple[Budget, ...]
+    differences: tuple[Difference, ...]
+    input: str
+    names: Mapping[str, str]
+    keys: tuple[str, ...]
+    notes: tuple[str, ...]

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.fleet.statistics import bound_typical
+from pipeline.fleet.statistics.intervals import bound_typical
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.fleet.statistics import Interval
+    from pipeline.fleet.statistics.intervals import Interval
 
 OVER_RUNS = "over runs"
 THIS_RUN = "this run only"
@@ -23,6 +23,7 @@ _MEDIANS = (
     "height_rate", "relative_slip", "slip_energy", "lost_energy", "unpredictability",
     "relative_unpredictability", "transitory_slip",
 )  # fmt: skip
+_REACH = 1.5
 _SUMS = ("samples", "windows", "distance", "duration")
 _NO_INTERVALS: Mapping[tuple[str, str], Interval] = {}
 
@@ -114,3 +115,35 @@ def read_day(run: str) -> str | None:
     if not (1 <= month <= 12 and 1 <= day <= 31):  # noqa: PLR2004 - the calendar
         return None
     return f"{year:04d}-{month:02d}-{day:02d}"
+
+
+def spread_windows(windows: pl.LazyFrame, groups: pl.DataFrame) -> pl.DataFrame:
+    """Box plot numbers of the 2 s window norms of every group and input.
+
+    Whiskers end at the last window within 1.5 quartile distances of the box (Tukey 1977).
+
+    Args:
+        windows: table `windows`; suspect ones are left out.
+        groups: ``run`` and ``group``.
+
+    Returns:
+        ``group``, ``input``, ``windows``, ``low``, ``q1``, ``median``, ``q3``, ``high`` [m/s].
+    """
+    norm = pl.col("window_norm")
+    first, third = norm.quantile(0.25), norm.quantile(0.75)
+    reach = _REACH * (third - first)
+    return (
+        windows.filter(~pl.col("suspect"), norm.is_finite())
+        .join(groups.lazy(), on="run")
+        .group_by("group", "input")
+        .agg(
+            pl.len().alias("windows"),
+            norm.filter(norm >= first - reach).min().alias("low"),
+            first.alias("q1"),
+            norm.median().alias("median"),
+            third.alias("q3"),
+            norm.filter(norm <= third + reach).max().alias("high"),
+        )
+        .sort("median", "group")
+        .collect()
+    )

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import polars as pl
 
+from pipeline.core.errors import naming_os_errors
 from pipeline.fleet.errors import ComparisonError
 from schemas.deployments import Deployments
 
@@ -108,17 +109,11 @@ def write_deployments(frame: pl.DataFrame, path: Path) -> None:
     """
     plain = frame.with_columns(pl.col(pl.Enum).cast(pl.String), pl.col(pl.Float64).round_sig_figs(_DIGITS))
     temporary = path.with_name(f".tmp-{path.name}")
-    try:
+    what, hint = "the table cannot be written", "Choose another file"
+    with naming_os_errors(ComparisonError, "not_written", what, where=path, hint=hint):
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.write_text(plain.write_csv(), encoding="utf-8")
         temporary.replace(path)
-    except OSError as error:
-        raise ComparisonError(
-            "not_written",
-            f"the table cannot be written: {error.strerror}",
-            where=str(path),
-            hint="Choose another file",
-        ) from error
 
 
 def _check(text: pl.DataFrame, where: str) -> pl.DataFrame:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
+from pipeline.core.errors import naming_os_errors
 from pipeline.fleet.errors import ComparisonError
 from schemas.contract import contract_of
 from schemas.features import Features
@@ -44,13 +45,9 @@ def write_features(frame: pl.DataFrame, path: Path) -> None:
     from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
     from pipeline.store.tables import encode_parquet  # noqa: PLC0415
 
-    try:
+    what, hint = "the file cannot be written", "Choose another file."
+    with naming_os_errors(ComparisonError, "not_written", what, where=path, hint=hint):
         replace_file(path, encode_parquet(contract_of("features"), frame, compression="none"))
-    except OSError as error:
-        raise ComparisonError(
-            "not_written", f"the file cannot be written: {error.strerror}", where=str(path),
-            hint="Choose another file.",
-        ) from error  # fmt: skip
 
 
 def check_features(frame: pl.DataFrame, where: str) -> pl.DataFrame:

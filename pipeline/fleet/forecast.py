@@ -11,7 +11,7 @@ import polars as pl
 from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.hierarchy import leave_out_odd, take_numbers
 from pipeline.fleet.runs import UNKNOWN
-from pipeline.fleet.statistics import draw_run
+from pipeline.fleet.statistics.posterior import draw_run
 from pipeline.models.bounds import stands_at_bound
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Place

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.fleet.statistics import kendall_p, kendall_tau
+from pipeline.fleet.statistics.ranks import kendall_p, kendall_tau
 
 _LEVEL = 0.05
 

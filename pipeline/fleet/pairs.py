@@ -9,24 +9,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.fleet.statistics import (
-    DRAWS,
-    MOST_GROUPS,
-    adjust_holm,
-    adjust_max_t,
-    bootstrap_median,
-    compare_blocks,
-    compare_runs,
-    cut_blocks,
-    mann_whitney,
-    name_delta,
-    runs_needed,
-)
+from pipeline.fleet.statistics.families import MOST_GROUPS, adjust_holm, adjust_max_t, runs_needed
+from pipeline.fleet.statistics.intervals import bootstrap_median
+from pipeline.fleet.statistics.pairs import compare_blocks, compare_runs, cut_blocks
+from pipeline.fleet.statistics.permutation import DRAWS
+from pipeline.fleet.statistics.ranks import mann_whitney, name_delta
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.fleet.statistics import Blocks, Comparison, Interval
+    from pipeline.fleet.statistics.intervals import Interval
+    from pipeline.fleet.statistics.pairs import Blocks, Comparison
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

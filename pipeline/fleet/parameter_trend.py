@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.fleet.hierarchy import leave_out_odd, list_numbers
 from pipeline.fleet.runs import UNKNOWN
-from pipeline.fleet.statistics import FEWEST_FREE, find_shifts, guess_shift
+from pipeline.fleet.statistics.shifts import FEWEST_FREE, find_shifts, guess_shift
 from pipeline.models.catalogue import find_effect
 from pipeline.models.level import Level
 

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
 import polars as pl
 
 from pipeline.fleet.terrain import complexity, rate_name
+
+if TYPE_CHECKING:
+    from pipeline.fleet.measures import Measure
 
 LOW_STATUSES = ("unconfirmed", "inferred", "placeholder", "second-hand")
 ZONES: tuple[tuple[str, float], ...] = (("low", 3.5), ("medium", 4.8), ("high", float("inf")))
@@ -86,3 +92,26 @@ def _name_zone() -> pl.Expr:
     for name, end in reversed(ZONES[:-1]):
         named = pl.when(risk < end).then(pl.lit(name)).otherwise(named)
     return named.alias("zone")
+
+
+@dataclass(frozen=True)
+class DeploymentMap:
+    """The map as tables.
+
+    Attributes:
+        deployments: the table of deployments.
+        points: those that can be placed.
+        own: own datasets that can be placed.
+        keys: run/generation of the runs of every own dataset.
+        notes: what is not on the map, and why.
+        input: what u is of the own datasets.
+        measure: what colours them.
+    """
+
+    deployments: pl.DataFrame
+    points: pl.DataFrame
+    own: pl.DataFrame
+    keys: tuple[str, ...]
+    notes: tuple[str, ...]
+    input: str
+    measure: Measure

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import polars as pl
@@ -169,3 +170,28 @@ def _write_cell(value: object, digits: int) -> str:
     if isinstance(value, float):
         return f"{value:.{digits}f}"
     return "".join(_SPECIAL.get(mark, mark) for mark in str(value))
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came of it.
+
+    Attributes:
+        datasets: table `datasets`, both inputs.
+        comparisons: table `comparisons`.
+        runs: one row a run and input with all its numbers.
+        input: what u is in the comparisons.
+        quantity: what was compared.
+        intervals: ``dataset``, ``value``, ``low``, ``high``, ``interval`` of what was compared.
+        windows: box plot numbers of the window norms, as of `spread_windows`.
+        notes: what must be known: runs left out, pairs that cannot be told apart.
+    """
+
+    datasets: pl.DataFrame
+    comparisons: pl.DataFrame
+    runs: pl.DataFrame
+    input: str
+    quantity: str
+    intervals: pl.DataFrame
+    windows: pl.DataFrame
+    notes: tuple[str, ...]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pipeline.fleet.parameter_trend import LevelChange, describe_change, say_change
-from pipeline.fleet.statistics import find_changes
+from pipeline.fleet.statistics.changes import find_changes
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -192,3 +192,15 @@ def _find_steps(points: pl.DataFrame, level: float) -> tuple[LevelChange, ...]:
         )
         for i, change in enumerate(changes)
     )
+
+
+@dataclass(frozen=True)
+class Trend:
+    """Series of groups, parameters of vehicles, what to look at, what must be known, what was asked."""
+
+    series: tuple[Series, ...]
+    parameters: tuple[ParameterTrend, ...]
+    alerts: tuple[Alert, ...]
+    keys: tuple[str, ...]
+    notes: tuple[str, ...]
+    asked: Mapping[str, object]

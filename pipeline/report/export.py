@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
+from pipeline.core.errors import naming_os_errors
 from pipeline.report.errors import ReportError
 from pipeline.report.page import draw_pictures
 from pipeline.report.scene import Scene
@@ -79,16 +80,12 @@ def write_pictures(
         else:
             content = vl_convert.vegalite_to_png(spec, scale=_PNG_SCALE)
         path = Path(folder) / f"{picture.id}.{format}"
-        try:
+        hint = "Choose a folder that can be written"
+        with naming_os_errors(
+            ReportError, "figure_not_written", "a figure cannot be written", where=path, hint=hint
+        ):
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
-        except OSError as error:
-            raise ReportError(
-                "figure_not_written",
-                f"a figure cannot be written: {error.strerror}",
-                where=str(path),
-                hint="Choose a folder that can be written",
-            ) from error
         written.append(path)
     return written
 

@@ -68,8 +68,7 @@ def make_motion_run(manifest: Manifest, vehicle: Vehicle, tables: Mapping[str, p
             where=manifest.run,
             hint="Check the pose topic with `slip inspect`.",
         )
-    log = manifest.details.get("log")
-    sha256 = str(log.get("sha256", "")) if isinstance(log, dict) else ""
+    sha256 = str(manifest.part("log").get("sha256", ""))
     return load_run(tables, vehicle, name=manifest.run, sha256=sha256)
 
 

@@ -134,6 +134,13 @@ class Manifest:
             raise _table_damaged("its columns are not those of its contract", path)
         return frame
 
+    def part(self, *keys: str) -> Mapping[str, JSON]:
+        """The object that stands in the details under these keys, one within the other; empty without one."""
+        found: JSON = dict(self.details)
+        for key in keys:
+            found = found.get(key) if isinstance(found, dict) else None
+        return found if isinstance(found, dict) else {}
+
     def read_json(self, name: str) -> dict[str, JSON]:
         """A JSON object of exactly this generation.
 

@@ -103,7 +103,7 @@ class FigureCache:
                 {
                     "id": figure.id,
                     "title": figure.title,
-                    "width": figure.width.value,
+                    "width": figure.width,
                     "words": figure.describe(scene),
                     "note": f"{_LEFT} {drawing.note}" if figure.id in _COLOURED else drawing.note,
                 }

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.analysis.log_setup import name_run
-from pipeline.analysis.options import STAGES, Options
+from pipeline.analysis.options import STAGE_WORDS, STAGES, Options
 from pipeline.core.errors import SlipError
 from pipeline.store import LogSighting, Store, see_log
 from pipeline.web.errors import WorkbenchError
@@ -30,14 +30,8 @@ if TYPE_CHECKING:
 WORDS = {
     "sample": "driving a simulated Husky over tile",
     "upload": "taking the log in",
-    "read": "reading the log",
-    "extract": "extracting commands and poses",
-    "align": "putting clocks and scales right",
-    "velocity": "differentiating poses",
-    "slip": "computing slip",
-    "aggregate": "aggregating",
+    **STAGE_WORDS,
     "diagnosis": "naming what is missing",
-    "report": "drawing the report",
     "plan": "planning the next drive",
 }
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from pipeline.core.errors import naming_os_errors
 from pipeline.core.paths import resolve_inside
 from pipeline.models import Model
 from pipeline.models.model_file import ModelFile, parse_model
@@ -153,16 +154,13 @@ class SessionFile:
         Raises:
             WorkbenchError: ``desk_not_written``.
         """
-        try:
+        hint = "Free some space, or choose a results folder that can be written."
+        kept = naming_os_errors(
+            WorkbenchError, "desk_not_written", "the state cannot be kept", where=self.path, hint=hint
+        )
+        with kept:
             make_folder(self.path.parent)
             replace_file(self.path, json.dumps(msgspec.to_builtins(session), allow_nan=False).encode())
-        except OSError as error:
-            raise WorkbenchError(
-                "desk_not_written",
-                f"the state cannot be kept: {error.strerror}",
-                where=str(self.path),
-                hint="Free some space, or choose a results folder that can be written.",
-            ) from error
 
     def parse(self, text: str) -> ModelFile:
         """The model of a step."""

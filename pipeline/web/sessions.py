@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.batch.work import Report, Task
-    from pipeline.models.formula import FormulaEffect
-    from pipeline.models.model_file import ModelFile
     from pipeline.store import Manifest
     from pipeline.web.limits import Limits
     from pipeline.web.places import Places
@@ -76,9 +74,7 @@ class Sessions:
         Raises:
             SlipError: it cannot be done; the session is as it was.
         """
-        manifest = find_run(self.store, ask.run)
-        file = SessionFile(self.results, ask.run, ask.slot)
-        prepared = self._cache.prepared(manifest, self._input_of(ask, file, manifest))
+        file, prepared = self._find(ask)
         with self._trials.waiting(), prepared.lock, evaluating(ask.run):
             session = actions.open_session(file, prepared)
             if ask.action == "preview":
@@ -92,15 +88,11 @@ class Sessions:
 
     def draw(self, ask: Ask) -> dict[str, object]:
         """All figures of a session."""
-        with self._trials.waiting(), evaluating(ask.run):
-            figures, shown = self._look(ask)
-            return figures.draw(shown)
+        return self._look(ask, FigureCache.draw)
 
     def redraw(self, ask: Ask) -> dict[str, object]:
         """The rows of a session's figures that a change moves."""
-        with self._trials.waiting(), evaluating(ask.run):
-            figures, shown = self._look(ask)
-            return figures.redraw(shown)
+        return self._look(ask, FigureCache.redraw)
 
     def format_model(self, run: str, slot: str) -> str:
         """The model file of a session as text."""
@@ -115,19 +107,12 @@ class Sessions:
         write_model(replace(parsed, model=switch_off(parsed.model, session.step.off)), file.model_path)
         return file.model_path
 
-    def _input_of(self, ask: Ask, file: SessionFile, manifest: Manifest) -> str | None:
-        if ask.input is not None:
-            return ask.input
-        kept = file.read()
-        return kept.input if kept is not None and kept.key == manifest.key else None
-
-    def _open(self, ask: Ask) -> tuple[PreparedRun, Session, ModelFile]:
+    def _find(self, ask: Ask) -> tuple[SessionFile, PreparedRun]:
         manifest = find_run(self.store, ask.run)
         file = SessionFile(self.results, ask.run, ask.slot)
-        prepared = self._cache.prepared(manifest, self._input_of(ask, file, manifest))
-        with prepared.lock:
-            session = actions.open_session(file, prepared)
-        return prepared, session, file.parse(session.step.model)
+        kept = None if ask.input is not None else file.read()
+        source = kept.input if kept is not None and kept.key == manifest.key else ask.input
+        return file, self._cache.prepared(manifest, source)
 
     def _read_session(self, run: str, slot: str) -> tuple[SessionFile, Session]:
         find_run(self.store, run)
@@ -146,7 +131,11 @@ class Sessions:
             "add_named": lambda: self._add_named(file, prepared, session, ask),
             "add_found": lambda: self._add_found(file, prepared, session, ask),
             "formula": lambda: actions.add_effect(
-                file, prepared, session, _read_formula(ask), anyway=ask.anyway
+                file,
+                prepared,
+                session,
+                make_formula(ask.effect, ask.channel, ask.formula, ask.parameters),
+                anyway=ask.anyway,
             ),
             "drop": lambda: actions.drop_effect(file, prepared, session, ask.effect),
             "switch": lambda: actions.switch_effect(file, prepared, session, ask.effect),
@@ -209,11 +198,14 @@ class Sessions:
             "slot": file.slot,
         }
 
-    def _look(self, ask: Ask) -> tuple[FigureCache, Shown]:
-        prepared, session, parsed = self._open(ask)
-        model = switch_off(parsed.model, session.step.off)
-        shown = prepared.show(model, session.step.timing, session.step.ladder, session.floor or None)
-        return self._figures_of(prepared.manifest), shown
+    def _look(self, ask: Ask, how: Callable[[FigureCache, Shown], dict[str, object]]) -> dict[str, object]:
+        with self._trials.waiting(), evaluating(ask.run):
+            file, prepared = self._find(ask)
+            with prepared.lock:
+                session = actions.open_session(file, prepared)
+            model = switch_off(file.parse(session.step.model).model, session.step.off)
+            shown = prepared.show(model, session.step.timing, session.step.ladder, session.floor or None)
+            return how(self._figures_of(prepared.manifest), shown)
 
     def _figures_of(self, manifest: Manifest) -> FigureCache:
         key = (manifest.run, manifest.key)
@@ -224,7 +216,3 @@ class Sessions:
                     self._figures.popitem(last=False)
             self._figures.move_to_end(key)
             return self._figures[key]
-
-
-def _read_formula(ask: Ask) -> FormulaEffect:
-    return make_formula(ask.effect, ask.channel, ask.formula, ask.parameters)

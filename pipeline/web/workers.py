@@ -126,15 +126,14 @@ def work_on_errand(task: Task) -> Report:
 
     entry = Entry(log=task.log, basis=task.basis, state="failed", run=task.options.run or "")
     try:
+        store = Store(task.options.out)
         if task.basis == DIAGNOSE:
-            store = Store(task.options.out)
             write_diagnosis(task.options.out, find_run(store, entry.run))
-            return Report(entry=replace(entry, state="done"))
-        if isinstance(task, Errand) and task.basis == PLAN:
-            store = Store(task.options.out)
+        elif isinstance(task, Errand) and task.basis == PLAN:
             write_run_plan(store, find_run(store, entry.run), task.area)
-            return Report(entry=replace(entry, state="done"))
-        return Report(entry=_analyze(task, entry))
+        else:
+            return Report(entry=_analyze(task, entry))
+        return Report(entry=replace(entry, state="done"))
     except SlipError as error:
         told = f"{error.where}: {error.what}" if error.where else error.what
         return Report(entry=replace(entry, code=error.code, reason=told, hint=error.hint))

@@ -11,7 +11,6 @@ from comparison_store import Run, write_run
 
 from pipeline.analysis.map import draw_up_map, write_map
 from pipeline.cli.app import main
-from pipeline.fleet import ComparisonError
 from pipeline.fleet.deployments import (
     add_deployment,
     find_own_table,
@@ -19,6 +18,7 @@ from pipeline.fleet.deployments import (
     read_deployments,
     write_deployments,
 )
+from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.place import place_deployments
 from pipeline.fleet.terrain import TERRAINS, rate_name, rate_terrain
 from pipeline.report.deployments.labels import Box, place_labels

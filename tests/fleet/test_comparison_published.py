@@ -12,8 +12,7 @@ import pytest
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.compare import Question, compare_results
 from pipeline.analysis.options import Options
-from pipeline.fleet import follow_published
-from pipeline.fleet.published import Limits
+from pipeline.fleet.published import Limits, follow_published
 from pipeline.store import Store
 
 if TYPE_CHECKING:

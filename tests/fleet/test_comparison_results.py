@@ -14,8 +14,9 @@ from pipeline.analysis.compare import Answer, Question, compare_results
 from pipeline.analysis.compare_files import describe_answer, write_answer
 from pipeline.analysis.errors import JobError
 from pipeline.cli.app import main
-from pipeline.fleet import ComparisonError, Group, Samples, compare_groups
+from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.measures import compare_orders
+from pipeline.fleet.pairs import Group, Samples, compare_groups
 from pipeline.store import Store
 from schemas.contract import list_contracts
 from schemas.slip import Slip

@@ -12,7 +12,7 @@ from comparison_store import Run, write_run
 from pipeline.analysis.errors import JobError
 from pipeline.analysis.trend import Trend, follow_trend, write_trend
 from pipeline.cli.app import main
-from pipeline.fleet import read_day
+from pipeline.fleet.datasets import read_day
 from pipeline.fleet.trend import describe_quiet
 from pipeline.store import Store
 

@@ -19,7 +19,7 @@ from comparison_store import Run, write_run
 from pipeline.analysis.map import draw_up_map
 from pipeline.analysis.share import gather_features
 from pipeline.cli.app import main
-from pipeline.fleet import ComparisonError
+from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.features import LARGEST_BYTES, merge_features, read_features, write_features
 from pipeline.store import Store
 

@@ -7,9 +7,9 @@ import pytest
 from test_fleet_levels import ALIKE, ICE_AND_OTHERS, draw
 
 from pipeline.analysis.prediction import Expected, Prediction, describe_prediction, make_model_file
-from pipeline.fleet import ComparisonError
+from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.forecast import forecast_vehicle
-from pipeline.fleet.statistics import Interval
+from pipeline.fleet.statistics.intervals import Interval
 from pipeline.vehicles import find_preset
 
 

@@ -15,7 +15,8 @@ from pipeline.analysis.plan import UNDECIDED, ask, expect
 from pipeline.cli import main
 from pipeline.diagnosis.recording import load_recording
 from pipeline.models import find_effect
-from pipeline.plan import choose_limits, learn
+from pipeline.plan.knowledge import learn
+from pipeline.plan.limits import choose_limits
 from pipeline.simulate import Program, make_scenario
 from pipeline.store import Store
 from pipeline.vehicles import Vehicle, find_preset

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from pipeline.fleet.parameter_trend import ParameterTrend, describe_change, follow_parameters
-from pipeline.fleet.statistics import find_shifts
+from pipeline.fleet.statistics.shifts import find_shifts
 
 GROUNDS = {"asphalt": 1.76, "gravel": 1.7, "sand": 1.92}
 

@@ -21,23 +21,14 @@ from pipeline.analysis.planned import PREVIEW, leave_plan, place_plan, read_prev
 from pipeline.cli import main
 from pipeline.cli.output import FAILED
 from pipeline.models import find_effect
-from pipeline.plan import (
-    PROTOCOLS,
-    PlanError,
-    Request,
-    ask_presence,
-    assume,
-    choose_limits,
-    compare_protocols,
-    make_plan,
-    parse_area,
-    write_plan,
-)
-from pipeline.plan.files import WHEELS, list_types, read_promises
-from pipeline.plan.limits import is_steered, parse_time
+from pipeline.plan.ask import ask_presence
+from pipeline.plan.errors import PlanError
+from pipeline.plan.files import WHEELS, list_types, read_promises, write_plan
+from pipeline.plan.knowledge import assume
+from pipeline.plan.limits import choose_limits, is_steered, parse_area, parse_time
 from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, join, limit_yaw_rate, list_manoeuvres, wait
-from pipeline.plan.plan import Plan, find_largest
-from pipeline.plan.protocols import LONGEST_S, drive_protocol
+from pipeline.plan.plan import Plan, Request, find_largest, make_plan
+from pipeline.plan.protocols import LONGEST_S, PROTOCOLS, compare_protocols, drive_protocol
 from pipeline.plan.rehearsal import Rehearsal
 from pipeline.report.plan import preview_plan
 from pipeline.runs.errors import MotionError
@@ -268,7 +259,7 @@ def test_a_protocol_is_driven_no_longer_than_is_said(name: str) -> None:
 def test_an_unknown_protocol_is_refused_before_anything_is_worked_out(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("pipeline.plan.make_plan", lambda *_: pytest.fail("the plan was made first"))
+    monkeypatch.setattr("pipeline.plan.plan.make_plan", lambda *_: pytest.fail("the plan was made first"))
     with pytest.raises(SystemExit) as ended:
         main(["plan", "--vehicle", "husky_a200", "--compare", "drive,dance", "--out", str(tmp_path / "plan")])
     assert ended.value.code == FAILED

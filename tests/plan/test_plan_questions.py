@@ -18,9 +18,10 @@ from pipeline.diagnosis.excitation import Unobservable
 from pipeline.diagnosis.recording import load_recording
 from pipeline.diagnosis.undecided import Undecided
 from pipeline.models import find_effect
-from pipeline.plan import ask_apart, assume, check_plan, learn
+from pipeline.plan.ask import ask_apart
+from pipeline.plan.check import check_plan
 from pipeline.plan.files import Promised
-from pipeline.plan.knowledge import Hypothesis
+from pipeline.plan.knowledge import Hypothesis, assume, learn
 from pipeline.plan.plan import Promise
 from pipeline.plan.questions import DECIDED_T, Answerable, Evidence, Groups, Precision, Separation
 from pipeline.simulate import Program

@@ -24,14 +24,11 @@ from pipeline.analysis.options import Options
 from pipeline.logs import LogWriter
 from pipeline.models import Model, find_effect
 from pipeline.report.errors import ReportError
-from pipeline.report.exports import (
-    ExportSource,
-    write_csv,
-    write_derived_log,
-    write_foxglove_layout,
-    write_plotjuggler_layout,
-)
 from pipeline.report.exports import derived as derived_module
+from pipeline.report.exports.csv import write_csv
+from pipeline.report.exports.derived import write_derived_log
+from pipeline.report.exports.layouts import write_foxglove_layout, write_plotjuggler_layout
+from pipeline.report.exports.source import ExportSource
 from pipeline.report.motion_run import load_vehicle
 from pipeline.runs import MotionError
 from pipeline.simulate import simulate_case

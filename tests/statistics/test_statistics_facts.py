@@ -13,7 +13,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from pipeline.fleet import statistics as ps
+from pipeline.fleet.statistics.arrays import StatisticsError
+from pipeline.fleet.statistics.changes import find_changes
+from pipeline.fleet.statistics.correlation import integrated_time, number_blocks
+from pipeline.fleet.statistics.families import adjust_holm, adjust_max_t, runs_needed
+from pipeline.fleet.statistics.intervals import bootstrap_median, bound_mean, bound_typical
+from pipeline.fleet.statistics.permutation import permute_means, permute_studentized, smallest_p
+from pipeline.fleet.statistics.ranks import (
+    cliffs_delta,
+    kendall_p,
+    kendall_tau,
+    list_swaps,
+    mann_whitney,
+    name_delta,
+    shift_between,
+)
 
 NUMBERS = st.floats(-100.0, 100.0, allow_nan=False).map(lambda value: round(value, 3))
 SIDE = st.lists(NUMBERS, min_size=1, max_size=5)
@@ -23,16 +37,16 @@ SIDE = st.lists(NUMBERS, min_size=1, max_size=5)
 @settings(max_examples=60, deadline=None)
 def test_the_shift_and_delta_are_those_of_all_pairs(a: list[float], b: list[float]) -> None:
     pairs = [y - x for x in a for y in b]
-    assert ps.shift_between(a, b) == pytest.approx(float(np.median(pairs)), abs=1e-12)
+    assert shift_between(a, b) == pytest.approx(float(np.median(pairs)), abs=1e-12)
     above, below = sum(p > 0 for p in pairs), sum(p < 0 for p in pairs)
-    assert ps.cliffs_delta(a, b) == pytest.approx((above - below) / len(pairs))
-    assert ps.cliffs_delta(a, b) == -ps.cliffs_delta(b, a)
+    assert cliffs_delta(a, b) == pytest.approx((above - below) / len(pairs))
+    assert cliffs_delta(a, b) == -cliffs_delta(b, a)
 
 
 @given(SIDE, SIDE)
 @settings(max_examples=60, deadline=None)
 def test_the_exact_permutation_counts_every_labelling(a: list[float], b: list[float]) -> None:
-    test = ps.permute_means(a, b)
+    test = permute_means(a, b)
     values = np.array(a + b)
     observed = abs(np.mean(b) - np.mean(a))
     found = []
@@ -49,68 +63,68 @@ def test_the_exact_permutation_counts_every_labelling(a: list[float], b: list[fl
 def test_the_smallest_p_is_reached_by_sides_that_do_not_overlap() -> None:
     for n, m, p in ((3, 3, 0.10), (4, 4, 2 / 70), (5, 5, 2 / 252), (1, 3, 0.25), (1, 1, 1.0)):
         low, high = np.arange(n) * 0.01, 10.0 + np.arange(m) * 0.01
-        assert ps.smallest_p(n, m) == pytest.approx(p)
-        assert ps.permute_means(low, high).p == pytest.approx(p)
+        assert smallest_p(n, m) == pytest.approx(p)
+        assert permute_means(low, high).p == pytest.approx(p)
 
 
 def test_many_units_are_relabelled_at_random_and_never_give_zero() -> None:
     a, b = np.zeros(30) + np.arange(30) * 1e-3, np.ones(30)
-    for permute in (ps.permute_means, ps.permute_studentized):
+    for permute in (permute_means, permute_studentized):
         test = permute(a, b)
         assert not test.exact
         assert test.p == test.smallest_p == 1 / 10_000
 
 
 def test_equal_sides_are_never_different() -> None:
-    assert ps.permute_means([1.0, 1.0], [1.0, 1.0]).p == 1.0
-    assert ps.permute_studentized([2.0] * 20, [2.0] * 20).p == 1.0
-    assert ps.mann_whitney([1.0] * 9, [1.0] * 9) == 1.0
+    assert permute_means([1.0, 1.0], [1.0, 1.0]).p == 1.0
+    assert permute_studentized([2.0] * 20, [2.0] * 20).p == 1.0
+    assert mann_whitney([1.0] * 9, [1.0] * 9) == 1.0
 
 
 def test_holm_is_the_textbook_correction() -> None:
-    assert ps.adjust_holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert ps.adjust_holm([0.9, 0.8]) == pytest.approx([1.0, 1.0])
-    assert ps.adjust_holm([]).size == 0
+    assert adjust_holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert adjust_holm([0.9, 0.8]) == pytest.approx([1.0, 1.0])
+    assert adjust_holm([]).size == 0
 
 
 def test_runs_needed_are_those_of_the_run_counts_and_the_family() -> None:
     # 4 + 4 runs allow one pair at 5 %, 5 + 5 six, 6 + 6 twenty-three.
-    assert [ps.runs_needed(pairs) for pairs in (1, 2, 6, 7, 23, 24)] == [4, 5, 5, 6, 6, 7]
+    assert [runs_needed(pairs) for pairs in (1, 2, 6, 7, 23, 24)] == [4, 5, 5, 6, 6, 7]
 
 
 def test_max_t_keeps_the_p_of_a_large_difference_where_holm_loses_it() -> None:
     rng = np.random.default_rng(1)
     groups = [rng.normal(level, 0.05, 4) for level in (0.0, 0.0, 3.0)]
-    corrected = ps.adjust_max_t(groups)
-    plain = [ps.permute_means(groups[i], groups[j]).p for i, j in ((0, 1), (0, 2), (1, 2))]
+    corrected = adjust_max_t(groups)
+    plain = [permute_means(groups[i], groups[j]).p for i, j in ((0, 1), (0, 2), (1, 2))]
     assert corrected[0, 2] == pytest.approx(2 / 70)
     assert corrected[1, 2] == pytest.approx(2 / 70)
     assert corrected[0, 1] > 0.05
-    assert ps.adjust_holm(plain)[1] > 0.05
+    assert adjust_holm(plain)[1] > 0.05
 
 
 @given(st.lists(st.lists(NUMBERS, min_size=1, max_size=3), min_size=2, max_size=3))
 @settings(max_examples=25, deadline=None)
 def test_corrected_p_is_never_below_the_pairs_own(groups: list[list[float]]) -> None:
-    corrected = ps.adjust_max_t(groups)
+    corrected = adjust_max_t(groups)
     assert np.array_equal(corrected, corrected.T)
     for i, j in itertools.combinations(range(len(groups)), 2):
-        assert corrected[i, j] >= ps.permute_means(groups[i], groups[j]).p - 1e-9
+        assert corrected[i, j] >= permute_means(groups[i], groups[j]).p - 1e-9
 
 
 def test_mann_whitney_is_scipys() -> None:
     rng = np.random.default_rng(2)
     a, b = rng.integers(0, 12, 60).astype(float), rng.integers(2, 14, 45).astype(float)
     wanted = stats.mannwhitneyu(a, b, alternative="two-sided", method="asymptotic").pvalue
-    assert ps.mann_whitney(a, b) == pytest.approx(wanted, rel=1e-9)
+    assert mann_whitney(a, b) == pytest.approx(wanted, rel=1e-9)
 
 
 def test_the_t_interval_is_scipys() -> None:
     values = np.array([1.1, 0.9, 1.4, 1.2])
     low, high = stats.t.interval(0.95, 3, loc=values.mean(), scale=stats.sem(values))
-    found = ps.bound_mean(values)
+    found = bound_mean(values)
     assert (found.low, found.high) == pytest.approx((low, high))
-    typical = ps.bound_typical(np.exp(values))
+    typical = bound_typical(np.exp(values))
     assert (typical.low, typical.high) == pytest.approx((math.exp(low), math.exp(high)))
 
 
@@ -123,15 +137,15 @@ def test_the_integrated_time_of_a_known_process_comes_back() -> None:
         values[i] = rho * values[i - 1] + noise[i]
     true = 1.0 + 2.0 * rho / (1.0 - rho)
     ticks = np.arange(count)
-    assert ps.integrated_time(values, ticks) == pytest.approx(true, rel=0.1)
+    assert integrated_time(values, ticks) == pytest.approx(true, rel=0.1)
     kept = (ticks % 120) < 100
-    assert ps.integrated_time(values[kept], ticks[kept]) == pytest.approx(true, rel=0.1)
+    assert integrated_time(values[kept], ticks[kept]) == pytest.approx(true, rel=0.1)
 
 
 def test_white_noise_and_constants_have_the_shortest_memory() -> None:
     rng = np.random.default_rng(4)
-    assert ps.integrated_time(rng.standard_normal(5_000), np.arange(5_000)) < 1.2
-    assert ps.integrated_time(np.ones(100), np.arange(100)) == 1.0
+    assert integrated_time(rng.standard_normal(5_000), np.arange(5_000)) < 1.2
+    assert integrated_time(np.ones(100), np.arange(100)) == 1.0
 
 
 @given(
@@ -142,7 +156,7 @@ def test_white_noise_and_constants_have_the_shortest_memory() -> None:
 def test_no_block_crosses_a_piece_or_is_shorter_than_it_must(sizes: list[int], length: float) -> None:
     ticks = np.concatenate([np.arange(size) + 1_000 * i for i, size in enumerate(sizes)])
     pieces = np.repeat(np.arange(len(sizes)), sizes)
-    blocks = ps.number_blocks(ticks, pieces, length)
+    blocks = number_blocks(ticks, pieces, length)
     assert sorted(set(blocks.tolist())) == list(range(blocks.max() + 1))
     for number in range(blocks.max() + 1):
         inside = blocks == number
@@ -155,12 +169,12 @@ def test_no_block_crosses_a_piece_or_is_shorter_than_it_must(sizes: list[int], l
 def test_a_step_in_a_series_is_found_where_it_is() -> None:
     rng = np.random.default_rng(5)
     series = np.concatenate((rng.normal(1.8, 0.03, 12), rng.normal(2.1, 0.03, 9)))
-    (change,) = ps.find_changes(series)
+    (change,) = find_changes(series)
     assert change.index == 12
     assert change.before == pytest.approx(1.8, abs=0.03)
     assert change.after == pytest.approx(2.1, abs=0.03)
-    assert ps.find_changes(series[:5]) == ()
-    assert ps.find_changes(np.ones(30)) == ()
+    assert find_changes(series[:5]) == ()
+    assert find_changes(np.ones(30)) == ()
 
 
 def test_a_small_level_takes_time_where_there_is_a_step_and_little_memory() -> None:
@@ -170,7 +184,7 @@ def test_a_small_level_takes_time_where_there_is_a_step_and_little_memory() -> N
     tracemalloc.start()
     for series in (still, stepped):
         start = time.process_time()
-        found = ps.find_changes(series, level=0.025 / 1_000)
+        found = find_changes(series, level=0.025 / 1_000)
         took.append(time.process_time() - start)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -180,33 +194,33 @@ def test_a_small_level_takes_time_where_there_is_a_step_and_little_memory() -> N
 
 
 def test_orders_are_compared_and_contradictions_named() -> None:
-    assert ps.kendall_tau([1, 2, 3], [2, 4, 9]) == 1.0
-    assert ps.kendall_tau([1, 2, 3], [3, 2, 1]) == -1.0
-    assert ps.kendall_tau([1, 1], [1, 2]) == 0.0
+    assert kendall_tau([1, 2, 3], [2, 4, 9]) == 1.0
+    assert kendall_tau([1, 2, 3], [3, 2, 1]) == -1.0
+    assert kendall_tau([1, 1], [1, 2]) == 0.0
     rng = np.random.default_rng(6)
     a, b = rng.integers(0, 5, 20), rng.integers(0, 5, 20)
-    assert ps.kendall_tau(a, b) == pytest.approx(stats.kendalltau(a, b).statistic)
-    assert ps.list_swaps([1.0, 2.0, 3.0], [3.0, 2.0, 4.0]) == [(1, 0)]
+    assert kendall_tau(a, b) == pytest.approx(stats.kendalltau(a, b).statistic)
+    assert list_swaps([1.0, 2.0, 3.0], [3.0, 2.0, 4.0]) == [(1, 0)]
 
 
 @pytest.mark.parametrize(
     "ask",
     [
-        lambda: ps.permute_means([1.0, math.nan], [1.0]),
-        lambda: ps.bound_mean([1.0]),
-        lambda: ps.shift_between([], [1.0]),
-        lambda: ps.bootstrap_median([1.0, math.inf], [0, 0]),
-        lambda: ps.find_changes([1.0, math.nan]),
+        lambda: permute_means([1.0, math.nan], [1.0]),
+        lambda: bound_mean([1.0]),
+        lambda: shift_between([], [1.0]),
+        lambda: bootstrap_median([1.0, math.inf], [0, 0]),
+        lambda: find_changes([1.0, math.nan]),
     ],
 )
 def test_what_no_statistic_can_be_made_of_is_refused(ask) -> None:  # noqa: ANN001
-    with pytest.raises(ps.StatisticsError) as caught:
+    with pytest.raises(StatisticsError) as caught:
         ask()
     assert caught.value.code in ("not_finite", "too_few_values")
 
 
 def test_words_for_delta() -> None:
-    assert [ps.name_delta(delta) for delta in (0.0, -0.2, 0.4, -1.0)] == [
+    assert [name_delta(delta) for delta in (0.0, -0.2, 0.4, -1.0)] == [
         "negligible",
         "small",
         "medium",
@@ -216,8 +230,8 @@ def test_words_for_delta() -> None:
 
 @pytest.mark.parametrize("count", [2, 4, 6])
 def test_kendall_p_counts_all_orders(count: int) -> None:
-    taus = [ps.kendall_tau(np.arange(count), order) for order in itertools.permutations(range(count))]
+    taus = [kendall_tau(np.arange(count), order) for order in itertools.permutations(range(count))]
     for tau in set(taus):
-        p, smallest = ps.kendall_p(tau, count)
+        p, smallest = kendall_p(tau, count)
         assert p == pytest.approx(np.mean(np.abs(taus) >= abs(tau) - 1e-9))
         assert smallest == pytest.approx(2 / len(taus))

@@ -12,7 +12,12 @@ import numpy as np
 import pytest
 from simulated_runs import RATE, simulate_runs
 
-from pipeline.fleet import statistics as ps
+from pipeline.fleet.statistics.changes import find_changes
+from pipeline.fleet.statistics.families import adjust_max_t
+from pipeline.fleet.statistics.intervals import bootstrap_median, bound_typical
+from pipeline.fleet.statistics.pairs import compare_runs, cut_blocks
+from pipeline.fleet.statistics.permutation import permute_studentized
+from pipeline.fleet.statistics.ranks import mann_whitney
 
 SPREAD = 0.1
 
@@ -29,7 +34,7 @@ def compare_once(runs: int, rng: np.random.Generator, *, seconds: float, memory:
         )
         for median in (1.0, factor)
     ]
-    return ps.compare_runs(*sides)
+    return compare_runs(*sides)
 
 
 @pytest.mark.parametrize(("runs", "attainable"), [(3, 0.0), (4, 2 / 70), (5, 12 / 252)])
@@ -50,7 +55,7 @@ def test_intervals_over_runs_hold_the_truth(runs: int) -> None:
     hits = []
     for _ in range(600):
         medians = np.median(simulate_runs(runs, seconds=30.0, memory=1.0, spread=SPREAD, rng=rng), axis=1)
-        found = ps.bound_typical(medians)
+        found = bound_typical(medians)
         hits.append(found.low <= 1.0 <= found.high)
     assert 0.92 <= np.mean(hits) <= 0.97
 
@@ -63,10 +68,10 @@ def test_blocks_of_single_runs_keep_the_level_that_plain_samples_break(memory: f
     for seed in range(repetitions):
         sides = simulate_runs(2, seconds=seconds, memory=memory, spread=0.0, rng=rng)
         ticks = np.arange(sides.shape[1])
-        cut = [ps.cut_blocks(side, ticks, np.zeros_like(ticks), step=2.0 * RATE) for side in sides]
-        test = ps.permute_studentized(cut[0].medians, cut[1].medians, draws=399, seed=seed)
+        cut = [cut_blocks(side, ticks, np.zeros_like(ticks), step=2.0 * RATE) for side in sides]
+        test = permute_studentized(cut[0].medians, cut[1].medians, draws=399, seed=seed)
         blocks.append(test.p <= 0.05)
-        plain.append(ps.mann_whitney(*sides) <= 0.05)
+        plain.append(mann_whitney(*sides) <= 0.05)
     assert np.mean(blocks) <= rejections_allowed(0.05, repetitions)[1]
     assert np.mean(plain) > 0.5
 
@@ -77,8 +82,8 @@ def test_the_interval_of_one_run_holds_its_own_median() -> None:
     for _ in range(150):
         (values,) = simulate_runs(1, seconds=300.0, memory=1.0, spread=0.0, rng=rng)
         ticks = np.arange(values.size)
-        cut = ps.cut_blocks(values, ticks, np.zeros_like(ticks), step=2.0 * RATE)
-        found = ps.bootstrap_median(values, cut.numbers, draws=600)
+        cut = cut_blocks(values, ticks, np.zeros_like(ticks), step=2.0 * RATE)
+        found = bootstrap_median(values, cut.numbers, draws=600)
         hits.append(found.low <= 1.0 <= found.high)
     assert 0.90 <= np.mean(hits) <= 0.985
 
@@ -89,7 +94,7 @@ def test_a_family_of_equal_groups_gives_a_false_alarm_once_in_twenty() -> None:
     alarms = []
     for seed in range(repetitions):
         groups = [rng.normal(0.0, SPREAD, 4) for _ in range(3)]
-        alarms.append(ps.adjust_max_t(groups, seed=seed, draws=399).min() <= 0.05)
+        alarms.append(adjust_max_t(groups, seed=seed, draws=399).min() <= 0.05)
     assert np.mean(alarms) <= rejections_allowed(0.05, repetitions)[1]
 
 
@@ -99,7 +104,7 @@ def test_a_family_controls_the_pair_that_is_equal_while_a_third_differs() -> Non
     alarms, powers = [], []
     for seed in range(repetitions):
         groups = [rng.normal(level, SPREAD, 5) for level in (0.0, 0.0, 1.0)]
-        corrected = ps.adjust_max_t(groups, seed=seed, draws=399)
+        corrected = adjust_max_t(groups, seed=seed, draws=399)
         alarms.append(corrected[0, 1] <= 0.05)
         powers.append(corrected[0, 2] <= 0.05)
     assert np.mean(alarms) <= rejections_allowed(0.05, repetitions)[1]
@@ -124,7 +129,7 @@ def test_power_grows_with_the_difference_and_the_runs() -> None:
 
 def test_chance_makes_a_step_in_a_series_once_in_twenty() -> None:
     rng = np.random.default_rng(9)
-    found = [bool(ps.find_changes(rng.normal(0.0, 1.0, 15), seed=seed)) for seed in range(300)]
+    found = [bool(find_changes(rng.normal(0.0, 1.0, 15), seed=seed)) for seed in range(300)]
     assert np.mean(found) <= rejections_allowed(0.05, 300)[1]
 
 
@@ -137,8 +142,8 @@ def test_long_nulls_at_every_memory() -> None:
         for seed in range(repetitions):
             sides = simulate_runs(2, seconds=600.0, memory=memory, spread=0.0, rng=rng)
             ticks = np.arange(sides.shape[1])
-            cut = [ps.cut_blocks(side, ticks, np.zeros_like(ticks), step=2.0 * RATE) for side in sides]
-            test = ps.permute_studentized(cut[0].medians, cut[1].medians, draws=499, seed=seed)
+            cut = [cut_blocks(side, ticks, np.zeros_like(ticks), step=2.0 * RATE) for side in sides]
+            test = permute_studentized(cut[0].medians, cut[1].medians, draws=499, seed=seed)
             rejected.append(test.p <= 0.05)
         assert np.mean(rejected) <= rejections_allowed(0.05, repetitions)[1]
     for runs, attainable in ((4, 2 / 70), (5, 12 / 252)):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.fleet.statistics import StatisticsError, draw_run
+from pipeline.fleet.statistics.arrays import StatisticsError
+from pipeline.fleet.statistics.posterior import draw_run
 
 GROUPS = ("asphalt", "gravel", "ice")
 

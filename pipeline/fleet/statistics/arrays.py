@@ -7,13 +7,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.fleet.statistics.errors import StatisticsError
+from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+
+
+class StatisticsError(SlipError):
+    """Numbers that no statistic can be made of."""
 
 
 def check_values(values: ArrayLike, *, what: str, fewest: int = 1) -> Floats:

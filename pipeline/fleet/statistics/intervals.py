@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.fleet.statistics.arrays import Floats, check_values
-from pipeline.fleet.statistics.effect_sizes import shift_between
+from pipeline.fleet.statistics.ranks import shift_between
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.fleet.statistics.arrays import Floats, Integers, check_values
-from pipeline.fleet.statistics.errors import StatisticsError
+from pipeline.fleet.statistics.arrays import Floats, Integers, StatisticsError, check_values
 from pipeline.fleet.statistics.intervals import Interval, student_quantile
 
 if TYPE_CHECKING:

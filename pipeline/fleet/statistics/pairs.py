@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from pipeline.fleet.statistics.arrays import Floats, Integers, check_values
 from pipeline.fleet.statistics.correlation import TIMES_PER_BLOCK, integrated_time, number_blocks
-from pipeline.fleet.statistics.effect_sizes import cliffs_delta, shift_between
 from pipeline.fleet.statistics.intervals import Interval, bound_shift
 from pipeline.fleet.statistics.permutation import DRAWS, PermutationTest, permute_means, permute_studentized
+from pipeline.fleet.statistics.ranks import cliffs_delta, shift_between
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.fleet.statistics.arrays import Floats, check_values
-from pipeline.fleet.statistics.errors import StatisticsError
+from pipeline.fleet.statistics.arrays import Floats, StatisticsError, check_values
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -8,7 +8,7 @@ import polars as pl
 
 from pipeline.core.durations import say_duration
 from pipeline.fleet.measures import MEASURES, compare_orders
-from pipeline.report.comparison.difficulty import list_contradictions, tabulate_difficulty
+from pipeline.fleet.statistics.ranks import kendall_tau, list_swaps
 from pipeline.report.comparison.figures import draw_boxes, draw_runs
 from pipeline.report.elements import Cell, Column, Picture, Table
 from pipeline.report.page import render_figures
@@ -16,9 +16,13 @@ from pipeline.report.run import INPUT_WORDS
 from pipeline.report.words import MISSING, say_distance, say_number
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
+
+    from pipeline.fleet.tables import Answer
 
 _LEVEL = 0.05
+_MOST_SWAPS = 4
+_FEWEST = 2
 _ABOUT_PAIRS = (
     "Whole runs are permuted where a side has several, blocks where each side is one run; p corrected over "
     "all pairs of the same unit"
@@ -47,68 +51,38 @@ _PAIRS = (
 )  # fmt: skip
 
 
-def render_comparison(
-    *,
-    datasets: pl.DataFrame,
-    comparisons: pl.DataFrame,
-    runs: pl.DataFrame,
-    intervals: pl.DataFrame,
-    windows: pl.DataFrame,
-    input_name: str,
-    quantity: str,
-    notes: Sequence[str],
-) -> str:
-    """The whole page as HTML.
-
-    Args:
-        datasets: table `datasets`.
-        comparisons: table `comparisons`.
-        runs: one row a run and input.
-        intervals: ``dataset``, ``value``, ``low``, ``high``, ``interval`` of what was compared.
-        windows: as of `spread_windows`.
-        input_name: what u was in the comparisons.
-        quantity: what was compared, a column of `datasets`.
-        notes: what must be known.
-    """
-    shown = datasets.filter(pl.col("input") == input_name)
+def render_comparison(answer: Answer) -> str:
+    """The whole page as HTML."""
+    shown = answer.datasets.filter(pl.col("input") == answer.input)
     facts = [
         f"{shown.height} datasets",
         f"{shown['runs'].sum()} runs",
-        f"slip {INPUT_WORDS[input_name]}",
-        "as published" if quantity == "published_norm" else "median modulus",
+        f"slip {INPUT_WORDS[answer.input]}",
+        "as published" if answer.quantity == "published_norm" else "median modulus",
     ]
     return render_figures(
         "report/templates/comparison.html",
-        list_pictures(runs, intervals, windows, input_name=input_name, quantity=quantity),
+        list_pictures(answer),
         title="Deployments compared",
         facts=facts,
-        verdict=_say_verdict(comparisons),
-        datasets=_tabulate_datasets(shown, input_name),
-        pairs=_tabulate_pairs(comparisons),
+        verdict=_say_verdict(answer.comparisons),
+        datasets=_tabulate_datasets(shown, answer.input),
+        pairs=_tabulate_pairs(answer.comparisons),
         difficulty=tabulate_difficulty(shown),
         swaps=list_contradictions(shown),
         measures=list(MEASURES.values()),
         orders=list(dict.fromkeys(one.text for one in compare_orders(shown))),
-        notes=notes,
+        notes=answer.notes,
         counted=shown.select("dataset", "keys").to_dicts(),
     )
 
 
-def list_pictures(
-    runs: pl.DataFrame, intervals: pl.DataFrame, windows: pl.DataFrame, *, input_name: str, quantity: str
-) -> list[Picture]:
-    """The published figure and the honest one.
-
-    Args:
-        runs: one row a run and input.
-        intervals: ``dataset``, ``value``, ``low``, ``high``, ``interval`` of what was compared.
-        windows: as of `spread_windows`.
-        input_name: what u was.
-        quantity: column of the run medians.
-    """
-    boxes = windows.filter(pl.col("input") == input_name)
-    own = runs.filter(pl.col("input") == input_name)
-    published = quantity == "published_norm"
+def list_pictures(answer: Answer) -> list[Picture]:
+    """The published figure and the honest one."""
+    input_name = answer.input
+    boxes = answer.windows.filter(pl.col("input") == input_name)
+    own = answer.runs.filter(pl.col("input") == input_name)
+    published = answer.quantity == "published_norm"
     pictures = []
     if not boxes.is_empty():
         words = "of the published chain" if published else INPUT_WORDS[input_name]
@@ -117,14 +91,14 @@ def list_pictures(
         pictures.append(
             Picture("window_norms_by_dataset", "The published figure", drawing, f"Medians in m/s: {told}.")
         )
-    rated = intervals.filter(pl.col("value").is_not_null()).sort("value")
+    rated = answer.intervals.filter(pl.col("value").is_not_null()).sort("value")
     if not rated.is_empty():
         title = (
             "window norm of the published chain [m/s]"
             if published
             else f"median slip modulus {INPUT_WORDS[input_name]} [m/s]"
         )
-        drawing = draw_runs(own, rated, value=quantity, title=title)
+        drawing = draw_runs(own, rated, value=answer.quantity, title=title)
         told = ", ".join(f"{row['dataset']} {row['value']:.3g}" for row in rated.iter_rows(named=True))
         pictures.append(Picture("run_medians_by_dataset", "The honest figure", drawing, f"In m/s: {told}."))
     return pictures
@@ -207,3 +181,56 @@ def _say_ends(row: Mapping[str, object]) -> str:
     if not isinstance(low, float) or not isinstance(high, float):
         return MISSING
     return f"{say_number(low)}\u00a0to\u00a0{say_number(high)}"
+
+
+def tabulate_difficulty(shown: pl.DataFrame) -> Table:
+    """Values and ranks of every measure, and how far each agrees with the modulus.
+
+    Args:
+        shown: table `datasets` of one input.
+    """
+    rated = _rate(shown)
+    columns = [measure.column for measure in MEASURES.values()]
+    ranks = {column: rated[column].rank("min") for column in columns}
+    rows: list[list[str | Cell]] = [
+        [
+            str(row["dataset"]),
+            *(
+                Cell(
+                    say_number(row[column]),
+                    small=f"({int(ranks[column][i])})" if row[column] is not None else "",
+                )
+                for column in columns
+            ),
+        ]
+        for i, row in enumerate(rated.iter_rows(named=True))
+    ]
+    both = {column: rated.drop_nulls(column) for column in columns}
+    agreement = (
+        MISSING
+        if pair.height < _FEWEST
+        else f"{kendall_tau(pair['median_modulus'].to_numpy(), pair[column].to_numpy()):.2f}"
+        for column, pair in both.items()
+    )
+    rows.append([Cell("agreement with the modulus (Kendall)", tag="i"), *agreement])
+    head = [Column("dataset"), *(Column(one.name, one.unit, number=True) for one in MEASURES.values())]
+    return Table("Median over runs and, in brackets, the rank from easy to hard", head, rows)
+
+
+def list_contradictions(shown: pl.DataFrame) -> list[str]:
+    """Pairs of datasets that a measure orders otherwise than the modulus does, in words."""
+    told = []
+    for measure in MEASURES.values():
+        both = _rate(shown).drop_nulls(measure.column)
+        if both.height >= _FEWEST:
+            swaps = list_swaps(both["median_modulus"].to_numpy(), both[measure.column].to_numpy())
+            told += [
+                f"{both['dataset'][i]} slips more than {both['dataset'][j]} by modulus, "
+                f"but less by {measure.name}"
+                for i, j in swaps[:_MOST_SWAPS]
+            ]
+    return told
+
+
+def _rate(shown: pl.DataFrame) -> pl.DataFrame:
+    return shown.drop_nulls("median_modulus").sort("median_modulus")

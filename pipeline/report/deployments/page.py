@@ -13,9 +13,8 @@ from pipeline.report.run import INPUT_WORDS
 from pipeline.report.words import say_number
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from pipeline.fleet.measures import Measure
+    from pipeline.fleet.place import DeploymentMap
 
 _LITERATURE = (
     Column("deployment"), Column("mass", "kg", number=True), Column("known"),
@@ -24,56 +23,32 @@ _LITERATURE = (
 )  # fmt: skip
 
 
-def picture_map(points: pl.DataFrame, own: pl.DataFrame, measure: Measure, input_name: str) -> Picture:
-    """The map as a figure.
-
-    Args:
-        points: as of `place_deployments`.
-        own: as of `place_datasets`; may be empty.
-        measure: what colours them.
-        input_name: what u was.
-    """
+def picture_map(drawn: DeploymentMap) -> Picture:
+    """The map as a figure."""
+    points, own, measure = drawn.points, drawn.own, drawn.measure
     high = points.filter(pl.col("zone") == "high")["key"].to_list()
     words = (
         f"{points.height} deployments of the literature and {own.height} own datasets, by kinetic energy and "
         f"terrain complexity. At high risk: {', '.join(high) or 'none'}."
     )
-    about = f"{measure.name} {INPUT_WORDS[input_name]} [{measure.unit}]"
+    about = f"{measure.name} {INPUT_WORDS[drawn.input]} [{measure.unit}]"
     return Picture("deployment_map", "The map", draw_map(points, own, about), words)
 
 
-def render_map(
-    deployments: pl.DataFrame,
-    points: pl.DataFrame,
-    own: pl.DataFrame,
-    measure: Measure,
-    *,
-    input_name: str,
-    notes: Sequence[str],
-    keys: Sequence[str],
-) -> str:
-    """The whole page as HTML.
-
-    Args:
-        deployments: the table of deployments.
-        points: as of `place_deployments`.
-        own: as of `place_datasets`.
-        measure: what colours them.
-        input_name: what u was.
-        notes: what must be known.
-        keys: run/generation of the runs counted, one text a dataset.
-    """
+def render_map(drawn: DeploymentMap) -> str:
+    """The whole page as HTML."""
+    deployments, points, own = drawn.deployments, drawn.points, drawn.own
     facts = [f"{deployments.height} deployments", f"{points.height} on the map", f"{own.height} own datasets"]
     return render_figures(
         "report/templates/map.html",
-        [picture_map(points, own, measure, input_name)],
+        [picture_map(drawn)],
         title="Deployment map",
         facts=facts,
-        notes=notes,
-        own=_tabulate_own(own, measure, input_name),
+        notes=drawn.notes,
+        own=_tabulate_own(own, drawn.measure, drawn.input),
         literature=_tabulate_literature(deployments, points),
         left=deployments.filter(~pl.col("key").is_in(points["key"].to_list())).to_dicts(),
-        runs=keys,
+        runs=drawn.keys,
     )
 
 

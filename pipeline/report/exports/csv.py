@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.report.errors import ReportError
+from pipeline.report.errors import writing_export
 from schemas import contract_of
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def write_csv(source: ExportSource, folder: Path) -> list[Path]:
         ReportError: ``export_not_written``.
     """
     written = []
-    try:
+    with writing_export(where=folder):
         folder.mkdir(parents=True, exist_ok=True)
         for table in sorted(source.manifest.tables):
             path = folder / f"{table}.csv"
@@ -43,13 +43,6 @@ def write_csv(source: ExportSource, folder: Path) -> list[Path]:
                     frame.write_csv(file, include_header=False)
             part.replace(path)
             written.append(path)
-    except OSError as error:
-        raise ReportError(
-            "export_not_written",
-            f"cannot be written: {error.strerror}",
-            where=str(folder),
-            hint="Choose another place with --out.",
-        ) from error
     return written
 
 

@@ -70,12 +70,8 @@ def write_derived_log(source: ExportSource, path: Path) -> Path:
 
 
 def _name_log(source: ExportSource) -> dict[str, str]:
-    log = source.manifest.details.get("log")
-    return (
-        {"log": str(log.get("path", "")), "sha256": str(log.get("sha256", ""))}
-        if isinstance(log, dict)
-        else {}
-    )
+    log = source.manifest.part("log")
+    return {key: str(log.get(name, "")) for key, name in (("log", "path"), ("sha256", "sha256")) if log}
 
 
 def _write_twist(

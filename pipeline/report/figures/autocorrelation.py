@@ -10,7 +10,7 @@ import polars as pl
 from pipeline.identification.correlation import FEWEST, LONGEST_S, autocorrelate
 from pipeline.report import theme
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.residuals import QUANTITIES
 from pipeline.report.motion_view import COMPONENTS
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     Correlation = tuple[Floats, Floats, float]
 
 
-def draw_autocorrelation(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """A panel a channel, before and after; None without a model or with too few windows."""
     rows = list_autocorrelations(scene)
     if not rows:
@@ -114,7 +114,7 @@ def _tabulate_correlations(found: dict[str, Correlation]) -> pl.DataFrame:
     return pl.concat(frames)
 
 
-def describe_autocorrelation(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """The correlation after one second, before and after, and the bound."""
     rows = list_autocorrelations(scene)
     if not rows:
@@ -129,12 +129,4 @@ def describe_autocorrelation(scene: Scene) -> str:
     return f"Autocorrelation of residuals one second apart: {'; '.join(told)}; noise stays below {bound:.2f}."
 
 
-FIGURE = Figure(
-    id="autocorrelation",
-    title="Does what is left repeat itself?",
-    section=Section.WHY,
-    order=4,
-    width=Width.HALF,
-    draw=draw_autocorrelation,
-    describe=describe_autocorrelation,
-)
+FIGURE = Figure("Does what is left repeat itself?", Section.WHY, draw, describe, order=4)

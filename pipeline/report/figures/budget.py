@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.report import theme
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS, mapping_in, number_in, objects_in
 from pipeline.report.words import say_number, say_share
 
@@ -31,7 +31,7 @@ _LEFT = {"disturbance": "disturbance", "localization_noise": "localization noise
 _COLOURS = {"effect": theme.MODEL, "disturbance": theme.GROUND, "localization_noise": theme.CROSS}
 
 
-def draw_budget(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """Steps from the whole of the ideal model's mean square slip down to nothing, one a cause."""
     rows = list_parts(scene)
     if rows.is_empty():
@@ -99,7 +99,7 @@ def _find_budget(scene: Scene, quantity: str) -> Mapping[str, object]:
     return next((one for one in found if (one.get("input"), one.get("quantity")) == wanted), {})
 
 
-def describe_budget(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """Every cause with its share."""
     slip = _find_budget(scene, "slip")
     total = number_in(slip, "total")
@@ -112,12 +112,4 @@ def describe_budget(scene: Scene) -> str:
     )
 
 
-FIGURE = Figure(
-    id="budget",
-    title="The budget: who carries the slip",
-    section=Section.WHY,
-    order=1,
-    width=Width.HALF,
-    draw=draw_budget,
-    describe=describe_budget,
-)
+FIGURE = Figure("The budget: who carries the slip", Section.WHY, draw, describe, order=1)

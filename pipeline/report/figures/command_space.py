@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.report import theme
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.scales import round_up
 
@@ -21,7 +21,7 @@ _FEWEST_SAMPLES = 3
 _SMALLEST_BOUND = 0.1
 
 
-def draw_command_space(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """A heat map: colour is the median modulus of the samples in a cell; empty cells stay empty."""
     slip = scene.sound_slip.get(scene.report.main_input)
     if slip is None:
@@ -97,7 +97,7 @@ def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def describe_command_space(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """Which commands slip most and least."""
     slip = scene.sound_slip.get(scene.report.main_input)
     if slip is None:
@@ -113,12 +113,4 @@ def describe_command_space(scene: Scene) -> str:
     )
 
 
-FIGURE = Figure(
-    id="command_space",
-    title="Over the commands",
-    section=Section.WHERE,
-    order=20,
-    width=Width.HALF,
-    draw=draw_command_space,
-    describe=describe_command_space,
-)
+FIGURE = Figure("Over the commands", Section.WHERE, draw, describe, order=20)

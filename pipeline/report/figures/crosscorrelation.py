@@ -8,7 +8,7 @@ import polars as pl
 
 from pipeline.identification.correlation import LONGEST_S, cross_correlate
 from pipeline.report.figures.autocorrelation import draw_correlations, list_correlations
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.residuals import QUANTITIES
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _WORDS = {"f_x": "speed", "f_y": "sideways speed", "f_w": "yaw rate", "f_x_f_w": "speed \u00d7 yaw rate"}
 
 
-def draw_crosscorrelation(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """A panel a channel, before and after; None without a model or with too few windows."""
     rows, motion = list_crosscorrelations(scene), scene.report.motion
     if not rows or motion is None:
@@ -49,7 +49,7 @@ def list_crosscorrelations(scene: Scene) -> dict[str, pl.DataFrame]:
     )
 
 
-def describe_crosscorrelation(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """The largest correlation with the input, before and after."""
     rows, told = list_crosscorrelations(scene), []
     for name, frame in rows.items():
@@ -60,12 +60,4 @@ def describe_crosscorrelation(scene: Scene) -> str:
     return f"Largest correlation of residuals with the input within five seconds: {'; '.join(told)}."
 
 
-FIGURE = Figure(
-    id="crosscorrelation",
-    title="Does what is left follow the input?",
-    section=Section.WHY,
-    order=5,
-    width=Width.HALF,
-    draw=draw_crosscorrelation,
-    describe=describe_crosscorrelation,
-)
+FIGURE = Figure("Does what is left follow the input?", Section.WHY, draw, describe, order=5)

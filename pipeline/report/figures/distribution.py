@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.shares import describe_medians, draw_shares, tabulate_shares
 
 if TYPE_CHECKING:
     from pipeline.report.scene import Scene
 
 
-def draw_distribution(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """The share of time steps below each modulus."""
     if not scene.sound_slip:
         return None
@@ -20,18 +20,10 @@ def draw_distribution(scene: Scene) -> Drawing | None:
     return Drawing(chart, {"modulus_shares": curves, "modulus_shares_medians": medians})
 
 
-def describe_distribution(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """The medians."""
     _, medians = tabulate_shares({name: frame["modulus"] for name, frame in scene.sound_slip.items()})
     return describe_medians(medians, "slip modulus")
 
 
-FIGURE = Figure(
-    id="distribution",
-    title="Distribution over time steps",
-    section=Section.HOW_BAD,
-    order=20,
-    width=Width.HALF,
-    draw=draw_distribution,
-    describe=describe_distribution,
-)
+FIGURE = Figure("Distribution over time steps", Section.HOW_BAD, draw, describe, order=20)

@@ -11,7 +11,7 @@ from pipeline.diagnosis.verdict import LEAST_T
 from pipeline.identification.growth import INTERVAL_SHARE, find_goal
 from pipeline.report import theme
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import mapping_in, number_in, numbers_in, objects_in
 from pipeline.report.words import begin_large
 
@@ -30,7 +30,7 @@ _DASHES = ([1, 0], [1, 0], [1, 0], [1, 0], [8, 3], [3, 3], [8, 3, 2, 3])
 _WIDEST = 1.0
 
 
-def draw_enough(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """Half-width of every interval as a share of its number, and below it t of every name."""
     rows = list_growth(scene)
     if rows["enough_width"].is_empty():
@@ -112,18 +112,10 @@ def _list_points(curve: Mapping[str, object], key: str) -> Iterator[tuple[float,
             yield second, value
 
 
-def describe_enough(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """The diagnosis' own sentence."""
     told = scene.report.diagnosis.get("enough")
     return f"Is the log long enough: {told}." if told else "Nothing was named that grows with driving."
 
 
-FIGURE = Figure(
-    id="enough",
-    title="Is the log long enough",
-    section=Section.WHY,
-    order=6,
-    width=Width.FULL,
-    draw=draw_enough,
-    describe=describe_enough,
-)
+FIGURE = Figure("Is the log long enough", Section.WHY, draw, describe, order=6, width="full")

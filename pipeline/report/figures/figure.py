@@ -5,9 +5,9 @@ from __future__ import annotations
 import functools
 import importlib
 import pkgutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -28,13 +28,6 @@ class Section(Enum):
     WHERE = "where"
     EFFECT = "effect"
     WHY = "why"
-
-
-class Width(Enum):
-    """How much of the page's width a figure takes on a wide screen."""
-
-    HALF = "half"
-    FULL = "full"
 
 
 @dataclass(frozen=True)
@@ -66,24 +59,24 @@ class Figure:
     """A figure that any run may have.
 
     Attributes:
-        id: stable name, also of its file.
         title: what it shows, in a few words.
         section: the question it answers.
-        order: place within the section, small first.
-        width: how much of a wide page it takes.
         draw: the function from tables to a drawing; None when there is nothing to draw.
         describe: the same in a sentence or two, for people who cannot see it.
+        order: place within the section, small first.
+        width: how much of a wide page it takes.
         panels: of a figure that a page sets part by part: the parts by name, empty where there is nothing.
+        id: stable name, that of its file.
     """
 
-    id: str
     title: str
     section: Section
-    order: int
-    width: Width
     draw: Callable[[Scene], Drawing | None]
     describe: Callable[[Scene], str]
+    order: int
+    width: Literal["half", "full"] = "half"
     panels: Callable[[Scene], Mapping[str, Panel]] | None = None
+    id: str = ""
 
 
 @functools.cache
@@ -96,6 +89,6 @@ def list_figures() -> tuple[Figure, ...]:
         content = vars(importlib.import_module(f"{folder.__name__}.{module.name}"))
         figure = content.get("FIGURE")
         if isinstance(figure, Figure):
-            found.append(figure)
+            found.append(replace(figure, id=module.name))
     sections = list(Section)
     return tuple(sorted(found, key=lambda figure: (sections.index(figure.section), figure.order, figure.id)))

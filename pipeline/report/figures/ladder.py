@@ -10,7 +10,7 @@ import polars as pl
 from pipeline.identification.ladder import ERRORS_OVER_2S, list_rises
 from pipeline.report import theme
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS, mapping_in, number_in, objects_in
 from pipeline.report.words import say_number
 
@@ -31,7 +31,7 @@ _ROOM = 1.04
 _FAR = 0.6
 
 
-def draw_ladder(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """A staircase: one bar a rung, the longest on top, between the ceiling and the floor as dashed lines.
 
     The ceiling is the error of the ideal model, the floor how well motion repeats itself: what can be
@@ -154,7 +154,7 @@ def _find_ladder(scene: Scene) -> tuple[Sequence[Mapping[str, object]], Mapping[
     return objects_in(scene.report.diagnosis, "ladder"), mapping_in(scene.report.diagnosis, "noise_floor")
 
 
-def describe_ladder(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """Every rung with its errors."""
     rows = list_rungs(scene)
     told = "; ".join(f"{row['step']}: {row['told']}" for row in rows["ladder"].iter_rows(named=True))
@@ -167,12 +167,4 @@ def describe_ladder(scene: Scene) -> str:
     return f"Error of two-second predictions {words} on data not seen. {told}.{bounds}"
 
 
-FIGURE = Figure(
-    id="ladder",
-    title="The ladder: error after each effect",
-    section=Section.WHY,
-    order=0,
-    width=Width.HALF,
-    draw=draw_ladder,
-    describe=describe_ladder,
-)
+FIGURE = Figure("The ladder: error after each effect", Section.WHY, draw, describe, order=0)

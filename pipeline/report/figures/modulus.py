@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import altair as alt
-
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.scales import find_range
 from pipeline.report.words import say_number
@@ -16,23 +14,14 @@ if TYPE_CHECKING:
     from pipeline.report.scene import Scene
 
 
-def draw_modulus(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """One line an input; gaps are left open, stretches after a change of command shaded."""
     lines = scene.modulus_lines
     if lines is None:
         return None
     shown = find_range(lines.frame, lines.usual)
-    line = (
-        alt.Chart(alt.NamedData("modulus"))
-        .mark_line(clip=True, order=False)
-        .encode(
-            x=parts.time_axis(scene),
-            y=parts.value_axis(shown),
-            color=parts.series_colour(list(scene.slip), INPUT_WORDS),
-        )
-    )
-    chart = alt.layer(*parts.shade_spans(), line).properties(
-        width=parts.WIDTH,
+    colour = parts.series_colour(list(scene.slip), INPUT_WORDS)
+    chart = parts.draw_lines(scene, ["modulus"], shown, colour).properties(
         height=150,
         title=parts.title_panel("slip modulus", "m/s", shown),
         usermeta=parts.brush_over_time(),
@@ -43,7 +32,7 @@ def draw_modulus(scene: Scene) -> Drawing | None:
     )
 
 
-def describe_modulus(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """Median, highest value and its time for each input."""
     told = []
     for name, frame in scene.sound_slip.items():
@@ -55,12 +44,4 @@ def describe_modulus(scene: Scene) -> str:
     return "Slip modulus over time: " + "; ".join(told) + "."
 
 
-FIGURE = Figure(
-    id="modulus",
-    title="Slip over time",
-    section=Section.HOW_BAD,
-    order=10,
-    width=Width.FULL,
-    draw=draw_modulus,
-    describe=describe_modulus,
-)
+FIGURE = Figure("Slip over time", Section.HOW_BAD, draw, describe, order=10, width="full")

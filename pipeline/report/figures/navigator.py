@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.report import theme
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.thinning import break_lines, thin_to_peaks
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _BINS = 600
 
 
-def draw_navigator(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """Slip modulus over the whole run, and the stretch that is shown; None where the run is short."""
     slip, span = scene.main_slip, scene.worst_span
     if slip is None or span is None:
@@ -43,7 +43,7 @@ def draw_navigator(scene: Scene) -> Drawing | None:
     return Drawing(chart, rows, note)
 
 
-def describe_navigator(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """Which stretch is the worst."""
     span = scene.worst_span
     if span is None:
@@ -55,12 +55,4 @@ def describe_navigator(scene: Scene) -> str:
     )
 
 
-FIGURE = Figure(
-    id="navigator",
-    title="The whole run",
-    section=Section.WHERE,
-    order=29,
-    width=Width.FULL,
-    draw=draw_navigator,
-    describe=describe_navigator,
-)
+FIGURE = Figure("The whole run", Section.WHERE, draw, describe, order=29, width="full")

@@ -63,6 +63,19 @@ def title_panel(quantity: str, unit: str, shown: Range) -> alt.Title:
     )
 
 
+def draw_lines(
+    scene: Scene, names: list[str], shown: Range, colour: alt.Color, x: alt.X | None = None
+) -> alt.LayerChart | alt.FacetChart:
+    """Lines of `names` over time and in front of the bands; a title and a height are the caller's."""
+    lines = [
+        alt.Chart(alt.NamedData(name))
+        .mark_line(clip=True, order=False)
+        .encode(x=x or time_axis(scene), y=value_axis(shown), color=colour)
+        for name in names
+    ]
+    return alt.layer(*shade_spans(), *lines).properties(width=WIDTH)
+
+
 def shade_spans() -> list[alt.Chart]:
     """Bands over the full height of a panel: after a change of command, suspect, marked by the reader."""
     bands = (

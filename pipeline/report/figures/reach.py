@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import altair as alt
 import polars as pl
 
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scales import find_range, usual_ends
 from pipeline.report.scene import LINE_BINS
 from pipeline.report.thinning import break_lines, thin_series
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
     from pipeline.report.scene import Scene
 
 
-def draw_reach(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """Two lines over time; None without a model."""
     motion = scene.report.motion
     if motion is None or motion.reach.is_empty():
@@ -25,17 +24,8 @@ def draw_reach(scene: Scene) -> Drawing | None:
     rows = list_reach(scene)
     ends = usual_ends(motion.reach["ideal"], exact=False)
     shown = find_range(rows["reach"], (ends[0], ends[1]))
-    line = (
-        alt.Chart(alt.NamedData("reach"))
-        .mark_line(clip=True, order=False)
-        .encode(
-            x=parts.time_axis(scene),
-            y=parts.value_axis(shown),
-            color=parts.before_and_after(motion.input),
-        )
-    )
-    chart = alt.layer(*parts.shade_spans(), line).properties(
-        width=parts.WIDTH,
+    colour = parts.before_and_after(motion.input)
+    chart = parts.draw_lines(scene, ["reach"], shown, colour).properties(
         height=130,
         title=parts.title_panel("error of a 2 s prediction", "m", shown),
         usermeta=parts.brush_over_time(),
@@ -56,7 +46,7 @@ def list_reach(scene: Scene) -> dict[str, pl.DataFrame]:
     return {"reach": pl.concat(lines)}
 
 
-def describe_reach(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """Medians and the worst moment of the model."""
     motion = scene.report.motion
     if motion is None or motion.reach.is_empty():
@@ -69,12 +59,4 @@ def describe_reach(scene: Scene) -> str:
     )
 
 
-FIGURE = Figure(
-    id="reach",
-    title="Predictions over two seconds",
-    section=Section.WHY,
-    order=6,
-    width=Width.FULL,
-    draw=draw_reach,
-    describe=describe_reach,
-)
+FIGURE = Figure("Predictions over two seconds", Section.WHY, draw, describe, order=6, width="full")

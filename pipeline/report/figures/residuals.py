@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.report import theme
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.motion_view import COMPONENTS, SIGNALS
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ _USUAL = {"x": "f_x", "y": "f_x_f_w", "w": "f_w"}
 _QUARTILES = (0.25, 0.5, 0.75)
 
 
-def draw_residuals(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """A panel a channel: median and quartiles of the residual over its signal; None without a model."""
     motion = scene.report.motion
     if motion is None or motion.residuals.is_empty():
@@ -136,7 +136,7 @@ def _draw_panel(motion: MotionView, component: str, rows: pl.DataFrame) -> Pictu
     )
 
 
-def describe_residuals(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """Which signal explains which channel, and the spread before and after."""
     motion = scene.report.motion
     if motion is None or motion.residuals.is_empty():
@@ -155,12 +155,4 @@ def describe_residuals(scene: Scene) -> str:
     return "Residuals against the signal that explains most of them: " + "; ".join(told) + "."
 
 
-FIGURE = Figure(
-    id="residuals",
-    title="What is left, against the signal that explains it",
-    section=Section.WHY,
-    order=2,
-    width=Width.HALF,
-    draw=draw_residuals,
-    describe=describe_residuals,
-)
+FIGURE = Figure("What is left, against the signal that explains it", Section.WHY, draw, describe, order=2)

@@ -11,7 +11,7 @@ import polars as pl
 from pipeline.identification.signature import SINCE_STEP, VARIABLES
 from pipeline.report import theme
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Panel, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Panel, Section
 from pipeline.report.figures.residuals import QUANTITIES
 from pipeline.report.words import say_number, say_share
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _SERIES = {"before": "error without it", "after": "with it", "curve": "what it does"}
 
 
-def draw_signatures(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """All effects below each other; None without a model, or of one without effects."""
     panels = list_panels(scene)
     if not panels:
@@ -128,19 +128,17 @@ def _describe(signature: Signature) -> str:
     )
 
 
-def describe_signatures(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """Every effect's residual before and after."""
     panels = list_panels(scene)
     return " ".join(panel.words for panel in panels.values()) or "There is no model to draw."
 
 
 FIGURE = Figure(
-    id="signature",
-    title="What each effect does, and what was measured of it",
-    section=Section.EFFECT,
+    "What each effect does, and what was measured of it",
+    Section.EFFECT,
+    draw,
+    describe,
     order=0,
-    width=Width.HALF,
-    draw=draw_signatures,
-    describe=describe_signatures,
     panels=list_panels,
 )

@@ -8,7 +8,7 @@ import altair as alt
 import polars as pl
 
 from pipeline.report import theme
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.words import say_split
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ _COLOURS = {"drivetrain": theme.DRIVETRAIN, "ground": theme.GROUND, "cross": the
 _SUBSETS = ("all", "transitory", "steady")
 
 
-def draw_split(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """Mean squares of the two parts of slip on the command, for all, transitory and steady samples."""
     rows = _list_parts(scene)
     if rows is None:
@@ -86,7 +86,7 @@ def _list_parts(scene: Scene) -> pl.DataFrame | None:
     )
 
 
-def describe_split(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """The shares of all samples in words."""
     rows = _list_parts(scene)
     if rows is None:
@@ -96,12 +96,4 @@ def describe_split(scene: Scene) -> str:
     return f"Mean square of the slip on the command: {say_split(**shares)}."
 
 
-FIGURE = Figure(
-    id="split",
-    title="Drivetrain and ground",
-    section=Section.WHY,
-    order=10,
-    width=Width.FULL,
-    draw=draw_split,
-    describe=describe_split,
-)
+FIGURE = Figure("Drivetrain and ground", Section.WHY, draw, describe, order=10, width="full")

@@ -10,7 +10,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 
 if TYPE_CHECKING:
     from pipeline.report.figures.figure import Picture
@@ -24,7 +24,7 @@ _FEWEST = 2
 _WORDS = {"command": "command", "velocity": "measured", "model": "model"}
 
 
-def draw_step_response(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """A panel each for speed and yaw rate; None where too few steps are held for long enough."""
     rows = list_responses(scene)
     panels = [
@@ -109,7 +109,7 @@ def _draw_panel(component: str, series: list[str]) -> Picture:
     return alt.layer(drawn).properties(width=480, height=96, title=title)
 
 
-def describe_step_response(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """When the measured response reaches 63 % of the step."""
     told = []
     for name, rows in list_responses(scene).items():
@@ -121,12 +121,4 @@ def describe_step_response(scene: Scene) -> str:
     return "Median response to a step of the command. " + "; ".join(told) + "."
 
 
-FIGURE = Figure(
-    id="step_response",
-    title="After a step of the command",
-    section=Section.WHY,
-    order=3,
-    width=Width.HALF,
-    draw=draw_step_response,
-    describe=describe_step_response,
-)
+FIGURE = Figure("After a step of the command", Section.WHY, draw, describe, order=3)

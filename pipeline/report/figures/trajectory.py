@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.report import theme
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.thinning import break_lines
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ _MARGIN = 0.05
 _SMALLEST_SPAN_M = 1.0
 
 
-def draw_trajectory(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """A map with equal scales in x and y; start and end marked, segments not joined."""
     track = scene.track
     if track is None:
@@ -131,7 +131,7 @@ def _axis(name: str, offset: float) -> alt.Axis:
     return alt.Axis(title=title, tickCount=5, format=",~r", minExtent=parts.GUTTER - 20)
 
 
-def describe_trajectory(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """Size of the area, distance and where slip was highest."""
     if scene.track is None:
         return "There are no poses to draw."
@@ -145,12 +145,4 @@ def describe_trajectory(scene: Scene) -> str:
     return f"{told} Slip was highest, {row['modulus']:.2f} m/s, at x {row['x']:.1f} m, y {row['y']:.1f} m."
 
 
-FIGURE = Figure(
-    id="trajectory",
-    title="On the map",
-    section=Section.GLANCE,
-    order=10,
-    width=Width.HALF,
-    draw=draw_trajectory,
-    describe=describe_trajectory,
-)
+FIGURE = Figure("On the map", Section.GLANCE, draw, describe, order=10)

@@ -8,7 +8,7 @@ import altair as alt
 import polars as pl
 
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scales import find_range
 from pipeline.report.scene import COMPONENTS, LINE_BINS
 from pipeline.report.thinning import break_lines, drop_flat_rows, thin_series
@@ -24,7 +24,7 @@ _QUANTITIES = {
 }
 
 
-def draw_velocities(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """Three panels over one time axis: measured, ideal on command, ideal on measured wheels."""
     lines = {component: scene.component_lines(component) for component in COMPONENTS}
     there = {component: line for component, line in lines.items() if line is not None}
@@ -46,17 +46,9 @@ def _draw_panel(scene: Scene, component: str, lines: Thinned) -> Picture:
     last = component == COMPONENTS[-1]
     series = [*scene.slip, "velocity", *(["model"] if scene.report.motion else [])]
     names = [f"velocity_{component}", *([f"model_{component}"] if scene.report.motion else [])]
-    drawn = [
-        alt.Chart(alt.NamedData(name))
-        .mark_line(clip=True, order=False)
-        .encode(
-            x=parts.time_axis(scene) if last else parts.time_axis(scene, title=None),
-            y=parts.value_axis(shown),
-            color=parts.series_colour(series, parts.SERIES_WORDS),
-        )
-        for name in names
-    ]
-    return alt.layer(*parts.shade_spans(), *drawn).properties(width=parts.WIDTH, height=118, title=title)
+    colour = parts.series_colour(series, parts.SERIES_WORDS)
+    x = parts.time_axis(scene) if last else parts.time_axis(scene, title=None)
+    return parts.draw_lines(scene, names, shown, colour, x).properties(height=118, title=title)
 
 
 def model_rows(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -72,7 +64,7 @@ def model_rows(scene: Scene) -> dict[str, pl.DataFrame]:
     return rows
 
 
-def describe_velocities(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """Names the lines and their root mean square distance."""
     words = [parts.SERIES_WORDS[name] for name in scene.slip]
     return (
@@ -83,12 +75,4 @@ def describe_velocities(scene: Scene) -> str:
     )
 
 
-FIGURE = Figure(
-    id="velocities",
-    title="Velocities: measured against ideal",
-    section=Section.WHERE,
-    order=30,
-    width=Width.FULL,
-    draw=draw_velocities,
-    describe=describe_velocities,
-)
+FIGURE = Figure("Velocities: measured against ideal", Section.WHERE, draw, describe, order=30, width="full")

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.report.figures.figure import Drawing, Figure, Section, Width
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.shares import describe_medians, draw_shares, tabulate_shares
 
 if TYPE_CHECKING:
     from pipeline.report.scene import Scene
 
 
-def draw_window_norms(scene: Scene) -> Drawing | None:
+def draw(scene: Scene) -> Drawing | None:
     """The share of windows below each norm."""
     norms = _list_norms(scene)
     if not norms:
@@ -37,18 +37,10 @@ def _list_norms(scene: Scene) -> dict[str, pl.Series]:
     return {name: norms for name, norms in by_input.items() if not norms.is_empty()}
 
 
-def describe_window_norms(scene: Scene) -> str:
+def describe(scene: Scene) -> str:
     """The medians."""
     _, medians = tabulate_shares(_list_norms(scene))
     return describe_medians(medians, "2 s window norm")
 
 
-FIGURE = Figure(
-    id="window_norms",
-    title="Distribution over 2 s windows",
-    section=Section.HOW_BAD,
-    order=30,
-    width=Width.HALF,
-    draw=draw_window_norms,
-    describe=describe_window_norms,
-)
+FIGURE = Figure("Distribution over 2 s windows", Section.HOW_BAD, draw, describe, order=30)

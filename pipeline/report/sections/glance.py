@@ -16,7 +16,7 @@ from pipeline.report.sections.why import say_effect
 from pipeline.report.words import say_number
 
 if TYPE_CHECKING:
-    from pipeline.report.sections.page import Page
+    from pipeline.report.sections import Page
 
 _MOST_REGIONS = 2
 _MOST_NAMES = 3

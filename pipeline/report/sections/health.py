@@ -11,7 +11,7 @@ from pipeline.report.words import MISSING, say_bytes, say_number, say_share
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from pipeline.report.sections.page import Page
+    from pipeline.report.sections import Page
 
 _RANK = {"error": 0, "warning": 1, "info": 2}
 _SEVERITY_WORDS = {"error": "do not trust", "warning": "take care", "info": "note"}

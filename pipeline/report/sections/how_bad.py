@@ -12,7 +12,7 @@ from pipeline.report.words import MISSING, say_number
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.report.sections.page import Page
+    from pipeline.report.sections import Page
 
 
 def view_how_bad(page: Page) -> dict[str, object]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from pipeline.report.run import mapping_in
 
 if TYPE_CHECKING:
-    from pipeline.report.sections.page import Page
+    from pipeline.report.sections import Page
 
 
 def view_provenance(page: Page) -> dict[str, object]:
@@ -23,14 +23,13 @@ def view_provenance(page: Page) -> dict[str, object]:
         ("dataset", report.text("dataset")),
         ("rate", f"{rate:g} Hz" if rate is not None else ""),
     ]
-    facts += [(name, _list_entries(mapping_in(origin, name))) for name in ("versions", "keys")]
+    facts += [
+        (name, ", ".join(f"{key} {value}" for key, value in mapping_in(origin, name).items()))
+        for name in ("versions", "keys")
+    ]
     configuration = origin.get("configuration")
     if isinstance(configuration, Mapping):
         configuration = configuration and json.dumps(
             configuration, indent=2, sort_keys=True, ensure_ascii=False, default=str
         )
     return {"facts": [fact for fact in facts if fact[1]], "configuration": configuration}
-
-
-def _list_entries(entries: Mapping[str, object]) -> str:
-    return ", ".join(f"{name} {value}" for name, value in entries.items())

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pipeline.report.run import RunReport
-    from pipeline.report.sections.page import Page
+    from pipeline.report.sections import Page
 
 
 def view_what_now(page: Page) -> dict[str, object]:

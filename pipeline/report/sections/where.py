@@ -9,7 +9,7 @@ from pipeline.report.run import objects_in
 
 if TYPE_CHECKING:
     from pipeline.report.run import RunReport
-    from pipeline.report.sections.page import Page
+    from pipeline.report.sections import Page
 
 
 def view_where(page: Page) -> dict[str, object]:

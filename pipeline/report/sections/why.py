@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from pipeline.report.run import RunReport
-    from pipeline.report.sections.page import Page
+    from pipeline.report.sections import Page
 
 _MANY_FOLD = 10.0
 _CHANNELS = {"x": "forward motion", "y": "sideways motion", "w": "yaw rate"}

@@ -18,7 +18,7 @@ from pipeline.report.words import MISSING, say_number, say_share
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.fleet.causes import Budget, Difference
+    from pipeline.fleet.causes import Budget, Causes, Difference
 
 _COLOURS = (
     theme.MODEL, theme.ON_COMMAND, theme.ON_MEASURED, theme.SLIP, theme.DRIVETRAIN, theme.MARK,
@@ -28,27 +28,9 @@ _LEFT = {"disturbance": theme.GROUND, "localization_noise": theme.CROSS}
 _OTHERS = "other effects"
 
 
-def render_causes(
-    budgets: Sequence[Budget],
-    differences: Sequence[Difference],
-    *,
-    input_name: str,
-    sentences: Sequence[str],
-    names: Mapping[str, str],
-    notes: Sequence[str],
-    keys: Sequence[str],
-) -> str:
-    """The whole page as HTML.
-
-    Args:
-        budgets: of every dataset.
-        differences: of every two.
-        input_name: what u was.
-        sentences: the differences in words.
-        names: what effects are called, where that is not their id.
-        notes: what must be known.
-        keys: run/generation of every run.
-    """
+def render_causes(causes: Causes, sentences: Sequence[str]) -> str:
+    """The whole page as HTML; sentences: the differences in words."""
+    budgets, names, keys = causes.budgets, causes.names, causes.keys
     return render_figures(
         "report/templates/causes.html",
         [draw_causes(budgets, names)],
@@ -56,12 +38,12 @@ def render_causes(
         facts=[
             f"{len(budgets)} dataset{'s' * (len(budgets) != 1)}",
             f"{len(keys)} run{'s' * (len(keys) != 1)}",
-            f"slip {INPUT_WORDS[input_name]}",
+            f"slip {INPUT_WORDS[causes.input]}",
         ],
         sentences_told=sentences,
         budgets=_tabulate_budgets(budgets, names),
-        differences=_tabulate_differences(differences, names),
-        notes=notes,
+        differences=_tabulate_differences(causes.differences, names),
+        notes=causes.notes,
         runs=keys,
     )
 

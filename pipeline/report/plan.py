@@ -9,7 +9,7 @@ import altair as alt
 import numpy as np
 import polars as pl
 
-from pipeline.plan import SAFETY
+from pipeline.plan.plan import SAFETY
 from pipeline.report import theme
 from pipeline.report.elements import Picture
 from pipeline.report.figures import Drawing
@@ -21,7 +21,7 @@ from pipeline.report.templating import render_template
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.plan import Plan
+    from pipeline.plan.plan import Plan
 
 # One pose in so many, and so many ways beside the base's.
 _EVERY = 4

@@ -21,29 +21,15 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.fleet.parameter_trend import ParameterTrend
-    from pipeline.fleet.trend import Alert, Series
+    from pipeline.fleet.trend import Series, Trend
 
 _FEWEST_POINTS = 3
 _LATER = ("finding ", "suspect share", "warnings")
 
 
-def render_trend(
-    series: Sequence[Series],
-    parameters: Sequence[ParameterTrend],
-    alerts: Sequence[Alert],
-    *,
-    notes: Sequence[str],
-    keys: Sequence[str],
-) -> str:
-    """The whole page as HTML.
-
-    Args:
-        series: as of `follow_quantities`; those with fewer than three runs are left out.
-        parameters: as of `follow_parameters`; the same.
-        alerts: as of `raise_alerts`.
-        notes: what must be known.
-        keys: run/generation of every run.
-    """
+def render_trend(trend: Trend) -> str:
+    """The whole page as HTML; series and parameters with fewer than three runs are left out."""
+    series, parameters, keys, alerts = trend.series, trend.parameters, trend.keys, trend.alerts
     vehicles = list(dict.fromkeys(one.vehicle for one in parameters))
     names = list(dict.fromkeys(one.group for one in series))
     groups = [
@@ -69,7 +55,7 @@ def render_trend(
         ],
         alerts=[alert.text for alert in alerts],
         quiet=begin_large(describe_quiet(series, parameters)),
-        notes=notes,
+        notes=trend.notes,
         groups=[group for group in groups if group[2]],
         runs=keys,
     )
