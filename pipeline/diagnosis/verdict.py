@@ -6,6 +6,7 @@ stretch of ten seconds.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -68,10 +69,11 @@ def compare(part: Part, weights: Weights, before: Floats, after: Floats) -> Verd
     """Judge held-out residuals of two models under one weights."""
     old, new = weights.cost(before), weights.cost(after)
     gain = 1.0 - float(new.sum()) / max(float(old.sum()), 1e-12)
-    shift = ((before - after) / weights.scale) ** 2
-    moved = shift.sum(axis=1)
+    moved = (((before - after) / weights.scale) ** 2).sum(axis=1)
     stretch = part.number_stretches(SHORT_S)
-    deviation = 2.0 * float(np.sqrt(shift.sum(axis=0) @ measure_repeated(part, after / weights.scale)))
+    # As if all channels were as noisy as the noisiest: thresholds of z are made for it.
+    noise = float(measure_repeated(part, after / weights.scale).max())
+    deviation = 2.0 * math.sqrt(noise * float(moved.sum()))
     z = _normal_t(_add_up(stretch, old - new), _add_up(stretch, moved), deviation)
     return Verdict(gain, _find_t(part.unit, stretch, old, new, moved), z)
 
