@@ -13,6 +13,7 @@ import polars as pl
 from pipeline.analysis.diagnosis import read_length_scale
 from pipeline.analysis.errors import JobError
 from pipeline.analysis.fleet import find_estimates
+from pipeline.core.arrays import Complex, Flags, Floats
 from pipeline.fleet.datasets import read_day
 from pipeline.fleet.forecast import DRAWS, make_effects
 from pipeline.fleet.statistics.intervals import Interval
@@ -30,14 +31,11 @@ from pipeline.runs.errors import MotionError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from pipeline.fleet.forecast import Forecast
     from pipeline.models.effect import Effect
     from pipeline.store import Manifest, Store
     from pipeline.vehicles import Vehicle
 
-    Floats = NDArray[np.float64]
 
 MOST_RUNS = 8
 """Runs whose commands stand for those to come: more make the answer slower and hardly another."""
@@ -157,7 +155,7 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
     return Prediction(forecast, vehicle, error, without, modulus_median, used)
 
 
-def weigh_runs(there: NDArray[np.bool_]) -> Floats:
+def weigh_runs(there: Flags) -> Floats:
     """How likely the next run is driven as each of these was, shape (n,).
 
     As one of the n on its terrain with chance n / (n + 1), else as one on others (Blackwell and MacQueen,
@@ -177,14 +175,14 @@ def _bound(draws: Floats) -> Expected:
     return Expected(middle, Interval(low, high, _LEVEL))
 
 
-def _predict(run: _Driven, effects: Sequence[Effect]) -> NDArray[np.complex128]:
+def _predict(run: _Driven, effects: Sequence[Effect]) -> Complex:
     """Positions of predictions over 2 s [m], by prediction and time since its start."""
     poses = predict_from(run.comparison, effects, Timing()).poses
-    positions: NDArray[np.complex128] = poses[:, 1:, 0] + 1j * poses[:, 1:, 1]
+    positions: Complex = poses[:, 1:, 0] + 1j * poses[:, 1:, 1]
     return positions
 
 
-def _measure_gap(one: NDArray[np.complex128], other: NDArray[np.complex128]) -> float:
+def _measure_gap(one: Complex, other: Complex) -> float:
     return float(np.sqrt(np.mean(np.abs(one - other) ** 2)))
 
 

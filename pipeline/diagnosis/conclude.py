@@ -9,8 +9,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.diagnosis import residual_structure
 from pipeline.diagnosis.context import measure_exceeded
 from pipeline.diagnosis.diagnosis import Named, RunDiagnosis
@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from pipeline.identification.state import State
     from pipeline.models import Effect
 
-Floats = NDArray[np.float64]
 
 _DRAWS = 400
 _WORTH = 0.01

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.diagnosis.errors import DiagnosisError
 from pipeline.diagnosis.plausibility import EXCEEDED_SHARE
 from pipeline.identification.comparison import Input
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from pipeline.runs.recording import MotionRun
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
 
 _FEWEST_WINDOWS = 60
 _DRIVETRAIN = frozenset({Place.COMMAND, Place.DRIVE})

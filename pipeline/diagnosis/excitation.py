@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.diagnosis.verdict import LEAST_STRETCHES, SHORT_S, measure_repeated
 from pipeline.identification.columns import weigh_columns
 from pipeline.models.effect import Excitation, Search
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from pipeline.identification.proposals import Candidate
     from pipeline.models.effect import Effect
 
-Floats = NDArray[np.float64]
 _STANDARD_ERRORS = 4.0
 _DETECTED = 9.0
 """Standard errors of a size that is seen: 10 of 12 hidden effects were named at it, 4 at half of it and 12 at

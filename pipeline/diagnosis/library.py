@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.identification.proposals import TERM
 from pipeline.models.effect import ANY, Parameter, Search
 from pipeline.models.formula.formula_effect import FormulaEffect
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from pipeline.diagnosis.selection import CandidateModel, Selection
 
-Floats = NDArray[np.float64]
 
 CHANNELS = ("v_x", "v_y", "v_w")
 _WIDE = 50.0

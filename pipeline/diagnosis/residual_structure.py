@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.diagnosis.diagnosis import Unexplained
 from pipeline.diagnosis.error_regions import CHANNELS
 from pipeline.diagnosis.library import join_formula
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from pipeline.diagnosis.diagnosis import Json
     from pipeline.identification.persistence import Makeup
 
-Floats = NDArray[np.float64]
 
 _BINS = 8
 _PART = 0.3

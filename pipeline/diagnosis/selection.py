@@ -8,8 +8,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.core.parallel import map_parallel
 from pipeline.diagnosis.budget import Budget
 from pipeline.diagnosis.plausibility import is_nameable
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from pipeline.models.effect import Effect
     from pipeline.models.evidence import Evidence, Largest
 
-Floats = NDArray[np.float64]
 
 _FIRST_STEPS = 4
 _PAIRED = 5

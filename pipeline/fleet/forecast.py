@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import polars as pl
 
+from pipeline.core.arrays import Floats
 from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.hierarchy import leave_out_odd, take_numbers
 from pipeline.fleet.runs import UNKNOWN
@@ -20,7 +21,6 @@ from pipeline.models.parameter import USUAL_SPREAD, is_of_one_run
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.fleet.statistics.arrays import Floats
     from pipeline.models.effect import Effect
 
 DRAWS = 400

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats, Ints
 from pipeline.fleet.statistics.families import MOST_GROUPS, adjust_holm, adjust_max_t, runs_needed
 from pipeline.fleet.statistics.intervals import bootstrap_median
 from pipeline.fleet.statistics.pairs import compare_blocks, compare_runs, cut_blocks
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from pipeline.fleet.statistics.intervals import Interval
     from pipeline.fleet.statistics.pairs import Blocks, Comparison
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 LEVEL = 0.05
 RUNS = "runs"
@@ -45,8 +43,8 @@ class Samples:
     """
 
     values: Floats
-    ticks: Integers
-    pieces: Integers
+    ticks: Ints
+    pieces: Ints
     step: float
 
     @property

@@ -8,13 +8,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from pipeline.core.arrays import Flags, Floats
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 def make_columns(windows: int, numbers: int) -> Floats:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.identification.columns import combine_columns, pick_columns, weigh_columns
 from pipeline.identification.proposals import propose
 from pipeline.identification.state import State
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from pipeline.identification.weights import Weights
     from pipeline.models.effect import Effect, Parameter
 
-Floats = NDArray[np.float64]
 
 _ITERATIONS = 20
 _ENOUGH = 2e-5

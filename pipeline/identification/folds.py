@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats
 from pipeline.identification.columns import (
     combine_columns,
     flatten,
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from pipeline.identification.parts import Part
     from pipeline.identification.state import State
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 FOLDS = 5
 GAP_S = 1.5

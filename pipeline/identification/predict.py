@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats, Ints
 from pipeline.identification.comparison import Comparison, Input
 from pipeline.models.forward import Timing
 from pipeline.runs.heading import HeadingSource
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from pipeline.models.effect import Effect
     from pipeline.models.model import Model
     from pipeline.runs.recording import MotionRun
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,7 @@ class Prediction:
     """
 
     times: Floats
-    span: NDArray[np.int64]
+    span: Ints
     velocity: Floats
     start_times: Floats
     poses: Floats

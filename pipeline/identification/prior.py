@@ -14,14 +14,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from pipeline.core.arrays import Floats
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.identification.state import Free, State
 
-Floats = NDArray[np.float64]
 
 # Degrees of freedom: what was known is forgotten where a run lies several deviations off.
 _FREEDOM = 4.0

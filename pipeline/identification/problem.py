@@ -7,8 +7,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats
 from pipeline.identification.comparison import Comparison, Input, choose_rate
 from pipeline.identification.floor import estimate_floor
 from pipeline.identification.folds import Fold, find_near, make_folds
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from pipeline.runs.recording import MotionRun
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 _FEWEST_WINDOWS = 20
 _STILL = 1e-9

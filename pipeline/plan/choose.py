@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from pipeline.core.arrays import Complex, Floats
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -14,8 +15,6 @@ if TYPE_CHECKING:
     from pipeline.plan.limits import Area
     from pipeline.plan.questions import Answerable
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _ROUNDS = 2
 _NOTHING = 1e-4

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
+from pipeline.core.arrays import Floats
 from pipeline.core.toml import TomlError, parse_toml
 from pipeline.logs import LogWriter
 from pipeline.models.catalogue import find_effect
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from numpy.typing import NDArray
 
 PAGE = "plan.html"
 _NAMES = ("plan.toml", "plan.csv", "plan.mcap")
@@ -122,7 +122,7 @@ def read_promises(path: Path) -> Promised:
 
 def _write_mcap(plan: Plan, path: Path) -> None:
     stamps = _START_NS + np.round(plan.commands.times * _SECOND).astype(np.int64)
-    fields: list[dict[str, NDArray[np.float64]]]
+    fields: list[dict[str, Floats]]
     if plan.type_name == WHEELS and plan.wheels is not None:
         fields = [{"data": side} for side in plan.wheels]
     else:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.identification import Input, Problem, fit_model
 from pipeline.identification.columns import pick_columns, weigh_columns
 from pipeline.identification.few_shot import tie_to_prior
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from pipeline.runs import MotionRun
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
 
 # Without a log: spread of a window's residual [m/s, m/s, rad/s], and windows that repeat each other.
 _USUAL_NOISE = (0.02, 0.02, 0.02)

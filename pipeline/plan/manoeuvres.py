@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.plan.limits import is_steered
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from pipeline.plan.limits import Limits
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
 
 RATE_HZ = 20.0
 LEAD_S = 3.0

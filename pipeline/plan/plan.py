@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Complex, Floats
 from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.models import find_effect, list_effects
 from pipeline.plan.choose import Chooser, Shape
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from pipeline.plan.manoeuvres import Manoeuvre
     from pipeline.plan.questions import Answerable, Question
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _MODELS = 12
 # Of effects that may act unnoticed, times the usual one: the largest does not always lead farthest.

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.plan.errors import PlanError
 from pipeline.plan.limits import is_steered
 from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, Commands, hold_within, join, wait
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from pipeline.plan.questions import Question
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
 Stages = list[tuple[float, float, float]]
 
 LONGEST_S = 300.0

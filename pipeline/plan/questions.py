@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri, stdtrit
 
+from pipeline.core.arrays import Floats, Ints
 from pipeline.plan.rehearsal import start_state
 
 if TYPE_CHECKING:
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from pipeline.plan.knowledge import Hypothesis, Knowledge
     from pipeline.plan.rehearsal import Rehearsal
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # The diagnosis decides between two that were found at 1.6; a t scatters about its mean by one, and here it is
 # to be decided nearly always.
@@ -131,7 +129,7 @@ class Groups:
     """
 
     seconds: Floats
-    stretch: Integers
+    stretch: Ints
     before_s: float = 0.0
 
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Complex, Floats
 from pipeline.identification import Comparison, Input, Problem, State
 from pipeline.identification.problem import measure_largest
 from pipeline.models import Place, Timing
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from pipeline.runs.signals import Velocity
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _POSE_HZ = 20.0
 # Poses and encoders go on after the last command.

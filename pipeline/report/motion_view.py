@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.identification import fit_model, predict_from
 from pipeline.identification.signature import VARIABLES, find_signatures, measure_variables
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from pipeline.identification.comparison import HorizonErrors
     from pipeline.identification.signature import Signature
 
-Floats = NDArray[np.float64]
 
 COMPONENTS = ("x", "y", "w")
 SIGNALS = {name: VARIABLES[name] for name in ("f_x", "f_y", "f_w", "f_x_f_w", "a_x", "a_w", "roll", "pitch")}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.arrays import Floats
 from pipeline.core.errors import SlipError
 from pipeline.diagnosis.verdict import compare
 from pipeline.identification import fit_model, hold_out
@@ -21,8 +22,6 @@ from pipeline.web.errors import evaluating
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from numpy.typing import NDArray
 
     from pipeline.identification import HeldOut, Problem
     from pipeline.models import Model
@@ -146,7 +145,7 @@ def _try_each(
     problem = prepared.second_problem()
     base: HeldOut = hold_out(problem, fit_model(problem, model))
     kinds = {effect.id: effect for effect in list_effects()}
-    taken: dict[str, NDArray[np.float64]] = {}
+    taken: dict[str, Floats] = {}
     for name in names:
         idle.wait()
         if trial.stopped:
@@ -183,9 +182,7 @@ def _share_left(base: HeldOut, new: HeldOut) -> float:
     return position * after.r_mrmse_rad / max(before.r_mrmse_rad, 1e-12)
 
 
-def _find_twins(
-    name: str, new: HeldOut, base: HeldOut, taken: dict[str, NDArray[np.float64]], trial: Trial
-) -> list[str]:
+def _find_twins(name: str, new: HeldOut, base: HeldOut, taken: dict[str, Floats], trial: Trial) -> list[str]:
     """Effects tried before that take the same off the residuals, which are told so too.
 
     Args:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
+from pipeline.core.arrays import Floats
 from pipeline.diagnosis.error_regions import map_errors, pick_regions
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.identification import Input, Problem, State, choose_input, fit_model, hold_out
@@ -23,9 +24,6 @@ from pipeline.report.motion_view import MotionStage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-
-    import numpy as np
-    from numpy.typing import NDArray
 
     from pipeline.identification import Errors, Fitted
     from pipeline.models import Model
@@ -59,7 +57,7 @@ class Shown:
 
     view: MotionView
     where: list[str]
-    predict: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    predict: Callable[[Floats], Floats]
 
 
 @dataclass

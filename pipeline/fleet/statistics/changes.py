@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.fleet.statistics.arrays import Floats, check_values
+from pipeline.core.arrays import Floats
+from pipeline.fleet.statistics.arrays import check_values
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.fleet.statistics.arrays import Floats, Integers, check_values
+from pipeline.core.arrays import Floats, Ints
+from pipeline.fleet.statistics.arrays import check_values
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -52,7 +53,7 @@ def integrated_time(values: ArrayLike, ticks: ArrayLike) -> float:
     return tau
 
 
-def number_blocks(ticks: ArrayLike, pieces: ArrayLike, length: float) -> Integers:
+def number_blocks(ticks: ArrayLike, pieces: ArrayLike, length: float) -> Ints:
     """Cut samples into blocks of about ``length`` grid steps; no block crosses the end of a piece.
 
     A piece is cut into as many equal blocks of at least that length as fit; a shorter one is a block.

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.fleet.statistics.arrays import Floats, check_values
+from pipeline.core.arrays import Floats
+from pipeline.fleet.statistics.arrays import check_values
 from pipeline.fleet.statistics.permutation import DRAWS, LARGEST_EXACT
 
 if TYPE_CHECKING:

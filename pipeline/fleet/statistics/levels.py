@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.fleet.statistics.arrays import Floats, Integers, StatisticsError, check_values
+from pipeline.core.arrays import Floats, Ints
+from pipeline.fleet.statistics.arrays import StatisticsError, check_values
 from pipeline.fleet.statistics.intervals import Interval, student_quantile
 
 if TYPE_CHECKING:
@@ -171,7 +172,7 @@ class Sample:
 
     y: Floats
     known: Floats
-    group: Integers
+    group: Ints
     count: int
 
     def weigh(self, run: float) -> tuple[Floats, Floats, Floats]:

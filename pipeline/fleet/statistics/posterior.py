@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.fleet.statistics.arrays import Floats, StatisticsError, check_values
+from pipeline.core.arrays import Floats
+from pipeline.fleet.statistics.arrays import StatisticsError, check_values
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.arrays import Floats, Ints
 from pipeline.fleet.statistics.intervals import student_quantile
 from pipeline.fleet.statistics.levels import Sample, make_sample, maximize_likelihood
 
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from pipeline.fleet.statistics.arrays import Floats, Integers
 
 FEWEST_FREE = 2
 """Degrees of freedom that runs must leave beside their groups and one step: four runs of one group do."""
@@ -143,7 +143,7 @@ class _Scan:
     groups: int
     basis: Floats
     steps: Floats
-    places: Integers
+    places: Ints
     norms: Floats
 
     @classmethod
