@@ -10,7 +10,7 @@ import polars as pl
 from pipeline.analysis.compared_runs import find_material, keep_runs
 from pipeline.analysis.errors import JobError
 from pipeline.analysis.fleet import fit_results
-from pipeline.fleet.causes import Causes, compare_causes
+from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
 from pipeline.fleet.tables import write_csv, write_latex
 
 if TYPE_CHECKING:
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.analysis.options import FigureFormat
-    from pipeline.fleet.causes import Budget, Difference
     from pipeline.store import Store
 
 _EFFECT = "effect"

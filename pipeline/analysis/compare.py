@@ -12,16 +12,14 @@ from pipeline.analysis.compared_runs import ComparedRuns, find_material, keep_ru
 from pipeline.analysis.errors import JobError
 from pipeline.analysis.samples import follow_published_runs, read_moduli, read_norms
 from pipeline.fleet.datasets import OVER_RUNS, THIS_RUN, pool_runs, spread_windows
-from pipeline.fleet.pairs import Group, bound_run, compare_groups
+from pipeline.fleet.pairs import Group, Pair, Samples, bound_run, compare_groups
 from pipeline.fleet.runs import add_measures, gather_runs, measure_difficulty
-from pipeline.fleet.statistics.intervals import bound_typical
+from pipeline.fleet.statistics.intervals import Interval, bound_typical
 from pipeline.fleet.tables import Answer, tabulate_pairs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.fleet.pairs import Pair, Samples
-    from pipeline.fleet.statistics.intervals import Interval
     from pipeline.store import Store
 
 _WINDOW_COLUMNS = {

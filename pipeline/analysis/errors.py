@@ -1,7 +1,5 @@
 """What can keep a job from its work."""
 
-from __future__ import annotations
-
 from pipeline.core.errors import SlipError
 
 

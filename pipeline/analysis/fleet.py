@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, cast
 
 import polars as pl
 
-from pipeline.analysis.compared_runs import find_material, read_digest
+from pipeline.analysis.compared_runs import ComparedRuns, find_material, read_digest
 from pipeline.analysis.errors import JobError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from pipeline.analysis.compared_runs import ComparedRuns
     from pipeline.fleet.hierarchy import FleetModel, FleetNumber
     from pipeline.fleet.statistics.intervals import Interval
     from pipeline.store import Store

@@ -1,9 +1,8 @@
 """What a log holds and how healthy it is, without analyzing it."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
@@ -12,11 +11,6 @@ from pipeline.core.arrays import Ints
 from pipeline.core.errors import SlipError
 from pipeline.logs import ChannelInfo, LogIndex, Loss, Wanted, open_log, read_topics
 from pipeline.vehicles import Configuration, Sources, Vehicle, choose_sources, find_preset, load_configuration
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
 
 _GAP_PERIODS = 3.0
 _SMALLEST_GAP_S = 0.12

@@ -15,13 +15,13 @@ from pipeline.analysis.errors import JobError
 from pipeline.analysis.fleet import find_estimates
 from pipeline.core.arrays import Complex, Flags, Floats
 from pipeline.fleet.datasets import read_day
-from pipeline.fleet.forecast import DRAWS, make_effects
+from pipeline.fleet.forecast import DRAWS, Forecast, make_effects
 from pipeline.fleet.statistics.intervals import Interval
 from pipeline.fleet.statistics.posterior import draw_run
 from pipeline.identification.comparison import Comparison, Input
 from pipeline.identification.predict import predict_at_from, predict_from
 from pipeline.models.catalogue import find_effect
-from pipeline.models.effect import Place
+from pipeline.models.effect import Effect, Place
 from pipeline.models.forward import Timing
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
@@ -31,8 +31,6 @@ from pipeline.runs.errors import MotionError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.fleet.forecast import Forecast
-    from pipeline.models.effect import Effect
     from pipeline.store import Manifest, Store
     from pipeline.vehicles import Vehicle
 

@@ -12,7 +12,13 @@ import polars as pl
 from pipeline.analysis.compared_runs import ComparedRuns, find_material
 from pipeline.analysis.errors import JobError
 from pipeline.fleet.errors import ComparisonError
-from pipeline.fleet.parameter_trend import describe_parameter, find_latest, follow_parameters, say_power
+from pipeline.fleet.parameter_trend import (
+    ParameterTrend,
+    describe_parameter,
+    find_latest,
+    follow_parameters,
+    say_power,
+)
 from pipeline.fleet.runs import gather_runs
 from pipeline.fleet.trend import (
     FEWEST_RUNS,
@@ -28,7 +34,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from pipeline.fleet.parameter_trend import ParameterTrend
     from pipeline.store import Store
 
 TREND = "trend.json"

@@ -14,7 +14,7 @@ from pipeline.identification.comparison import Input
 from pipeline.identification.problem import Problem
 from pipeline.models.catalogue import list_effects
 from pipeline.models.effect import Place
-from pipeline.models.evidence import LEAST_DELAY_S, Evidence
+from pipeline.models.evidence import LEAST_DELAY_S, Evidence, Largest
 from pipeline.runs.errors import MotionError
 from pipeline.runs.signals import find_fastest_wheel, name_inputs
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.identification.proposals import Candidate
-    from pipeline.models.evidence import Largest
     from pipeline.runs.recording import MotionRun
     from pipeline.vehicles import Vehicle
 

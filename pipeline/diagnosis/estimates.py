@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from pipeline.diagnosis.diagnosis import EstimatedNumber
+from pipeline.diagnosis.diagnosis import EstimatedNumber, Named
 from pipeline.identification.unnamed import estimate_unnamed
 from pipeline.models.catalogue import list_effects
 
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from pipeline.diagnosis.context import Context
-    from pipeline.diagnosis.diagnosis import Named
     from pipeline.identification.judgement import Judgement
     from pipeline.models import Effect, Model
 

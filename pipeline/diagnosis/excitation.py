@@ -11,14 +11,13 @@ import numpy as np
 from pipeline.core.arrays import Floats
 from pipeline.diagnosis.verdict import LEAST_STRETCHES, SHORT_S, measure_repeated
 from pipeline.identification.columns import weigh_columns
-from pipeline.models.effect import Excitation, Search
+from pipeline.models.effect import Effect, Excitation, Search
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.diagnosis.selection import CandidateModel, Selection
     from pipeline.identification.proposals import Candidate
-    from pipeline.models.effect import Effect
 
 _STANDARD_ERRORS = 4.0
 _DETECTED = 9.0

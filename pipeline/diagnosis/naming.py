@@ -10,18 +10,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from pipeline.diagnosis.search import search_effects
-from pipeline.diagnosis.selection import open_selection
+from pipeline.diagnosis.selection import CandidateModel, Selection, open_selection
 from pipeline.identification.comparison import Input
 from pipeline.identification.state import State
-from pipeline.models.effect import Place
+from pipeline.models.effect import Effect, Place
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.diagnosis.budget import Budget
     from pipeline.diagnosis.context import Context
-    from pipeline.diagnosis.selection import CandidateModel, Selection
-    from pipeline.models.effect import Effect
 
 Way = Literal["command", "measured", "wheels"]
 

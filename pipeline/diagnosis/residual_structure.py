@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.diagnosis.diagnosis import Unexplained
+from pipeline.diagnosis.diagnosis import Json, Unexplained
 from pipeline.diagnosis.error_regions import CHANNELS
 from pipeline.diagnosis.library import join_formula
 from pipeline.diagnosis.materiality import LEAST_TURN_RAD, LEAST_WAY_SHARE
@@ -20,15 +20,13 @@ from pipeline.diagnosis.unexplained import (
     is_explainable,
     measure_asked,
 )
-from pipeline.identification.persistence import split_residuals
+from pipeline.identification.persistence import Makeup, split_residuals
 from pipeline.runs.windows import HORIZON_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis.diagnose import Explored
-    from pipeline.diagnosis.diagnosis import Json
-    from pipeline.identification.persistence import Makeup
 
 
 _BINS = 8

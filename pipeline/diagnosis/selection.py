@@ -15,16 +15,14 @@ from pipeline.diagnosis.budget import Budget
 from pipeline.diagnosis.plausibility import is_nameable
 from pipeline.diagnosis.verdict import LEAST_GAIN, Verdict, compare
 from pipeline.identification.fit import PartFit, fit_part
-from pipeline.identification.folds import hold_out_part, make_folds
-from pipeline.identification.proposals import propose, propose_pairs
+from pipeline.identification.folds import Fold, hold_out_part, make_folds
+from pipeline.identification.proposals import Candidate, Proposal, Trial, propose, propose_pairs
 from pipeline.identification.weights import Weights, make_weights, measure_spread
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from pipeline.identification.folds import Fold
     from pipeline.identification.parts import Part
-    from pipeline.identification.proposals import Candidate, Proposal, Trial
     from pipeline.identification.state import State
     from pipeline.models.effect import Effect
     from pipeline.models.evidence import Evidence, Largest

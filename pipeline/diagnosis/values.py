@@ -9,12 +9,11 @@ import numpy as np
 
 from pipeline.diagnosis.diagnosis import Value
 from pipeline.models.bounds import stands_at_bound
-from pipeline.models.parameter import is_of_one_run
+from pipeline.models.parameter import Parameter, is_of_one_run
 
 if TYPE_CHECKING:
     from pipeline.identification import Estimates
     from pipeline.models import Effect
-    from pipeline.models.parameter import Parameter
     from pipeline.runs import MotionRun
 
 _SURE = 1.96

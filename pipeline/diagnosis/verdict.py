@@ -14,10 +14,9 @@ import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.core.parallel import map_parallel
-from pipeline.identification.parts import count_seconds
+from pipeline.identification.parts import Part, count_seconds
 
 if TYPE_CHECKING:
-    from pipeline.identification.parts import Part
     from pipeline.identification.weights import Weights
 
 

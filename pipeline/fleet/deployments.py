@@ -4,8 +4,6 @@ The project's own table is `data_samples/deployments.csv` in the repository; an 
 beside this module.
 """
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

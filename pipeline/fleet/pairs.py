@@ -1,26 +1,17 @@
 """Groups of runs compared pair by pair, with the correction for asking often."""
 
-from __future__ import annotations
-
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.fleet.statistics.families import MOST_GROUPS, adjust_holm, adjust_max_t, runs_needed
-from pipeline.fleet.statistics.intervals import bootstrap_median
-from pipeline.fleet.statistics.pairs import compare_blocks, compare_runs, cut_blocks
+from pipeline.fleet.statistics.intervals import Interval, bootstrap_median
+from pipeline.fleet.statistics.pairs import Blocks, Comparison, compare_blocks, compare_runs, cut_blocks
 from pipeline.fleet.statistics.permutation import DRAWS
 from pipeline.fleet.statistics.ranks import mann_whitney, name_delta
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.fleet.statistics.intervals import Interval
-    from pipeline.fleet.statistics.pairs import Blocks, Comparison
-
 
 LEVEL = 0.05
 RUNS = "runs"

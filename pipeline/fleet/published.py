@@ -5,21 +5,15 @@ powertrain's answer to it, their v comes from splines of held poses. Where the p
 a choice, the choice here is documented at the function that makes it.
 """
 
-from __future__ import annotations
-
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
 from pipeline.core import timegrid
 from pipeline.core.arrays import Flags, Floats, Ints
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
 
 SAMPLES = 40
 WINDOW_S = 2.0

@@ -1,7 +1,5 @@
 """What is left of slip after the best static model: the part that nobody could have foreseen."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

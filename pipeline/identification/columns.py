@@ -3,16 +3,11 @@
 All arrays are of shape (n, 3, p): n windows, three channels, p numbers.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 
 def make_columns(windows: int, numbers: int) -> Floats:

@@ -10,21 +10,18 @@ import numpy as np
 
 from pipeline.core.arrays import Complex, Floats, Ints
 from pipeline.models.catalogue import is_own
-from pipeline.models.effect import Late, ReportEffect
+from pipeline.models.effect import Effect, Late, ReportEffect
 from pipeline.models.forward import Forward, Timing, replace_context
 from pipeline.runs.errors import MotionError
-from pipeline.runs.grid import lay_grid
+from pipeline.runs.grid import Grid, lay_grid
 from pipeline.runs.heading import HeadingSource, choose_heading
-from pipeline.runs.signals import Resets, RunContext, Signal
+from pipeline.runs.signals import Resets, RunContext, Signal, Velocity
 from pipeline.runs.windows import WINDOW_S, find_lead, gather_nodes, join_horizons, join_windows
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from pipeline.models.effect import Effect
-    from pipeline.runs.grid import Grid
     from pipeline.runs.recording import MotionRun
-    from pipeline.runs.signals import Velocity
     from pipeline.vehicles import Vehicle
 
 

@@ -7,16 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.identification.fit import fit_model
+from pipeline.identification.fit import Fitted, PartFit, fit_model
 from pipeline.identification.intervals import SHORTEST_TIME_S, count_repeats
-from pipeline.identification.parts import BodyPart
+from pipeline.identification.parts import BodyPart, Part
 from pipeline.identification.prior import Prior
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.identification.fit import Fitted, PartFit
-    from pipeline.identification.parts import Part
     from pipeline.identification.problem import Problem
     from pipeline.models.model import Model
 

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pipeline.identification.comparison import Input
-from pipeline.models.effect import Place
+from pipeline.models.effect import Effect, Place
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from pipeline.models.effect import Effect
     from pipeline.runs.recording import MotionRun
 
 

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
-from pipeline.identification.parts import count_seconds
+from pipeline.identification.parts import Part, count_seconds
 from pipeline.models.bounds import stands_at_bound
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.identification.fit import Fitted, PartFit
-    from pipeline.identification.parts import Part
     from pipeline.identification.problem import Problem
     from pipeline.identification.state import Free
 

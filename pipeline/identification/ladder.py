@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, nan, prod
 from typing import TYPE_CHECKING, Final
 
 from pipeline.identification.fit import Fitted, fit_model
-from pipeline.identification.scoring import HeldOut, hold_out
+from pipeline.identification.scoring import Errors, HeldOut, hold_out
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from pipeline.identification.problem import Problem
-    from pipeline.identification.scoring import Errors
     from pipeline.models.model import Model
 
 NOTHING = 1e-3

@@ -15,10 +15,10 @@ import numpy as np
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.identification.columns import make_columns
 from pipeline.identification.prior import NO_PRIOR, Prior
-from pipeline.identification.state import State
+from pipeline.identification.state import DelayName, Free, State
 from pipeline.identification.weights import measure_noise
 from pipeline.models.catalogue import find_late_effect
-from pipeline.models.effect import Late, Place
+from pipeline.models.effect import Effect, Late, Place
 from pipeline.models.forward import Timing
 from pipeline.runs.windows import WINDOW_S
 
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.identification.comparison import Comparison
-    from pipeline.identification.state import DelayName, Free
-    from pipeline.models.effect import Effect
     from pipeline.models.evidence import Largest
     from pipeline.runs.signals import Signal, Velocity
 

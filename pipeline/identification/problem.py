@@ -13,8 +13,8 @@ from pipeline.identification.comparison import Comparison, Input, choose_rate
 from pipeline.identification.floor import estimate_floor
 from pipeline.identification.folds import Fold, find_near, make_folds
 from pipeline.identification.parts import BodyPart, Part, WheelPart
-from pipeline.identification.state import State
-from pipeline.models.effect import Place
+from pipeline.identification.state import DelayName, State
+from pipeline.models.effect import Effect, Place
 from pipeline.models.evidence import Largest
 from pipeline.models.forward import Timing
 from pipeline.runs.errors import MotionError
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.identification.scoring import Errors
-    from pipeline.identification.state import DelayName
-    from pipeline.models.effect import Effect
     from pipeline.models.model import Model
     from pipeline.runs.recording import MotionRun
     from pipeline.vehicles import Vehicle

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
-from pipeline.models.effect import Search
+from pipeline.models.effect import Effect, Search
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from pipeline.models.effect import Effect
     from pipeline.models.forward import Timing
 
 DelayName = Literal["wheel_delay_s"]

@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.identification.fit import PartFit, solve_step
+from pipeline.identification.fit import Fitted, PartFit, solve_step
 from pipeline.identification.intervals import Estimate, estimate_part
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from pipeline.identification.fit import Fitted
     from pipeline.identification.parts import Part
     from pipeline.models.effect import Effect
 

@@ -1,8 +1,7 @@
 """A plan's files: `plan.toml` to read, `plan.csv`, and `plan.mcap` to play."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -16,11 +15,6 @@ from pipeline.plan.errors import PlanError
 from pipeline.plan.manoeuvres import RATE_HZ
 from pipeline.plan.plan import SAFETY, Impossible, Plan, Promise
 from pipeline.store.files import replace_file
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
 
 PAGE = "plan.html"
 _NAMES = ("plan.toml", "plan.csv", "plan.mcap")

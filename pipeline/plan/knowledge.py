@@ -18,7 +18,7 @@ from pipeline.identification import Input, Problem, fit_model
 from pipeline.identification.columns import pick_columns, weigh_columns
 from pipeline.identification.few_shot import tie_to_prior
 from pipeline.identification.intervals import count_repeats
-from pipeline.models import Model
+from pipeline.models import Effect, Model
 from pipeline.plan.errors import PlanError
 from pipeline.plan.limits import is_steered
 from pipeline.plan.rehearsal import Senses, read_senses, start_state
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from pipeline.identification.fit import Fitted, PartFit
     from pipeline.identification.parts import Part
     from pipeline.identification.state import Free
-    from pipeline.models import Effect
     from pipeline.runs import MotionRun
     from pipeline.vehicles import Vehicle
 

@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.plan.limits import is_steered
+from pipeline.plan.limits import Limits, is_steered
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.plan.limits import Limits
     from pipeline.vehicles import Vehicle
 
 

@@ -10,18 +10,16 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.plan.errors import PlanError
-from pipeline.plan.limits import is_steered
+from pipeline.plan.limits import Limits, is_steered
 from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, Commands, hold_within, join, wait
 from pipeline.plan.plan import since_when
-from pipeline.plan.questions import Judge
+from pipeline.plan.questions import Judge, Question
 from pipeline.plan.rehearsal import Rehearsal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.plan.knowledge import Knowledge
-    from pipeline.plan.limits import Limits
-    from pipeline.plan.questions import Question
     from pipeline.vehicles import Vehicle
 
 Stages = list[tuple[float, float, float]]

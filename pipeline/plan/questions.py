@@ -16,14 +16,13 @@ import numpy as np
 from scipy.special import chdtri, stdtrit
 
 from pipeline.core.arrays import Floats, Ints
-from pipeline.plan.rehearsal import start_state
+from pipeline.plan.rehearsal import Rehearsal, start_state
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.identification import Free, Problem
     from pipeline.plan.knowledge import Hypothesis, Knowledge
-    from pipeline.plan.rehearsal import Rehearsal
 
 
 # The diagnosis decides between two that were found at 1.6; a t scatters about its mean by one, and here it is

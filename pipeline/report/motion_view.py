@@ -14,15 +14,13 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.identification import fit_model, predict_from
-from pipeline.identification.signature import VARIABLES, find_signatures, measure_variables
+from pipeline.identification import Fitted, Problem, State, fit_model, predict_from
+from pipeline.identification.signature import VARIABLES, Signature, find_signatures, measure_variables
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.identification import Fitted, Problem, State
     from pipeline.identification.comparison import HorizonErrors
-    from pipeline.identification.signature import Signature
 
 
 COMPONENTS = ("x", "y", "w")

@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import msgspec
-from starlette.requests import ClientDisconnect
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
 from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-
-    from starlette.requests import Request
 
     from pipeline.web.places import Places
 

@@ -6,14 +6,13 @@ import inspect
 import math
 from typing import TYPE_CHECKING
 
-from pipeline.models import list_effects
+from pipeline.models import Effect, Parameter, list_effects
 from pipeline.models.bounds import stands_at_bound
 from pipeline.models.formula import FormulaEffect
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.models import Effect, Parameter
     from pipeline.models.model_file import ModelFile
     from pipeline.vehicles import Vehicle
     from pipeline.web.session import Session

@@ -1,19 +1,13 @@
 """A formula as typed on the page: parsed into an effect, never run as text."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import re
-from typing import TYPE_CHECKING
 
-from pipeline.models import list_effects
+from pipeline.models import Parameter, list_effects
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.formula.formula_effect import CHANNELS, make_parameter
 from pipeline.web.errors import WorkbenchError
-
-if TYPE_CHECKING:
-    from pipeline.models import Parameter
 
 _LONGEST = 400
 _ID = re.compile(r"[a-z][a-z0-9_]{0,39}")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from pipeline.analysis.log_setup import name_run
 from pipeline.analysis.options import STAGE_WORDS, STAGES, Options
 from pipeline.core.errors import SlipError
-from pipeline.store import LogSighting, Store, see_log
+from pipeline.store import LogSighting, Manifest, Store, see_log
 from pipeline.web.errors import WorkbenchError
 from pipeline.web.uploads import Upload, Uploads, clean_name
 from pipeline.web.workers import ANALYZE, DIAGNOSE, PLAN, Errand, Workers
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from pipeline.batch.work import Report, Task
-    from pipeline.store import Manifest
     from pipeline.web.limits import Limits
     from pipeline.web.places import Places
 

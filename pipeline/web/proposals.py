@@ -12,10 +12,10 @@ import numpy as np
 from pipeline.core.arrays import Floats
 from pipeline.core.errors import SlipError
 from pipeline.diagnosis.verdict import compare
-from pipeline.identification import fit_model, hold_out
+from pipeline.identification import HeldOut, Problem, fit_model, hold_out
 from pipeline.identification.ladder import compare_losses, list_rises
 from pipeline.identification.weights import make_weights
-from pipeline.models import list_effects
+from pipeline.models import Model, list_effects
 from pipeline.runs import MotionError
 from pipeline.web.cards import describe_shortly
 from pipeline.web.errors import evaluating
@@ -23,8 +23,6 @@ from pipeline.web.errors import evaluating
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from pipeline.identification import HeldOut, Problem
-    from pipeline.models import Model
     from pipeline.web.run_cache import PreparedRun
 
 _WORTH = 0.99

@@ -1,16 +1,10 @@
 """How long slip remembers: integrated autocorrelation time, blocks, and the samples that count."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.fleet.statistics.arrays import check_values
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 _FEWEST_PAIRS = 20
 _LONGEST_SHARE = 0.25

@@ -1,12 +1,9 @@
 """Two sides compared: whole runs where there are any, blocks where each side is one run."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.fleet.statistics.arrays import check_values
@@ -14,10 +11,6 @@ from pipeline.fleet.statistics.correlation import TIMES_PER_BLOCK, integrated_ti
 from pipeline.fleet.statistics.intervals import Interval, bound_shift
 from pipeline.fleet.statistics.permutation import DRAWS, PermutationTest, permute_means, permute_studentized
 from pipeline.fleet.statistics.ranks import cliffs_delta, shift_between
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
 
 _FEWEST_BLOCKS = 12
 _SMALLEST_SHARE = 0.25

@@ -5,23 +5,17 @@ were no difference. Samples of one run could not: they are correlated. Source: G
 and Bootstrap Tests of Hypotheses (2005); studentized: Janssen, Statistics and Probability Letters 36 (1997).
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pipeline.core.arrays import Flags, Floats
 from pipeline.fleet.statistics.arrays import check_values
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import ArrayLike
 
 LARGEST_EXACT = 20_000
 DRAWS = 9_999

@@ -13,12 +13,11 @@ from pipeline.report import theme
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.residuals import QUANTITIES
-from pipeline.report.motion_view import COMPONENTS
+from pipeline.report.motion_view import COMPONENTS, MotionView
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pipeline.report.motion_view import MotionView
     from pipeline.report.scene import Scene
 
     Correlation = tuple[Floats, Floats, float]
