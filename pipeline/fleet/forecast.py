@@ -1,7 +1,5 @@
 """Before driving there: what the runs of a vehicle let expect of its numbers on a terrain."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -5,8 +5,6 @@ what is the run's own, plus the error of its estimate (`statistics.levels`). Whi
 runs tell where one cannot: wheels that are too small are so on every ground, wheels that slip are not.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Parameters of vehicles over the dates of their runs, whatever ground they were on: limits, and changes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

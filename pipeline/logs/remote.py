@@ -14,7 +14,7 @@ import threading
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path, PosixPath
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final, Self, cast
 from urllib.parse import quote_from_bytes, unquote_to_bytes
 
 from pipeline.logs import buckets
@@ -22,7 +22,6 @@ from pipeline.logs.errors import LogError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from typing import Self
 
     from pipeline.logs.buckets import Info
 

@@ -1,24 +1,17 @@
 """Finding effects: those of the folder `effects`, and those of files that a user names."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import inspect
 import pkgutil
 import sys
+from collections.abc import Mapping
+from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
 
-from pipeline.models.effect import Effect, find_late
+from pipeline.models.effect import Effect, Late, find_late
 from pipeline.models.trust import hash_code
 from pipeline.runs.errors import MotionError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from pipeline.models.effect import Late
 
 EffectClass = type[Effect]
 

@@ -19,13 +19,12 @@ from pipeline.models.effect import (
     Place,
     ReportEffect,
 )
-from pipeline.runs.grid import HeldDrive, MeasuredDrive
+from pipeline.runs.grid import Grid, HeldDrive, MeasuredDrive
 from pipeline.runs.signals import Rolling, RunContext, Velocity, Wheels, roll_ideally
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from pipeline.runs.grid import Grid
     from pipeline.runs.recording import DriveSeries
 
 Result = TypeVar("Result")

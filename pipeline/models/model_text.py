@@ -10,17 +10,15 @@ import msgspec
 import tomlkit
 
 from pipeline.models.formula.formula_effect import FormulaEffect
-from pipeline.models.model_file import FORMAT
+from pipeline.models.model_file import FORMAT, ModelFile
 from pipeline.runs.errors import MotionError
 from pipeline.store.files import replace_file
-from pipeline.vehicles import find_preset
+from pipeline.vehicles import Vehicle, find_preset
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.models.effect import Effect, Parameter
-    from pipeline.models.model_file import ModelFile
-    from pipeline.vehicles import Vehicle
 
 _GEOMETRY = (
     "wheel_radius_m",

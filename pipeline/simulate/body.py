@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.simulate.drivetrain import move_by_corners
+from pipeline.simulate.drivetrain import Drive, move_by_corners
 from pipeline.simulate.signals import filter_pole, integrate_cells, lag_signal, make_coloured_noise
 
 if TYPE_CHECKING:
-    from pipeline.simulate.drivetrain import Drive
     from pipeline.simulate.effects import Effects
     from pipeline.simulate.scenario import Disturbance
     from pipeline.simulate.vehicles import Vehicle

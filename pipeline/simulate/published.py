@@ -13,7 +13,7 @@ from pipeline.core.arrays import Floats
 from pipeline.simulate.drivetrain import apply_ideal_model, invert_ideal_model
 from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.geodesy import to_earth
-from pipeline.simulate.messages import Sheet
+from pipeline.simulate.messages import Field, Sheet
 from pipeline.simulate.programs import make_commands
 from pipeline.simulate.scenario import Program
 from pipeline.simulate.signals import integrate_cells
@@ -22,7 +22,6 @@ from pipeline.simulate.streams import open_stream
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from pipeline.simulate.messages import Field
     from pipeline.simulate.run import SimulatedRun
 
 Series = dict[str, Floats]

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from pipeline.core import rigid
 from pipeline.core.arrays import Floats
-from pipeline.simulate.drivetrain import move_by_corners
+from pipeline.simulate.drivetrain import Drive, move_by_corners
 from pipeline.simulate.signals import integrate_cells
 from pipeline.simulate.streams import open_stream
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.simulate.drivetrain import Drive
     from pipeline.simulate.path import Path
     from pipeline.simulate.scenario import Encoders, Imu
     from pipeline.simulate.vehicles import Vehicle

@@ -13,11 +13,10 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.stages.finding import Finding
-from pipeline.vehicles import list_factors
+from pipeline.vehicles import Vehicle, list_factors
 
 if TYPE_CHECKING:
     from pipeline.stages.samples import Samples
-    from pipeline.vehicles import Vehicle
 
 
 _UNIT_NEAR: Final = 0.2

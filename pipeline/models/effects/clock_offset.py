@@ -15,11 +15,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect, Search, Spread
-from pipeline.models.evidence import LEAST_DELAY_S
+from pipeline.models.evidence import LEAST_DELAY_S, Evidence
 from pipeline.models.level import Level, Reading
 
 if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Velocity
 
 

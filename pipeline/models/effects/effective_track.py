@@ -12,13 +12,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import SIDES, Excitation, KinematicEffect, Least, Parameter, Plausible, Spread
+from pipeline.models.effect import (
+    SIDES,
+    Effect,
+    Excitation,
+    KinematicEffect,
+    Least,
+    Parameter,
+    Plausible,
+    Spread,
+)
 from pipeline.models.effects.wheel_radius import WheelRadius
 from pipeline.models.level import Level, Reading
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
-    from pipeline.models.effect import Effect
     from pipeline.runs.signals import Rolling, RunContext
     from pipeline.vehicles import Vehicle
 

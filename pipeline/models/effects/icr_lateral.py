@@ -11,12 +11,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import Excitation, Least, LinearEffect, Parameter, Place, Plausible
+from pipeline.models.effect import Column, Excitation, Least, LinearEffect, Parameter, Place, Plausible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 

@@ -13,12 +13,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import Excitation, Least, LinearEffect, Parameter, Place, Plausible, Spread
+from pipeline.models.effect import (
+    Column,
+    Excitation,
+    Least,
+    LinearEffect,
+    Parameter,
+    Place,
+    Plausible,
+    Spread,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 

@@ -14,11 +14,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import SIDEWAYS, Excitation, KinematicEffect, Least, Parameter, Plausible
+from pipeline.models.effect import SIDEWAYS, Effect, Excitation, KinematicEffect, Least, Parameter, Plausible
 from pipeline.models.effects.wheel_radius import WheelRadius
 
 if TYPE_CHECKING:
-    from pipeline.models.effect import Effect
     from pipeline.runs.signals import Rolling, RunContext
 
 

@@ -13,13 +13,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import Excitation, Least, LinearEffect, Parameter, Plausible, Spread
+from pipeline.models.effect import Column, Excitation, Least, LinearEffect, Parameter, Plausible, Spread
 from pipeline.models.evidence import LEAST_DELAY_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 

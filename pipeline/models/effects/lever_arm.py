@@ -11,13 +11,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.models.effect import Excitation, LinearEffect, Parameter, Part, Place
+from pipeline.models.effect import Column, Excitation, LinearEffect, Parameter, Part, Place
 from pipeline.models.wording import name_side
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
     from pipeline.vehicles import Vehicle
 

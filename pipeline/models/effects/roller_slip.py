@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import SIDEWAYS, Excitation, LinearEffect, Parameter, Plausible
+from pipeline.models.effect import SIDEWAYS, Column, Excitation, LinearEffect, Parameter, Plausible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 

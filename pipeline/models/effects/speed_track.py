@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import SIDES, Excitation, Least, LinearEffect, Parameter, Plausible
+from pipeline.models.effect import SIDES, Column, Excitation, Least, LinearEffect, Parameter, Plausible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 

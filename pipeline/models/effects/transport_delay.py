@@ -14,11 +14,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pipeline.models.effect import CommandEffect, Excitation, Least, Parameter, Plausible, Search
-from pipeline.models.evidence import LEAST_DELAY_S
+from pipeline.models.evidence import LEAST_DELAY_S, Evidence
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import Commands, RunContext
 
 

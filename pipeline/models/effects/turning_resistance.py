@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import Excitation, LinearEffect, Parameter, Plausible
+from pipeline.models.effect import Column, Excitation, LinearEffect, Parameter, Plausible
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.models.effect import Column
     from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 

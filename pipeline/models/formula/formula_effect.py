@@ -13,15 +13,13 @@ import numpy as np
 from pipeline.core.arrays import Floats
 from pipeline.models.effect import AddedEffect, Excitation, Parameter
 from pipeline.models.formula.expression import Expression, parse_expression
-from pipeline.models.formula.units import parse_unit
+from pipeline.models.formula.units import Unit, parse_unit
 from pipeline.runs.errors import MotionError
-from pipeline.runs.signals import roll_ideally
+from pipeline.runs.signals import Rolling, RunContext, Velocity, roll_ideally
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from pipeline.models.formula.units import Unit
-    from pipeline.runs.signals import Rolling, RunContext, Velocity
     from pipeline.vehicles import Vehicle
 
 

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.logs import Ragged, RaggedStrings
+from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract.reading import PoseArrays, axis_fields, first_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.logs import TopicColumns
     from pipeline.vehicles import Vehicle
     from pipeline.vehicles.message_types import PoseFields
 

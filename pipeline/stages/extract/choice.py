@@ -21,7 +21,7 @@ from pipeline.stages.extract.course import estimate_noise
 from pipeline.stages.extract.drive import read_speed
 from pipeline.stages.extract.tables import extract_tables
 from pipeline.stages.trust import measure_rest
-from pipeline.vehicles import PoseContent, PoseSource
+from pipeline.vehicles import Configuration, PoseContent, PoseSource, Sources, Vehicle
 from pipeline.vehicles.candidates import DEAD_RECKONED, FILTERED, LOCALIZED
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
     from pipeline.logs import LogData
     from pipeline.stages.finding import Finding
-    from pipeline.vehicles import Configuration, Sources, Vehicle
 
 
 _FIXED_FRAME: Final = re.compile(
