@@ -39,12 +39,8 @@ def find_log(text: str, out: Path) -> Path:
     manifest = find_run(text, Store(out))
     log = to_location(recorded_path(manifest))
     if not log.exists():
-        raise JobError(
-            "log_gone",
-            "the log of this run is not there any more",
-            where=str(log),
-            hint="Give the path it has now.",
-        )
+        hint = "Give the path it has now."
+        raise JobError("log_gone", "the log of this run is not there any more", where=str(log), hint=hint)
     return log
 
 

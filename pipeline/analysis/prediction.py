@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.analysis.diagnosis import read_length_scale
-from pipeline.analysis.errors import JobError
+from pipeline.analysis.errors import lack_runs
 from pipeline.analysis.fleet import find_estimates
 from pipeline.core.arrays import Complex, Flags, Floats
 from pipeline.fleet.datasets import read_day
@@ -204,12 +204,8 @@ def _load_runs(store: Store, forecast: Forecast) -> list[_Driven]:
                 own = named.filter(pl.col("run") == name)
                 runs.append(_load_run(manifest, own, Input(forecast.input)))
     if not runs:
-        raise JobError(
-            "nothing_to_drive",
-            f"no run of {forecast.vehicle} has the {forecast.input} input to drive again",
-            where=str(store.root),
-            hint="Choose the other input.",
-        )
+        what = f"no run of {forecast.vehicle} has the {forecast.input} input to drive again"
+        raise lack_runs("nothing_to_drive", what, store.root, "Choose the other input.")
     return runs
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from pipeline.analysis.compared_runs import ComparedRuns, find_material
-from pipeline.analysis.errors import JobError
+from pipeline.analysis.errors import JobError, lack_runs
 from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.parameter_trend import (
     ParameterTrend,
@@ -69,12 +69,8 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
     if undated:
         notes.append(f"left out, because no date is known: {', '.join(undated)}")
     if dated.is_empty():
-        raise JobError(
-            "nothing_to_follow",
-            "there is no run with a date" + "".join(f"; {note}" for note in notes),
-            where=str(store.root),
-            hint="Analyze logs whose clock was set, or put the date into their names (2026-05-03).",
-        )
+        hint = "Analyze logs whose clock was set, or put the date into their names (2026-05-03)."
+        raise lack_runs("nothing_to_follow", "there is no run with a date", store.root, hint, notes)
     dated = dated.with_row_index("order").with_columns(pl.col("order").cast(pl.Int64))
     values = (
         dated.select("run", "group", "day", "order")

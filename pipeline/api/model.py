@@ -66,12 +66,8 @@ def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Ef
     if not texts:
         return find_effect(name)().change(**numbers)
     if not name.isidentifier():
-        raise MotionError(
-            "bad_value",
-            f"{name!r} cannot be the id of an effect",
-            where="effect",
-            hint="Use letters, digits and _, a letter first.",
-        )
+        hint = "Use letters, digits and _, a letter first."
+        raise MotionError("bad_value", f"{name!r} cannot be the id of an effect", where="effect", hint=hint)
     parameters = [make_parameter(key, unit, (low, high)) for key, (unit, low, high) in tuples.items()]
     return FormulaEffect(name, texts, tuple(parameters))
 

@@ -214,12 +214,8 @@ class RemoteSource(AbstractContextManager["RemoteSource"]):
                 "log_not_found", "there is no such object", where=str(self._path), hint="Check bucket and key"
             ) from None
         if not info.get("size"):
-            raise LogError(
-                "log_empty",
-                "the object holds no bytes",
-                where=str(self._path),
-                hint="The recorder was stopped before it wrote anything; leave it out",
-            )
+            hint = "The recorder was stopped before it wrote anything; leave it out"
+            raise LogError("log_empty", "the object holds no bytes", where=str(self._path), hint=hint)
         return info
 
     def read_at(self, offset: int, length: int) -> bytes:

@@ -45,12 +45,8 @@ def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> Effe
 
     near = difflib.get_close_matches(name, known, n=3)
     guess = f"Did you mean {' or '.join(near)}? " if near else ""
-    raise MotionError(
-        "unknown_effect",
-        f"no effect is called {name!r}",
-        where=name,
-        hint=f"{guess}`slip effects` lists them all.",
-    )
+    hint = f"{guess}`slip effects` lists them all."
+    raise MotionError("unknown_effect", f"no effect is called {name!r}", where=name, hint=hint)
 
 
 def find_late_effect(late: Late) -> EffectClass:
@@ -61,12 +57,8 @@ def find_late_effect(late: Late) -> EffectClass:
     """
     found = find_late(list_effects(), late)
     if found is None:
-        raise MotionError(
-            "unknown_effect",
-            f"no effect says that {late.value}",
-            where=late.name,
-            hint="Give one of the folder `effects` that `late`.",
-        )
+        hint = "Give one of the folder `effects` that `late`."
+        raise MotionError("unknown_effect", f"no effect says that {late.value}", where=late.name, hint=hint)
     return found
 
 
@@ -96,12 +88,8 @@ def run_effects(code: bytes, path: Path) -> Mapping[str, EffectClass]:
         ) from error
     found = {effect.id: effect for effect in _effects_of(module)}
     if not found:
-        raise MotionError(
-            "effects_file",
-            "the file defines no effect",
-            where=str(path),
-            hint="Derive a class from one of pipeline.models's effect classes and give it an id.",
-        )
+        hint = "Derive a class from one of pipeline.models's effect classes and give it an id."
+        raise MotionError("effects_file", "the file defines no effect", where=str(path), hint=hint)
     return found
 
 

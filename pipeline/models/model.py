@@ -83,12 +83,8 @@ class Model:
         for effect in self.effects:
             if effect.id == name:
                 return effect
-        raise MotionError(
-            "no_such_effect",
-            f"the model has no effect {name!r}",
-            where=name,
-            hint=f"It has: {', '.join(self.ids) or 'none'}.",
-        )
+        hint = f"It has: {', '.join(self.ids) or 'none'}."
+        raise MotionError("no_such_effect", f"the model has no effect {name!r}", where=name, hint=hint)
 
     def change(self, name: str, **values: float) -> Model:
         """The model with other values of one effect's parameters.

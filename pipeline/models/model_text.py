@@ -52,12 +52,8 @@ def write_text(path: Path, text: str, *, code: str) -> None:
     try:
         replace_file(path, text.encode())
     except OSError as error:
-        raise MotionError(
-            code,
-            f"cannot be written: {error.strerror}",
-            where=str(path),
-            hint="Check the folder and its permissions.",
-        ) from None
+        hint = "Check the folder and its permissions."
+        raise MotionError(code, f"cannot be written: {error.strerror}", where=str(path), hint=hint) from None
 
 
 def format_model(file: ModelFile) -> str:

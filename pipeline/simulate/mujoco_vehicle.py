@@ -161,11 +161,8 @@ def _step_world(scenario: Scenario, machine: SkidSteer, asked: Drive) -> tuple[F
     try:
         mujoco = importlib.import_module("mujoco")
     except ImportError as problem:
-        raise SimulateError(
-            "mujoco_needed",
-            "mujoco is not installed",
-            hint="Install the extra: pip install 'slip-pipeline[sim]'",
-        ) from problem
+        hint = "Install the extra: pip install 'slip-pipeline[sim]'"
+        raise SimulateError("mujoco_needed", "mujoco is not installed", hint=hint) from problem
     model = mujoco.MjModel.from_xml_string(_describe_world(scenario, machine))
     data = mujoco.MjData(model)
     x, y, yaw = scenario.start_pose

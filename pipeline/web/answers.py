@@ -45,11 +45,8 @@ def make_handlers(places: Places) -> dict[type[Exception], Callable[[Request, Ex
 
 
 def _name_defect(error: Exception) -> SlipError:
-    return SlipError(
-        "defect",
-        f"something went wrong that should not ({type(error).__name__})",
-        hint="The server tells more where it was started; nothing was changed.",
-    )
+    hint = "The server tells more where it was started; nothing was changed."
+    return SlipError("defect", f"something went wrong that should not ({type(error).__name__})", hint=hint)
 
 
 def _make_plain(value: object) -> object:

@@ -265,11 +265,8 @@ class _RememberingContext(SpawnContext):
 
 
 def _describe_failed_start(reason: str) -> BatchError:
-    return BatchError(
-        "no_workers",
-        f"worker processes cannot be started ({reason})",
-        hint="See what they said above; --executor inline works without them",
-    )
+    hint = "See what they said above; --executor inline works without them"
+    return BatchError("no_workers", f"worker processes cannot be started ({reason})", hint=hint)
 
 
 def describe_exit(code: int | None) -> str:

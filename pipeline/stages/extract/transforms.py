@@ -70,12 +70,8 @@ def _choose_frames(buffer: TransformBuffer, where: str) -> tuple[str, str]:
         above.append(parents[above[-1]])
     named = [frame for fixed in _FIXED for frame in above[1:] if frame.rsplit("/", 1)[-1] == fixed]
     if not named and len(above) == 1:
-        raise StageError(
-            "no_base_frame",
-            f"the transforms give {child} no parent",
-            where=where,
-            hint=f"Name both: [pose] frames = [parent, child]. Known frames: {', '.join(frames)}.",
-        )
+        hint = f"Name both: [pose] frames = [parent, child]. Known frames: {', '.join(frames)}."
+        raise StageError("no_base_frame", f"the transforms give {child} no parent", where=where, hint=hint)
     return (named[0] if named else above[-1]), child
 
 
