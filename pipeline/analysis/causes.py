@@ -1,24 +1,18 @@
 """Deployments compared by cause: from the results to the answer of `slip compare --causes`, and its files."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import polars as pl
 
 from pipeline.analysis.compared_runs import find_material, keep_runs
 from pipeline.analysis.errors import lack_runs
 from pipeline.analysis.fleet import fit_results
+from pipeline.analysis.options import FigureFormat
 from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
 from pipeline.fleet.tables import write_csv, write_latex
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from pipeline.analysis.options import FigureFormat
-    from pipeline.store import Store
+from pipeline.store import Store
 
 _EFFECT = "effect"
 

@@ -1,9 +1,7 @@
 """Deployments side by side: from the results to tables, one page, and the answer of `slip compare`."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -16,11 +14,7 @@ from pipeline.fleet.pairs import Group, Pair, Samples, bound_run, compare_groups
 from pipeline.fleet.runs import add_measures, gather_runs, measure_difficulty
 from pipeline.fleet.statistics.intervals import Interval, bound_typical
 from pipeline.fleet.tables import Answer, tabulate_pairs
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.store import Store
+from pipeline.store import Store
 
 _WINDOW_COLUMNS = {
     "run": pl.String,

@@ -1,9 +1,7 @@
 """A model fitted to runs, before and after a change: behind `slip model` and behind Python's `fit`."""
 
-from __future__ import annotations
-
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from pipeline.analysis.geometry import Owner, agree_on_vehicle
 from pipeline.identification.describe import (
@@ -17,15 +15,11 @@ from pipeline.identification.inputs import InputChoice, choose_input
 from pipeline.identification.judgement import Judgement, judge_model, note_fit
 from pipeline.identification.problem import Problem
 from pipeline.identification.scoring import Errors, measure_by_terrain
+from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_run import load_motion_run, load_vehicle
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from pipeline.models.model_file import ModelFile
-    from pipeline.runs.recording import MotionRun
-    from pipeline.store import Manifest
-    from pipeline.vehicles import Vehicle
+from pipeline.runs.recording import MotionRun
+from pipeline.store import Manifest
+from pipeline.vehicles import Vehicle
 
 
 @dataclass(frozen=True)

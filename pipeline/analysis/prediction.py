@@ -1,11 +1,9 @@
 """Before driving there: the model, the slip and the error over 2 s that a fleet's runs let expect."""
 
-from __future__ import annotations
-
 import contextlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -27,13 +25,8 @@ from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_run import load_motion_run, load_vehicle
 from pipeline.runs.errors import MotionError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.store import Manifest, Store
-    from pipeline.vehicles import Vehicle
-
+from pipeline.store import Manifest, Store
+from pipeline.vehicles import Vehicle
 
 MOST_RUNS = 8
 """Runs whose commands stand for those to come: more make the answer slower and hardly another."""

@@ -1,9 +1,5 @@
 """What the results share with others: features of every run, without data, names of files or places."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import polars as pl
 
 from pipeline.analysis.compare import measure_runs
@@ -11,10 +7,8 @@ from pipeline.analysis.compared_runs import find_material, read_digest
 from pipeline.analysis.errors import ANALYZE_FIRST, lack_runs
 from pipeline.core.version import read_version
 from pipeline.fleet.features import check_features
+from pipeline.store import Store
 from schemas.features import Features
-
-if TYPE_CHECKING:
-    from pipeline.store import Store
 
 _HASH = 64
 

@@ -1,11 +1,10 @@
 """What of a vehicle changed over its runs: slip, fitted parameters, and the health of its data."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import polars as pl
 
@@ -29,12 +28,7 @@ from pipeline.fleet.trend import (
     follow_quantities,
     raise_alerts,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from pipeline.store import Store
+from pipeline.store import Store
 
 TREND = "trend.json"
 _SLIP = {

@@ -1,9 +1,7 @@
 """The whole diagnosis: clocks, excitation, search, what is left, and the ladder of what was named."""
 
-from __future__ import annotations
-
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,12 +26,8 @@ from pipeline.diagnosis.unexplained import (
     search_formula,
 )
 from pipeline.identification import Input, InputChoice, choose_input
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from pipeline.models import Effect, Model
-    from pipeline.vehicles import Vehicle
+from pipeline.models import Effect, Model
+from pipeline.vehicles import Vehicle
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,17 +16,12 @@ from pipeline.diagnosis.plausibility import is_nameable
 from pipeline.diagnosis.verdict import LEAST_GAIN, Verdict, compare
 from pipeline.identification.fit import PartFit, fit_part
 from pipeline.identification.folds import Fold, hold_out_part, make_folds
+from pipeline.identification.parts import Part
 from pipeline.identification.proposals import Candidate, Proposal, Trial, propose, propose_pairs
+from pipeline.identification.state import State
 from pipeline.identification.weights import Weights, make_weights, measure_spread
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from pipeline.identification.parts import Part
-    from pipeline.identification.state import State
-    from pipeline.models.effect import Effect
-    from pipeline.models.evidence import Evidence, Largest
-
+from pipeline.models.effect import Effect
+from pipeline.models.evidence import Evidence, Largest
 
 _FIRST_STEPS = 4
 _PAIRED = 5

@@ -4,21 +4,15 @@ Residuals of field data are autocorrelated, so that textbook tests name what is 
 stretch of ten seconds.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.core.parallel import map_parallel
 from pipeline.identification.parts import Part, count_seconds
-
-if TYPE_CHECKING:
-    from pipeline.identification.weights import Weights
-
+from pipeline.identification.weights import Weights
 
 LEAST_GAIN = 0.01
 LEAST_T = 2.2

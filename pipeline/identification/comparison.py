@@ -1,10 +1,9 @@
 """One run made ready: its grid, heading, windows and horizons, and a model's residuals on them."""
 
-from __future__ import annotations
-
 import enum
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -15,15 +14,10 @@ from pipeline.models.forward import Forward, Timing, replace_context
 from pipeline.runs.errors import MotionError
 from pipeline.runs.grid import Grid, lay_grid
 from pipeline.runs.heading import HeadingSource, choose_heading
+from pipeline.runs.recording import MotionRun
 from pipeline.runs.signals import Resets, RunContext, Signal, Velocity
 from pipeline.runs.windows import WINDOW_S, find_lead, gather_nodes, join_horizons, join_windows
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from pipeline.runs.recording import MotionRun
-    from pipeline.vehicles import Vehicle
-
+from pipeline.vehicles import Vehicle
 
 # Cell means of held commands are exact: finer cells change residuals in the sixth digit.
 _RATE_HZ = 50.0

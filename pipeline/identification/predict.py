@@ -1,23 +1,17 @@
 """Predicting: velocities and poses of a run from a model, over a horizon from measured states."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.identification.comparison import Comparison, Input
+from pipeline.models.effect import Effect
 from pipeline.models.forward import Timing
+from pipeline.models.model import Model
 from pipeline.runs.heading import HeadingSource
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.models.effect import Effect
-    from pipeline.models.model import Model
-    from pipeline.runs.recording import MotionRun
+from pipeline.runs.recording import MotionRun
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pipeline.models.effect import Effect, Search
-
-if TYPE_CHECKING:
-    from pipeline.models.forward import Timing
+from pipeline.models.forward import Timing
 
 DelayName = Literal["wheel_delay_s"]
 Own = Mapping[int, Mapping[tuple[str, str], float]]

@@ -4,26 +4,21 @@ What a store says of an object (size, ETag, time) stands in the place of what a 
 Only the ranges that are asked for are fetched, and they are counted.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re
 import stat
 import threading
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path, PosixPath
-from typing import TYPE_CHECKING, Final, Self, cast
+from typing import Final, Self, cast
 from urllib.parse import quote_from_bytes, unquote_to_bytes
 
 from pipeline.logs import buckets
+from pipeline.logs.buckets import Info
 from pipeline.logs.errors import LogError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from pipeline.logs.buckets import Info
 
 _SCHEME = re.compile(r"^([a-z][a-z0-9+]+):/+")
 _LOCAL: Final = "file://"

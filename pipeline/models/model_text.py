@@ -1,24 +1,18 @@
 """Writing a model file: plain TOML with units, values and intervals, one line a parameter."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import msgspec
 import tomlkit
 
+from pipeline.models.effect import Effect, Parameter
 from pipeline.models.formula.formula_effect import FormulaEffect
 from pipeline.models.model_file import FORMAT, ModelFile
 from pipeline.runs.errors import MotionError
 from pipeline.store.files import replace_file
 from pipeline.vehicles import Vehicle, find_preset
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.models.effect import Effect, Parameter
 
 _GEOMETRY = (
     "wheel_radius_m",

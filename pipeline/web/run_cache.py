@@ -1,12 +1,10 @@
 """Runs made ready for fitting, kept in memory: the expensive part of every answer."""
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING
 
 import polars as pl
 
@@ -21,13 +19,9 @@ from pipeline.identification.scoring import score
 from pipeline.models import Model, Timing
 from pipeline.report.motion_run import load_motion_run, load_vehicle
 from pipeline.report.motion_view import MotionStage, MotionView
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.runs import MotionRun
-    from pipeline.store import Manifest
-    from pipeline.vehicles import Vehicle
+from pipeline.runs import MotionRun
+from pipeline.store import Manifest
+from pipeline.vehicles import Vehicle
 
 _MOST_RUNS = 6
 _MOST_FITS = 60

@@ -9,9 +9,7 @@ Spin on the spot and drive curves.
 Source: Mandow et al., IROS 2007, the longitudinal coordinate of the instantaneous centres of rotation.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 from pipeline.models.effect import (
     Column,
@@ -23,11 +21,7 @@ from pipeline.models.effect import (
     Plausible,
     Spread,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class IcrOffset(LinearEffect):
