@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -12,12 +13,7 @@ from pipeline.analysis.errors import JobError
 from pipeline.core.arrays import Floats
 from pipeline.core.errors import SlipError, naming_os_errors
 from pipeline.stages.finding import Finding
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from pipeline.vehicles import Vehicle
+from pipeline.vehicles import Vehicle
 
 COLUMNS = ("model_x", "model_y", "model_w", "residual_modulus")
 

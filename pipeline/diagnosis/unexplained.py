@@ -1,11 +1,10 @@
 """Structure that no effect of the catalogue takes: how much, in which channel, and as which formula."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 
@@ -13,18 +12,13 @@ from pipeline.core.arrays import Flags, Floats
 from pipeline.core.parallel import map_parallel
 from pipeline.diagnosis.library import is_term, list_terms, list_waves
 from pipeline.diagnosis.search import prune
+from pipeline.diagnosis.selection import CandidateModel, Selection
+from pipeline.identification.comparison import Comparison
 from pipeline.identification.folds import find_near
+from pipeline.identification.parts import Part
 from pipeline.identification.persistence import take_own_past
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.diagnosis.selection import CandidateModel, Selection
-    from pipeline.identification.comparison import Comparison
-    from pipeline.identification.parts import Part
-    from pipeline.models.formula.formula_effect import FormulaEffect
-    from pipeline.runs.signals import RunContext
-
+from pipeline.models.formula.formula_effect import FormulaEffect
+from pipeline.runs.signals import RunContext
 
 _MOST_TERMS = 3
 _TRIED = 2

@@ -4,10 +4,7 @@ Residuals of field data are autocorrelated: stretches are whole, and gaps separa
 judged.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,12 +17,9 @@ from pipeline.identification.columns import (
     weigh_columns,
 )
 from pipeline.identification.fit import PartFit, measure_loss, solve_step
+from pipeline.identification.parts import Part
+from pipeline.identification.state import State
 from pipeline.identification.weights import Weights
-
-if TYPE_CHECKING:
-    from pipeline.identification.parts import Part
-    from pipeline.identification.state import State
-
 
 FOLDS = 5
 GAP_S = 1.5

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
+from pipeline.identification.fit import Fitted, PartFit
 from pipeline.identification.parts import Part, count_seconds
+from pipeline.identification.problem import Problem
+from pipeline.identification.state import Free
 from pipeline.models.bounds import stands_at_bound
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.identification.fit import Fitted, PartFit
-    from pipeline.identification.problem import Problem
-    from pipeline.identification.state import Free
-
 
 _HUBER = 3.0
 _GAUSSIAN = 1.4826

@@ -3,32 +3,25 @@
 A part of the way from command to body: the whole of it, from the wheels to the body, or to the wheels.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.identification.columns import make_columns
+from pipeline.identification.comparison import Comparison
 from pipeline.identification.prior import NO_PRIOR, Prior
 from pipeline.identification.state import DelayName, Free, State
 from pipeline.identification.weights import measure_noise
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Effect, Late, Place
+from pipeline.models.evidence import Largest
 from pipeline.models.forward import Timing
+from pipeline.runs.signals import Signal, Velocity
 from pipeline.runs.windows import WINDOW_S
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.identification.comparison import Comparison
-    from pipeline.models.evidence import Largest
-    from pipeline.runs.signals import Signal, Velocity
-
 
 UNIT_S = 10.0
 _ROUNDING_S = 1e-6

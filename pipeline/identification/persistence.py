@@ -5,22 +5,15 @@ Neighbouring windows of half a second share a pose. Its error enters them with o
 that the model lacks, whether or not anything that was recorded tells of it.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.identification.comparison import Comparison
 from pipeline.runs.windows import WINDOW_S
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.identification.comparison import Comparison
-
 
 _LAGS = 6
 NEAR_S = 0.07

@@ -5,24 +5,17 @@ the model with it. It is drawn against the variable of which it is most a functi
 largest share of the difference's mean square. Nothing here knows an effect by its id.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.identification.comparison import Comparison
 from pipeline.identification.parts import average_windows, locate_windows, number_stretches
+from pipeline.identification.problem import Problem
+from pipeline.identification.state import State
 from pipeline.models.forward import Timing
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.identification.comparison import Comparison
-    from pipeline.identification.problem import Problem
-    from pipeline.identification.state import State
-
 
 CHANNELS = ("x", "y", "w")
 SINCE_STEP = "since_step"

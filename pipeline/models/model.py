@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
+from pipeline.models.effect import Effect
 from pipeline.runs.errors import MotionError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from pipeline.models.effect import Effect
-    from pipeline.vehicles import Vehicle
+from pipeline.vehicles import Vehicle
 
 
 @dataclass(frozen=True)

@@ -1,20 +1,13 @@
 """Choice of manoeuvres: greedy by what is answered in a second, then improved by exchange."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Complex, Floats
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.plan.limits import Area
-    from pipeline.plan.questions import Answerable
-
+from pipeline.plan.limits import Area
+from pipeline.plan.questions import Answerable
 
 _ROUNDS = 2
 _NOTHING = 1e-4

@@ -1,19 +1,13 @@
 """Answers of the server: JSON, also of numbers that are none, and errors that tell nothing of its disk."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
 
 import msgspec
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
 from pipeline.core.errors import SlipError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from pipeline.web.places import Places
+from pipeline.web.places import Places
 
 _NOT_FOUND = ("no_such_run", "no_such_desk", "no_such_job")
 

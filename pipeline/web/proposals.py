@@ -1,11 +1,9 @@
 """What to add next: each effect of the catalogue tried on top of the model."""
 
-from __future__ import annotations
-
 import threading
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,11 +17,7 @@ from pipeline.models import Model, list_effects
 from pipeline.runs import MotionError
 from pipeline.web.cards import describe_shortly
 from pipeline.web.errors import evaluating
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from pipeline.web.run_cache import PreparedRun
+from pipeline.web.run_cache import PreparedRun
 
 _WORTH = 0.99
 _MOST_KEPT = 40
