@@ -26,7 +26,7 @@ from pipeline.diagnosis import diagnose_runs
 from pipeline.diagnosis.enough import describe_enough
 from pipeline.diagnosis.recording import load_recording
 from pipeline.identification import Input, Problem, fit_model
-from pipeline.identification.fit import PartFit  # noqa: TC001
+from pipeline.identification.fit import PartFit
 from pipeline.identification.growth import Curve, find_goal, last_until
 from pipeline.identification.intervals import narrow_part, sum_blocks
 from pipeline.identification.parts import Part, count_seconds

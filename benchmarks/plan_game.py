@@ -30,7 +30,7 @@ from pipeline.diagnosis import Named, Recording, diagnose_runs
 from pipeline.plan.check import check_plan
 from pipeline.plan.files import read_promises, write_plan
 from pipeline.plan.limits import parse_area
-from pipeline.plan.plan import Plan  # noqa: TC001
+from pipeline.plan.plan import Plan
 from pipeline.simulate import (
     Disturbance,
     PoseSensor,
@@ -42,7 +42,7 @@ from pipeline.simulate import (
     write_log,
 )
 from pipeline.simulate.played import read_played
-from pipeline.vehicles import Vehicle  # noqa: TC001
+from pipeline.vehicles import Vehicle
 
 VEHICLES = ("husky", "jackal", "marmotte", "car")
 # What a plan on level ground can show; sizes are the simulator's usual ones times 0.7 to 1.3.

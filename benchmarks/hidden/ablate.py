@@ -38,7 +38,7 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.diagnosis import read_recording
 from pipeline.analysis.options import Options
 from pipeline.diagnosis import Recording, diagnose_runs
-from pipeline.vehicles import Vehicle  # noqa: TC001
+from pipeline.vehicles import Vehicle
 
 _LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"
 _RECORDINGS = "recordings"

@@ -23,7 +23,7 @@ from pipeline.analysis.diagnosis import read_recording
 from pipeline.analysis.options import Options
 from pipeline.core.errors import SlipError
 from pipeline.diagnosis import Recording, diagnose_runs
-from pipeline.vehicles import Vehicle  # noqa: TC001
+from pipeline.vehicles import Vehicle
 
 # An empty log has no true model to compare with; poor driving is asked what it admits not to know.
 _UNCHECKED = frozenset({"empty", "poor"})

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from draw import Answer  # noqa: TC002 - it runs as a script, too
 
-from pipeline.diagnosis import Recording  # noqa: TC001
+from pipeline.diagnosis import Recording
 from pipeline.diagnosis.recording import load_recording
 from pipeline.identification import Input, Problem, fit_model, hold_out
 from pipeline.identification.scoring import measure_errors
@@ -23,7 +23,7 @@ from pipeline.models.effect import Late, find_late
 from pipeline.models.model_file import parse_model
 from pipeline.models.model_text import format_model
 from pipeline.runs import HeadingSource, MotionError
-from pipeline.vehicles import Vehicle  # noqa: TC001
+from pipeline.vehicles import Vehicle
 
 Json = Mapping[str, object]
 

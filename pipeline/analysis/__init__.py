@@ -5,5 +5,3 @@ tables, summary and report in one moment.
 """
 
 from pipeline.analysis.options import Options
-
-__all__ = ["Options"]

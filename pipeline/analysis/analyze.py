@@ -12,23 +12,20 @@ import msgspec
 from pipeline.analysis.diagnosis import DIAGNOSIS, diagnose_work, has_diagnosis, key_diagnosis
 from pipeline.analysis.keys import hash_json, key_stages
 from pipeline.analysis.log_setup import LogSetup, name_run, set_up_log
-from pipeline.analysis.options import FIGURES, STAGES
+from pipeline.analysis.options import FIGURES, STAGES, FigureFormat, Options
 from pipeline.analysis.peers import find_peers
 from pipeline.analysis.provenance import list_versions
 from pipeline.analysis.relative import hash_model
 from pipeline.analysis.summary import summarize_run
 from pipeline.analysis.work import Progress, Work, read_wanted, stored_contexts, stored_keys
 from pipeline.core.version import read_version
-from pipeline.logs import spell_location, to_location
-from pipeline.store import JSON, LogIdentities, Manifest, Store, see_log
+from pipeline.logs import LogData, spell_location, to_location
+from pipeline.store import JSON, Generation, LogIdentities, Manifest, Store, see_log
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.analysis.options import FigureFormat, Options
-    from pipeline.logs import LogData
     from pipeline.report.run import RunReport
-    from pipeline.store import Generation
 
 SUMMARY = "summary.json"
 REPORT = "report.html"

@@ -1,25 +1,18 @@
 """Deployments compared by cause: from the results to the answer of `slip compare --causes`, and its files."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import polars as pl
 
 from pipeline.analysis.compared_runs import find_material, keep_runs
-from pipeline.analysis.errors import JobError
+from pipeline.analysis.errors import lack_runs
 from pipeline.analysis.fleet import fit_results
-from pipeline.fleet.causes import Causes, compare_causes
+from pipeline.analysis.options import FigureFormat
+from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
 from pipeline.fleet.tables import write_csv, write_latex
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from pipeline.analysis.options import FigureFormat
-    from pipeline.fleet.causes import Budget, Difference
-    from pipeline.store import Store
+from pipeline.store import Store
 
 _EFFECT = "effect"
 
@@ -47,23 +40,16 @@ def find_causes(store: Store, by: Sequence[str], chosen: str | None) -> Causes:
             .join(compared.labels.select("run", "group"), on="run")
         )
     if rows.is_empty():
-        raise JobError(
-            "nothing_to_compare",
-            "no run has a budget of its slip" + "".join(f"; {note}" for note in compared.notes),
-            where=str(store.root),
-            hint="Analyze logs with their diagnosis: slip analyze LOG... --terrain NAME.",
-        )
+        hint = "Analyze logs with their diagnosis: slip analyze LOG... --terrain NAME."
+        what = "no run has a budget of its slip"
+        raise lack_runs("nothing_to_compare", what, store.root, hint, compared.notes)
     on_command = rows.filter(pl.col("input") == "command")["run"].n_unique()
     source = chosen or ("command" if on_command == rows["run"].n_unique() else "measured")
     own = rows.filter(pl.col("input") == source)
     compared = keep_runs(compared, own["run"].unique().to_list(), f"no budget of its slip on {source}")
     if own.is_empty():
-        raise JobError(
-            "nothing_to_compare",
-            f"no run has a budget of its slip on {source}",
-            where=str(store.root),
-            hint="Choose the other input.",
-        )
+        what = f"no run has a budget of its slip on {source}"
+        raise lack_runs("nothing_to_compare", what, store.root, "Choose the other input.")
     budgets, differences = compare_causes(own)
     keys = tuple(f"{run}/{manifest.key}" for run, manifest in sorted(compared.manifests.items()))
     return Causes(budgets, differences, source, _find_names(store), keys, compared.notes)

@@ -7,29 +7,31 @@
 4. A vehicle that nothing tells gets the geometry that the wheels and the pose show.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import msgspec
 
 from pipeline.analysis.vehicle_facts import find_controller, find_description, find_static_frames
-from pipeline.logs import TransformBuffer, read_topics
+from pipeline.logs import ChannelInfo, LogData, LogIndex, TopicColumns, TransformBuffer, read_topics
 from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.extract.choice import PoseRating, rate_poses, replace_pose
 from pipeline.stages.extract.geometry import fit_controller, fit_geometry
 from pipeline.stages.extract.reading import find_sideways_share, with_texts
 from pipeline.stages.finding import Finding
+from pipeline.store import JSON
 from pipeline.vehicles import (
     CONFIGURED,
+    Configuration,
     ConfigurationError,
+    Controller,
     DriveForm,
     DriveSource,
     PoseSource,
     Recognized,
     Sources,
     Vehicle,
+    VehicleSource,
     apply_parameters,
     choose_sources,
     find_alike,
@@ -43,13 +45,6 @@ from pipeline.vehicles import (
 from pipeline.vehicles.candidates import LOCALIZED
 from pipeline.vehicles.message_types import find_type
 from pipeline.vehicles.topics import list_topics
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.logs import ChannelInfo, LogData, LogIndex, TopicColumns
-    from pipeline.store import JSON
-    from pipeline.vehicles import Configuration, Controller, VehicleSource
 
 UNKNOWN_VEHICLE = "unknown"
 _STAND_IN_RADIUS_M = 0.1

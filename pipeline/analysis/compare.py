@@ -1,28 +1,20 @@
 """Deployments side by side: from the results to tables, one page, and the answer of `slip compare`."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
 from pipeline.analysis.compared_runs import ComparedRuns, find_material, keep_runs
-from pipeline.analysis.errors import JobError
+from pipeline.analysis.errors import ANALYZE_FIRST, lack_runs
 from pipeline.analysis.samples import follow_published_runs, read_moduli, read_norms
 from pipeline.fleet.datasets import OVER_RUNS, THIS_RUN, pool_runs, spread_windows
-from pipeline.fleet.pairs import Group, bound_run, compare_groups
+from pipeline.fleet.pairs import Group, Pair, Samples, bound_run, compare_groups
 from pipeline.fleet.runs import add_measures, gather_runs, measure_difficulty
-from pipeline.fleet.statistics.intervals import bound_typical
+from pipeline.fleet.statistics.intervals import Interval, bound_typical
 from pipeline.fleet.tables import Answer, tabulate_pairs
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.fleet.pairs import Pair, Samples
-    from pipeline.fleet.statistics.intervals import Interval
-    from pipeline.store import Store
+from pipeline.store import Store
 
 _WINDOW_COLUMNS = {
     "run": pl.String,
@@ -61,12 +53,8 @@ def compare_results(store: Store, question: Question) -> Answer:
     compared = find_material(store, question.by, trusted_only=True)
     compared, runs, notes = measure_runs(compared)
     if runs.is_empty():
-        raise JobError(
-            "nothing_to_compare",
-            "there is no run whose numbers can be compared" + "".join(f"; {note}" for note in compared.notes),
-            where=str(store.root),
-            hint="Analyze logs first: slip analyze LOG... --out RESULTS --terrain NAME.",
-        )
+        what = "there is no run whose numbers can be compared"
+        raise lack_runs("nothing_to_compare", what, store.root, ANALYZE_FIRST, compared.notes)
     chosen = question.input or choose_input(runs)
     quantity = "median_modulus"
     if question.as_published:

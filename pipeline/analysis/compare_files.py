@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from pipeline.fleet.measures import compare_orders
-from pipeline.fleet.tables import write_csv, write_latex
+from pipeline.fleet.tables import Answer, write_csv, write_latex
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.analysis.options import FigureFormat
-    from pipeline.fleet.tables import Answer
     from pipeline.store import Store
 
 

@@ -1,23 +1,17 @@
 """The runs of the results that can be compared, and why the others cannot."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
 
 import polars as pl
 
 from pipeline.analysis.diagnosis import DIAGNOSED
 from pipeline.fleet.datasets import read_day
 from pipeline.fleet.runs import label_runs
+from pipeline.store import Manifest, Store
 from pipeline.store.queries import scan_table
 from schemas import contract_of
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.store import Manifest, Store
 
 _EARLIEST_YEAR = 2000
 _TABLES = ("aggregates", "slip")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-from pipeline.analysis.geometry import agree_on_vehicle
+from pipeline.analysis.geometry import Owner, agree_on_vehicle
 from pipeline.analysis.keys import hash_json
 from pipeline.analysis.options import INPUTS
-from pipeline.analysis.work import stored_keys
+from pipeline.analysis.work import Work, stored_keys
 from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-    from pipeline.analysis.geometry import Owner
-    from pipeline.analysis.work import Work
     from pipeline.diagnosis import Recording
     from pipeline.models import Model
     from pipeline.store import JSON, Manifest

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, cast
 
 import polars as pl
 
-from pipeline.analysis.compared_runs import find_material, read_digest
-from pipeline.analysis.errors import JobError
+from pipeline.analysis.compared_runs import ComparedRuns, find_material, read_digest
+from pipeline.analysis.errors import JobError, lack_runs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from pipeline.analysis.compared_runs import ComparedRuns
     from pipeline.fleet.hierarchy import FleetModel, FleetNumber
     from pipeline.fleet.statistics.intervals import Interval
     from pipeline.store import Store
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
 FLEET = "fleet.json"
 _TABLES = ("estimates",)
 _EVERY = "*"
+_NAME_EFFECTS = "Name the effects of its logs: slip batch LOGS --diagnosis"
 
 
 def fit_results(store: Store) -> tuple[FleetModel, tuple[str, ...]]:
@@ -39,12 +39,7 @@ def fit_results(store: Store) -> tuple[FleetModel, tuple[str, ...]]:
 
     compared = _find_runs(store)
     if not compared.manifests:
-        raise JobError(
-            "nothing_to_fit",
-            "no run has estimates" + "".join(f"; {note}" for note in compared.notes),
-            where=str(store.root),
-            hint="Name the effects of its logs: slip batch LOGS --diagnosis",
-        )
+        raise lack_runs("nothing_to_fit", "no run has estimates", store.root, _NAME_EFFECTS, compared.notes)
     model = fit_fleet(compared.scan("estimates").collect())
     notes = (*compared.notes, *model.notes)
     return FleetModel(model.numbers, model.runs, notes), _list_keys(compared)
@@ -65,12 +60,8 @@ def find_estimates(store: Store, *, without: Sequence[str] = ()) -> pl.DataFrame
         run: manifest for run, manifest in compared.manifests.items() if read_digest(manifest) not in without
     }
     if not known:
-        raise JobError(
-            "nothing_to_fit",
-            "no other run has estimates" if compared.manifests else "no run has estimates",
-            where=str(store.root),
-            hint="Name the effects of its logs: slip batch LOGS --diagnosis",
-        )
+        what = "no other run has estimates" if compared.manifests else "no run has estimates"
+        raise lack_runs("nothing_to_fit", what, store.root, _NAME_EFFECTS)
     return compared.scan("estimates").filter(pl.col("run").is_in(list(known))).collect()
 
 

@@ -1,22 +1,16 @@
 """What a log holds and how healthy it is, without analyzing it."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
 from pipeline.analysis.choice import UNKNOWN_VEHICLE, Choice, choose
+from pipeline.core.arrays import Ints
 from pipeline.core.errors import SlipError
 from pipeline.logs import ChannelInfo, LogIndex, Loss, Wanted, open_log, read_topics
 from pipeline.vehicles import Configuration, Sources, Vehicle, choose_sources, find_preset, load_configuration
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 _GAP_PERIODS = 3.0
 _SMALLEST_GAP_S = 0.12
@@ -93,9 +87,7 @@ def inspect_log(path: Path, *, config: Path | None, overrides: Mapping[str, obje
     return Inspection(index, topics, data.losses, notes, choice, problem, data.unchecked)
 
 
-def _measure_topic(
-    channel: ChannelInfo, log_time: NDArray[np.int64], header_time: NDArray[np.int64] | None
-) -> TopicHealth:
+def _measure_topic(channel: ChannelInfo, log_time: Ints, header_time: Ints | None) -> TopicHealth:
     plain = TopicHealth(channel.topic, channel.type_name, channel.message_count)
     if log_time.size < 2:  # noqa: PLR2004 - one message has no rate
         return plain

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from pipeline.analysis.choice import Choice, choose
 from pipeline.analysis.errors import JobError
+from pipeline.analysis.options import Options
 from pipeline.logs import LogIndex, open_log, spell_location
+from pipeline.store import Store
 from pipeline.vehicles import Configuration, Sources, Vehicle, load_configuration
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.analysis.options import Options
-    from pipeline.store import Store
 
 UNKNOWN = "unknown"
 

@@ -1,16 +1,10 @@
 """From what a user types, a log or a run, to the log or the results."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.analysis.errors import JobError
 from pipeline.logs import spell_location, to_location
-from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from pipeline.store import Manifest
+from pipeline.store import Manifest, Store
 
 
 def find_run(text: str, store: Store) -> Manifest:
@@ -45,12 +39,8 @@ def find_log(text: str, out: Path) -> Path:
     manifest = find_run(text, Store(out))
     log = to_location(recorded_path(manifest))
     if not log.exists():
-        raise JobError(
-            "log_gone",
-            "the log of this run is not there any more",
-            where=str(log),
-            hint="Give the path it has now.",
-        )
+        hint = "Give the path it has now."
+        raise JobError("log_gone", "the log of this run is not there any more", where=str(log), hint=hint)
     return log
 
 

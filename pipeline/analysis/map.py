@@ -1,24 +1,18 @@
 """The deployment map: the literature with the user's own datasets on it."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 import polars as pl
 
 from pipeline.analysis.compare import choose_input, measure_runs
 from pipeline.analysis.compared_runs import find_material, read_digest
+from pipeline.analysis.options import FigureFormat
 from pipeline.fleet.datasets import pool_runs
 from pipeline.fleet.deployments import find_own_table, read_deployments
 from pipeline.fleet.measures import MEASURES
 from pipeline.fleet.place import DeploymentMap, place_datasets, place_deployments
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from pipeline.analysis.options import FigureFormat
-    from pipeline.store import Store
+from pipeline.store import Store
 
 _SHARED = " (shared)"
 

@@ -1,11 +1,9 @@
 """A model fitted to runs, before and after a change: behind `slip model` and behind Python's `fit`."""
 
-from __future__ import annotations
-
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
-from pipeline.analysis.geometry import agree_on_vehicle
+from pipeline.analysis.geometry import Owner, agree_on_vehicle
 from pipeline.identification.describe import (
     correlations_as_json,
     errors_as_json,
@@ -13,23 +11,15 @@ from pipeline.identification.describe import (
     parameters_as_json,
     step_as_json,
 )
-from pipeline.identification.inputs import choose_input
-from pipeline.identification.judgement import judge_model, note_fit
+from pipeline.identification.inputs import InputChoice, choose_input
+from pipeline.identification.judgement import Judgement, judge_model, note_fit
 from pipeline.identification.problem import Problem
-from pipeline.identification.scoring import measure_by_terrain
+from pipeline.identification.scoring import Errors, measure_by_terrain
+from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_run import load_motion_run, load_vehicle
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from pipeline.analysis.geometry import Owner
-    from pipeline.identification.inputs import InputChoice
-    from pipeline.identification.judgement import Judgement
-    from pipeline.identification.scoring import Errors
-    from pipeline.models.model_file import ModelFile
-    from pipeline.runs.recording import MotionRun
-    from pipeline.store import Manifest
-    from pipeline.vehicles import Vehicle
+from pipeline.runs.recording import MotionRun
+from pipeline.store import Manifest
+from pipeline.vehicles import Vehicle
 
 
 @dataclass(frozen=True)

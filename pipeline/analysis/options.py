@@ -1,13 +1,9 @@
 """What the user asked of an analysis."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from typing import Literal, get_args
 
 INPUTS = ("command", "measured")
 STAGE_WORDS = {

@@ -1,17 +1,10 @@
 """The other runs of a dataset, beside which a report sets its own."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
-from pipeline.store import StoreError
+from pipeline.store import JSON, Manifest, Store, StoreError
 from pipeline.store.manifest_file import load_manifest
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.store import JSON, Manifest, Store
 
 _SUMMARY = "summary.json"
 _MOST_RUNS = 2000

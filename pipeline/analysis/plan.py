@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.core.errors import SlipError
 from pipeline.plan.files import WHEELS, list_types
-from pipeline.plan.limits import is_steered
+from pipeline.plan.limits import Area, Limits, is_steered
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from pipeline.diagnosis import Recording, RunDiagnosis
     from pipeline.fleet.forecast import Forecast
     from pipeline.plan.knowledge import Knowledge
-    from pipeline.plan.limits import Area, Limits
     from pipeline.plan.plan import Plan
     from pipeline.plan.questions import Question
     from pipeline.store import Manifest

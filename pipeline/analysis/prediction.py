@@ -1,43 +1,32 @@
 """Before driving there: the model, the slip and the error over 2 s that a fleet's runs let expect."""
 
-from __future__ import annotations
-
 import contextlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
 from pipeline.analysis.diagnosis import read_length_scale
-from pipeline.analysis.errors import JobError
+from pipeline.analysis.errors import lack_runs
 from pipeline.analysis.fleet import find_estimates
+from pipeline.core.arrays import Complex, Flags, Floats
 from pipeline.fleet.datasets import read_day
-from pipeline.fleet.forecast import DRAWS, make_effects
+from pipeline.fleet.forecast import DRAWS, Forecast, make_effects
 from pipeline.fleet.statistics.intervals import Interval
 from pipeline.fleet.statistics.posterior import draw_run
 from pipeline.identification.comparison import Comparison, Input
 from pipeline.identification.predict import predict_at_from, predict_from
 from pipeline.models.catalogue import find_effect
-from pipeline.models.effect import Place
+from pipeline.models.effect import Effect, Place
 from pipeline.models.forward import Timing
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_run import load_motion_run, load_vehicle
 from pipeline.runs.errors import MotionError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from pipeline.fleet.forecast import Forecast
-    from pipeline.models.effect import Effect
-    from pipeline.store import Manifest, Store
-    from pipeline.vehicles import Vehicle
-
-    Floats = NDArray[np.float64]
+from pipeline.store import Manifest, Store
+from pipeline.vehicles import Vehicle
 
 MOST_RUNS = 8
 """Runs whose commands stand for those to come: more make the answer slower and hardly another."""
@@ -157,7 +146,7 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
     return Prediction(forecast, vehicle, error, without, modulus_median, used)
 
 
-def weigh_runs(there: NDArray[np.bool_]) -> Floats:
+def weigh_runs(there: Flags) -> Floats:
     """How likely the next run is driven as each of these was, shape (n,).
 
     As one of the n on its terrain with chance n / (n + 1), else as one on others (Blackwell and MacQueen,
@@ -177,14 +166,14 @@ def _bound(draws: Floats) -> Expected:
     return Expected(middle, Interval(low, high, _LEVEL))
 
 
-def _predict(run: _Driven, effects: Sequence[Effect]) -> NDArray[np.complex128]:
+def _predict(run: _Driven, effects: Sequence[Effect]) -> Complex:
     """Positions of predictions over 2 s [m], by prediction and time since its start."""
     poses = predict_from(run.comparison, effects, Timing()).poses
-    positions: NDArray[np.complex128] = poses[:, 1:, 0] + 1j * poses[:, 1:, 1]
+    positions: Complex = poses[:, 1:, 0] + 1j * poses[:, 1:, 1]
     return positions
 
 
-def _measure_gap(one: NDArray[np.complex128], other: NDArray[np.complex128]) -> float:
+def _measure_gap(one: Complex, other: Complex) -> float:
     return float(np.sqrt(np.mean(np.abs(one - other) ** 2)))
 
 
@@ -208,12 +197,8 @@ def _load_runs(store: Store, forecast: Forecast) -> list[_Driven]:
                 own = named.filter(pl.col("run") == name)
                 runs.append(_load_run(manifest, own, Input(forecast.input)))
     if not runs:
-        raise JobError(
-            "nothing_to_drive",
-            f"no run of {forecast.vehicle} has the {forecast.input} input to drive again",
-            where=str(store.root),
-            hint="Choose the other input.",
-        )
+        what = f"no run of {forecast.vehicle} has the {forecast.input} input to drive again"
+        raise lack_runs("nothing_to_drive", what, store.root, "Choose the other input.")
     return runs
 
 

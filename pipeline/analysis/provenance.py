@@ -6,15 +6,12 @@ import platform
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
-from typing import TYPE_CHECKING
 
+from pipeline.analysis.log_setup import LogSetup
+from pipeline.analysis.work import Work
 from pipeline.core.version import PACKAGE, read_version
 from pipeline.logs import ROS1_BAG, SQLITE_BAG
 from pipeline.stages.extract import list_wanted
-
-if TYPE_CHECKING:
-    from pipeline.analysis.log_setup import LogSetup
-    from pipeline.analysis.work import Work
 
 _Packages = Mapping[str, tuple[str, ...]]
 _ALWAYS = ("numpy", "scipy", "polars", "pyarrow")

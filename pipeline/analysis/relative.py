@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import polars as pl
 
 from pipeline.analysis.errors import JobError
+from pipeline.core.arrays import Floats
 from pipeline.core.errors import SlipError, naming_os_errors
 from pipeline.stages.finding import Finding
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from pipeline.vehicles import Vehicle
+from pipeline.vehicles import Vehicle
 
 COLUMNS = ("model_x", "model_y", "model_w", "residual_modulus")
 
@@ -99,9 +94,7 @@ def add_model(
     return pl.concat(parts), tuple(found)
 
 
-def find_residual_modulus(
-    predicted: NDArray[np.float64], slip: pl.DataFrame, *, length: float
-) -> NDArray[np.float64]:
+def find_residual_modulus(predicted: Floats, slip: pl.DataFrame, *, length: float) -> Floats:
     """Modulus of what a model leaves of the motion [m/s], shape (n,).
 
     Args:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import polars as pl
 
+from pipeline.analysis.compared_runs import ComparedRuns
 from pipeline.fleet.pairs import Samples
 from pipeline.fleet.published import WINDOW_S, follow_published, read_limits
-
-if TYPE_CHECKING:
-    from pipeline.analysis.compared_runs import ComparedRuns
 
 _FEWEST = 2
 

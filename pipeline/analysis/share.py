@@ -1,20 +1,14 @@
 """What the results share with others: features of every run, without data, names of files or places."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import polars as pl
 
 from pipeline.analysis.compare import measure_runs
 from pipeline.analysis.compared_runs import find_material, read_digest
-from pipeline.analysis.errors import JobError
+from pipeline.analysis.errors import ANALYZE_FIRST, lack_runs
 from pipeline.core.version import read_version
 from pipeline.fleet.features import check_features
+from pipeline.store import Store
 from schemas.features import Features
-
-if TYPE_CHECKING:
-    from pipeline.store import Store
 
 _HASH = 64
 
@@ -34,12 +28,7 @@ def gather_features(store: Store) -> tuple[pl.DataFrame, tuple[str, ...]]:
         notes.append(f"left out, the hash of the log is not known: {', '.join(nameless)}")
     known = runs.filter(~pl.col("run").is_in(nameless)) if not runs.is_empty() else runs
     if known.is_empty():
-        raise JobError(
-            "nothing_to_share",
-            "there is no run to share" + "".join(f"; {note}" for note in notes),
-            where=str(store.root),
-            hint="Analyze logs first: slip analyze LOG... --out RESULTS --terrain NAME.",
-        )
+        raise lack_runs("nothing_to_share", "there is no run to share", store.root, ANALYZE_FIRST, notes)
     schema = Features.create_empty().schema
     shared = known.with_columns(
         pl.col("run").replace_strict(digests, return_dtype=pl.String).alias("sha256"),

@@ -1,13 +1,11 @@
 """Runs for verbs that read: results that are there are read as they are, a new log is analyzed once."""
 
-from __future__ import annotations
-
 import json
 import tempfile
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -15,17 +13,11 @@ from pipeline.analysis.analyze import SUMMARY, analyze_log, update_datasets
 from pipeline.analysis.errors import JobError
 from pipeline.analysis.log_setup import name_run, set_up_log
 from pipeline.analysis.lookup import find_run, recorded_path
-from pipeline.analysis.options import INPUTS
-from pipeline.analysis.work import stored_contexts
+from pipeline.analysis.options import INPUTS, Options
+from pipeline.analysis.work import Progress, stored_contexts
 from pipeline.core.errors import SlipError
 from pipeline.logs import hash_log, list_files
 from pipeline.store import LogIdentities, Manifest, Store
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from pipeline.analysis.options import Options
-    from pipeline.analysis.work import Progress
 
 
 @dataclass(frozen=True)

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import polars as pl
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.analysis.work import Work
-    from pipeline.store import JSON
+from pipeline.analysis.work import Work
+from pipeline.store import JSON
 
 _DIGITS = 6
 

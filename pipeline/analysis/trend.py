@@ -1,18 +1,23 @@
 """What of a vehicle changed over its runs: slip, fitted parameters, and the health of its data."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import polars as pl
 
 from pipeline.analysis.compared_runs import ComparedRuns, find_material
-from pipeline.analysis.errors import JobError
+from pipeline.analysis.errors import JobError, lack_runs
 from pipeline.fleet.errors import ComparisonError
-from pipeline.fleet.parameter_trend import describe_parameter, find_latest, follow_parameters, say_power
+from pipeline.fleet.parameter_trend import (
+    ParameterTrend,
+    describe_parameter,
+    find_latest,
+    follow_parameters,
+    say_power,
+)
 from pipeline.fleet.runs import gather_runs
 from pipeline.fleet.trend import (
     FEWEST_RUNS,
@@ -23,13 +28,7 @@ from pipeline.fleet.trend import (
     follow_quantities,
     raise_alerts,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from pipeline.fleet.parameter_trend import ParameterTrend
-    from pipeline.store import Store
+from pipeline.store import Store
 
 TREND = "trend.json"
 _SLIP = {
@@ -64,12 +63,8 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
     if undated:
         notes.append(f"left out, because no date is known: {', '.join(undated)}")
     if dated.is_empty():
-        raise JobError(
-            "nothing_to_follow",
-            "there is no run with a date" + "".join(f"; {note}" for note in notes),
-            where=str(store.root),
-            hint="Analyze logs whose clock was set, or put the date into their names (2026-05-03).",
-        )
+        hint = "Analyze logs whose clock was set, or put the date into their names (2026-05-03)."
+        raise lack_runs("nothing_to_follow", "there is no run with a date", store.root, hint, notes)
     dated = dated.with_row_index("order").with_columns(pl.col("order").cast(pl.Int64))
     values = (
         dated.select("run", "group", "day", "order")

@@ -1,14 +1,14 @@
 """What a log says of its vehicle beside its topics: description, parameters, frames of wheels."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 from pipeline.logs import (
     LogError,
+    LogIndex,
     Ragged,
     RaggedStrings,
     Strings,
+    TopicColumns,
     TransformBuffer,
     Wanted,
     read_topics,
@@ -16,11 +16,6 @@ from pipeline.logs import (
 )
 from pipeline.vehicles import Controller, Description, list_metadata, read_description, read_parameters
 from pipeline.vehicles.message_types import plain_type
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from pipeline.logs import LogIndex, TopicColumns
 
 _EVENTS = "rcl_interfaces/ParameterEvent"
 _LISTS = ("new_parameters", "changed_parameters")

@@ -13,7 +13,7 @@ import msgspec
 import polars as pl
 
 from pipeline.analysis.keys import EXTRACTED, TABLES
-from pipeline.analysis.options import STAGES
+from pipeline.analysis.options import STAGES, Options
 from pipeline.analysis.relative import add_model
 from pipeline.logs import LogData, Loss, read_topics
 from pipeline.runs.recording import Alignment, read_alignment
@@ -22,16 +22,13 @@ from pipeline.stages.align import align_tables
 from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.finding import Finding, tabulate_findings
 from pipeline.stages.samples import gather_samples
-from pipeline.store.tables import check_table
-from pipeline.vehicles import DriveForm
+from pipeline.store.tables import CheckedTable, check_table
+from pipeline.vehicles import DriveForm, Vehicle
 from schemas import contract_of
 
 if TYPE_CHECKING:
     from pipeline.analysis.log_setup import LogSetup
-    from pipeline.analysis.options import Options
     from pipeline.store import JSON, Generation, Manifest, TableReport
-    from pipeline.store.tables import CheckedTable
-    from pipeline.vehicles import Vehicle
 
 Progress = Callable[[str], None]
 

@@ -7,5 +7,3 @@ cannot be done raises `SlipError`: one line that says what is wrong, where, and 
 from pipeline.api.model import Fit, Model, effect
 from pipeline.api.run import Diagnosis, Run, analyze, load, table
 from pipeline.core.errors import SlipError
-
-__all__ = ["Diagnosis", "Fit", "Model", "Run", "SlipError", "analyze", "effect", "load", "table"]

@@ -6,12 +6,12 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import polars as pl
 from threadpoolctl import threadpool_limits
 
-from pipeline.analysis.model_fit import fit_to_runs, read_runs
+from pipeline.analysis.model_fit import ModelFit, fit_to_runs, read_runs
 from pipeline.api.shown import tabulate_ladder, tabulate_parameters, write_html
 from pipeline.identification.describe import (
     describe_ladder,
@@ -27,18 +27,14 @@ from pipeline.models.export import export_model, read_current
 from pipeline.models.formula.formula_effect import CHANNELS, FormulaEffect, make_parameter
 from pipeline.report.export import make_charts
 from pipeline.report.run import RunReport
-from pipeline.runs import MotionError
+from pipeline.runs import MotionError, MotionRun
 from pipeline.vehicles import Vehicle, resolve_vehicle
 from pipeline.vehicles.configuration import VehicleSection
 
 if TYPE_CHECKING:
-    from typing import Literal
-
     from pipeline.analysis.geometry import Owner
-    from pipeline.analysis.model_fit import ModelFit
     from pipeline.api.run import Run
     from pipeline.report.figures.figure import Picture as Chart
-    from pipeline.runs import MotionRun
 
     Source = Literal["command", "measured"]
 
@@ -70,12 +66,8 @@ def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Ef
     if not texts:
         return find_effect(name)().change(**numbers)
     if not name.isidentifier():
-        raise MotionError(
-            "bad_value",
-            f"{name!r} cannot be the id of an effect",
-            where="effect",
-            hint="Use letters, digits and _, a letter first.",
-        )
+        hint = "Use letters, digits and _, a letter first."
+        raise MotionError("bad_value", f"{name!r} cannot be the id of an effect", where="effect", hint=hint)
     parameters = [make_parameter(key, unit, (low, high)) for key, (unit, low, high) in tuples.items()]
     return FormulaEffect(name, texts, tuple(parameters))
 

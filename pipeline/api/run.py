@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 import polars as pl
 from threadpoolctl import threadpool_limits
@@ -22,15 +22,13 @@ from pipeline.report.export import make_charts
 from pipeline.report.motion_run import load_vehicle
 from pipeline.report.run import RunReport, mapping_in, number_in, objects_in
 from pipeline.report.words import say_distance
-from pipeline.store import Store
+from pipeline.store import Manifest, Store
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-    from typing import Literal
 
     from pipeline.analysis.geometry import Owner
     from pipeline.report.figures.figure import Picture as Chart
-    from pipeline.store import Manifest
 
     Content = Mapping[str, object]
 

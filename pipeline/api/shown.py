@@ -1,16 +1,11 @@
 """What a notebook shows: rungs and numbers as tables, small HTML."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from html import escape
-from typing import TYPE_CHECKING
 
 import polars as pl
 
 from pipeline.report.run import number_in, objects_in
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 _ERRORS = ("t_mrmse_m", "r_mrmse_rad", "explained_share")
 _DIGITS = 4

@@ -4,24 +4,16 @@ It covers more than the keys of the stages do, so that it can be had without ope
 the keys decide what has to be computed.
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import fields
 from functools import cache
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import msgspec
 
-from pipeline.analysis import diagnosis
+from pipeline.analysis import Options, diagnosis
 from pipeline.analysis.keys import VERSIONS, hash_json
 from pipeline.vehicles import list_configuration_files, list_presets
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.analysis import Options
-
 
 _WITHOUT_INFLUENCE = ("out", "run", "config", "fleet", "report", "figures", "force")
 """Options that the tables do not depend on, or whose content is hashed by itself."""

@@ -4,21 +4,14 @@ The ledger decides nothing that the results do not confirm: a log counts as done
 the generation that its note names. Losing a note costs a look at the log.
 """
 
-from __future__ import annotations
-
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.store import LOG_NOTES, LogSighting, StoreError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.store import JSON, Mirror, Store
+from pipeline.store import JSON, LOG_NOTES, LogSighting, Mirror, Store, StoreError
 
 STATES = ("done", "unchanged", "lossy", "failed", "quarantined")
 """What a log can come out as; each of them is counted."""

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from pipeline.batch.basis import BasisHasher
 from pipeline.batch.ledger import Entry, Ledger
 from pipeline.batch.naming import KnownRun, assign_names, list_doubtful
+from pipeline.batch.request import Request
 from pipeline.core.errors import SlipError
 from pipeline.logs import LogError, hash_log, to_location
 from pipeline.store import LogIdentities, LogSighting, Manifest, Store, see_log
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
-    from pathlib import Path
-
-    from pipeline.batch.request import Request
 
 
 @dataclass(frozen=True, kw_only=True)

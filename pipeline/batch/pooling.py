@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from pipeline.analysis.keys import hash_json
-
-if TYPE_CHECKING:
-    from pipeline.store import Mirror, Store
+from pipeline.store import Mirror, Store
 
 _NOTES = "batch/pooled"
 _NOTE = "all runs"

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from pipeline.batch.errors import BatchError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.batch.request import Pruning
-    from pipeline.store import Store
+from pipeline.batch.request import Pruning
+from pipeline.store import Store
 
 
 @dataclass(frozen=True, kw_only=True)

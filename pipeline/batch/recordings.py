@@ -106,12 +106,8 @@ def _find_in(target: str, looker: Looker) -> Iterator[Path]:
     elif place is not None and looker.ask(place, place.exists):
         looker.skip(place, "it is a pipe, a socket or a device, and no file")
     elif len(looker.skipped) == before:
-        raise BatchError(
-            "logs_not_found",
-            "there is no such file or folder",
-            where=target,
-            hint="Check the path; quote a glob so that the shell leaves it alone",
-        )
+        hint = "Check the path; quote a glob so that the shell leaves it alone"
+        raise BatchError("logs_not_found", "there is no such file or folder", where=target, hint=hint)
 
 
 def _find_match(match: Path, looker: Looker) -> Iterator[Path]:

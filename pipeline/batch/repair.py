@@ -1,24 +1,18 @@
 """What can be made again of results that are not what was written, and having it made by the next batch."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING
 
 from pipeline.batch.ledger import Ledger
 from pipeline.batch.pooling import POOLED, forget_pools
 from pipeline.logs import to_location
+from pipeline.store import Examination, Mirror, Problem, Store
 from pipeline.store.listing import entry_name, is_run_manifest
 from pipeline.store.manifest import MANIFEST
 from pipeline.store.manifest_file import parse_manifest
 from pipeline.store.names import encode_run
 from pipeline.store.verification import DiskFiles
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from pipeline.store import Examination, Mirror, Problem, Store
 
 _UNREADABLE = ("manifest_damaged", "name_clash")
 _VERBS = {"comparison": "slip compare", "trend": "slip trend", "map": "slip map"}

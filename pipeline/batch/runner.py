@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
-from pipeline.batch.ledger import FATAL_KILLS, Entry
+from pipeline.batch.executors import Blame, Executor
+from pipeline.batch.ledger import FATAL_KILLS, Entry, Ledger
+from pipeline.batch.plan import Item
+from pipeline.batch.request import Request
 from pipeline.batch.work import Report, Task
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from pipeline.batch.executors import Blame, Executor
-    from pipeline.batch.ledger import Ledger
-    from pipeline.batch.plan import Item
-    from pipeline.batch.request import Request
 
 STOPPING = ("disk_full", "read_only", "no_locks", "cluster_lost")
 """Errors that every other log would meet as well."""

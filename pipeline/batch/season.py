@@ -5,27 +5,22 @@ from __future__ import annotations
 import hashlib
 import threading
 import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from pathlib import Path
+from typing import Protocol
 
-from pipeline.batch.executors import Settings, find_executor
+from pipeline.batch.executors import Executor, Settings, find_executor
 from pipeline.batch.ledger import STATES, Entry, Ledger
 from pipeline.batch.plan import Item, Plan, make_plan
 from pipeline.batch.pooling import load_libraries, refresh_pools, refresh_remote_pools
 from pipeline.batch.pruning import prune_results
 from pipeline.batch.recordings import find_recordings
+from pipeline.batch.request import Request, Shard
 from pipeline.batch.runner import Result, run_items
-from pipeline.batch.work import Report, work_on
+from pipeline.batch.work import Report, Task, work_on
 from pipeline.core.errors import SlipError
 from pipeline.store import Mirror, Store
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
-
-    from pipeline.batch.executors import Executor
-    from pipeline.batch.request import Request, Shard
-    from pipeline.batch.work import Task
 
 
 class Watch(Protocol):

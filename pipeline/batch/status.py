@@ -1,18 +1,12 @@
 """What is done, failed and quarantined, without looking at a log."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from pipeline.batch.ledger import Entry, Ledger
 from pipeline.batch.pruning import measure_results
 from pipeline.logs import RemotePath, to_location
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.store import Store, StoreError
+from pipeline.store import Store, StoreError
 
 _COUNTED = ("done", "lossy", "failed", "quarantined", "copy")
 

@@ -1,19 +1,12 @@
 """Are results and logs still what they were?"""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from pipeline.batch.repair import repair_results
+from pipeline.batch.repair import Repair, repair_results
 from pipeline.core.errors import SlipError
 from pipeline.logs import hash_log, to_location
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pipeline.batch.repair import Repair
-    from pipeline.store import Mirror, Problem, Store
+from pipeline.store import Mirror, Problem, Store
 
 
 @dataclass(frozen=True, kw_only=True)

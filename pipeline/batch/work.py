@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from pipeline.batch.ledger import Entry, Ledger
 from pipeline.core.errors import SlipError
 from pipeline.logs import FETCHED
-from pipeline.store import Mirror, Store
+from pipeline.store import LogSighting, Mirror, Store
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from pipeline.analysis import Options
     from pipeline.analysis.analyze import Outcome
-    from pipeline.store import LogSighting
 
 
 @dataclass(frozen=True, kw_only=True)

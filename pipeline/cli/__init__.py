@@ -4,5 +4,3 @@ Each verb is one file of this folder; heavy rooms are imported inside the verbs,
 """
 
 from pipeline.cli.app import main
-
-__all__ = ["main"]

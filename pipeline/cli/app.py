@@ -1,12 +1,11 @@
 """The `slip` program: its verbs, and what errors become."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import pkgutil
 import sys
-from typing import TYPE_CHECKING, Literal, get_args, get_origin
+from collections.abc import Sequence
+from typing import Literal, get_args, get_origin
 
 from cyclopts import App, CycloptsError, CycloptsPanel, MissingArgumentError
 
@@ -16,9 +15,6 @@ from pipeline.core.errors import SlipError
 from pipeline.core.interpreter import keep_current_folder_out
 from pipeline.core.quiet import silence_warnings
 from pipeline.core.version import read_version
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 HELP = """How far was the motion from the ideal model, and why?
 

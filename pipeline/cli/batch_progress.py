@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from pipeline.cli.output import say, tidy_line
 from pipeline.core.durations import say_duration
 
 if TYPE_CHECKING:
     from types import TracebackType
-    from typing import Self
 
     from rich.progress import Progress, TaskID
 

@@ -1,7 +1,5 @@
 """Options that several verbs share: the vehicle, the inputs, where results go."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, fields

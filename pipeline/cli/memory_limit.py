@@ -1,17 +1,12 @@
 """What verbs do when a file takes more memory than it may."""
 
-from __future__ import annotations
-
 import os
 import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 from pipeline.cli.output import FAILED, print_error
 from pipeline.core.errors import SlipError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 _SHARE = 0.8
 """Of the machine's memory: the rest of the machine needs some, too."""

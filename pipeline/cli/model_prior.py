@@ -44,12 +44,8 @@ def require_model(path: Path | None) -> Path:
     from pipeline.runs.errors import MotionError  # noqa: PLC0415 - heavy
 
     if path is None:
-        raise MotionError(
-            "no_model",
-            "no model file was given",
-            where="slip model fit",
-            hint="Give one, or take what the fleet lets expect: --prior fleet.",
-        )
+        hint = "Give one, or take what the fleet lets expect: --prior fleet."
+        raise MotionError("no_model", "no model file was given", where="slip model fit", hint=hint)
     return path
 
 

@@ -1,7 +1,5 @@
 """The one-screen summary of a run, for a tired person."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path

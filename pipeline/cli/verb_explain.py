@@ -50,11 +50,8 @@ def _describe_column(column: str) -> dict[str, str]:
         if contract.name == table and name in contract.schema.columns():
             return contract.metadata_of(name)
     known = ", ".join(contract.name for contract in list_contracts())
-    raise SlipError(
-        "no_such_column",
-        f"no contract has the column {column!r}",
-        hint=f"Write table.column; the tables are {known}.",
-    )
+    hint = f"Write table.column; the tables are {known}."
+    raise SlipError("no_such_column", f"no contract has the column {column!r}", hint=hint)
 
 
 def _describe(manifest: Manifest) -> list[str]:

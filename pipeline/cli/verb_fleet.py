@@ -1,16 +1,12 @@
 """`slip fleet`: what is the vehicle's, what is the ground's, what changes from run to run."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import Annotated, cast
 
 from cyclopts import App, Parameter
 
 from pipeline.cli.output import print_result
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 _LABEL = 26
 _LEVEL = 9

@@ -1,16 +1,12 @@
 """`slip predict`: what to expect of a vehicle on a terrain before driving there."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, cast
+from typing import Annotated, Literal, cast
 
 from cyclopts import Parameter
 
 from pipeline.cli.output import print_result
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 _LABEL = 26
 _WORDS = (

@@ -1,7 +1,5 @@
 """`slip schedule`: units for the nightly run."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Annotated

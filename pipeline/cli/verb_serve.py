@@ -1,7 +1,5 @@
 """`slip serve`: the workbench, a page on this machine."""
 
-from __future__ import annotations
-
 import atexit
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`slip share`: features of deployments, for a database of many."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

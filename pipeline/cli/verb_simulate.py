@@ -1,7 +1,5 @@
 """`slip simulate`: logs with known effects, for teaching and tests."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """`slip stage`: one stage alone, from the stored tables of the one before."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal

@@ -122,9 +122,5 @@ def _outside(where: str, name: str, problem: str) -> PathError:
 
 def _refuse(code: str, where: str, name: str, problem: str) -> PathError:
     shown = name if len(name) <= _SHOWN else f"{name[:_SHOWN]}..."
-    return PathError(
-        code,
-        f"the name {shown!r} {problem}",
-        where=where,
-        hint="It comes from outside and is not used; get the data from a source that you trust",
-    )
+    hint = "It comes from outside and is not used; get the data from a source that you trust"
+    return PathError(code, f"the name {shown!r} {problem}", where=where, hint=hint)

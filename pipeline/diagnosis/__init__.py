@@ -5,17 +5,5 @@ model, what this log cannot tell, and what no catalogued effect takes.
 """
 
 from pipeline.diagnosis.diagnose import diagnose_runs
-from pipeline.diagnosis.diagnosis import Diagnosis, Named, RunDiagnosis, Unexplained, Value
-from pipeline.diagnosis.errors import DiagnosisError
+from pipeline.diagnosis.diagnosis import Diagnosis, Named, RunDiagnosis, Value
 from pipeline.diagnosis.recording import Recording
-
-__all__ = [
-    "Diagnosis",
-    "DiagnosisError",
-    "Named",
-    "Recording",
-    "RunDiagnosis",
-    "Unexplained",
-    "Value",
-    "diagnose_runs",
-]

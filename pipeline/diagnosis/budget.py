@@ -1,17 +1,12 @@
 """How long a search may take, and what it says meanwhile."""
 
-from __future__ import annotations
-
 import math
 import re
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from pipeline.core.parallel import measure_cpu
 from pipeline.diagnosis.errors import DiagnosisError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
 
 _USUAL_S = 60.0
 _FOR_S = 600.0

@@ -9,17 +9,17 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.diagnosis import residual_structure
-from pipeline.diagnosis.context import measure_exceeded
-from pipeline.diagnosis.diagnosis import Named, RunDiagnosis
+from pipeline.diagnosis.context import Context, measure_exceeded
+from pipeline.diagnosis.diagnosis import Json, Named, RunDiagnosis, Value
 from pipeline.diagnosis.enough import Growth
 from pipeline.diagnosis.error_regions import map_errors, pick_regions
 from pipeline.diagnosis.estimates import list_estimates
 from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.materiality import measure_moves
-from pipeline.diagnosis.naming_rules import join_classes, list_equivalents
+from pipeline.diagnosis.naming_rules import Clocks, join_classes, list_equivalents
 from pipeline.diagnosis.plausibility import find_exceeded, find_implausible
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.values import list_values, read_clock
@@ -28,10 +28,10 @@ from pipeline.identification import Input
 from pipeline.identification.apportion import apportion
 from pipeline.identification.describe import errors_as_json, ladder_as_json
 from pipeline.identification.growth import Curve, narrow_intervals
-from pipeline.identification.judgement import judge_model, note_fit
+from pipeline.identification.judgement import Judgement, judge_model, note_fit
 from pipeline.identification.ladder import compare_losses
-from pipeline.identification.parts import BodyPart, count_seconds
-from pipeline.models import Model, ModelFile, find_effect
+from pipeline.identification.parts import BodyPart, Part, count_seconds
+from pipeline.models import Effect, Model, ModelFile, find_effect
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late, find_late
 from pipeline.runs import MotionError
@@ -40,18 +40,11 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis.budget import Budget
-    from pipeline.diagnosis.context import Context
     from pipeline.diagnosis.diagnose import Explored
-    from pipeline.diagnosis.diagnosis import Json, Value
-    from pipeline.diagnosis.naming_rules import Clocks
     from pipeline.diagnosis.recording import Recording
     from pipeline.diagnosis.undecided import Undecided
-    from pipeline.identification.judgement import Judgement
-    from pipeline.identification.parts import Part
     from pipeline.identification.state import State
-    from pipeline.models import Effect
 
-Floats = NDArray[np.float64]
 
 _DRAWS = 400
 _WORTH = 0.01

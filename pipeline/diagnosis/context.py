@@ -1,32 +1,24 @@
 """What is diagnosed: the runs made ready, and the candidates that follow from their topics."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.diagnosis.errors import DiagnosisError
 from pipeline.diagnosis.plausibility import EXCEEDED_SHARE
 from pipeline.identification.comparison import Input
 from pipeline.identification.problem import Problem
+from pipeline.identification.proposals import Candidate
 from pipeline.models.catalogue import list_effects
 from pipeline.models.effect import Place
-from pipeline.models.evidence import LEAST_DELAY_S, Evidence
+from pipeline.models.evidence import LEAST_DELAY_S, Evidence, Largest
 from pipeline.runs.errors import MotionError
+from pipeline.runs.recording import MotionRun
 from pipeline.runs.signals import find_fastest_wheel, name_inputs
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.identification.proposals import Candidate
-    from pipeline.models.evidence import Largest
-    from pipeline.runs.recording import MotionRun
-    from pipeline.vehicles import Vehicle
-
-Floats = NDArray[np.float64]
+from pipeline.vehicles import Vehicle
 
 _FEWEST_WINDOWS = 60
 _DRIVETRAIN = frozenset({Place.COMMAND, Place.DRIVE})

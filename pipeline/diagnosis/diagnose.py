@@ -1,22 +1,20 @@
 """The whole diagnosis: clocks, excitation, search, what is left, and the ladder of what was named."""
 
-from __future__ import annotations
-
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.parallel import both_cores
 from pipeline.diagnosis import conclude
 from pipeline.diagnosis.budget import Budget, usual_budget
-from pipeline.diagnosis.context import prepare
+from pipeline.diagnosis.context import Context, prepare
 from pipeline.diagnosis.diagnosis import Diagnosis, RunDiagnosis
-from pipeline.diagnosis.excitation import find_unobservable
+from pipeline.diagnosis.excitation import Detectable, Unobservable, find_unobservable
 from pipeline.diagnosis.naming import Search, search_body, search_wheels
 from pipeline.diagnosis.naming_rules import Clocks, read_clocks
-from pipeline.diagnosis.recording import FATAL, load_recording
-from pipeline.diagnosis.undecided import find_undecided
+from pipeline.diagnosis.recording import FATAL, Recording, load_recording
+from pipeline.diagnosis.undecided import Undecided, find_undecided
 from pipeline.diagnosis.unexplained import (
     LEAST_OF_DRIVE,
     Explainable,
@@ -27,18 +25,9 @@ from pipeline.diagnosis.unexplained import (
     measure_asked,
     search_formula,
 )
-from pipeline.identification import Input, choose_input
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from pipeline.diagnosis.context import Context
-    from pipeline.diagnosis.excitation import Detectable, Unobservable
-    from pipeline.diagnosis.recording import Recording
-    from pipeline.diagnosis.undecided import Undecided
-    from pipeline.identification import InputChoice
-    from pipeline.models import Effect, Model
-    from pipeline.vehicles import Vehicle
+from pipeline.identification import Input, InputChoice, choose_input
+from pipeline.models import Effect, Model
+from pipeline.vehicles import Vehicle
 
 
 @dataclass(frozen=True)

@@ -7,25 +7,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
-from pipeline.diagnosis.enough import describe_enough
-from pipeline.diagnosis.error_regions import tabulate_regions
-from pipeline.diagnosis.materiality import LEAST_TURN_RAD, LEAST_WAY_SHARE
+from pipeline.diagnosis.enough import Growth, describe_enough
+from pipeline.diagnosis.error_regions import Region, tabulate_regions
+from pipeline.diagnosis.materiality import LEAST_TURN_RAD, LEAST_WAY_SHARE, Moves
 from pipeline.models.catalogue import find_effect
-from pipeline.models.level import Level
+from pipeline.models.level import Level, Reading
 from pipeline.models.model_text import format_model
 from pipeline.runs.windows import HORIZON_S
 
 if TYPE_CHECKING:
     import polars as pl
 
-    from pipeline.diagnosis.enough import Growth
-    from pipeline.diagnosis.error_regions import Region
     from pipeline.diagnosis.excitation import Detectable, Unobservable
-    from pipeline.diagnosis.materiality import Moves
     from pipeline.diagnosis.undecided import Undecided
     from pipeline.identification.apportion import Share, SlipBudget
     from pipeline.models import ModelFile
-    from pipeline.models.level import Reading
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.identification.growth import INTERVAL_SHARE, extrapolate, find_goal, last_until
+from pipeline.identification.growth import INTERVAL_SHARE, Curve, extrapolate, find_goal, last_until
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis.diagnosis import Json, Named
-    from pipeline.identification.growth import Curve
 
 _POINTS = 60
 # By less than this share the rest of a drive makes no interval narrower.

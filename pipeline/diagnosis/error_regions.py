@@ -7,15 +7,14 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from pipeline.core.arrays import Flags, Floats
 
 if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.identification.parts import Part
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 CHANNELS = ("x", "y", "w")
 _WORDS = {"x": "forward error", "y": "sideways error", "w": "yaw error"}

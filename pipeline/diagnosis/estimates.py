@@ -1,21 +1,14 @@
 """Numbers of all effects that runs tell of, with their errors: by them runs are set side by side."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
 
-from pipeline.diagnosis.diagnosis import EstimatedNumber
+from pipeline.diagnosis.context import Context
+from pipeline.diagnosis.diagnosis import EstimatedNumber, Named
+from pipeline.identification.judgement import Judgement
 from pipeline.identification.unnamed import estimate_unnamed
+from pipeline.models import Effect, Model
 from pipeline.models.catalogue import list_effects
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from pipeline.diagnosis.context import Context
-    from pipeline.diagnosis.diagnosis import Named
-    from pipeline.identification.judgement import Judgement
-    from pipeline.models import Effect, Model
 
 # Half of a 95 % interval is so many standard errors.
 _HALF = 1.959964

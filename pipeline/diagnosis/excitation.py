@@ -1,26 +1,19 @@
 """What a log can tell at all: effects of a usual size that would leave no trace in it, and why."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
+from pipeline.diagnosis.selection import CandidateModel, Selection
 from pipeline.diagnosis.verdict import LEAST_STRETCHES, SHORT_S, measure_repeated
 from pipeline.identification.columns import weigh_columns
-from pipeline.models.effect import Excitation, Search
+from pipeline.identification.proposals import Candidate
+from pipeline.models.effect import Effect, Excitation, Search
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.diagnosis.selection import CandidateModel, Selection
-    from pipeline.identification.proposals import Candidate
-    from pipeline.models.effect import Effect
-
-Floats = NDArray[np.float64]
 _STANDARD_ERRORS = 4.0
 _DETECTED = 9.0
 """Standard errors of a size that is seen: 10 of 12 hidden effects were named at it, 4 at half of it and 12 at

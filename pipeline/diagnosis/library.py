@@ -3,25 +3,17 @@
 Every term is a formula effect with consistent units, in the syntax that a model file takes.
 """
 
-from __future__ import annotations
-
 import functools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
+from pipeline.diagnosis.selection import CandidateModel, Selection
 from pipeline.identification.proposals import TERM
 from pipeline.models.effect import ANY, Parameter, Search
 from pipeline.models.formula.formula_effect import FormulaEffect
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.diagnosis.selection import CandidateModel, Selection
-
-Floats = NDArray[np.float64]
 
 CHANNELS = ("v_x", "v_y", "v_w")
 _WIDE = 50.0

@@ -4,16 +4,12 @@ A name is worth its line where leaving the effect out would be felt. Long and qu
 certainty what moves a prediction by millimetres: it is listed apart.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from pipeline.identification.judgement import Judgement
-    from pipeline.models.effect import Effect
+from pipeline.identification.judgement import Judgement
+from pipeline.models.effect import Effect
 
 LEAST_WAY_SHARE = 0.005
 """Of the way driven over 2 s: half a cell of 5 cm after 5 m. The sample logs hide 2.6 % or more."""

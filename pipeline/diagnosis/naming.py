@@ -4,24 +4,17 @@ With measured wheels there are two: from command to wheels, which is the drivetr
 body, which is the ground alone. Without them the command must answer for both.
 """
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+from pipeline.diagnosis.budget import Budget
+from pipeline.diagnosis.context import Context
 from pipeline.diagnosis.search import search_effects
-from pipeline.diagnosis.selection import open_selection
+from pipeline.diagnosis.selection import CandidateModel, Selection, open_selection
 from pipeline.identification.comparison import Input
 from pipeline.identification.state import State
-from pipeline.models.effect import Place
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.diagnosis.budget import Budget
-    from pipeline.diagnosis.context import Context
-    from pipeline.diagnosis.selection import CandidateModel, Selection
-    from pipeline.models.effect import Effect
+from pipeline.models.effect import Effect, Place
 
 Way = Literal["command", "measured", "wheels"]
 

@@ -1,25 +1,17 @@
 """From what a search found to what is named: classes that cannot be told apart, and clocks."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.diagnosis.context import is_late
+from pipeline.diagnosis.context import Context, is_late
 from pipeline.diagnosis.excitation import suggest_manoeuvre
+from pipeline.diagnosis.naming import Search
 from pipeline.diagnosis.undecided import Undecided
 from pipeline.models.catalogue import find_late_effect, list_effects
-from pipeline.models.effect import Late, find_late
+from pipeline.models.effect import Effect, Late, find_late
 from pipeline.models.evidence import LEAST_DELAY_S
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.diagnosis.context import Context
-    from pipeline.diagnosis.naming import Search
-    from pipeline.models.effect import Effect
 
 _SKEWED_CLOCK = 0.03
 _HELD_SHARE = 0.2

@@ -1,17 +1,12 @@
 """What is too small to be named, and what no vehicle does: as an effect's file declares it."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.models.effect import Effect, Parameter
-    from pipeline.models.evidence import Evidence
+from pipeline.models.effect import Effect, Parameter
+from pipeline.models.evidence import Evidence
 
 _AT_BOUND = 1e-3
 # Wheels run over their limit by no more: rounding of encoders and a motor that overshoots.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from pipeline.runs import load_run
+from pipeline.runs import MotionRun, load_run
 from pipeline.stages.wiring import FAULTS
 
 if TYPE_CHECKING:
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-    from pipeline.runs import MotionRun
     from pipeline.vehicles import Vehicle
 
 # Where one of these stands, a fit means nothing: no effect is named.

@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.diagnosis.diagnosis import Unexplained
+from pipeline.core.arrays import Floats
+from pipeline.diagnosis.diagnosis import Json, Unexplained
 from pipeline.diagnosis.error_regions import CHANNELS
 from pipeline.diagnosis.library import join_formula
 from pipeline.diagnosis.materiality import LEAST_TURN_RAD, LEAST_WAY_SHARE
@@ -20,17 +20,14 @@ from pipeline.diagnosis.unexplained import (
     is_explainable,
     measure_asked,
 )
-from pipeline.identification.persistence import split_residuals
+from pipeline.identification.persistence import Makeup, split_residuals
 from pipeline.runs.windows import HORIZON_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis.diagnose import Explored
-    from pipeline.diagnosis.diagnosis import Json
-    from pipeline.identification.persistence import Makeup
 
-Floats = NDArray[np.float64]
 
 _BINS = 8
 _PART = 0.3

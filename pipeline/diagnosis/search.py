@@ -1,15 +1,10 @@
 """The search for the missing effects: add, drop, swap; every number is fitted anew after each move."""
 
-from __future__ import annotations
-
 import math
 from itertools import combinations
-from typing import TYPE_CHECKING
 
+from pipeline.diagnosis.selection import CandidateModel, Selection
 from pipeline.diagnosis.verdict import LEAST_GAIN
-
-if TYPE_CHECKING:
-    from pipeline.diagnosis.selection import CandidateModel, Selection
 
 _TRIED = 4
 _MUCH = 0.67

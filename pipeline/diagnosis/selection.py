@@ -3,33 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.core.parallel import map_parallel
 from pipeline.diagnosis.budget import Budget
 from pipeline.diagnosis.plausibility import is_nameable
 from pipeline.diagnosis.verdict import LEAST_GAIN, Verdict, compare
 from pipeline.identification.fit import PartFit, fit_part
-from pipeline.identification.folds import hold_out_part, make_folds
-from pipeline.identification.proposals import propose, propose_pairs
+from pipeline.identification.folds import Fold, hold_out_part, make_folds
+from pipeline.identification.parts import Part
+from pipeline.identification.proposals import Candidate, Proposal, Trial, propose, propose_pairs
+from pipeline.identification.state import State
 from pipeline.identification.weights import Weights, make_weights, measure_spread
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from pipeline.identification.folds import Fold
-    from pipeline.identification.parts import Part
-    from pipeline.identification.proposals import Candidate, Proposal, Trial
-    from pipeline.identification.state import State
-    from pipeline.models.effect import Effect
-    from pipeline.models.evidence import Evidence, Largest
-
-Floats = NDArray[np.float64]
+from pipeline.models.effect import Effect
+from pipeline.models.evidence import Evidence, Largest
 
 _FIRST_STEPS = 4
 _PAIRED = 5

@@ -1,22 +1,16 @@
 """Explanations that are as good as the one chosen, as far as this log goes."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.diagnosis.diagnosis import Value
 from pipeline.diagnosis.excitation import suggest_manoeuvre
+from pipeline.diagnosis.selection import CandidateModel, Selection
 from pipeline.diagnosis.values import list_values
 from pipeline.identification.intervals import estimate_part
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.diagnosis.diagnosis import Value
-    from pipeline.diagnosis.selection import CandidateModel, Selection
-    from pipeline.models.effect import Effect
+from pipeline.models.effect import Effect
 
 _LOOKED_AT = 6
 _AS_GOOD = 0.01

@@ -1,31 +1,24 @@
 """Structure that no effect of the catalogue takes: how much, in which channel, and as which formula."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats
 from pipeline.core.parallel import map_parallel
 from pipeline.diagnosis.library import is_term, list_terms, list_waves
 from pipeline.diagnosis.search import prune
+from pipeline.diagnosis.selection import CandidateModel, Selection
+from pipeline.identification.comparison import Comparison
 from pipeline.identification.folds import find_near
+from pipeline.identification.parts import Part
 from pipeline.identification.persistence import take_own_past
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.diagnosis.selection import CandidateModel, Selection
-    from pipeline.identification.comparison import Comparison
-    from pipeline.identification.parts import Part
-    from pipeline.models.formula.formula_effect import FormulaEffect
-    from pipeline.runs.signals import RunContext
-
-Floats = NDArray[np.float64]
+from pipeline.models.formula.formula_effect import FormulaEffect
+from pipeline.runs.signals import RunContext
 
 _MOST_TERMS = 3
 _TRIED = 2
@@ -247,15 +240,15 @@ def _describe(comparison: Comparison) -> tuple[Floats, tuple[str, ...]]:
     return np.column_stack(list(columns.values())), tuple(columns)
 
 
-def _find_reversals(rim: Floats) -> NDArray[np.bool_]:
+def _find_reversals(rim: Floats) -> Flags:
     """Where a wheel goes the other way than it last went."""
     way = np.sign(rim)
     last = np.maximum.accumulate(np.where(way != 0.0, np.arange(way.size), 0))
-    reversed_: NDArray[np.bool_] = way * way[np.append(0, last[:-1])] < 0.0
+    reversed_: Flags = way * way[np.append(0, last[:-1])] < 0.0
     return reversed_
 
 
-def _age(at: Floats, around: RunContext, events: NDArray[np.bool_]) -> Floats:
+def _age(at: Floats, around: RunContext, events: Flags) -> Floats:
     """Seconds since the last event, at most `_LONGEST_S`."""
     happened = around.times[events]
     number = np.searchsorted(happened, at, side="right")

@@ -4,25 +4,16 @@ Residuals of field data are autocorrelated, so that textbook tests name what is 
 stretch of ten seconds.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats, Ints
 from pipeline.core.parallel import map_parallel
-from pipeline.identification.parts import count_seconds
-
-if TYPE_CHECKING:
-    from pipeline.identification.parts import Part
-    from pipeline.identification.weights import Weights
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from pipeline.identification.parts import Part, count_seconds
+from pipeline.identification.weights import Weights
 
 LEAST_GAIN = 0.01
 LEAST_T = 2.2
@@ -93,16 +84,16 @@ def grow_t(part: Part, weights: Weights, before: Floats, after: Floats) -> tuple
     return seconds, np.array(t)
 
 
-def _find_t_until(known: tuple[Integers, Integers, Floats, Floats, Floats], end: int) -> float:
+def _find_t_until(known: tuple[Ints, Ints, Floats, Floats, Floats], end: int) -> float:
     unit, stretch, old, new, moved = known
     return _find_t(unit[:end], stretch[:end], old[:end], new[:end], moved[:end])
 
 
-def _add_up(label: Integers, values: Floats) -> Floats:
+def _add_up(label: Ints, values: Floats) -> Floats:
     return np.asarray(np.bincount(label, values), dtype=np.float64)
 
 
-def _find_t(unit: Integers, stretch: Integers, old: Floats, new: Floats, moved: Floats) -> float:
+def _find_t(unit: Ints, stretch: Ints, old: Floats, new: Floats, moved: Floats) -> float:
     """See `Verdict`; of costs by window."""
     count = np.bincount(unit)
     kept = count >= min(_FEWEST_WINDOWS, int(count.max()))

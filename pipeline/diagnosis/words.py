@@ -1,19 +1,14 @@
 """A diagnosis as lines of text: how bad, where, what is missing, what now."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, cast
+from collections.abc import Mapping, Sequence
+from typing import cast
 
+from pipeline.diagnosis.diagnosis import Diagnosis, Json, Named, RunDiagnosis, Value
 from pipeline.diagnosis.enough import describe_enough
 from pipeline.diagnosis.materiality import describe_threshold
 from pipeline.models.catalogue import find_effect
 from pipeline.runs.windows import HORIZON_S
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.diagnosis.diagnosis import Diagnosis, Json, Named, RunDiagnosis, Value
 
 _LABEL = 10
 _WHERE_SHOWN = 3

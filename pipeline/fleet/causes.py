@@ -8,22 +8,18 @@ roots is that of their squares over the sum of the roots, so does the rms slip.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
+from pipeline.core.arrays import Floats
 from pipeline.fleet.statistics.families import adjust_holm, runs_needed
 from pipeline.fleet.statistics.intervals import bound_difference
 from pipeline.fleet.statistics.permutation import permute_means
 from pipeline.identification.apportion import jackknife_ratio
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.fleet.statistics.arrays import Floats
 
 RUNS, BLOCKS = "runs", "blocks"
 _LEVEL = 0.05

@@ -1,18 +1,11 @@
 """Runs pooled into datasets: the run is the unit, however long it is."""
 
-from __future__ import annotations
-
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 import polars as pl
 
-from pipeline.fleet.statistics.intervals import bound_typical
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.fleet.statistics.intervals import Interval
+from pipeline.fleet.statistics.intervals import Interval, bound_typical
 
 OVER_RUNS = "over runs"
 THIS_RUN = "this run only"

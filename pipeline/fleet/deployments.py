@@ -4,8 +4,6 @@ The project's own table is `data_samples/deployments.csv` in the repository; an 
 beside this module.
 """
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 
@@ -53,12 +51,8 @@ def read_deployments(path: Path) -> pl.DataFrame:
             "no_deployments", "there is no such table", where=str(path), hint="Give a CSV file"
         ) from error
     except (pl.exceptions.PolarsError, OSError, UnicodeDecodeError) as error:
-        raise ComparisonError(
-            "bad_deployments",
-            f"the table cannot be read: {str(error).splitlines()[0]}",
-            where=str(path),
-            hint="Write it as CSV, UTF-8, with a line of names",
-        ) from error
+        what = f"the table cannot be read: {str(error).splitlines()[0]}"
+        raise _refuse(what, str(path), "Write it as CSV, UTF-8, with a line of names") from error
     return _check(text, str(path))
 
 
@@ -121,12 +115,8 @@ def _check(text: pl.DataFrame, where: str) -> pl.DataFrame:
     schema = Deployments.create_empty().schema
     unknown = [name for name in text.columns if name not in schema]
     if unknown:
-        raise ComparisonError(
-            "bad_deployments",
-            f"unknown columns: {', '.join(unknown)}",
-            where=where,
-            hint=f"The columns are: {', '.join(schema)}",
-        )
+        hint = f"The columns are: {', '.join(schema)}"
+        raise _refuse(f"unknown columns: {', '.join(unknown)}", where, hint)
     typed = text.select(
         (pl.col(name).replace("", None) if name in text.columns else pl.lit(None, pl.String))
         .cast(kind, strict=False)
@@ -146,13 +136,8 @@ def _check(text: pl.DataFrame, where: str) -> pl.DataFrame:
     keys = ", ".join(failure.invalid()["key"].fill_null("?").unique().sort())
     broken = [f"{keys} break {'; '.join(sorted(failure.counts()))}"]
     if lost or len(failure):
-        complaints = lost or broken
-        raise ComparisonError(
-            "bad_deployments",
-            f"rows break the schema: {'; '.join(complaints[:5])}",
-            where=where,
-            hint="Mend them; every value needs a status; schemas/deployments.py says what columns mean",
-        )
+        hint = "Mend them; every value needs a status; schemas/deployments.py says what columns mean"
+        raise _refuse(f"rows break the schema: {'; '.join((lost or broken)[:5])}", where, hint)
     return valid
 
 
@@ -172,10 +157,10 @@ def _join(tables: list[pl.DataFrame], where: str) -> pl.DataFrame:
     joined = pl.concat(tables).unique(maintain_order=True)
     twice = joined.filter(pl.col("key").is_duplicated())["key"].unique().sort().to_list()
     if twice:
-        raise ComparisonError(
-            "bad_deployments",
-            f"the same key stands for different deployments: {', '.join(twice)}",
-            where=where,
-            hint="Give one of them another key, or make the rows agree",
-        )
+        what = f"the same key stands for different deployments: {', '.join(twice)}"
+        raise _refuse(what, where, "Give one of them another key, or make the rows agree")
     return joined
+
+
+def _refuse(what: str, where: str, hint: str) -> ComparisonError:
+    return ComparisonError("bad_deployments", what, where=where, hint=hint)

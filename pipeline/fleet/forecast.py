@@ -1,27 +1,21 @@
 """Before driving there: what the runs of a vehicle let expect of its numbers on a terrain."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import polars as pl
 
+from pipeline.core.arrays import Floats
 from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.hierarchy import leave_out_odd, take_numbers
 from pipeline.fleet.runs import UNKNOWN
 from pipeline.fleet.statistics.posterior import draw_run
 from pipeline.models.bounds import stands_at_bound
 from pipeline.models.catalogue import find_effect
-from pipeline.models.effect import Place
+from pipeline.models.effect import Effect, Place
 from pipeline.models.parameter import USUAL_SPREAD, is_of_one_run
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.fleet.statistics.arrays import Floats
-    from pipeline.models.effect import Effect
 
 DRAWS = 400
 """Draws of every number: ends of 95 % intervals are then known to a tenth of their width."""

@@ -5,24 +5,18 @@ what is the run's own, plus the error of its estimate (`statistics.levels`). Whi
 runs tell where one cannot: wheels that are too small are so on every ground, wheels that slip are not.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import polars as pl
 
 from pipeline.fleet.runs import UNKNOWN
-from pipeline.fleet.statistics.levels import find_outlier, split_levels
+from pipeline.fleet.statistics.levels import LevelFit, find_outlier, split_levels
 from pipeline.models.catalogue import find_effect
 from pipeline.models.level import Level
 from pipeline.models.parameter import is_of_one_run
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.fleet.statistics.levels import LevelFit
 
 SURE = 0.01
 """A difference is taken for one below this chance: of ten numbers of a vehicle, nine fleets in ten show none

@@ -1,7 +1,5 @@
 """Measures of difficulty, and whether vehicles agree on which ground is harder."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 

@@ -1,28 +1,17 @@
 """Groups of runs compared pair by pair, with the correction for asking often."""
 
-from __future__ import annotations
-
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats, Ints
 from pipeline.fleet.statistics.families import MOST_GROUPS, adjust_holm, adjust_max_t, runs_needed
-from pipeline.fleet.statistics.intervals import bootstrap_median
-from pipeline.fleet.statistics.pairs import compare_blocks, compare_runs, cut_blocks
+from pipeline.fleet.statistics.intervals import Interval, bootstrap_median
+from pipeline.fleet.statistics.pairs import Blocks, Comparison, compare_blocks, compare_runs, cut_blocks
 from pipeline.fleet.statistics.permutation import DRAWS
 from pipeline.fleet.statistics.ranks import mann_whitney, name_delta
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.fleet.statistics.intervals import Interval
-    from pipeline.fleet.statistics.pairs import Blocks, Comparison
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 LEVEL = 0.05
 RUNS = "runs"
@@ -45,8 +34,8 @@ class Samples:
     """
 
     values: Floats
-    ticks: Integers
-    pieces: Integers
+    ticks: Ints
+    pieces: Ints
     step: float
 
     @property

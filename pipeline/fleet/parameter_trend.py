@@ -1,10 +1,8 @@
 """Parameters of vehicles over the dates of their runs, whatever ground they were on: limits, and changes."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import polars as pl
 
@@ -13,9 +11,6 @@ from pipeline.fleet.runs import UNKNOWN
 from pipeline.fleet.statistics.shifts import FEWEST_FREE, find_shifts, guess_shift
 from pipeline.models.catalogue import find_effect
 from pipeline.models.level import Level
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 _PLACES = ("earliest", "latest")
 _PERIOD = "period"

@@ -5,22 +5,15 @@ powertrain's answer to it, their v comes from splines of held poses. Where the p
 a choice, the choice here is documented at the function that makes it.
 """
 
-from __future__ import annotations
-
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from pipeline.core import timegrid
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Flags, Floats, Ints
 
 SAMPLES = 40
 WINDOW_S = 2.0
@@ -66,7 +59,7 @@ class PublishedRun:
 class _Steps:
     """Command steps as rows of a matrix: sample indices, -1 beyond a step's end."""
 
-    index: NDArray[np.int64]
+    index: Ints
 
     def lay_out(self, values: Floats) -> Floats:
         """Values (n, 2) as (steps, longest, 2); beyond a step's end its last sample goes on."""
@@ -153,7 +146,7 @@ def _find_scale(both: pl.DataFrame) -> tuple[float, float]:
     return found[0], found[1]
 
 
-def _fit_lag(asked: Floats, got: Floats, there: NDArray[np.bool_]) -> float:
+def _fit_lag(asked: Floats, got: Floats, there: Flags) -> float:
     """Time constant [s] with which lagged wheel commands (left, right) are nearest to the measured wheels."""
     from scipy.optimize import minimize_scalar  # noqa: PLC0415 - heavy
 
@@ -175,15 +168,13 @@ def _lag(asked: Floats, start: Floats, tau: float) -> Floats:
     return answer
 
 
-def _cut_windows(index: NDArray[np.int64]) -> NDArray[np.int64]:
+def _cut_windows(index: Ints) -> Ints:
     """Whole windows from each step's start, as rows of sample indices."""
     whole = index[:, : index.shape[1] // SAMPLES * SAMPLES].reshape(-1, SAMPLES)
     return whole[whole[:, -1] >= 0]
 
 
-def _measure_windows(
-    both: pl.DataFrame, poses: pl.DataFrame, driven: Floats, windows: NDArray[np.int64]
-) -> Floats:
+def _measure_windows(both: pl.DataFrame, poses: pl.DataFrame, driven: Floats, windows: Ints) -> Floats:
     held = np.maximum(timegrid.hold_indices(both["t"].to_numpy() + 1e-6, poses["t"].to_numpy()), 0)
     turned = {name: poses[name].to_numpy()[held] for name in ("x", "y", "q_x", "q_y", "q_z", "q_w")}
     yaw = np.arctan2(

@@ -1,16 +1,11 @@
 """What each run brings into a comparison: its labels, its medians, its measures of difficulty."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import polars as pl
 
 from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.unpredictability import measure_unpredictability
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 LABELS = ("dataset", "vehicle", "terrain", "run", "day", "month", "year")
 UNKNOWN = "unknown"

@@ -8,8 +8,6 @@ order of Samson et al. 2024: a convention, not evidence. With weights varied by 
 to that order is 0.93.
 """
 
-from __future__ import annotations
-
 import re
 
 import polars as pl

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from pipeline.fleet.parameter_trend import LevelChange, describe_change, say_change
+from pipeline.fleet.parameter_trend import LevelChange, ParameterTrend, describe_change, say_change
 from pipeline.fleet.statistics.changes import find_changes
 
 if TYPE_CHECKING:
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-    from pipeline.fleet.parameter_trend import ParameterTrend
 
 FEWEST_RUNS = 8
 LEVEL = 0.05

@@ -1,15 +1,11 @@
 """What is left of slip after the best static model: the part that nobody could have foreseen."""
 
-from __future__ import annotations
-
 import itertools
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from pipeline.core.arrays import Floats
 
 _BLOCK_S = 10.0
 _FOLDS = 5
@@ -72,7 +68,7 @@ def _judge_runs(folds: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def _leave_out(folds: pl.DataFrame, channel: str, names: list[str]) -> NDArray[np.float64]:
+def _leave_out(folds: pl.DataFrame, channel: str, names: list[str]) -> Floats:
     """Squared error of every fold under the model of the others, shape (runs, folds)."""
     size = len(names)
     squares = _stack(folds, f"{channel}:")
@@ -87,10 +83,10 @@ def _leave_out(folds: pl.DataFrame, channel: str, names: list[str]) -> NDArray[n
     weights = np.linalg.solve(others, wanted[..., None])[..., 0]
     explained = 2.0 * np.einsum("rfi,rfi->rf", weights, right)
     spent = np.einsum("rfi,rfij,rfj->rf", weights, left, weights)
-    error: NDArray[np.float64] = squares - explained + spent
+    error: Floats = squares - explained + spent
     return error
 
 
-def _stack(folds: pl.DataFrame, column: str) -> NDArray[np.float64]:
-    stacked: NDArray[np.float64] = np.array(folds[column].to_list(), dtype=np.float64)
+def _stack(folds: pl.DataFrame, column: str) -> Floats:
+    stacked: Floats = np.array(folds[column].to_list(), dtype=np.float64)
     return stacked

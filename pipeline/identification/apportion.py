@@ -15,8 +15,8 @@ from itertools import pairwise, permutations
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats, Ints
 from pipeline.core.timegrid import nearest_indices
 from pipeline.identification.proposals import TERM
 from pipeline.identification.scoring import HeldOut, hold_out_models
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from pipeline.identification.judgement import Judgement
     from pipeline.identification.problem import Problem
 
-Floats = NDArray[np.float64]
 Kind = Literal["effect", "disturbance", "localization_noise"]
 Subset = frozenset[str]
 
@@ -197,7 +196,7 @@ def _sum_stretches(problem: Problem, held: HeldOut, length_scale_m: float) -> Fl
     return np.column_stack(columns)
 
 
-def _add_up(stretch: NDArray[np.int64], squares: Floats, unit: NDArray[np.int64]) -> Floats:
+def _add_up(stretch: Ints, squares: Floats, unit: Ints) -> Floats:
     known = np.isfinite(squares)
     sums = np.bincount(stretch[known], squares[known], minlength=int(unit.max()) + 1)
     parts: Floats = sums / max(int(known.sum()), 1)

@@ -3,18 +3,11 @@
 All arrays are of shape (n, 3, p): n windows, three channels, p numbers.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from pipeline.core.arrays import Flags, Floats
 
 
 def make_columns(windows: int, numbers: int) -> Floats:

@@ -1,35 +1,23 @@
 """One run made ready: its grid, heading, windows and horizons, and a model's residuals on them."""
 
-from __future__ import annotations
-
 import enum
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Complex, Floats, Ints
 from pipeline.models.catalogue import is_own
-from pipeline.models.effect import Late, ReportEffect
+from pipeline.models.effect import Effect, Late, ReportEffect
 from pipeline.models.forward import Forward, Timing, replace_context
 from pipeline.runs.errors import MotionError
-from pipeline.runs.grid import lay_grid
+from pipeline.runs.grid import Grid, lay_grid
 from pipeline.runs.heading import HeadingSource, choose_heading
-from pipeline.runs.signals import Resets, RunContext, Signal
+from pipeline.runs.recording import MotionRun
+from pipeline.runs.signals import Resets, RunContext, Signal, Velocity
 from pipeline.runs.windows import WINDOW_S, find_lead, gather_nodes, join_horizons, join_windows
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from pipeline.models.effect import Effect
-    from pipeline.runs.grid import Grid
-    from pipeline.runs.recording import MotionRun
-    from pipeline.runs.signals import Velocity
-    from pipeline.vehicles import Vehicle
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Complex = NDArray[np.complex128]
+from pipeline.vehicles import Vehicle
 
 # Cell means of held commands are exact: finer cells change residuals in the sixth digit.
 _RATE_HZ = 50.0
@@ -63,7 +51,7 @@ class HorizonErrors:
 
 
 Kept = TypeVar("Kept")
-Spot = tuple[Integers, Floats]
+Spot = tuple[Ints, Floats]
 
 
 @dataclass(frozen=True)
@@ -373,14 +361,14 @@ class Comparison:
         body = _reset_body(cells, np.unique(np.concatenate((cells.first, rows[0]))), rows)
         return replace(base, wheels=wheels, body=body)
 
-    def _first_moments(self) -> tuple[Integers, Integers]:
+    def _first_moments(self) -> tuple[Ints, Ints]:
         """First node of every span and the last within its first moments."""
         cells, nodes = self.cells, self.nodes
         first = np.searchsorted(nodes.times, cells.starts)
         last = np.searchsorted(nodes.times, cells.starts + _SETTLE_S) - 1
         return first, last
 
-    def _measure_velocity(self, first: Integers, last: Integers) -> tuple[Integers, Floats]:
+    def _measure_velocity(self, first: Ints, last: Ints) -> tuple[Ints, Floats]:
         """Body velocity between pairs of nodes: cells in their middle, and (v_x, v_y, v_w) or NaN."""
         cells, nodes = self.cells, self.nodes
         heading = self._node_headings(0.0)
@@ -397,7 +385,7 @@ class Comparison:
         middle = 0.5 * (nodes.times[one] + nodes.times[two])
         return np.minimum(cells.locate_edges(middle).astype(np.int64), cells.times.size - 1), velocity
 
-    def _locate_nodes(self, nodes: Integers) -> Integers:
+    def _locate_nodes(self, nodes: Ints) -> Ints:
         """Cells in which nodes were reached."""
         at = self.nodes.times[np.clip(nodes, 0, self.nodes.times.size - 1)]
         return np.minimum(self.cells.locate_edges(at).astype(np.int64), self.cells.times.size - 1)
@@ -408,7 +396,7 @@ def choose_rate(runs: Iterable[MotionRun]) -> float:
     return _COARSE_HZ if sum(run.duration_s for run in runs) * _RATE_HZ > _MOST_CELLS else _RATE_HZ
 
 
-def _reset_body(cells: Grid, first: Integers, known: tuple[Integers, Floats]) -> Resets:
+def _reset_body(cells: Grid, first: Ints, known: tuple[Ints, Floats]) -> Resets:
     """Resets of the body's state: at the cells given where a velocity is known, else at the first cell."""
     at, velocity = known
     good = np.isfinite(velocity).all(axis=1)

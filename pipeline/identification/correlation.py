@@ -4,19 +4,12 @@ Residuals of a model that lacks nothing are white and uncorrelated with its inpu
 Identification, section 16.6). Windows that overlap share data: only lags of whole windows are looked at.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.runs.windows import WINDOW_S
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-Floats = NDArray[np.float64]
 
 LONGEST_S = 5.0
 FEWEST = 40

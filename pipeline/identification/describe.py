@@ -1,28 +1,20 @@
 """Models, ladders and errors as plain numbers for JSON and as lines for people."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 from pipeline.identification.intervals import NOTHING as NOT_FITTED
-from pipeline.identification.ladder import ERRORS_OVER_2S, NOTHING, list_rises
-from pipeline.models.effect import Search
+from pipeline.identification.intervals import Estimates
+from pipeline.identification.ladder import ERRORS_OVER_2S, NOTHING, Ladder, Rung, list_rises
+from pipeline.identification.scoring import Errors
+from pipeline.models.effect import Effect, Parameter, Search
 from pipeline.models.formula.formula_effect import FormulaEffect
+from pipeline.models.model import Model
+from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import is_of_one_run
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.identification.intervals import Estimates
-    from pipeline.identification.ladder import Ladder, Rung
-    from pipeline.identification.scoring import Errors
-    from pipeline.models.effect import Effect, Parameter
-    from pipeline.models.model import Model
-    from pipeline.models.model_file import ModelFile
-    from pipeline.runs.recording import MotionRun
+from pipeline.runs.recording import MotionRun
 
 _DIGITS = 6
 _HEADS = ("x m/s", "y m/s", "w rad/s", "T 2s m", "R 2s rad")

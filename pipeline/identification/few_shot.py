@@ -1,24 +1,16 @@
 """A model fitted to little driving, with what is known of its numbers before."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from copy import copy
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.identification.fit import fit_model
+from pipeline.identification.fit import Fitted, PartFit, fit_model
 from pipeline.identification.intervals import SHORTEST_TIME_S, count_repeats
-from pipeline.identification.parts import BodyPart
+from pipeline.identification.parts import BodyPart, Part
 from pipeline.identification.prior import Prior
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.identification.fit import Fitted, PartFit
-    from pipeline.identification.parts import Part
-    from pipeline.identification.problem import Problem
-    from pipeline.models.model import Model
+from pipeline.identification.problem import Problem
+from pipeline.models.model import Model
 
 
 def tie_to_prior(problem: Problem, model: Model, numbers: Mapping[str, tuple[float, float]]) -> Problem:

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.identification.columns import combine_columns, pick_columns, weigh_columns
 from pipeline.identification.proposals import propose
-from pipeline.identification.state import State
-from pipeline.identification.weights import make_weights
+from pipeline.identification.state import Free, State
+from pipeline.identification.weights import Weights, make_weights
 from pipeline.models.model import Model
 
 if TYPE_CHECKING:
@@ -20,11 +20,8 @@ if TYPE_CHECKING:
 
     from pipeline.identification.parts import Part
     from pipeline.identification.problem import Problem
-    from pipeline.identification.state import Free
-    from pipeline.identification.weights import Weights
     from pipeline.models.effect import Effect, Parameter
 
-Floats = NDArray[np.float64]
 
 _ITERATIONS = 20
 _ENOUGH = 2e-5

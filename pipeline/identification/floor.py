@@ -15,8 +15,8 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.identification.parts import average_lags, find_live
 from pipeline.identification.persistence import NEAR_S, Makeup, pair_windows, split_differences
 from pipeline.identification.scoring import Errors
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from pipeline.identification.comparison import Comparison
     from pipeline.identification.problem import Problem
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 # From the end of one window to the start of the other [s]: at zero they share a pose.
 _GAPS_S = (0.0, 0.5, 1.0, 1.5, 2.0)

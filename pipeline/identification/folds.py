@@ -4,14 +4,11 @@ Residuals of field data are autocorrelated: stretches are whole, and gaps separa
 judged.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats
 from pipeline.identification.columns import (
     combine_columns,
     flatten,
@@ -20,14 +17,9 @@ from pipeline.identification.columns import (
     weigh_columns,
 )
 from pipeline.identification.fit import PartFit, measure_loss, solve_step
+from pipeline.identification.parts import Part
+from pipeline.identification.state import State
 from pipeline.identification.weights import Weights
-
-if TYPE_CHECKING:
-    from pipeline.identification.parts import Part
-    from pipeline.identification.state import State
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 FOLDS = 5
 GAP_S = 1.5

@@ -1,21 +1,14 @@
 """Curves of what is known against the seconds that were driven for it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
+from pipeline.identification.fit import Fitted
 from pipeline.identification.intervals import narrow_part
 from pipeline.models.catalogue import find_effect
-
-if TYPE_CHECKING:
-    from pipeline.identification.fit import Fitted
-
-Floats = NDArray[np.float64]
 
 INTERVAL_SHARE = 0.05
 """Of a number's size: half of a 95 % interval that is narrow enough."""

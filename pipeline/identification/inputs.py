@@ -1,18 +1,11 @@
 """What models are fed with: one choice for every verb, and its reason."""
 
-from __future__ import annotations
-
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from pipeline.identification.comparison import Input
-from pipeline.models.effect import Place
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from pipeline.models.effect import Effect
-    from pipeline.runs.recording import MotionRun
+from pipeline.models.effect import Effect, Place
+from pipeline.runs.recording import MotionRun
 
 
 @dataclass(frozen=True)

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.identification.parts import count_seconds
+from pipeline.core.arrays import Floats, Ints
+from pipeline.identification.fit import Fitted, PartFit
+from pipeline.identification.parts import Part, count_seconds
+from pipeline.identification.problem import Problem
+from pipeline.identification.state import Free
 from pipeline.models.bounds import stands_at_bound
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.identification.fit import Fitted, PartFit
-    from pipeline.identification.parts import Part
-    from pipeline.identification.problem import Problem
-    from pipeline.identification.state import Free
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _HUBER = 3.0
 _GAUSSIAN = 1.4826
@@ -217,7 +209,7 @@ def narrow_part(part: Part, fit: PartFit, order: Sequence[int] | None = None) ->
     return np.asarray(seconds, dtype=np.float64), halves
 
 
-def _find_observable(part: Part, fit: PartFit, blocks: Blocks) -> tuple[Floats, Integers, Floats]:
+def _find_observable(part: Part, fit: PartFit, blocks: Blocks) -> tuple[Floats, Ints, Floats]:
     """Normal matrix with the prior, which numbers move it at all, and the size of each."""
     total = blocks.normals.sum(axis=0) + np.diag(part.prior.weigh(fit.state, fit.free))
     size = np.sqrt(np.maximum(np.diag(total), 0.0))
@@ -234,7 +226,7 @@ def _find_quantile(freedom: float) -> float:
     return float(stdtrit(min(freedom, _NORMAL), 0.975))
 
 
-def _find_spread(part: Part, blocks: Blocks, total: Floats, rows: Integers, size: Floats) -> Floats | None:
+def _find_spread(part: Part, blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> Floats | None:
     """Covariance of the observable numbers; None where nothing tells it."""
     if rows.size and part.prior.numbers:
         scale = np.outer(size[rows], size[rows])
@@ -245,7 +237,7 @@ def _find_spread(part: Part, blocks: Blocks, total: Floats, rows: Integers, size
     return None
 
 
-def _solve(total: Floats, pull: Floats, rows: Integers, size: Floats) -> Floats:
+def _solve(total: Floats, pull: Floats, rows: Ints, size: Floats) -> Floats:
     """How far numbers move under a pull, zero where they are not observable, shape (p,)."""
     scale = size[rows]
     scaled = total[np.ix_(rows, rows)] / np.outer(scale, scale) + 1e-9 * np.eye(rows.size)
@@ -254,7 +246,7 @@ def _solve(total: Floats, pull: Floats, rows: Integers, size: Floats) -> Floats:
     return moved
 
 
-def _carry_clocks(blocks: Blocks, total: Floats, rows: Integers, size: Floats) -> Floats:
+def _carry_clocks(blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> Floats:
     """Standard errors that come from not knowing the clocks exactly, shape (rows,)."""
     carried = np.zeros(rows.size)
     for pull in blocks.clocks.sum(axis=1) if rows.size else ():
@@ -262,7 +254,7 @@ def _carry_clocks(blocks: Blocks, total: Floats, rows: Integers, size: Floats) -
     return carried
 
 
-def _pull_clocks(part: Part, fit: PartFit, label: Integers, pieces: int) -> Floats:
+def _pull_clocks(part: Part, fit: PartFit, label: Ints, pieces: int) -> Floats:
     """How one standard error of each run's clock pulls the numbers in every block, shape (runs, k, p)."""
     factor = fit.weights.factors(fit.residual)
     found = []
@@ -302,7 +294,7 @@ def _sum_losses(fit: PartFit, residual: Floats) -> float:
     return 0.5 * float(fit.weights.cost(residual).sum())
 
 
-def join_blocks(part: Part, fit: PartFit) -> Integers:
+def join_blocks(part: Part, fit: PartFit) -> Ints:
     """Number of the block of every window: command steps, joined where they are too short."""
     length = max(_SHORTEST_BLOCK_S, _TAUS * integrate_correlation(part, fit))
     joined = np.empty(part.block.size, dtype=np.int64)
@@ -365,7 +357,7 @@ class Blocks:
         clocks: what their clocks may pull, shape (runs, k, p).
     """
 
-    label: Integers
+    label: Ints
     normals: Floats
     gradients: Floats
     clocks: Floats
@@ -375,7 +367,7 @@ class Blocks:
         """How many."""
         return int(self.normals.shape[0])
 
-    def take(self, numbers: Integers) -> Blocks:
+    def take(self, numbers: Ints) -> Blocks:
         """Those of these numbers."""
         return Blocks(self.label, self.normals[numbers], self.gradients[numbers], self.clocks[:, numbers])
 
@@ -397,7 +389,7 @@ def sum_blocks(part: Part, fit: PartFit) -> Blocks:
     return Blocks(label, normals, gradients, _pull_clocks(part, fit, label, pieces))
 
 
-def _jackknife(normals: Floats, gradients: Floats, rows: Integers, size: Floats) -> Floats:
+def _jackknife(normals: Floats, gradients: Floats, rows: Ints, size: Floats) -> Floats:
     """Covariance of the numbers from the fits without each block, shape (rows, rows)."""
     scale = size[rows]
     small = normals[:, rows][:, :, rows] / np.outer(scale, scale)

@@ -1,23 +1,16 @@
 """What one does with a model and runs: judge it, fit it, note in its file what it was fitted on."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from pipeline.identification.describe import errors_as_json
 from pipeline.identification.fit import Fitted, fit_model
 from pipeline.identification.intervals import Estimates, estimate_intervals
 from pipeline.identification.ladder import Ladder, Rung, climb
-from pipeline.identification.scoring import hold_out
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.identification.problem import Problem
-    from pipeline.identification.scoring import Errors
-    from pipeline.models.model import Model
-    from pipeline.models.model_file import ModelFile
+from pipeline.identification.problem import Problem
+from pipeline.identification.scoring import Errors, hold_out
+from pipeline.models.model import Model
+from pipeline.models.model_file import ModelFile
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,14 @@
 """The ladder: the ideal model, then one effect more at each rung, on data that no rung has seen."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, nan, prod
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from pipeline.identification.fit import Fitted, fit_model
-from pipeline.identification.scoring import HeldOut, hold_out
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.identification.problem import Problem
-    from pipeline.identification.scoring import Errors
-    from pipeline.models.model import Model
+from pipeline.identification.problem import Problem
+from pipeline.identification.scoring import Errors, HeldOut, hold_out
+from pipeline.models.model import Model
 
 NOTHING = 1e-3
 # What two fits of one model differ by on other folds: a rung may cost so much of one error for the other.

@@ -3,37 +3,25 @@
 A part of the way from command to body: the whole of it, from the wheels to the body, or to the wheels.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.identification.columns import make_columns
+from pipeline.identification.comparison import Comparison
 from pipeline.identification.prior import NO_PRIOR, Prior
-from pipeline.identification.state import State
+from pipeline.identification.state import DelayName, Free, State
 from pipeline.identification.weights import measure_noise
 from pipeline.models.catalogue import find_late_effect
-from pipeline.models.effect import Late, Place
+from pipeline.models.effect import Effect, Late, Place
+from pipeline.models.evidence import Largest
 from pipeline.models.forward import Timing
+from pipeline.runs.signals import Signal, Velocity
 from pipeline.runs.windows import WINDOW_S
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.identification.comparison import Comparison
-    from pipeline.identification.state import DelayName, Free
-    from pipeline.models.effect import Effect
-    from pipeline.models.evidence import Largest
-    from pipeline.runs.signals import Signal, Velocity
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 UNIT_S = 10.0
 _ROUNDING_S = 1e-6
@@ -86,13 +74,13 @@ class Part(ABC):
         self.times: Floats = np.concatenate([w.times for w in windows])
         begin = np.array([comparison.run.start_s for comparison in self.comparisons])
         self._since: Floats = self.times.mean(axis=1) - begin[self.run]
-        self._stretches: dict[float, Integers] = {}
+        self._stretches: dict[float, Ints] = {}
         self.unit = self.number_stretches(UNIT_S)
         shift = np.concatenate(([0], np.cumsum([int(w.block.max(initial=-1)) + 1 for w in windows])))
-        self.block: Integers = np.concatenate([w.block + shift[i] for i, w in enumerate(windows)])
+        self.block: Ints = np.concatenate([w.block + shift[i] for i, w in enumerate(windows)])
         self.live = find_live(self.find_ideal())
 
-    def number_stretches(self, length: float) -> Integers:
+    def number_stretches(self, length: float) -> Ints:
         """Stretches of a length [s] since each run's start, numbered through all runs, shape (n,)."""
         if length not in self._stretches:
             self._stretches[length] = number_stretches(self.run, self._since, length)
@@ -259,7 +247,7 @@ class WheelPart(Part):
         return self._compare(state, run, state.timing[run].wheel_delay_s + late_s)
 
 
-def number_stretches(run: Integers, since: Floats, length: float = UNIT_S) -> Integers:
+def number_stretches(run: Ints, since: Floats, length: float = UNIT_S) -> Ints:
     """Stretches of ten seconds, or of another length, numbered through all runs.
 
     Args:
@@ -291,9 +279,9 @@ def find_live(ideal: Floats) -> Flags:
 class Spans:
     """Where windows begin and end among the cell edges: edge before, share of the cell, and width [s]."""
 
-    first: Integers
+    first: Ints
     into_first: Floats
-    last: Integers
+    last: Ints
     into_last: Floats
     width: Floats
 

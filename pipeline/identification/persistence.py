@@ -5,23 +5,15 @@ Neighbouring windows of half a second share a pose. Its error enters them with o
 that the model lacks, whether or not anything that was recorded tells of it.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.identification.comparison import Comparison
 from pipeline.runs.windows import WINDOW_S
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.identification.comparison import Comparison
-
-Floats = NDArray[np.float64]
 
 _LAGS = 6
 NEAR_S = 0.07
@@ -103,7 +95,7 @@ def split_residuals(comparisons: Sequence[Comparison], residuals: Floats) -> tup
 def _covary(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
     """Mean products of residuals of windows 0, 0.5, ... 3 s apart, outliers held, shape (3, lags + 1)."""
     sums, counts = np.zeros((3, _LAGS + 1)), np.zeros(_LAGS + 1)
-    known: NDArray[np.bool_] = np.asarray(np.isfinite(residuals).all(axis=1))
+    known: Flags = np.asarray(np.isfinite(residuals).all(axis=1))
     if not known.any():
         return sums
     size = np.abs(residuals[known])
@@ -149,9 +141,7 @@ def take_own_past(comparisons: Sequence[Comparison], residuals: Floats) -> Float
     return fresh
 
 
-def pair_windows(
-    times: Floats, gap_s: float, latest_s: float = NEAR_S
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def pair_windows(times: Floats, gap_s: float, latest_s: float = NEAR_S) -> tuple[Ints, Ints]:
     """Windows, and the first of those that begin a gap after their ends.
 
     Args:

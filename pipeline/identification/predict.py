@@ -1,25 +1,17 @@
 """Predicting: velocities and poses of a run from a model, over a horizon from measured states."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats, Ints
 from pipeline.identification.comparison import Comparison, Input
+from pipeline.models.effect import Effect
 from pipeline.models.forward import Timing
+from pipeline.models.model import Model
 from pipeline.runs.heading import HeadingSource
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.models.effect import Effect
-    from pipeline.models.model import Model
-    from pipeline.runs.recording import MotionRun
-
-Floats = NDArray[np.float64]
+from pipeline.runs.recording import MotionRun
 
 
 @dataclass(frozen=True)
@@ -37,7 +29,7 @@ class Prediction:
     """
 
     times: Floats
-    span: NDArray[np.int64]
+    span: Ints
     velocity: Floats
     start_times: Floats
     poses: Floats

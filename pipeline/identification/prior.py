@@ -8,20 +8,13 @@ repeat each other in time and are larger than noise, so that they say less than 
 is weighed up by that `excess`.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.identification.state import Free, State
-
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Floats
+from pipeline.identification.state import Free, State
 
 # Degrees of freedom: what was known is forgotten where a run lies several deviations off.
 _FREEDOM = 4.0

@@ -2,37 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats
 from pipeline.identification.comparison import Comparison, Input, choose_rate
 from pipeline.identification.floor import estimate_floor
 from pipeline.identification.folds import Fold, find_near, make_folds
 from pipeline.identification.parts import BodyPart, Part, WheelPart
-from pipeline.identification.state import State
-from pipeline.models.effect import Place
+from pipeline.identification.scoring import Errors
+from pipeline.identification.state import DelayName, State
+from pipeline.models.effect import Effect, Place
 from pipeline.models.evidence import Largest
 from pipeline.models.forward import Timing
+from pipeline.models.model import Model
 from pipeline.runs.errors import MotionError
 from pipeline.runs.heading import HeadingSource
+from pipeline.runs.recording import MotionRun
 from pipeline.runs.signals import find_fastest_wheel, name_inputs
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.identification.scoring import Errors
-    from pipeline.identification.state import DelayName
-    from pipeline.models.effect import Effect
-    from pipeline.models.model import Model
-    from pipeline.runs.recording import MotionRun
-    from pipeline.vehicles import Vehicle
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from pipeline.vehicles import Vehicle
 
 _FEWEST_WINDOWS = 20
 _STILL = 1e-9

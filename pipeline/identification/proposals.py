@@ -9,8 +9,8 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats
 from pipeline.core.parallel import map_parallel
 from pipeline.identification.columns import combine_columns, pick_columns, stack_columns, weigh_columns
 from pipeline.models.effect import Effect, Parameter, Search
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from pipeline.identification.state import State
     from pipeline.models.evidence import Largest
 
-Floats = NDArray[np.float64]
 EffectClass = type[Effect]
 TERM = "term_"
 
@@ -194,13 +193,13 @@ def _list_values(parameter: Parameter, largest: Largest) -> list[float]:
     return [value for value in values if low <= value <= high]
 
 
-def _find_traced(trial: Trial, size: Floats) -> NDArray[np.bool_]:
+def _find_traced(trial: Trial, size: Floats) -> Flags:
     """Numbers of an effect that would show at a usual size; all of them where none would, shape (p,)."""
     if not trial.names:
         return np.ones(size.size, dtype=bool)
     parameters = [trial.effect.parameter(name) for name in trial.names]
     usual = np.array([abs(p.typical - p.neutral) for p in parameters])
-    traced: NDArray[np.bool_] = size * usual > _FAINT
+    traced: Flags = size * usual > _FAINT
     return traced if traced.any() else size > _NO_TRACE
 
 

@@ -7,8 +7,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats
 from pipeline.core.parallel import map_parallel
 from pipeline.core.timegrid import nearest_indices
 from pipeline.identification.folds import refit
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from pipeline.identification.fit import Fitted
     from pipeline.identification.problem import Problem
     from pipeline.identification.state import State
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

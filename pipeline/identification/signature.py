@@ -5,27 +5,17 @@ the model with it. It is drawn against the variable of which it is most a functi
 largest share of the difference's mean square. Nothing here knows an effect by its id.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.identification.comparison import Comparison
 from pipeline.identification.parts import average_windows, locate_windows, number_stretches
+from pipeline.identification.problem import Problem
+from pipeline.identification.state import State
 from pipeline.models.forward import Timing
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.identification.comparison import Comparison
-    from pipeline.identification.problem import Problem
-    from pipeline.identification.state import State
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 CHANNELS = ("x", "y", "w")
 SINCE_STEP = "since_step"
@@ -189,7 +179,7 @@ def _measure_by_channel(
     return found
 
 
-def _find_steps(signal: Floats) -> tuple[Integers, Floats]:
+def _find_steps(signal: Floats) -> tuple[Ints, Floats]:
     """Cells where a held signal steps, and by how much; a step within a cell takes two of them."""
     least = _STEP * float(np.ptp(signal))
     jumps = np.diff(signal)
@@ -211,7 +201,7 @@ class _Bins:
     """
 
     inside: Flags
-    number: Integers
+    number: Ints
     scale: Floats
     middle: Floats
 
@@ -230,7 +220,7 @@ class _Bins:
         rest = inside - self.regress(inside)[self.number] * self.scale
         return float(np.sum(inside**2) - np.sum(rest**2)) / total
 
-    def find_error(self, residual: Floats, block: Integers) -> Floats:
+    def find_error(self, residual: Floats, block: Ints) -> Floats:
         """Half the 95 % interval of `regress` between blocks (Liang and Zeger 1986), shape (k,)."""
         rest = (residual - self.regress(residual)[self.number] * self.scale) * self.scale
         count, width = self.middle.size, int(block.max()) + 1
@@ -243,7 +233,7 @@ class _Bins:
         return error
 
 
-def _bin(values: Floats, block: Integers, scale: Floats | None = None) -> _Bins:
+def _bin(values: Floats, block: Ints, scale: Floats | None = None) -> _Bins:
     """A variable in bins; windows where it is NaN are left out, lone extremes stand in the outer bins."""
     number = np.full(values.size, -1, dtype=np.int64)
     known = np.isfinite(values)
@@ -261,7 +251,7 @@ def _bin(values: Floats, block: Integers, scale: Floats | None = None) -> _Bins:
     return _Bins(inside, number, scale, middle)
 
 
-def _merge(met: Integers) -> Integers:
+def _merge(met: Ints) -> Ints:
     """Neighbours of bins with too few windows, or windows of too few blocks, joined to them.
 
     Args:
@@ -282,7 +272,7 @@ def _merge(met: Integers) -> Integers:
 
 
 def _find_one(
-    name: str, curve: Floats, after: Floats, by_channel: Sequence[Mapping[str, _Bins]], block: Integers
+    name: str, curve: Floats, after: Floats, by_channel: Sequence[Mapping[str, _Bins]], block: Ints
 ) -> Signature | None:
     """The signature in the channel, and along the variable, where the effect shows most.
 

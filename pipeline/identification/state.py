@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-from pipeline.models.effect import Search
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from pipeline.models.effect import Effect
-    from pipeline.models.forward import Timing
+from pipeline.models.effect import Effect, Search
+from pipeline.models.forward import Timing
 
 DelayName = Literal["wheel_delay_s"]
 Own = Mapping[int, Mapping[tuple[str, str], float]]

@@ -1,22 +1,16 @@
 """What carries over: a model fitted on some runs, asked about others."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.identification.comparison import Input
 from pipeline.identification.fit import fit_model
 from pipeline.identification.problem import Problem
 from pipeline.identification.scoring import HeldOut, hold_out
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.identification.comparison import Input
-    from pipeline.models.model import Model
-    from pipeline.runs.recording import MotionRun
+from pipeline.models.model import Model
+from pipeline.runs.recording import MotionRun
 
 CARRIES_OVER = 1.1
 

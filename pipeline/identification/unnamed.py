@@ -4,23 +4,16 @@ That an effect is not named in a run is no number, and setting runs side by side
 one step of the joint fit gives the effect, with the error that not knowing the others' numbers leaves it.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.identification.fit import PartFit, solve_step
+from pipeline.identification.fit import Fitted, PartFit, solve_step
 from pipeline.identification.intervals import Estimate, estimate_part
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from pipeline.identification.fit import Fitted
-    from pipeline.identification.parts import Part
-    from pipeline.models.effect import Effect
+from pipeline.identification.parts import Part
+from pipeline.models.effect import Effect
 
 
 def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Estimate, ...]:

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from pipeline.core.arrays import Floats
 
 if TYPE_CHECKING:
     from pipeline.identification.parts import Part
 
-Floats = NDArray[np.float64]
 
 _GAUSSIAN = 1.4826
 _CLIP = 6.0

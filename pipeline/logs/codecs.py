@@ -1,20 +1,16 @@
 """Choosing how a channel is decoded from the encodings it declares."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from pipeline.logs.channel import StructuredDecoder
 from pipeline.logs.definitions import bundled_structure
 from pipeline.logs.errors import unsupported
 from pipeline.logs.fields import select_leaves
 from pipeline.logs.idl import parse_idl
+from pipeline.logs.index import ChannelInfo
 from pipeline.logs.objects import ObjectDecoder, decode_json, protobuf_decoder
 from pipeline.logs.schema import SchemaError, Structure, contains_text, leaf_paths, parse_msg
-
-if TYPE_CHECKING:
-    from pipeline.logs.index import ChannelInfo
 
 _EMPTY: Final = "the schema is empty"
 _STAMP: Final = ("header.stamp.sec", "header.stamp.nanosec")

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 from pipeline.logs.errors import Loss
 from pipeline.logs.loading import checksum_holds
-from pipeline.logs.scan import describe_contradiction
-from pipeline.logs.source import is_fetched
+from pipeline.logs.scan import Catalog, describe_contradiction
+from pipeline.logs.source import ByteSource, is_fetched
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from pipeline.logs.index import ChannelInfo
     from pipeline.logs.messages import Messages
-    from pipeline.logs.scan import Catalog
-    from pipeline.logs.source import ByteSource
 
 _NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be seen"
 

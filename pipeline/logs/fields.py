@@ -51,12 +51,8 @@ def select_leaves(leaves: Sequence[str], fields: Sequence[str] | None, *, where:
     for wanted in fields:
         found = _leaves_of(leaves, wanted)
         if not found:
-            raise LogError(
-                "field_not_found",
-                f"there is no field {wanted}",
-                where=where,
-                hint=f"The type has: {', '.join(leaves)}",
-            )
+            hint = f"The type has: {', '.join(leaves)}"
+            raise LogError("field_not_found", f"there is no field {wanted}", where=where, hint=hint)
         chosen.update(found)
     return chosen
 

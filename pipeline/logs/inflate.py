@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import threading
 import zlib
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from typing import IO, TYPE_CHECKING, Final
 
 import zstandard
 
 if TYPE_CHECKING:
-    from contextlib import AbstractContextManager
-
     from pipeline.logs.records import Buffer
 
 MAX_CHUNK: Final = 1 << 30

@@ -46,12 +46,8 @@ def normalize_columns(
     leaves = tuple(leaf_paths(structure))
     for path in fields:
         if path not in leaves:
-            raise LogError(
-                "field_not_found",
-                f"there is no field {path}",
-                where=where,
-                hint=f"The type has: {', '.join(leaves)}",
-            )
+            hint = f"The type has: {', '.join(leaves)}"
+            raise LogError("field_not_found", f"there is no field {path}", where=where, hint=hint)
     if rows == 0:
         return {}
     wanted = dict(wanted_leaves(plan_fields(structure, set(fields))))
@@ -60,12 +56,8 @@ def normalize_columns(
         try:
             columns[path] = _normalize(fields[path], leaf, rows, inside="[]." in path)
         except (ValueError, TypeError, OverflowError) as error:
-            raise LogError(
-                "bad_column",
-                f"field {path}: {error}",
-                where=where,
-                hint=f"Give one value, or {rows} of the field's type",
-            ) from None
+            hint = f"Give one value, or {rows} of the field's type"
+            raise LogError("bad_column", f"field {path}: {error}", where=where, hint=hint) from None
     _match_sequences(columns, rows, where)
     return columns
 

@@ -1,13 +1,12 @@
 """What one file holds: from its summary where that is whole, else by walking its records."""
 
-from __future__ import annotations
-
 import os
 import struct
 from dataclasses import dataclass, replace
 from functools import cache
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
@@ -18,12 +17,8 @@ from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import checksum
 from pipeline.logs.loading import checksum_holds, load_spans
 from pipeline.logs.scan import Catalog, Scanner
+from pipeline.logs.source import ByteSource
 from pipeline.logs.spans import Loaded, Span, SpanKind, StoredAs
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.logs.source import ByteSource
 
 _FOOTER: Final = struct.Struct("<QQI")
 _MAX_SUMMARY: Final = 1 << 29

@@ -237,12 +237,8 @@ def _merge_wanted(wanted: Iterable[Wanted]) -> dict[str, tuple[str, ...] | None]
 def _no_topic(index: LogIndex, topic: str) -> LogError:
     known = index.topics()
     listed = ", ".join(known[:_LISTED]) + (", ..." if len(known) > _LISTED else "")
-    return LogError(
-        "topic_not_found",
-        f"there is no topic {topic}",
-        where=str(index.path),
-        hint=f"It holds: {listed or 'no topics'}",
-    )
+    hint = f"It holds: {listed or 'no topics'}"
+    return LogError("topic_not_found", f"there is no topic {topic}", where=str(index.path), hint=hint)
 
 
 def _schema_of(index: LogIndex, number: int) -> bytes:

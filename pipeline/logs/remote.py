@@ -4,27 +4,21 @@ What a store says of an object (size, ETag, time) stands in the place of what a 
 Only the ranges that are asked for are fetched, and they are counted.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re
 import stat
 import threading
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path, PosixPath
-from typing import TYPE_CHECKING, Final, cast
+from typing import Final, Self, cast
 from urllib.parse import quote_from_bytes, unquote_to_bytes
 
 from pipeline.logs import buckets
+from pipeline.logs.buckets import Info
 from pipeline.logs.errors import LogError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from typing import Self
-
-    from pipeline.logs.buckets import Info
 
 _SCHEME = re.compile(r"^([a-z][a-z0-9+]+):/+")
 _LOCAL: Final = "file://"
@@ -215,12 +209,8 @@ class RemoteSource(AbstractContextManager["RemoteSource"]):
                 "log_not_found", "there is no such object", where=str(self._path), hint="Check bucket and key"
             ) from None
         if not info.get("size"):
-            raise LogError(
-                "log_empty",
-                "the object holds no bytes",
-                where=str(self._path),
-                hint="The recorder was stopped before it wrote anything; leave it out",
-            )
+            hint = "The recorder was stopped before it wrote anything; leave it out"
+            raise LogError("log_empty", "the object holds no bytes", where=str(self._path), hint=hint)
         return info
 
     def read_at(self, offset: int, length: int) -> bytes:

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from pipeline.core.arrays import Ints
-from pipeline.logs.messages import MESSAGE_OVERHEAD
+from pipeline.logs.messages import MESSAGE_OVERHEAD, Messages
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from pipeline.logs.messages import Messages
     from pipeline.logs.records import Buffer
 
     Key = tuple[int, int, bytes]

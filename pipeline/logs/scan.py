@@ -1,9 +1,7 @@
 """Walking the records of a file where no index vouches for them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from mcap.records import Channel, Header, Metadata, Schema
@@ -12,10 +10,8 @@ from pipeline.logs import records as rec
 from pipeline.logs.errors import Loss
 from pipeline.logs.messages import FIRST_PRIVATE
 from pipeline.logs.resync import FIRST_BLOCK, LAST_BLOCK, possible_places
+from pipeline.logs.source import ByteSource
 from pipeline.logs.spans import Span, SpanKind
-
-if TYPE_CHECKING:
-    from pipeline.logs.source import ByteSource
 
 _FIRST_WINDOW: Final = 1 << 12
 _WINDOW: Final = 1 << 18

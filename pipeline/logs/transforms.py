@@ -4,11 +4,10 @@ Every frame has one parent. A chain is answered at the stamps of its last moving
 child; slower links above it, such as map to odom, are interpolated there.
 """
 
-from __future__ import annotations
-
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -17,13 +16,7 @@ from pipeline.core.rigid import interpolate_poses, invert_quaternions, multiply_
 from pipeline.logs.columns import Ragged, RaggedStrings
 from pipeline.logs.errors import LogError
 from pipeline.logs.fields import join_stamp
-from pipeline.logs.reader import Wanted
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from pipeline.logs.reader import TopicColumns
-
+from pipeline.logs.reader import TopicColumns, Wanted
 
 _TRANSFORM: Final = "transforms[]."
 _NUMBERS: Final = (

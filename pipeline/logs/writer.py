@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
+from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple, Self
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -13,17 +13,15 @@ from pipeline.core.arrays import Flags, Ints
 from pipeline.logs.definitions import definition_text
 from pipeline.logs.encode import encode_rows
 from pipeline.logs.errors import LogError, unsupported
-from pipeline.logs.schema import leaf_paths, parse_msg
+from pipeline.logs.schema import Structure, leaf_paths, parse_msg
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from types import TracebackType
-    from typing import Self
 
     from numpy.typing import NDArray
 
     from pipeline.logs.normalize import Given
-    from pipeline.logs.schema import Structure
 
 
 LIBRARY: Final = "slip-pipeline"

@@ -1,24 +1,17 @@
 """Finding effects: those of the folder `effects`, and those of files that a user names."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import inspect
 import pkgutil
 import sys
+from collections.abc import Mapping
+from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
 
-from pipeline.models.effect import Effect, find_late
+from pipeline.models.effect import Effect, Late, find_late
 from pipeline.models.trust import hash_code
 from pipeline.runs.errors import MotionError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from pipeline.models.effect import Late
 
 EffectClass = type[Effect]
 
@@ -52,12 +45,8 @@ def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> Effe
 
     near = difflib.get_close_matches(name, known, n=3)
     guess = f"Did you mean {' or '.join(near)}? " if near else ""
-    raise MotionError(
-        "unknown_effect",
-        f"no effect is called {name!r}",
-        where=name,
-        hint=f"{guess}`slip effects` lists them all.",
-    )
+    hint = f"{guess}`slip effects` lists them all."
+    raise MotionError("unknown_effect", f"no effect is called {name!r}", where=name, hint=hint)
 
 
 def find_late_effect(late: Late) -> EffectClass:
@@ -68,12 +57,8 @@ def find_late_effect(late: Late) -> EffectClass:
     """
     found = find_late(list_effects(), late)
     if found is None:
-        raise MotionError(
-            "unknown_effect",
-            f"no effect says that {late.value}",
-            where=late.name,
-            hint="Give one of the folder `effects` that `late`.",
-        )
+        hint = "Give one of the folder `effects` that `late`."
+        raise MotionError("unknown_effect", f"no effect says that {late.value}", where=late.name, hint=hint)
     return found
 
 
@@ -103,12 +88,8 @@ def run_effects(code: bytes, path: Path) -> Mapping[str, EffectClass]:
         ) from error
     found = {effect.id: effect for effect in _effects_of(module)}
     if not found:
-        raise MotionError(
-            "effects_file",
-            "the file defines no effect",
-            where=str(path),
-            hint="Derive a class from one of pipeline.models's effect classes and give it an id.",
-        )
+        hint = "Derive a class from one of pipeline.models's effect classes and give it an id."
+        raise MotionError("effects_file", "the file defines no effect", where=str(path), hint=hint)
     return found
 
 

@@ -35,12 +35,8 @@ def find_target(name: str) -> Target:
     for target in list_targets():
         if target.name == name:
             return target
-    raise MotionError(
-        "unknown_target",
-        f"no export is called {name!r}",
-        where=name,
-        hint=f"There are: {', '.join(target.name for target in list_targets())}.",
-    )
+    hint = f"There are: {', '.join(target.name for target in list_targets())}."
+    raise MotionError("unknown_target", f"no export is called {name!r}", where=name, hint=hint)
 
 
 def read_current(path: Path, name: str) -> Current:

@@ -1,11 +1,10 @@
 """The forward model: from a run's input to the body velocity, each place's result kept for the next call."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -19,14 +18,9 @@ from pipeline.models.effect import (
     Place,
     ReportEffect,
 )
-from pipeline.runs.grid import HeldDrive, MeasuredDrive
+from pipeline.runs.grid import Grid, HeldDrive, MeasuredDrive
+from pipeline.runs.recording import DriveSeries
 from pipeline.runs.signals import Rolling, RunContext, Velocity, Wheels, roll_ideally
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from pipeline.runs.grid import Grid
-    from pipeline.runs.recording import DriveSeries
 
 Result = TypeVar("Result")
 

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
+from pipeline.models.effect import Effect
 from pipeline.runs.errors import MotionError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from pipeline.models.effect import Effect
-    from pipeline.vehicles import Vehicle
+from pipeline.vehicles import Vehicle
 
 
 @dataclass(frozen=True)
@@ -83,12 +79,8 @@ class Model:
         for effect in self.effects:
             if effect.id == name:
                 return effect
-        raise MotionError(
-            "no_such_effect",
-            f"the model has no effect {name!r}",
-            where=name,
-            hint=f"It has: {', '.join(self.ids) or 'none'}.",
-        )
+        hint = f"It has: {', '.join(self.ids) or 'none'}."
+        raise MotionError("no_such_effect", f"the model has no effect {name!r}", where=name, hint=hint)
 
     def change(self, name: str, **values: float) -> Model:
         """The model with other values of one effect's parameters.

@@ -1,33 +1,25 @@
 """The model file: TOML that people read, diff and commit; every error names its line."""
 
-from __future__ import annotations
-
 import math
 import re
 import shlex
 import unicodedata
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import msgspec
 
 from pipeline.core.errors import SlipError, shorten
 from pipeline.core.toml import TomlError, parse_toml, require_finite
-from pipeline.models.catalogue import find_effect, run_effects
+from pipeline.models.catalogue import EffectClass, find_effect, run_effects
+from pipeline.models.effect import Effect
 from pipeline.models.formula.formula_effect import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.model import Model
 from pipeline.models.trust import hash_code, list_trusted, read_code
 from pipeline.runs.errors import MotionError
-from pipeline.vehicles import ConfigurationError, resolve_vehicle
+from pipeline.vehicles import ConfigurationError, Vehicle, resolve_vehicle
 from pipeline.vehicles.configuration import VehicleSection
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from pipeline.models.catalogue import EffectClass
-    from pipeline.models.effect import Effect
-    from pipeline.vehicles import Vehicle
 
 FORMAT = 1
 _SECTIONS = ("format", "effects", "vehicle", "effect", "fit", "note")

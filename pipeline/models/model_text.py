@@ -1,26 +1,18 @@
 """Writing a model file: plain TOML with units, values and intervals, one line a parameter."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import msgspec
 import tomlkit
 
+from pipeline.models.effect import Effect, Parameter
 from pipeline.models.formula.formula_effect import FormulaEffect
-from pipeline.models.model_file import FORMAT
+from pipeline.models.model_file import FORMAT, ModelFile
 from pipeline.runs.errors import MotionError
 from pipeline.store.files import replace_file
-from pipeline.vehicles import find_preset
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.models.effect import Effect, Parameter
-    from pipeline.models.model_file import ModelFile
-    from pipeline.vehicles import Vehicle
+from pipeline.vehicles import Vehicle, find_preset
 
 _GEOMETRY = (
     "wheel_radius_m",
@@ -54,12 +46,8 @@ def write_text(path: Path, text: str, *, code: str) -> None:
     try:
         replace_file(path, text.encode())
     except OSError as error:
-        raise MotionError(
-            code,
-            f"cannot be written: {error.strerror}",
-            where=str(path),
-            hint="Check the folder and its permissions.",
-        ) from None
+        hint = "Check the folder and its permissions."
+        raise MotionError(code, f"cannot be written: {error.strerror}", where=str(path), hint=hint) from None
 
 
 def format_model(file: ModelFile) -> str:

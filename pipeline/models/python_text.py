@@ -9,13 +9,12 @@ from importlib import resources
 from typing import TYPE_CHECKING, cast
 
 from pipeline.models.catalogue import is_own
-from pipeline.models.effect import Place
+from pipeline.models.effect import Effect, Place
 from pipeline.models.formula.formula_effect import FormulaEffect
 from pipeline.models.quantity import Quantity
 from pipeline.runs.errors import MotionError
 
 if TYPE_CHECKING:
-    from pipeline.models.effect import Effect
     from pipeline.models.model import Model
 
 _PLAIN_NAMES = ("abs", "min", "max", "sign")

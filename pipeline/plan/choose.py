@@ -1,21 +1,13 @@
 """Choice of manoeuvres: greedy by what is answered in a second, then improved by exchange."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.plan.limits import Area
-    from pipeline.plan.questions import Answerable
-
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+from pipeline.core.arrays import Complex, Floats
+from pipeline.plan.limits import Area
+from pipeline.plan.questions import Answerable
 
 _ROUNDS = 2
 _NOTHING = 1e-4

@@ -1,12 +1,12 @@
 """A plan's files: `plan.toml` to read, `plan.csv`, and `plan.mcap` to play."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from pathlib import Path
 
 import msgspec
 import numpy as np
 
+from pipeline.core.arrays import Floats
 from pipeline.core.toml import TomlError, parse_toml
 from pipeline.logs import LogWriter
 from pipeline.models.catalogue import find_effect
@@ -15,12 +15,6 @@ from pipeline.plan.errors import PlanError
 from pipeline.plan.manoeuvres import RATE_HZ
 from pipeline.plan.plan import SAFETY, Impossible, Plan, Promise
 from pipeline.store.files import replace_file
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 PAGE = "plan.html"
 _NAMES = ("plan.toml", "plan.csv", "plan.mcap")
@@ -122,7 +116,7 @@ def read_promises(path: Path) -> Promised:
 
 def _write_mcap(plan: Plan, path: Path) -> None:
     stamps = _START_NS + np.round(plan.commands.times * _SECOND).astype(np.int64)
-    fields: list[dict[str, NDArray[np.float64]]]
+    fields: list[dict[str, Floats]]
     if plan.type_name == WHEELS and plan.wheels is not None:
         fields = [{"data": side} for side in plan.wheels]
     else:

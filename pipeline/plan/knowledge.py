@@ -8,32 +8,25 @@ what is known before, of the fleet or of what is usual, adds to it.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.identification import Input, Problem, fit_model
 from pipeline.identification.columns import pick_columns, weigh_columns
 from pipeline.identification.few_shot import tie_to_prior
+from pipeline.identification.fit import Fitted, PartFit
 from pipeline.identification.intervals import count_repeats
-from pipeline.models import Model
+from pipeline.identification.parts import Part
+from pipeline.identification.state import Free
+from pipeline.models import Effect, Model
 from pipeline.plan.errors import PlanError
 from pipeline.plan.limits import is_steered
 from pipeline.plan.rehearsal import Senses, read_senses, start_state
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.identification.fit import Fitted, PartFit
-    from pipeline.identification.parts import Part
-    from pipeline.identification.state import Free
-    from pipeline.models import Effect
-    from pipeline.runs import MotionRun
-    from pipeline.vehicles import Vehicle
-
-Floats = NDArray[np.float64]
+from pipeline.runs import MotionRun
+from pipeline.vehicles import Vehicle
 
 # Without a log: spread of a window's residual [m/s, m/s, rad/s], and windows that repeat each other.
 _USUAL_NOISE = (0.02, 0.02, 0.02)

@@ -8,15 +8,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Complex
 from pipeline.plan.errors import PlanError
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Largest
     from pipeline.vehicles import Vehicle
 
-Complex = NDArray[np.complex128]
 
 # Of a plan, where neither the user nor the vehicle's preset says more.
 _USUAL_YAW_RATE_RADPS = 1.0

@@ -11,17 +11,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.plan.limits import is_steered
+from pipeline.core.arrays import Floats
+from pipeline.plan.limits import Limits, is_steered
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.plan.limits import Limits
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
 
 RATE_HZ = 20.0
 LEAD_S = 3.0

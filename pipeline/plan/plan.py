@@ -8,29 +8,23 @@ from typing import TYPE_CHECKING, Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Complex, Floats
 from pipeline.diagnosis.excitation import suggest_manoeuvre
-from pipeline.models import find_effect, list_effects
+from pipeline.models import Effect, find_effect, list_effects
 from pipeline.plan.choose import Chooser, Shape
 from pipeline.plan.errors import PlanError
-from pipeline.plan.limits import is_steered
-from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, Commands, join, list_manoeuvres, wait
-from pipeline.plan.questions import DECIDED_T, STRETCHES, Judge, Separation
+from pipeline.plan.limits import Area, Limits, is_steered
+from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, Commands, Manoeuvre, join, list_manoeuvres, wait
+from pipeline.plan.questions import DECIDED_T, STRETCHES, Answerable, Judge, Question, Separation
 from pipeline.plan.rehearsal import Rehearsal, drive, start_state
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.models import Effect
     from pipeline.models.evidence import Largest
     from pipeline.plan.knowledge import Knowledge
-    from pipeline.plan.limits import Area, Limits
-    from pipeline.plan.manoeuvres import Manoeuvre
-    from pipeline.plan.questions import Answerable, Question
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _MODELS = 12
 # Of effects that may act unnoticed, times the usual one: the largest does not always lead farthest.

@@ -6,8 +6,8 @@ import csv
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.plan.errors import PlanError
 from pipeline.plan.manoeuvres import RATE_HZ
 from pipeline.runs.signals import name_inputs
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from pipeline.runs.recording import DriveSeries, MotionRun
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
 
 _ALIKE = 0.6
 """Likeness of a drive that was stopped at a third; that of other driving stays below it."""

@@ -7,24 +7,21 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.plan.errors import PlanError
-from pipeline.plan.limits import is_steered
+from pipeline.plan.limits import Limits, is_steered
 from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, Commands, hold_within, join, wait
 from pipeline.plan.plan import since_when
-from pipeline.plan.questions import Judge
+from pipeline.plan.questions import Judge, Question
 from pipeline.plan.rehearsal import Rehearsal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.plan.knowledge import Knowledge
-    from pipeline.plan.limits import Limits
-    from pipeline.plan.questions import Question
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
 Stages = list[tuple[float, float, float]]
 
 LONGEST_S = 300.0

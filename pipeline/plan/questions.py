@@ -13,20 +13,17 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri, stdtrit
 
-from pipeline.plan.rehearsal import start_state
+from pipeline.core.arrays import Floats, Ints
+from pipeline.plan.rehearsal import Rehearsal, start_state
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.identification import Free, Problem
     from pipeline.plan.knowledge import Hypothesis, Knowledge
-    from pipeline.plan.rehearsal import Rehearsal
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # The diagnosis decides between two that were found at 1.6; a t scatters about its mean by one, and here it is
 # to be decided nearly always.
@@ -131,7 +128,7 @@ class Groups:
     """
 
     seconds: Floats
-    stretch: Integers
+    stretch: Ints
     before_s: float = 0.0
 
 

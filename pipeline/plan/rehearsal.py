@@ -11,25 +11,22 @@ from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Complex, Floats
 from pipeline.identification import Comparison, Input, Problem, State
 from pipeline.identification.problem import measure_largest
-from pipeline.models import Place, Timing
+from pipeline.models import Effect, Place, Timing
 from pipeline.plan.limits import is_steered
 from pipeline.runs.recording import Alignment, DriveSeries, GyroFit, MotionRun, Track
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.models import Effect
     from pipeline.models.evidence import Largest
     from pipeline.plan.manoeuvres import Commands
     from pipeline.runs.signals import Velocity
     from pipeline.vehicles import Vehicle
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _POSE_HZ = 20.0
 # Poses and encoders go on after the last command.

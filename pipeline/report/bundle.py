@@ -4,8 +4,6 @@ Bundling takes most of a second and always gives the same text, so it is kept in
 cache is only a shortcut: a missing, damaged or read-only one costs that second and nothing else.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

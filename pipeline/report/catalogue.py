@@ -3,10 +3,8 @@
 Logs that gave no run stand below them, with the reason.
 """
 
-from __future__ import annotations
-
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 import polars as pl
@@ -14,13 +12,8 @@ import polars as pl
 from pipeline.report.elements import Column
 from pipeline.report.templating import read_own, render_template
 from pipeline.report.words import say_number
-from pipeline.store import LOG_NOTES
+from pipeline.store import LOG_NOTES, Manifest, Store
 from pipeline.store.queries import scan_table
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from pipeline.store import Manifest, Store
 
 _REPORT = "report.html"
 _WITHOUT_RUN = ("failed", "quarantined")

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.identification import Problem, State, choose_input
-from pipeline.models import Timing
+from pipeline.models import ModelFile, Timing
 from pipeline.models.model_file import parse_model
 from pipeline.report.motion_view import MotionStage, MotionView
 from pipeline.report.run import mapping_in, objects_in
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-    from pipeline.models import ModelFile
     from pipeline.vehicles import Vehicle
 
 

@@ -1,16 +1,12 @@
 """The page of `slip fleet fit`: numbers of vehicles by level, and what runs on other grounds would tell."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, cast
+from collections.abc import Mapping, Sequence
+from typing import cast
 
 from pipeline.report.elements import Cell, Column, Table
 from pipeline.report.page import render_figures
 from pipeline.report.run import mapping_in, number_in, objects_in
 from pipeline.report.words import say_number
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 _LEVELS = (
     Column("number"), Column("whose"), Column("value", number=True), Column("95 %", number=True),

@@ -4,27 +4,17 @@ The report and the workbench draw from the same rows. Making a run ready takes a
 model takes hundredths.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
-from pipeline.identification import fit_model, predict_from
-from pipeline.identification.signature import VARIABLES, find_signatures, measure_variables
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.identification import Fitted, Problem, State
-    from pipeline.identification.comparison import HorizonErrors
-    from pipeline.identification.signature import Signature
-
-Floats = NDArray[np.float64]
+from pipeline.core.arrays import Floats
+from pipeline.identification import Fitted, Problem, State, fit_model, predict_from
+from pipeline.identification.comparison import HorizonErrors
+from pipeline.identification.signature import VARIABLES, Signature, find_signatures, measure_variables
 
 COMPONENTS = ("x", "y", "w")
 SIGNALS = {name: VARIABLES[name] for name in ("f_x", "f_y", "f_w", "f_x_f_w", "a_x", "a_w", "roll", "pitch")}

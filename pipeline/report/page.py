@@ -4,9 +4,7 @@ A page is one file that asks the network for nothing. Vega evaluates its express
 without `eval`.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from pipeline.core.durations import say_recorded
 from pipeline.report import theme
@@ -15,17 +13,13 @@ from pipeline.report.elements import Picture
 from pipeline.report.figures import list_figures
 from pipeline.report.figures.figure import Section
 from pipeline.report.pages import list_ways
+from pipeline.report.run import RunReport
 from pipeline.report.scene import Scene
 from pipeline.report.sections import SECTIONS, Page
 from pipeline.report.sections.health import summarise_health
 from pipeline.report.specs import build_spec, share_rows
 from pipeline.report.templating import read_own, render_template
 from pipeline.report.words import say_date, say_distance
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.report.run import RunReport
 
 
 def render_report(report: RunReport) -> str:

@@ -4,19 +4,14 @@ Every page names all of them. One that was not there when a page was made is loo
 catalogue, which is made anew with every page: it leads on to what came since, and says how to make the rest.
 """
 
-from __future__ import annotations
-
 import html
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from pipeline.report.catalogue import render_catalogue
-
-if TYPE_CHECKING:
-    from pipeline.store import Store
+from pipeline.store import Store
 
 CATALOGUE = "index.html"
 PLANS = "workbench/plans"

@@ -1,15 +1,13 @@
 """A plan to look at before it is driven."""
 
-from __future__ import annotations
-
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import altair as alt
 import numpy as np
 import polars as pl
 
-from pipeline.plan.plan import SAFETY
+from pipeline.plan.plan import SAFETY, Plan
 from pipeline.report import theme
 from pipeline.report.elements import Picture
 from pipeline.report.figures import Drawing
@@ -17,11 +15,6 @@ from pipeline.report.page import render_figures
 from pipeline.report.pages import list_ways
 from pipeline.report.specs import build_spec, share_rows
 from pipeline.report.templating import render_template
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.plan.plan import Plan
 
 # One pose in so many, and so many ways beside the base's.
 _EVERY = 4

@@ -1,19 +1,14 @@
 """What several figures draw from: the tables of a run, joined and thinned once."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
+from pipeline.report.run import RunReport
 from pipeline.report.scales import round_up, usual_ends
 from pipeline.report.thinning import break_lines, drop_flat_rows, find_spans, thin_series, thin_to_peaks
-
-if TYPE_CHECKING:
-    from pipeline.report.run import RunReport
 
 LINE_BINS = 1000
 TRACK_BINS = 2400

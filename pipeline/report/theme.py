@@ -5,8 +5,6 @@ ramp of slip is monotonous in lightness, so that it also survives a grey print. 
 colours; the page exchanges each for its dark twin where the reader's system asks for it.
 """
 
-from __future__ import annotations
-
 from types import MappingProxyType
 
 MEASURED = "#1f2a33"

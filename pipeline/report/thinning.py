@@ -1,7 +1,5 @@
 """Fewer points, no lost peaks."""
 
-from __future__ import annotations
-
 import math
 
 import polars as pl

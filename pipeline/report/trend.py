@@ -1,27 +1,19 @@
 """The page of `slip trend`."""
 
-from __future__ import annotations
-
 import itertools
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import altair as alt
 import polars as pl
 
-from pipeline.fleet.parameter_trend import describe_change, say_power
-from pipeline.fleet.trend import describe_quiet, describe_step
+from pipeline.fleet.parameter_trend import ParameterTrend, describe_change, say_power
+from pipeline.fleet.trend import Series, Trend, describe_quiet, describe_step
 from pipeline.report import theme
 from pipeline.report.elements import Picture
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.words import begin_large
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.fleet.parameter_trend import ParameterTrend
-    from pipeline.fleet.trend import Series, Trend
 
 _FEWEST_POINTS = 3
 _LATER = ("finding ", "suspect share", "warnings")

@@ -1,7 +1,5 @@
 """Text for pages and screens: numbers with units, distances, dates."""
 
-from __future__ import annotations
-
 import math
 from datetime import UTC, datetime
 

@@ -1,18 +1,12 @@
 """A stretch of a run: what was driven first, and what after it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.runs.errors import MotionError
-from pipeline.runs.recording import DriveSeries
+from pipeline.runs.recording import DriveSeries, MotionRun
 from pipeline.runs.signals import find_fastest_wheel
-
-if TYPE_CHECKING:
-    from pipeline.runs.recording import MotionRun
 
 # Between poses farther apart than that nobody knows whether the vehicle drove [s].
 _LONGEST_STEP_S = 1.0

@@ -1,18 +1,14 @@
 """The fine grid of a run: spans without holes, cut into cells, and the inputs on them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.arrays import Floats, Ints
+from pipeline.runs.recording import DriveSeries, MotionRun
 from pipeline.runs.signals import Commands, Signal, Wheels
-
-if TYPE_CHECKING:
-    from pipeline.runs.recording import DriveSeries, MotionRun
 
 Number = TypeVar("Number", np.float64, np.int64)
 

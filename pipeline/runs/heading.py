@@ -15,11 +15,10 @@ import numpy as np
 
 from pipeline.core import timegrid
 from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.runs.recording import GyroFit
+from pipeline.runs.recording import GyroFit, MotionRun, Track
 
 if TYPE_CHECKING:
     from pipeline.runs.grid import Grid
-    from pipeline.runs.recording import MotionRun, Track
 
 
 _WINDOW_S = 0.5

@@ -323,12 +323,8 @@ def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> T
         if fresh.size > 1:
             parts.append(_unroll(piece[fresh], parts[-1] if parts else None))
     if sum(part.times.size for part in parts) < 10:  # noqa: PLR2004 - fewer say nothing
-        raise MotionError(
-            "no_poses",
-            "fewer than ten poses carry information",
-            where=name,
-            hint="Check the pose topic with `slip inspect`.",
-        )
+        hint = "Check the pose topic with `slip inspect`."
+        raise MotionError("no_poses", "fewer than ten poses carry information", where=name, hint=hint)
     return Track(
         *(np.concatenate([getattr(part, field) for part in parts]) for field in Track.__dataclass_fields__)
     )

@@ -4,21 +4,15 @@ Poses are gathered into nodes; windows join nodes of one segment. Nothing crosse
 stretch or the end of an interval with live commands.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.runs.grid import Grid
 from pipeline.runs.heading import has_barred
-
-if TYPE_CHECKING:
-    from pipeline.runs.grid import Grid
-    from pipeline.runs.recording import MotionRun, Track
-    from pipeline.runs.signals import Signal
-
+from pipeline.runs.recording import MotionRun, Track
+from pipeline.runs.signals import Signal
 
 WINDOW_S = 0.5
 HORIZON_S = 2.0

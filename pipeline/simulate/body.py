@@ -3,23 +3,17 @@
 What depends on the place or the slope is added while the pose is integrated (``path``).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.simulate.drivetrain import move_by_corners
+from pipeline.simulate.drivetrain import Drive, move_by_corners
+from pipeline.simulate.effects import Effects
+from pipeline.simulate.scenario import Disturbance
 from pipeline.simulate.signals import filter_pole, integrate_cells, lag_signal, make_coloured_noise
-
-if TYPE_CHECKING:
-    from pipeline.simulate.drivetrain import Drive
-    from pipeline.simulate.effects import Effects
-    from pipeline.simulate.scenario import Disturbance
-    from pipeline.simulate.vehicles import Vehicle
-
+from pipeline.simulate.vehicles import Vehicle
 
 _TURNING_MPS = 0.01
 

@@ -1,13 +1,8 @@
 """Robot descriptions (URDF) of simulated vehicles: wheels as cylinders on joints, as vendors write them."""
 
-from __future__ import annotations
+from collections.abc import Mapping
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.simulate.vehicles import Vehicle
+from pipeline.simulate.vehicles import Vehicle
 
 _WIDTH_M = 0.05
 

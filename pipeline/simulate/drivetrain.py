@@ -3,22 +3,16 @@
 Static limits act on the commands at their own stamps, so that nothing depends on the integration step there.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
+from pipeline.simulate.effects import Effects
 from pipeline.simulate.programs import Commands
 from pipeline.simulate.signals import follow, hold_on_grid, integrate_cells, lag_signal, limit_rate
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.simulate.effects import Effects
-    from pipeline.simulate.vehicles import Vehicle
+from pipeline.simulate.vehicles import Vehicle
 
 
 @dataclass(frozen=True)

@@ -4,19 +4,15 @@ The formulas themselves stand where they act: ``drivetrain`` (command to wheels)
 velocity) and ``localization`` (what the pose reports). Signs follow REP-103: x forward, y left, z up.
 """
 
-from __future__ import annotations
-
 import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pipeline.simulate.errors import SimulateError, unknown_name
-
-if TYPE_CHECKING:
-    from pipeline.simulate.vehicles import Kind
+from pipeline.simulate.vehicles import Kind
 
 _INF = math.inf
 

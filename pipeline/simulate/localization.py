@@ -1,9 +1,6 @@
 """What the localization reports of the true path: its own effects, its noise, its faults."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,14 +12,11 @@ from pipeline.core.rigid import (
     quaternions_from_yaw,
     rotate,
 )
+from pipeline.simulate.effects import Effects
+from pipeline.simulate.path import Path
+from pipeline.simulate.scenario import PoseSensor
 from pipeline.simulate.signals import make_coloured_noise
 from pipeline.simulate.streams import open_stream, spread_times
-
-if TYPE_CHECKING:
-    from pipeline.simulate.effects import Effects
-    from pipeline.simulate.path import Path
-    from pipeline.simulate.scenario import PoseSensor
-
 
 _DRIFT_STEP_S = 0.1
 _STRETCH_S = 2.0

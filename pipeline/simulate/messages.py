@@ -1,23 +1,17 @@
 """The messages of a run: for each topic its type, times and fields."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import quaternions_from_yaw
 from pipeline.simulate.drivetrain import CORNERS, apply_ideal_model, invert_ideal_model
+from pipeline.simulate.layouts import CommandTopic, Layout, PoseTopic, WheelTopic
 from pipeline.simulate.programs import Commands, make_commands
-from pipeline.simulate.run import integrate_odometry
+from pipeline.simulate.run import SimulatedRun, integrate_odometry
 from pipeline.simulate.scenario import Program
 from pipeline.simulate.streams import open_stream, spread_times
-
-if TYPE_CHECKING:
-    from pipeline.simulate.layouts import CommandTopic, Layout, PoseTopic, WheelTopic
-    from pipeline.simulate.run import SimulatedRun
 
 Field = Floats | float | str | list[str]
 

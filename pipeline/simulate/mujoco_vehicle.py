@@ -6,12 +6,9 @@ Wheels are heavy to turn (armature) and stiffly driven, contacts are explicit pa
 cone and a soft tangential constraint: without these a simulated skid-steer scrubs far too much.
 """
 
-from __future__ import annotations
-
 import importlib
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,13 +21,10 @@ from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.path import Path
 from pipeline.simulate.programs import make_commands
 from pipeline.simulate.run import SimulatedRun, Truth, record_truth
+from pipeline.simulate.scenario import Scenario
 from pipeline.simulate.streams import open_stream
 from pipeline.simulate.surface import tilt_quaternion
-
-if TYPE_CHECKING:
-    from pipeline.simulate.scenario import Scenario
-    from pipeline.simulate.vehicles import Vehicle
-
+from pipeline.simulate.vehicles import Vehicle
 
 _STEP_S = 0.002
 _SETTLE_STEPS = 500
@@ -161,11 +155,8 @@ def _step_world(scenario: Scenario, machine: SkidSteer, asked: Drive) -> tuple[F
     try:
         mujoco = importlib.import_module("mujoco")
     except ImportError as problem:
-        raise SimulateError(
-            "mujoco_needed",
-            "mujoco is not installed",
-            hint="Install the extra: pip install 'slip-pipeline[sim]'",
-        ) from problem
+        hint = "Install the extra: pip install 'slip-pipeline[sim]'"
+        raise SimulateError("mujoco_needed", "mujoco is not installed", hint=hint) from problem
     model = mujoco.MjModel.from_xml_string(_describe_world(scenario, machine))
     data = mujoco.MjData(model)
     x, y, yaw = scenario.start_pose

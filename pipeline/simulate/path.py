@@ -1,24 +1,18 @@
 """From body velocity to pose: over a plane at once, over hills and with odd physics step by step."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import multiply_quaternions, quaternions_from_euler, quaternions_from_yaw, rotate
+from pipeline.simulate.body import BodyMotion
+from pipeline.simulate.drivetrain import Drive
+from pipeline.simulate.effects import Effects
 from pipeline.simulate.scenario import ExtraPhysics, Ground, State
 from pipeline.simulate.signals import integrate_cells
 from pipeline.simulate.surface import Surface, Vector, cross, make_surface, slide_onto_plane, tilt_quaternion
-
-if TYPE_CHECKING:
-    from pipeline.simulate.body import BodyMotion
-    from pipeline.simulate.drivetrain import Drive
-    from pipeline.simulate.effects import Effects
-
 
 _SLOW_STEP_S = 0.005
 

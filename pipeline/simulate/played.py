@@ -1,18 +1,12 @@
 """Commands that were written to be played: read back, so that the hidden physics can be driven with them."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
 from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.programs import Commands
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.simulate.vehicles import Vehicle
+from pipeline.simulate.vehicles import Vehicle
 
 # Fields of speed and turn; a turn is a steering angle for a car, a yaw rate else.
 _STEERED = {

@@ -4,22 +4,16 @@ Every program is a function of its seed; a turn is a yaw rate [rad/s] on a diffe
 steering angle [rad] on a car.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.simulate.errors import SimulateError, unknown_name
+from pipeline.simulate.scenario import Program
 from pipeline.simulate.signals import make_coloured_noise
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pipeline.simulate.scenario import Program
-    from pipeline.simulate.vehicles import Vehicle
+from pipeline.simulate.vehicles import Vehicle
 
 
 @dataclass(frozen=True)

@@ -4,21 +4,16 @@ Types as farm-ng/farm-ng-core and farm-ng/farm-ng-amiga declare them; enumeratio
 they are in a message.
 """
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
+from pipeline.simulate.messages import Sheet
+from pipeline.simulate.scenario import Clock
 from pipeline.simulate.stamps import stamp_times
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from pipeline.simulate.messages import Sheet
-    from pipeline.simulate.scenario import Clock
 
 _CORE, _CANBUS, _FILTER = "farm_ng.core.proto", "farm_ng.canbus.proto", "farm_ng.filter.proto"
 TYPES: Final[dict[str, str]] = {

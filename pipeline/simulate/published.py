@@ -1,10 +1,9 @@
 """Topics as platforms publish them: a type and its fields, each filled from a quantity of the run."""
 
-from __future__ import annotations
-
 import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -13,17 +12,12 @@ from pipeline.core.arrays import Floats
 from pipeline.simulate.drivetrain import apply_ideal_model, invert_ideal_model
 from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.geodesy import to_earth
-from pipeline.simulate.messages import Sheet
+from pipeline.simulate.messages import Field, Sheet
 from pipeline.simulate.programs import make_commands
+from pipeline.simulate.run import SimulatedRun
 from pipeline.simulate.scenario import Program
 from pipeline.simulate.signals import integrate_cells
 from pipeline.simulate.streams import open_stream
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from pipeline.simulate.messages import Field
-    from pipeline.simulate.run import SimulatedRun
 
 Series = dict[str, Floats]
 Source = Literal[

@@ -1,23 +1,17 @@
 """Write a simulated run as a log: the messages of its layout's topics, never a word of the truth."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
 from pipeline.core.arrays import Ints
 from pipeline.simulate import messages
 from pipeline.simulate.layouts import find_layout
+from pipeline.simulate.messages import Field
 from pipeline.simulate.protobuf import is_protobuf, write_protobuf
 from pipeline.simulate.published import publish
+from pipeline.simulate.run import SimulatedRun
 from pipeline.simulate.stamps import stamp_headers, stamp_times
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.simulate.messages import Field
-    from pipeline.simulate.run import SimulatedRun
 
 _BOOTED_NS = 100_000_000_000
 

@@ -1,9 +1,6 @@
 """From a scenario to a simulated run: the truth, and what the robot's sensors say of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,13 +13,11 @@ from pipeline.simulate.layouts import find_layout
 from pipeline.simulate.localization import Poses, report_poses
 from pipeline.simulate.path import Path, integrate_path
 from pipeline.simulate.programs import Commands, make_commands
+from pipeline.simulate.scenario import Scenario
 from pipeline.simulate.sensors import ImuReadings, WheelReadings, read_encoders, read_imu
 from pipeline.simulate.signals import integrate_cells
 from pipeline.simulate.streams import open_stream
-
-if TYPE_CHECKING:
-    from pipeline.simulate.scenario import Scenario
-    from pipeline.simulate.vehicles import Vehicle
+from pipeline.simulate.vehicles import Vehicle
 
 
 @dataclass(frozen=True)

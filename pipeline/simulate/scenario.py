@@ -303,9 +303,5 @@ class Scenario:
             ("pose.rate_hz", self.pose.rate_hz, 0.1, 1000.0),
         ):
             if not low <= value <= high:
-                raise SimulateError(
-                    "bad_value",
-                    f"{name} = {value} is not possible",
-                    where=name,
-                    hint=f"Give {low:g} to {high:g}",
-                )
+                hint = f"Give {low:g} to {high:g}"
+                raise SimulateError("bad_value", f"{name} = {value} is not possible", where=name, hint=hint)

@@ -1,27 +1,19 @@
 """What encoders and the inertial unit report of the true motion."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import rigid
 from pipeline.core.arrays import Floats
-from pipeline.simulate.drivetrain import move_by_corners
+from pipeline.simulate.drivetrain import Drive, move_by_corners
+from pipeline.simulate.path import Path
+from pipeline.simulate.scenario import Encoders, Imu
 from pipeline.simulate.signals import integrate_cells
 from pipeline.simulate.streams import open_stream
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.simulate.drivetrain import Drive
-    from pipeline.simulate.path import Path
-    from pipeline.simulate.scenario import Encoders, Imu
-    from pipeline.simulate.vehicles import Vehicle
-
+from pipeline.simulate.vehicles import Vehicle
 
 _GRAVITY_MPS2 = 9.80665
 _GYRO_WINDOW_S = 0.01

@@ -1,15 +1,9 @@
 """From true seconds to the stamps of the robot's clock."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
-
-if TYPE_CHECKING:
-    from pipeline.simulate.scenario import Clock
+from pipeline.simulate.scenario import Clock
 
 Stamps = Ints
 

@@ -1,18 +1,13 @@
 """The ground as a surface: a tilted plane with sinusoidal hills, its height and its normal."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import quaternions_from_euler, rotate
-
-if TYPE_CHECKING:
-    from pipeline.simulate.scenario import Ground
+from pipeline.simulate.scenario import Ground
 
 Vector = tuple[float, float, float]
 

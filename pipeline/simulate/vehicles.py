@@ -46,12 +46,8 @@ class Vehicle:
     def __post_init__(self) -> None:
         for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "max_speed_mps"):
             if not getattr(self, name) > 0.0:
-                raise SimulateError(
-                    "bad_vehicle",
-                    f"{name} must be above zero",
-                    where=self.name,
-                    hint=f"Give {name} in SI units",
-                )
+                hint = f"Give {name} in SI units"
+                raise SimulateError("bad_vehicle", f"{name} must be above zero", where=self.name, hint=hint)
 
     @property
     def moves_sideways(self) -> bool:

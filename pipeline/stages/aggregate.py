@@ -1,15 +1,9 @@
 """The aggregate stage: what a run comes to."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 import polars as pl
 
-if TYPE_CHECKING:
-    from pipeline.vehicles import Vehicle
-
+from pipeline.vehicles import Vehicle
 
 _SUBSETS = pl.Enum(["all", "transitory", "steady"])
 _ROUGHNESS_S = 1.0

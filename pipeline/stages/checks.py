@@ -4,9 +4,7 @@ Each check is a function from the samples of a run to findings. They look at dis
 where neither smoothing nor vibration matters.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 
@@ -15,16 +13,11 @@ from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.stages.delays import estimate_delay
 from pipeline.stages.finding import Finding
+from pipeline.stages.samples import Samples
 from pipeline.stages.scale import check_scale
 from pipeline.stages.trust import check_live_commands
 from pipeline.stages.wiring import check_wiring
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pipeline.stages.samples import Samples
-    from pipeline.vehicles import Vehicle
-
+from pipeline.vehicles import Vehicle
 
 _GAIN_OF_NO_MOTION = 0.05
 _NET_OF_NO_MOTION = 0.5

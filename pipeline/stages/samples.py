@@ -1,20 +1,14 @@
 """The samples of a run side by side, as the checks of a whole run need them."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core.arrays import Flags, Floats
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.stages.slip import Ideal, Steps
+from pipeline.stages.slip import Ideal, Steps
 
 
 @dataclass(frozen=True)

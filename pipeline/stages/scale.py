@@ -5,20 +5,14 @@ is one: rpm for rad/s, degrees, millimetres. A smaller one is a radius only wher
 fast as its body command asks: a controller that knows the radius makes up for nothing that the ground takes.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.stages.finding import Finding
-from pipeline.vehicles import list_factors
-
-if TYPE_CHECKING:
-    from pipeline.stages.samples import Samples
-    from pipeline.vehicles import Vehicle
-
+from pipeline.stages.samples import Samples
+from pipeline.vehicles import Vehicle, list_factors
 
 _UNIT_NEAR: Final = 0.2
 """A gain within so much of a unit's is taken for it; slip of ground and a radius differ less."""

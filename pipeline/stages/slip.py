@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -15,12 +15,7 @@ from pipeline.runs.recording import read_wheel_times
 from pipeline.stages import steps
 from pipeline.stages.errors import StageError
 from pipeline.stages.finding import Finding
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.vehicles import Configuration, Vehicle
-
+from pipeline.vehicles import Configuration, Vehicle
 
 WINDOW_S = 2.0
 PUBLISHED_SAMPLES = 40

@@ -5,23 +5,17 @@ nor a tilted ground leaves a false velocity; their running sum is the vehicle's 
 quadratic fit of that odometer gives the velocity.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
 from pipeline.core import rigid, segments, timegrid
+from pipeline.runs.recording import GyroFit
 from pipeline.stages.errors import StageError
 from pipeline.stages.finding import Finding
 from pipeline.stages.gyro import smooth_gyro
-
-if TYPE_CHECKING:
-    from pipeline.runs.recording import GyroFit
-    from pipeline.vehicles.configuration import VelocitySection
-
+from pipeline.vehicles.configuration import VelocitySection
 
 _SHORTEST_SPAN = 0.5
 

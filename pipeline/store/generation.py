@@ -17,6 +17,7 @@ from pipeline.store.files import (
 from pipeline.store.homes import name_free_folder, point_latest
 from pipeline.store.listing import Replacement
 from pipeline.store.manifest import (
+    JSON,
     MANIFEST,
     MARKER,
     FileEntry,
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-    from pipeline.store.manifest import JSON
     from pipeline.store.tables import CheckedTable
 
 STEPS = (

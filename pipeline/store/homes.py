@@ -1,18 +1,11 @@
 """What stands in a run's folder besides its manifest: generations, the link ``latest``, leftovers."""
 
-from __future__ import annotations
-
+from collections.abc import Collection
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from pipeline.store.files import remove_folder, temporary_beside
-from pipeline.store.manifest import MARKER
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
-    from pathlib import Path
-
-    from pipeline.store.manifest import Manifest
+from pipeline.store.manifest import MARKER, Manifest
 
 LATEST = "latest"
 

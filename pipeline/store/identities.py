@@ -10,16 +10,12 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from stat import S_ISDIR
-from typing import TYPE_CHECKING
 
 from pipeline.logs import list_files
 from pipeline.store.manifest import hash_bytes
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.store.results import Store
+from pipeline.store.results import Store
 
 FOLDER = "identities"
 _DIGITS = 16

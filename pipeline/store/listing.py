@@ -6,23 +6,16 @@ both hashes until it has been: killed in between, either content is right. A fil
 written before there was one.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from pipeline.core.paths import PathError, check_name
 from pipeline.store import files
-from pipeline.store.manifest import MANIFEST, hash_bytes
+from pipeline.store.manifest import MANIFEST, Manifest, hash_bytes
 from pipeline.store.names import place_inside
 from pipeline.store.seals import seal, unseal
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from pipeline.store.manifest import Manifest
 
 LIST = "listed"
 """Folder of the list."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeAlias
@@ -17,7 +17,6 @@ from pipeline.store.errors import StoreError
 from pipeline.store.names import place_inside
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     import polars as pl
@@ -157,12 +156,8 @@ class Manifest:
         except (OSError, ValueError, RecursionError):
             content = None
         if not isinstance(content, dict):
-            raise StoreError(
-                "file_damaged",
-                "the file is not what was written",
-                where=str(path),
-                hint="Analyze the log again with --force; `slip verify --repair` lists what else is damaged",
-            )
+            hint = "Analyze the log again with --force; `slip verify --repair` lists what else is damaged"
+            raise StoreError("file_damaged", "the file is not what was written", where=str(path), hint=hint)
         return content
 
     def with_earlier(self, earlier: Sequence[str]) -> Manifest:
@@ -216,19 +211,11 @@ def name_damage(path: Path) -> Iterator[None]:
 
 
 def _table_damaged(why: str, path: Path) -> StoreError:
-    return StoreError(
-        "table_damaged",
-        f"the table cannot be read: {why}",
-        where=str(path),
-        hint="Analyze the log again with --force",
-    )
+    hint = "Analyze the log again with --force"
+    return StoreError("table_damaged", f"the table cannot be read: {why}", where=str(path), hint=hint)
 
 
 def file_missing(path: Path) -> StoreError:
     """The error for a file that a manifest names and that is not there."""
-    return StoreError(
-        "file_missing",
-        "a file of the results is gone",
-        where=str(path),
-        hint="slip verify --repair has the next slip batch make it again",
-    )
+    hint = "slip verify --repair has the next slip batch make it again"
+    return StoreError("file_missing", "a file of the results is gone", where=str(path), hint=hint)

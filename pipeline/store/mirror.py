@@ -19,21 +19,19 @@ from typing import TYPE_CHECKING
 from pipeline.store.errors import StoreError, name_disk_errors
 from pipeline.store.files import make_folder, replace_file
 from pipeline.store.listing import ABSENT, encode_entry, entry_name, is_run_manifest, make_entry
-from pipeline.store.manifest import MANIFEST, MARKER, hash_bytes
+from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes
 from pipeline.store.manifest_file import encode_manifest, load_manifest, parse_manifest
 from pipeline.store.names import encode_run, is_file_name, place_inside
 from pipeline.store.notes import LOG_NOTES
 from pipeline.store.results import RUNS, Store
 from pipeline.store.seals import seal, unseal
-from pipeline.store.verification import Examination, examine_files
+from pipeline.store.verification import Examination, Problem, examine_files
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from fsspec import AbstractFileSystem
 
-    from pipeline.store.manifest import Manifest
-    from pipeline.store.verification import Problem
 
 _SEEN = "mirror.json"
 _TOGETHER = 200

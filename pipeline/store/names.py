@@ -33,11 +33,8 @@ def encode_run(run: str) -> PurePosixPath:
         StoreError: ``bad_run_name``, the name is empty or cannot be written as UTF-8.
     """
     if not run or not _is_writable(run):
-        raise StoreError(
-            "bad_run_name",
-            f"{run!r} cannot name a run",
-            hint="Rename the log to a name that is not empty and is valid Unicode",
-        )
+        hint = "Rename the log to a name that is not empty and is valid Unicode"
+        raise StoreError("bad_run_name", f"{run!r} cannot name a run", hint=hint)
     folder, slash, stem = run.rpartition("/")
     parts = (folder, stem) if slash else (stem,)
     return PurePosixPath(*(_encode_part(part) for part in parts))
@@ -77,11 +74,8 @@ def check_key(key: str) -> None:
         StoreError: ``bad_key``.
     """
     if not is_key(key):
-        raise StoreError(
-            "bad_key",
-            f"{key!r} cannot be the key of a generation",
-            hint="Use letters, digits, _ and - only, at most 64",
-        )
+        hint = "Use letters, digits, _ and - only, at most 64"
+        raise StoreError("bad_key", f"{key!r} cannot be the key of a generation", hint=hint)
 
 
 def check_file_name(name: str) -> None:
@@ -91,11 +85,8 @@ def check_file_name(name: str) -> None:
         StoreError: ``bad_file_name``.
     """
     if not is_file_name(name):
-        raise StoreError(
-            "bad_file_name",
-            f"{name!r} cannot name a file of the results",
-            hint="Use letters, digits, dots, _ and -, and start with a letter or a digit",
-        )
+        hint = "Use letters, digits, dots, _ and -, and start with a letter or a digit"
+        raise StoreError("bad_file_name", f"{name!r} cannot name a file of the results", hint=hint)
 
 
 def is_key(key: str) -> bool:

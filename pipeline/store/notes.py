@@ -4,24 +4,17 @@ A note may be lost, for example in a power cut, and must then only cost time. Wh
 into a generation.
 """
 
-from __future__ import annotations
-
 import os
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, cast
+from pathlib import Path
+from typing import cast
 
 from pipeline.store.errors import StoreError, name_disk_errors
 from pipeline.store.files import temporary_beside
-from pipeline.store.manifest import hash_bytes
+from pipeline.store.manifest import JSON, hash_bytes
 from pipeline.store.names import place_inside
 from pipeline.store.seals import seal, unseal
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from pathlib import Path
-
-    from pipeline.store.manifest import JSON
-
 
 LOG_NOTES = "batch/logs"
 """Folder of the notes on logs, the only ones that several machines share."""

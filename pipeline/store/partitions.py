@@ -1,15 +1,10 @@
 """Which runs a question is about, told from their manifests alone."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.store.manifest import JSON, Manifest
+from pipeline.store.manifest import JSON, Manifest
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,24 +1,17 @@
 """Questions over all runs: one table as a lazy frame, or SQL over all tables."""
 
-from __future__ import annotations
-
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 import polars as pl
 
 from pipeline.store.errors import StoreError, name_disk_errors
-from pipeline.store.manifest import file_missing
+from pipeline.store.manifest import Manifest, file_missing
 from pipeline.store.names import place_inside
 from pipeline.store.partitions import describe_run
 from pipeline.store.tables import QUARANTINE, find_contract, schema_of
 from schemas import list_contracts
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from pipeline.store.manifest import Manifest
 
 _READERS = re.compile(
     r"(?:read|scan)_(?:csv|parquet|ipc|json|ndjson|avro|delta|iceberg|excel|database|\w*(?=\W*\())"

@@ -13,7 +13,7 @@ from pipeline.store.generation import Generation
 from pipeline.store.homes import point_latest, remove_orphans
 from pipeline.store.listing import LIST, encode_entry, entry_name, is_run_manifest, make_entry, replace_listed
 from pipeline.store.locks import hold_lock
-from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes, hash_file
+from pipeline.store.manifest import MANIFEST, MARKER, Manifest, TableReport, hash_bytes, hash_file
 from pipeline.store.manifest_file import encode_manifest, load_manifest
 from pipeline.store.names import check_file_name, check_home, check_key, encode_run, name_clash, place_inside
 from pipeline.store.notes import AGAIN_NOTES, Notes
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-    from pipeline.store.manifest import TableReport
     from pipeline.store.partitions import Partition
     from pipeline.store.verification import Examination, Problem
 

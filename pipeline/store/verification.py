@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.store.errors import StoreError
 from pipeline.store.listing import ABSENT, LIST, Entry, entry_name, is_run_manifest, parse_entry
-from pipeline.store.manifest import MANIFEST, MARKER, hash_bytes, hash_file
+from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes, hash_file
 from pipeline.store.manifest_file import parse_manifest, parse_marker
 from pipeline.store.names import check_home, is_file_name
 from pipeline.store.notes import NOTES
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
     from pathlib import Path
 
-    from pipeline.store.manifest import Manifest
     from pipeline.store.mirror import Mirror
 
 RUNS = "runs"

@@ -4,20 +4,13 @@ Wheel commands come before body commands, since the drive received them; measure
 publisher made of them.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from pipeline.vehicles.message_types import find_type, list_pairs
+from pipeline.vehicles.message_types import NumberField, find_type, list_pairs
 from pipeline.vehicles.sources import DriveForm, DriveSource, Signal
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-
-    from pipeline.vehicles.message_types import NumberField
 
 COMMANDED = re.compile(r"cmd|command|setpoint|target|desired|reference|control_input")
 MEASURED = re.compile(r"status|state|feedback|measured|encoder|actual|report")

@@ -1,18 +1,12 @@
 """Geometry out of the frames of wheels, where transforms place them and no robot description was recorded."""
 
-from __future__ import annotations
-
 import re
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.logs import LogError
-
-if TYPE_CHECKING:
-    from pipeline.logs import TransformBuffer
-
+from pipeline.logs import LogError, TransformBuffer
 
 _NO_WHEEL: Final = re.compile(r"caster|castor|swivel|cam|lidar|imu")
 _APART_M: Final = 0.02

@@ -4,21 +4,16 @@ A platform is recognized by a word of a namespace, a host, the robot's name, or 
 message types. A description gives the geometry of a vehicle that is no platform.
 """
 
-from __future__ import annotations
-
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import msgspec
 
+from pipeline.logs import ChannelInfo
+from pipeline.vehicles.description import Description
 from pipeline.vehicles.presets import Vehicle, list_presets
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from pipeline.logs import ChannelInfo
-    from pipeline.vehicles.description import Description
 
 VehicleSource = Literal[
     "flag",

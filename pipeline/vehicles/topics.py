@@ -5,16 +5,18 @@ that vehicles usually have, and words such as `cmd` or `status`, rank them. The 
 Where a log holds several robots, all roles are filled from the namespace of one.
 """
 
-from __future__ import annotations
-
 import os.path
 import re
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
+from pipeline.logs import ChannelInfo
 from pipeline.vehicles.candidates import DEAD_RECKONED, LOCALIZED, Topics
+from pipeline.vehicles.configuration import Configuration, DriveSection, IntervalSection, PoseSection
 from pipeline.vehicles.errors import ConfigurationError
 from pipeline.vehicles.message_types import find_type, list_types, plain_type
+from pipeline.vehicles.presets import Vehicle
 from pipeline.vehicles.robots import choose_robot, find_robots
 from pipeline.vehicles.sources import (
     CONFIGURED,
@@ -26,13 +28,6 @@ from pipeline.vehicles.sources import (
     Sources,
     TopicSource,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from pipeline.logs import ChannelInfo
-    from pipeline.vehicles.configuration import Configuration, DriveSection, IntervalSection, PoseSection
-    from pipeline.vehicles.presets import Vehicle
 
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 STRING_TYPE = "std_msgs/String"

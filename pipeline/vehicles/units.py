@@ -1,16 +1,11 @@
 """Units of what drives are told and what they measure, made one: rad/s, m/s, rad."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping
+from typing import Final
 
 from pipeline.vehicles.errors import ConfigurationError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.vehicles.presets import OwnUnit
+from pipeline.vehicles.presets import OwnUnit
 
 _KNOWN: Final[Mapping[str, tuple[float, str]]] = {
     "rad/s": (1.0, "rad/s"),

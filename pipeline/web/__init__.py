@@ -9,5 +9,3 @@ from pipeline.web.app import build_app
 from pipeline.web.errors import WorkbenchError
 from pipeline.web.limits import Limits
 from pipeline.web.server import is_loopback, serve
-
-__all__ = ["Limits", "WorkbenchError", "build_app", "is_loopback", "serve"]

@@ -9,19 +9,16 @@ import msgspec
 
 from pipeline.identification.describe import errors_as_json
 from pipeline.identification.ladder import CHANCE, ERRORS_OVER_2S, list_rises
-from pipeline.models import find_effect
+from pipeline.models import Effect, Model, find_effect
 from pipeline.web.cards import show_session
 from pipeline.web.errors import WorkbenchError
-from pipeline.web.run_cache import rung_as_json
-from pipeline.web.session import Session, Step, begin_session, format_step, switch_off
+from pipeline.web.run_cache import PreparedRun, rung_as_json
+from pipeline.web.session import Session, SessionFile, Step, begin_session, format_step, switch_off
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.identification import Errors
-    from pipeline.models import Effect, Model
-    from pipeline.web.run_cache import PreparedRun
-    from pipeline.web.session import SessionFile
 
     Rungs = Mapping[tuple[str, ...], dict[str, object]]
 

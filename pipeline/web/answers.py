@@ -1,21 +1,13 @@
 """Answers of the server: JSON, also of numbers that are none, and errors that tell nothing of its disk."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
 
 import msgspec
-from starlette.requests import ClientDisconnect
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
 from pipeline.core.errors import SlipError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from starlette.requests import Request
-
-    from pipeline.web.places import Places
+from pipeline.web.places import Places
 
 _NOT_FOUND = ("no_such_run", "no_such_desk", "no_such_job")
 
@@ -47,11 +39,8 @@ def make_handlers(places: Places) -> dict[type[Exception], Callable[[Request, Ex
 
 
 def _name_defect(error: Exception) -> SlipError:
-    return SlipError(
-        "defect",
-        f"something went wrong that should not ({type(error).__name__})",
-        hint="The server tells more where it was started; nothing was changed.",
-    )
+    hint = "The server tells more where it was started; nothing was changed."
+    return SlipError("defect", f"something went wrong that should not ({type(error).__name__})", hint=hint)
 
 
 def _make_plain(value: object) -> object:

@@ -1,22 +1,15 @@
 """A session as the page shows it: numbers, effects as cards, what was done."""
 
-from __future__ import annotations
-
 import inspect
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
-from pipeline.models import list_effects
+from pipeline.models import Effect, Parameter, list_effects
 from pipeline.models.bounds import stands_at_bound
 from pipeline.models.formula import FormulaEffect
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.models import Effect, Parameter
-    from pipeline.models.model_file import ModelFile
-    from pipeline.vehicles import Vehicle
-    from pipeline.web.session import Session
+from pipeline.models.model_file import ModelFile
+from pipeline.vehicles import Vehicle
+from pipeline.web.session import Session
 
 _STEPS = 200
 _LATEST = 12

@@ -1,22 +1,16 @@
 """What a diagnosis says of a run: kept with its results, or beside them where it was asked for here."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from pathlib import Path
 
 from pipeline.analysis.diagnosis import DIAGNOSIS, read_recording
 from pipeline.analysis.options import INPUTS
 from pipeline.report.run import mapping_in
+from pipeline.store import Manifest
 from pipeline.store.files import make_folder, replace_file
 from pipeline.web.runs import read_json
 from pipeline.web.session import place_of_run
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from pipeline.store import Manifest
 
 
 def read_diagnosis(results: Path, manifest: Manifest) -> Mapping[str, object] | None:

@@ -1,16 +1,11 @@
 """The error of this room."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.errors import SlipError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 _UNDOABLE = (ArithmeticError, ValueError, TypeError, LookupError, RecursionError, MemoryError)
 

@@ -1,10 +1,7 @@
 """The figures of the report, for one session: whole, or only the rows that a change of the model moves."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import polars as pl
 
@@ -24,11 +21,9 @@ from pipeline.report.figures.velocities import model_rows
 from pipeline.report.run import RunReport, number_in
 from pipeline.report.scene import Scene
 from pipeline.report.specs import build_spec, pack_rows, share_rows
+from pipeline.store import Manifest
+from pipeline.web.run_cache import Shown
 from pipeline.web.runs import read_summary
-
-if TYPE_CHECKING:
-    from pipeline.store import Manifest
-    from pipeline.web.run_cache import Shown
 
 FIGURES = (
     "ladder",

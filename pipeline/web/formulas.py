@@ -1,19 +1,13 @@
 """A formula as typed on the page: parsed into an effect, never run as text."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import re
-from typing import TYPE_CHECKING
 
-from pipeline.models import list_effects
+from pipeline.models import Parameter, list_effects
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.formula.formula_effect import CHANNELS, make_parameter
 from pipeline.web.errors import WorkbenchError
-
-if TYPE_CHECKING:
-    from pipeline.models import Parameter
 
 _LONGEST = 400
 _ID = re.compile(r"[a-z][a-z0-9_]{0,39}")
@@ -41,11 +35,8 @@ def make_formula(name: str, channel: str, text: str, parameters: str) -> Formula
         MotionError: the formula cannot be parsed, or its unit is not the channel's.
     """
     if not _ID.fullmatch(name):
-        raise WorkbenchError(
-            "bad_name",
-            f"{name!r} cannot name an effect",
-            hint="Use small letters, digits and _, a letter first, at most 40.",
-        )
+        hint = "Use small letters, digits and _, a letter first, at most 40."
+        raise WorkbenchError("bad_name", f"{name!r} cannot name an effect", hint=hint)
     if channel not in CHANNELS:
         raise WorkbenchError("bad_channel", f"there is no velocity {channel!r}", hint="Use v_x, v_y or v_w.")
     if max(len(text), len(parameters)) > _LONGEST:
@@ -69,11 +60,8 @@ def make_formula(name: str, channel: str, text: str, parameters: str) -> Formula
 def _read_parameter(text: str) -> Parameter:
     match = _PARAMETER.fullmatch(text)
     if match is None:
-        raise WorkbenchError(
-            "bad_parameter",
-            f"{text!r} is no parameter",
-            hint="Write name [unit] low .. high, for example: c [s] -0.5 .. 0.5",
-        )
+        hint = "Write name [unit] low .. high, for example: c [s] -0.5 .. 0.5"
+        raise WorkbenchError("bad_parameter", f"{text!r} is no parameter", hint=hint)
     if match["name"] in _TAKEN:
         raise WorkbenchError(
             "bad_parameter", f"{match['name']!r} cannot name a parameter", hint="Choose another name."

@@ -18,14 +18,13 @@ from typing import TYPE_CHECKING
 
 from starlette.datastructures import QueryParams
 from starlette.requests import cookie_parser
-from starlette.responses import HTMLResponse, JSONResponse
+from starlette.responses import HTMLResponse, JSONResponse, Response
 
 from pipeline.report.pages import is_page
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from starlette.responses import Response
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 POLICY = (

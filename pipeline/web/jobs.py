@@ -1,31 +1,24 @@
 """Dropped logs on their way to runs, and diagnoses: in the background, with progress."""
 
-from __future__ import annotations
-
 import hashlib
 import secrets
 import threading
 import time
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.analysis.log_setup import name_run
 from pipeline.analysis.options import STAGE_WORDS, STAGES, Options
+from pipeline.batch.work import Report, Task
 from pipeline.core.errors import SlipError
-from pipeline.store import LogSighting, Store, see_log
+from pipeline.store import LogSighting, Manifest, Store, see_log
 from pipeline.web.errors import WorkbenchError
+from pipeline.web.limits import Limits
+from pipeline.web.places import Places
 from pipeline.web.uploads import Upload, Uploads, clean_name
 from pipeline.web.workers import ANALYZE, DIAGNOSE, PLAN, Errand, Workers
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    from pipeline.batch.work import Report, Task
-    from pipeline.store import Manifest
-    from pipeline.web.limits import Limits
-    from pipeline.web.places import Places
 
 WORDS = {
     "sample": "driving a simulated Husky over tile",

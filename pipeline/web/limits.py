@@ -1,7 +1,5 @@
 """What logs that are dropped on the page, and the work on them, may cost."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """Where things stand on the server's disk, which the page is not told."""
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from pathlib import Path

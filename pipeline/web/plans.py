@@ -1,17 +1,11 @@
 """Drives that were planned for a stored run: their files and their previews, beside the results."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from pipeline.analysis.diagnosis import read_recording
 from pipeline.analysis.planned import PREVIEW, leave_plan, place_plan, read_preview
+from pipeline.store import Manifest, Store
 from pipeline.web.errors import WorkbenchError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.store import Manifest, Store
 
 KINDS = {
     "plan.html": "text/html",

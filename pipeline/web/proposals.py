@@ -1,32 +1,23 @@
 """What to add next: each effect of the catalogue tried on top of the model."""
 
-from __future__ import annotations
-
 import threading
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.arrays import Floats
 from pipeline.core.errors import SlipError
 from pipeline.diagnosis.verdict import compare
-from pipeline.identification import fit_model, hold_out
+from pipeline.identification import HeldOut, Problem, fit_model, hold_out
 from pipeline.identification.ladder import compare_losses, list_rises
 from pipeline.identification.weights import make_weights
-from pipeline.models import list_effects
+from pipeline.models import Model, list_effects
 from pipeline.runs import MotionError
 from pipeline.web.cards import describe_shortly
 from pipeline.web.errors import evaluating
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from pipeline.identification import HeldOut, Problem
-    from pipeline.models import Model
-    from pipeline.web.run_cache import PreparedRun
+from pipeline.web.run_cache import PreparedRun
 
 _WORTH = 0.99
 _MOST_KEPT = 40
@@ -146,7 +137,7 @@ def _try_each(
     problem = prepared.second_problem()
     base: HeldOut = hold_out(problem, fit_model(problem, model))
     kinds = {effect.id: effect for effect in list_effects()}
-    taken: dict[str, NDArray[np.float64]] = {}
+    taken: dict[str, Floats] = {}
     for name in names:
         idle.wait()
         if trial.stopped:
@@ -183,9 +174,7 @@ def _share_left(base: HeldOut, new: HeldOut) -> float:
     return position * after.r_mrmse_rad / max(before.r_mrmse_rad, 1e-12)
 
 
-def _find_twins(
-    name: str, new: HeldOut, base: HeldOut, taken: dict[str, NDArray[np.float64]], trial: Trial
-) -> list[str]:
+def _find_twins(name: str, new: HeldOut, base: HeldOut, taken: dict[str, Floats], trial: Trial) -> list[str]:
     """Effects tried before that take the same off the residuals, which are told so too.
 
     Args:

@@ -1,38 +1,27 @@
 """Runs made ready for fitting, kept in memory: the expensive part of every answer."""
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING
 
 import polars as pl
 
+from pipeline.core.arrays import Floats
 from pipeline.diagnosis.error_regions import map_errors, pick_regions
 from pipeline.diagnosis.unexplained import find_places
-from pipeline.identification import Input, Problem, State, choose_input, fit_model, hold_out
+from pipeline.identification import Errors, Fitted, Input, Problem, State, choose_input, fit_model, hold_out
 from pipeline.identification.describe import errors_as_json
 from pipeline.identification.intervals import estimate_intervals
 from pipeline.identification.predict import predict_at_from
 from pipeline.identification.scoring import score
-from pipeline.models import Timing
+from pipeline.models import Model, Timing
 from pipeline.report.motion_run import load_motion_run, load_vehicle
-from pipeline.report.motion_view import MotionStage
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from pipeline.identification import Errors, Fitted
-    from pipeline.models import Model
-    from pipeline.report.motion_view import MotionView
-    from pipeline.runs import MotionRun
-    from pipeline.store import Manifest
-    from pipeline.vehicles import Vehicle
+from pipeline.report.motion_view import MotionStage, MotionView
+from pipeline.runs import MotionRun
+from pipeline.store import Manifest
+from pipeline.vehicles import Vehicle
 
 _MOST_RUNS = 6
 _MOST_FITS = 60
@@ -59,7 +48,7 @@ class Shown:
 
     view: MotionView
     where: list[str]
-    predict: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    predict: Callable[[Floats], Floats]
 
 
 @dataclass

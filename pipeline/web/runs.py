@@ -1,18 +1,12 @@
 """The list of runs, for the page."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import msgspec
 
+from pipeline.store import Manifest, Store
 from pipeline.web.errors import WorkbenchError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.store import Manifest, Store
 
 _LONGEST = 500
 """Characters of a text that a log wrote; longer ones are cut on the page."""

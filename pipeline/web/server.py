@@ -1,22 +1,15 @@
 """Starting the server."""
 
-from __future__ import annotations
-
 import os
 import socket
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 from pipeline.report.bundle import warm_bundle
 from pipeline.web.app import build_app
 from pipeline.web.errors import WorkbenchError
 from pipeline.web.guard import LOOPBACK, make_token
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from pipeline.web.limits import Limits
-
+from pipeline.web.limits import Limits
 
 _LAST_PORT = 65535
 

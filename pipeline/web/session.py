@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import msgspec
 
@@ -15,13 +16,8 @@ from pipeline.models.model_file import ModelFile, parse_model
 from pipeline.models.model_text import format_model
 from pipeline.store.files import make_folder, replace_file
 from pipeline.store.names import encode_run
+from pipeline.vehicles import Vehicle
 from pipeline.web.errors import WorkbenchError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from pipeline.vehicles import Vehicle
 
 SLOTS = ("a", "b")
 FOLDER = "workbench"

@@ -1,16 +1,16 @@
 """Everything the server holds: results, runs made ready, sessions, trials, jobs; what is asked, answered."""
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
+from pipeline.batch.work import Report, Task
 from pipeline.models import Model
 from pipeline.models.model_text import write_model
 from pipeline.report.diagnosed import read_model_text
-from pipeline.store import Store
+from pipeline.store import Manifest, Store
 from pipeline.store.files import make_folder
 from pipeline.web import actions
 from pipeline.web.cards import list_catalogue, show_session
@@ -19,23 +19,14 @@ from pipeline.web.errors import WorkbenchError, evaluating
 from pipeline.web.figure_cache import FigureCache
 from pipeline.web.formulas import make_formula
 from pipeline.web.jobs import Jobs
+from pipeline.web.limits import Limits
+from pipeline.web.places import Places
 from pipeline.web.plans import find_plan
 from pipeline.web.proposals import Trials
-from pipeline.web.run_cache import RunCache
+from pipeline.web.requests import Ask
+from pipeline.web.run_cache import PreparedRun, RunCache, Shown
 from pipeline.web.runs import describe_run, find_run
-from pipeline.web.session import SessionFile, format_step, switch_off
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from pipeline.batch.work import Report, Task
-    from pipeline.store import Manifest
-    from pipeline.web.limits import Limits
-    from pipeline.web.places import Places
-    from pipeline.web.requests import Ask
-    from pipeline.web.run_cache import PreparedRun, Shown
-    from pipeline.web.session import Session
+from pipeline.web.session import Session, SessionFile, format_step, switch_off
 
 _MOST_ALBUMS = 6
 

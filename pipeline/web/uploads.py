@@ -4,29 +4,23 @@ They stand in a folder of this server's own, under names that this server makes 
 killed has left behind goes when the next one starts.
 """
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import os
 import re
 import secrets
 import shutil
+from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from pipeline.core.errors import SlipError
 from pipeline.core.paths import resolve_inside
 from pipeline.store.locks import hold_lock
 from pipeline.web.errors import WorkbenchError
+from pipeline.web.limits import Limits
 from pipeline.web.session import FOLDER
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-    from pathlib import Path
-
-    from pipeline.web.limits import Limits
 
 _LOCK = ".lock"
 _NAME_BYTES = 8

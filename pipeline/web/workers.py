@@ -3,13 +3,12 @@
 The process is a worker of a batch, with its limits of time and memory; a fresh one follows one that was lost.
 """
 
-from __future__ import annotations
-
 import threading
+from collections.abc import Callable
 from concurrent.futures import wait
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from pipeline.batch.executors import Settings
 from pipeline.batch.executors.local import LocalExecutor
@@ -18,14 +17,9 @@ from pipeline.batch.work import Report, Task
 from pipeline.store import Store
 from pipeline.web.diagnoses import write_diagnosis
 from pipeline.web.errors import WorkbenchError
+from pipeline.web.limits import Limits
 from pipeline.web.plans import write_run_plan
 from pipeline.web.runs import find_run
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from pipeline.web.limits import Limits
 
 DIAGNOSE = "diagnose"
 PLAN = "plan"

@@ -91,8 +91,5 @@ def find_executor(word: str, settings: Settings) -> Executor:
         module: _Module = importlib.import_module(f"{__name__}.{found.name}")
         if module.accepts(word):
             return module.open_executor(word, settings)
-    raise BatchError(
-        "no_such_executor",
-        f"no executor is called {word!r}",
-        hint="Use local, inline, dask, or the address of a dask scheduler such as tcp://host:8786",
-    )
+    hint = "Use local, inline, dask, or the address of a dask scheduler such as tcp://host:8786"
+    raise BatchError("no_such_executor", f"no executor is called {word!r}", hint=hint)

@@ -6,13 +6,9 @@ Nothing is isolated here: a log that crashes, hangs or eats memory takes the bat
 from __future__ import annotations
 
 from concurrent.futures import Future
-from typing import TYPE_CHECKING
 
 from pipeline.batch.executors import Blame, Settings
-from pipeline.batch.work import work_safely
-
-if TYPE_CHECKING:
-    from pipeline.batch.work import Report, Task
+from pipeline.batch.work import Report, Task, work_safely
 
 
 def accepts(word: str) -> bool:

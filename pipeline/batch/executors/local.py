@@ -16,19 +16,16 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from functools import partial
 from multiprocessing.context import SpawnContext, SpawnProcess
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 from pebble import ProcessExpired, ProcessPool
 
 from pipeline.batch.errors import BatchError
 from pipeline.batch.executors import Blame, Settings
 from pipeline.batch.memory import MemoryWatchdog
-from pipeline.batch.work import work_safely
+from pipeline.batch.work import Report, Task, work_safely
 from pipeline.core.interpreter import keep_current_folder_out
 from pipeline.core.quiet import silence_warnings
-
-if TYPE_CHECKING:
-    from pipeline.batch.work import Report, Task
 
 _TASKS_PER_WORKER = 2000
 """A worker is replaced after so many logs: whatever leaks in a library stays small."""
@@ -268,11 +265,8 @@ class _RememberingContext(SpawnContext):
 
 
 def _describe_failed_start(reason: str) -> BatchError:
-    return BatchError(
-        "no_workers",
-        f"worker processes cannot be started ({reason})",
-        hint="See what they said above; --executor inline works without them",
-    )
+    hint = "See what they said above; --executor inline works without them"
+    return BatchError("no_workers", f"worker processes cannot be started ({reason})", hint=hint)
 
 
 def describe_exit(code: int | None) -> str:

@@ -1,19 +1,10 @@
 """What the functions of this room are given: plain arrays, checked once."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
+from pipeline.core.arrays import Floats
 from pipeline.core.errors import SlipError
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 class StatisticsError(SlipError):

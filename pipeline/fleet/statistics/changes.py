@@ -1,17 +1,13 @@
 """When did a quantity change? Levels of a series of runs, and the places where they step."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from pipeline.fleet.statistics.arrays import Floats, check_values
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+from pipeline.core.arrays import Floats
+from pipeline.fleet.statistics.arrays import check_values
 
 FEWEST_RUNS = 3
 _DRAWS = 1_999

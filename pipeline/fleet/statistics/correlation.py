@@ -1,15 +1,10 @@
 """How long slip remembers: integrated autocorrelation time, blocks, and the samples that count."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import ArrayLike
 
-from pipeline.fleet.statistics.arrays import Floats, Integers, check_values
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+from pipeline.core.arrays import Floats, Ints
+from pipeline.fleet.statistics.arrays import check_values
 
 _FEWEST_PAIRS = 20
 _LONGEST_SHARE = 0.25
@@ -52,7 +47,7 @@ def integrated_time(values: ArrayLike, ticks: ArrayLike) -> float:
     return tau
 
 
-def number_blocks(ticks: ArrayLike, pieces: ArrayLike, length: float) -> Integers:
+def number_blocks(ticks: ArrayLike, pieces: ArrayLike, length: float) -> Ints:
     """Cut samples into blocks of about ``length`` grid steps; no block crosses the end of a piece.
 
     A piece is cut into as many equal blocks of at least that length as fit; a shorter one is a block.

@@ -1,21 +1,16 @@
 """Many pairs at once: p values corrected so that one false alarm in the whole family stays unlikely."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from pipeline.fleet.statistics.arrays import Floats, check_values
+from pipeline.core.arrays import Floats
+from pipeline.fleet.statistics.arrays import check_values
 from pipeline.fleet.statistics.permutation import DRAWS, LARGEST_EXACT
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import ArrayLike
 
 MOST_GROUPS = 8
 _TIE = 1e-9

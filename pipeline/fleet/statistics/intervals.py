@@ -1,18 +1,14 @@
 """Intervals: over runs for a dataset, over blocks for a single run."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from pipeline.fleet.statistics.arrays import Floats, check_values
+from pipeline.core.arrays import Floats
+from pipeline.fleet.statistics.arrays import check_values
 from pipeline.fleet.statistics.ranks import shift_between
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 _BINS = 512
 

@@ -12,18 +12,15 @@ Cochran's Q.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from pipeline.fleet.statistics.arrays import Floats, Integers, StatisticsError, check_values
+from pipeline.core.arrays import Floats, Ints
+from pipeline.fleet.statistics.arrays import StatisticsError, check_values
 from pipeline.fleet.statistics.intervals import Interval, student_quantile
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import ArrayLike
 
 _LEVEL = 0.95
 _NORMAL = 1e6
@@ -171,7 +168,7 @@ class Sample:
 
     y: Floats
     known: Floats
-    group: Integers
+    group: Ints
     count: int
 
     def weigh(self, run: float) -> tuple[Floats, Floats, Floats]:

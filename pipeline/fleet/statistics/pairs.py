@@ -1,23 +1,16 @@
 """Two sides compared: whole runs where there are any, blocks where each side is one run."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from pipeline.fleet.statistics.arrays import Floats, Integers, check_values
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.fleet.statistics.arrays import check_values
 from pipeline.fleet.statistics.correlation import TIMES_PER_BLOCK, integrated_time, number_blocks
 from pipeline.fleet.statistics.intervals import Interval, bound_shift
 from pipeline.fleet.statistics.permutation import DRAWS, PermutationTest, permute_means, permute_studentized
 from pipeline.fleet.statistics.ranks import cliffs_delta, shift_between
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-Flags = NDArray[np.bool_]
 
 _FEWEST_BLOCKS = 12
 _SMALLEST_SHARE = 0.25
@@ -52,7 +45,7 @@ class Blocks:
     """
 
     medians: Floats
-    numbers: Integers
+    numbers: Ints
     memory: float
     length: float
 
@@ -136,7 +129,7 @@ def cut_blocks(values: ArrayLike, ticks: ArrayLike, pieces: ArrayLike, *, step: 
     return Blocks(medians, numbers, memory, length)
 
 
-def _keep_apart(ticks: Integers, pieces: NDArray[np.generic], numbers: Integers, gap: float) -> Flags:
+def _keep_apart(ticks: Ints, pieces: NDArray[np.generic], numbers: Ints, gap: float) -> Flags:
     """False for the first ``gap`` grid steps of blocks that continue the piece of the block before."""
     first = np.flatnonzero(np.diff(numbers, prepend=-1))
     continues = np.zeros(first.size, dtype=bool)
@@ -146,7 +139,7 @@ def _keep_apart(ticks: Integers, pieces: NDArray[np.generic], numbers: Integers,
     return kept
 
 
-def _measure_blocks(samples: Floats, numbers: Integers, kept_samples: Flags) -> Floats:
+def _measure_blocks(samples: Floats, numbers: Ints, kept_samples: Flags) -> Floats:
     """Median of each block that has at least a quarter of the usual samples."""
     samples, numbers = samples[kept_samples], numbers[kept_samples]
     edges = np.concatenate((np.flatnonzero(np.diff(numbers, prepend=-1)), [samples.size]))

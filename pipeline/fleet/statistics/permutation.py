@@ -5,22 +5,17 @@ were no difference. Samples of one run could not: they are correlated. Source: G
 and Bootstrap Tests of Hypotheses (2005); studentized: Janssen, Statistics and Probability Letters 36 (1997).
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from pipeline.fleet.statistics.arrays import Floats, check_values
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import ArrayLike, NDArray
+from pipeline.core.arrays import Flags, Floats
+from pipeline.fleet.statistics.arrays import check_values
 
 LARGEST_EXACT = 20_000
 DRAWS = 9_999
@@ -82,7 +77,7 @@ def smallest_p(first: int, second: int, *, draws: int = DRAWS) -> float:
 
 
 @functools.lru_cache(maxsize=8)
-def list_labellings(first: int, second: int, *, seed: int, draws: int = DRAWS) -> NDArray[np.bool_]:
+def list_labellings(first: int, second: int, *, seed: int, draws: int = DRAWS) -> Flags:
     """Labellings of first + second units: all of them, or random ones with the given one in front.
 
     Returns:
@@ -105,7 +100,7 @@ def list_labellings(first: int, second: int, *, seed: int, draws: int = DRAWS) -
 def _permute(
     a: ArrayLike,
     b: ArrayLike,
-    statistic: Callable[[Floats, NDArray[np.bool_]], Floats],
+    statistic: Callable[[Floats, Flags], Floats],
     *,
     seed: int,
     draws: int,
@@ -128,7 +123,7 @@ def _permute(
     )
 
 
-def _differ_by_means(values: Floats, marks: NDArray[np.bool_]) -> Floats:
+def _differ_by_means(values: Floats, marks: Flags) -> Floats:
     first = marks.sum(axis=1)
     total = float(values.sum())
     inside: Floats = marks @ values
@@ -136,7 +131,7 @@ def _differ_by_means(values: Floats, marks: NDArray[np.bool_]) -> Floats:
     return difference
 
 
-def _differ_by_welch(values: Floats, marks: NDArray[np.bool_]) -> Floats:
+def _differ_by_welch(values: Floats, marks: Flags) -> Floats:
     first = marks.sum(axis=1)
     second = values.size - first
     sums, squares = marks @ values, marks @ values**2

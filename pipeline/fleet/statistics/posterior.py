@@ -7,19 +7,14 @@ as in `levels`, with a flat prior on mu and a half-normal one on either spread (
 group never seen included.
 """
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from pipeline.fleet.statistics.arrays import Floats, StatisticsError, check_values
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import ArrayLike
+from pipeline.core.arrays import Floats
+from pipeline.fleet.statistics.arrays import StatisticsError, check_values
 
 # Spreads on a grid, as parts of the usual ones: steps of a fifth, from far below any that matters.
 _GRID = np.geomspace(1e-3, 5.0, 48)

@@ -1,16 +1,11 @@
 """Statistics of ranks: shift and Cliff's delta, the Mann-Whitney test, Kendall's tau and swaps of order."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pipeline.fleet.statistics.arrays import check_values
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 _WORDS = ((0.147, "negligible"), (0.33, "small"), (0.474, "medium"))
 

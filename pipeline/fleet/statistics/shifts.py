@@ -12,20 +12,15 @@ Association 74 (1979), for the largest of all splits; Barnard, Technometrics 5 (
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from pipeline.core.arrays import Floats, Ints
 from pipeline.fleet.statistics.intervals import student_quantile
 from pipeline.fleet.statistics.levels import Sample, make_sample, maximize_likelihood
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import ArrayLike
-
-    from pipeline.fleet.statistics.arrays import Floats, Integers
 
 FEWEST_FREE = 2
 """Degrees of freedom that runs must leave beside their groups and one step: four runs of one group do."""
@@ -143,7 +138,7 @@ class _Scan:
     groups: int
     basis: Floats
     steps: Floats
-    places: Integers
+    places: Ints
     norms: Floats
 
     @classmethod

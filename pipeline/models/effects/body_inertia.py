@@ -18,11 +18,10 @@ import numpy as np
 from pipeline.models.effect import BodyEffect, Excitation, Late, Least, Parameter, Plausible, Search, Spread
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import Velocity
+from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 if TYPE_CHECKING:
     from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Rolling, RunContext
 
 
 class BodyInertia(BodyEffect):

@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter, Search
+from pipeline.models.effect import INF, CommandEffect, Effect, Excitation, Parameter, Search
 from pipeline.models.effects.turn_droop import TurnDroop
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
-    from pipeline.models.effect import Effect
     from pipeline.models.evidence import Evidence, Largest
     from pipeline.runs.signals import Commands, RunContext
 

@@ -8,16 +8,10 @@ down slowly. What turns over is braked until it stands. Ask for steps up and dow
 Source: hybrid speed response of a motor with a one-quadrant drive; Isermann, Mechatronic Systems, chapter 6.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from pipeline.models.effect import WHEELED, Excitation
 from pipeline.models.effects.drive_lag import TwoLags, time_constant
 from pipeline.models.filters import lag_unevenly
-
-if TYPE_CHECKING:
-    from pipeline.runs.signals import RunContext, Wheels
+from pipeline.runs.signals import RunContext, Wheels
 
 
 class BrakeLag(TwoLags):

@@ -10,17 +10,10 @@ their own tell it from a delay of the drive; without them d > 0 and such a delay
 Source: header stamps against log times; measured on the DRIVE recordings.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect, Search, Spread
-from pipeline.models.evidence import LEAST_DELAY_S
+from pipeline.models.evidence import LEAST_DELAY_S, Evidence
 from pipeline.models.level import Level, Reading
-
-if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import RunContext, Velocity
+from pipeline.runs.signals import RunContext, Velocity
 
 
 class ClockOffset(ReportEffect):

@@ -12,12 +12,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
-from pipeline.models.effect import DriveEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import DriveEffect, Effect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 
 if TYPE_CHECKING:
-    from pipeline.models.effect import Effect
     from pipeline.models.evidence import Evidence
     from pipeline.runs.signals import RunContext, Wheels
 

@@ -8,19 +8,21 @@ the sum of track width and wheelbase, on omni wheels the diameter of their circl
 Source: Mandow et al., IROS 2007; Baril et al., CRV 2020.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from pipeline.models.effect import SIDES, Excitation, KinematicEffect, Least, Parameter, Plausible, Spread
+from pipeline.models.effect import (
+    SIDES,
+    Effect,
+    Excitation,
+    KinematicEffect,
+    Least,
+    Parameter,
+    Plausible,
+    Spread,
+)
 from pipeline.models.effects.wheel_radius import WheelRadius
 from pipeline.models.level import Level, Reading
 from pipeline.models.quantity import Quantity
-
-if TYPE_CHECKING:
-    from pipeline.models.effect import Effect
-    from pipeline.runs.signals import Rolling, RunContext
-    from pipeline.vehicles import Vehicle
+from pipeline.runs.signals import Rolling, RunContext
+from pipeline.vehicles import Vehicle
 
 
 class EffectiveTrack(KinematicEffect):

@@ -8,21 +8,14 @@ is reported d earlier than the heading.
 Source: two clocks in one localization; measured on the DRIVE recordings.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect
-from pipeline.models.evidence import LEAST_DELAY_S
+from pipeline.models.evidence import LEAST_DELAY_S, Evidence
 from pipeline.models.level import Level, Reading
-from pipeline.runs.signals import earlier_in_span
-
-if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import RunContext, Velocity
+from pipeline.runs.signals import RunContext, Velocity, earlier_in_span
 
 
 class HeadingSkew(ReportEffect):

@@ -7,17 +7,10 @@ w is the yaw rate of the model. y_icr [m], positive to the left. Spin on the spo
 Source: Mandow et al., IROS 2007, the lateral coordinates of the instantaneous centres of rotation.
 """
 
-from __future__ import annotations
+from collections.abc import Mapping
 
-from typing import TYPE_CHECKING
-
-from pipeline.models.effect import Excitation, Least, LinearEffect, Parameter, Place, Plausible
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.models.effect import Column, Excitation, Least, LinearEffect, Parameter, Place, Plausible
+from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class IcrLateral(LinearEffect):

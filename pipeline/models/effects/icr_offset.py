@@ -9,17 +9,19 @@ Spin on the spot and drive curves.
 Source: Mandow et al., IROS 2007, the longitudinal coordinate of the instantaneous centres of rotation.
 """
 
-from __future__ import annotations
+from collections.abc import Mapping
 
-from typing import TYPE_CHECKING
-
-from pipeline.models.effect import Excitation, Least, LinearEffect, Parameter, Place, Plausible, Spread
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.models.effect import (
+    Column,
+    Excitation,
+    Least,
+    LinearEffect,
+    Parameter,
+    Place,
+    Plausible,
+    Spread,
+)
+from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class IcrOffset(LinearEffect):

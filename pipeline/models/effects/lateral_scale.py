@@ -9,17 +9,11 @@ ways.
 Source: Diegel, Badve, Bright, Potgieter and Tlale, ACRA 2002 (losses of mecanum wheels driving sideways).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
-from pipeline.models.effect import SIDEWAYS, Excitation, KinematicEffect, Least, Parameter, Plausible
+from pipeline.models.effect import SIDEWAYS, Effect, Excitation, KinematicEffect, Least, Parameter, Plausible
 from pipeline.models.effects.wheel_radius import WheelRadius
-
-if TYPE_CHECKING:
-    from pipeline.models.effect import Effect
-    from pipeline.runs.signals import Rolling, RunContext
+from pipeline.runs.signals import Rolling, RunContext
 
 
 class LateralScale(KinematicEffect):

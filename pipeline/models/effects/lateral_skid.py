@@ -9,18 +9,11 @@ backward, to tell it from a shifted centre of rotation.
 Source: Seegmiller and Kelly, RSS 2014, the centripetal term of the slip model.
 """
 
-from __future__ import annotations
+from collections.abc import Mapping
 
-from typing import TYPE_CHECKING
-
-from pipeline.models.effect import Excitation, Least, LinearEffect, Parameter, Plausible, Spread
+from pipeline.models.effect import Column, Excitation, Least, LinearEffect, Parameter, Plausible, Spread
 from pipeline.models.evidence import LEAST_DELAY_S
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class LateralSkid(LinearEffect):

@@ -7,19 +7,12 @@ w is the yaw rate of the model. l_x, l_y [m], 0 to 0.3. Check the transform betw
 Source: rigid body motion of a point; see any text on mechanics.
 """
 
-from __future__ import annotations
+from collections.abc import Mapping
 
-from typing import TYPE_CHECKING
-
-from pipeline.models.effect import Excitation, LinearEffect, Parameter, Part, Place
+from pipeline.models.effect import Column, Excitation, LinearEffect, Parameter, Part, Place
 from pipeline.models.wording import name_side
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
+from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.vehicles import Vehicle
 
 
 class LeverArm(LinearEffect):

@@ -8,17 +8,11 @@ forward and backward, and turn on the spot to both sides.
 Source: Nordin and Gutman, Automatica 38 (2002): mechanical systems with backlash.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from pipeline.models.effect import WHEELED, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.filters import wait_at_reversal
-
-if TYPE_CHECKING:
-    from pipeline.runs.signals import RunContext, Wheels
+from pipeline.runs.signals import RunContext, Wheels
 
 
 class ReversalPause(DriveEffect):

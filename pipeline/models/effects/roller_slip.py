@@ -8,19 +8,12 @@ to tell it from a scale that is the same at every speed.
 Source: slip growing with traction; see Wong, Theory of Ground Vehicles, chapter 2.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 
-from pipeline.models.effect import SIDEWAYS, Excitation, LinearEffect, Parameter, Plausible
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.models.effect import SIDEWAYS, Column, Excitation, LinearEffect, Parameter, Plausible
+from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class RollerSlip(LinearEffect):

@@ -8,17 +8,12 @@ Change speed often, straight ahead too.
 Source: loss of effectiveness of one actuator; Blanke et al., Diagnosis and Fault-Tolerant Control, chapter 3.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from pipeline.models.effect import Excitation
 from pipeline.models.effects.drive_lag import TwoLags, time_constant
 from pipeline.models.filters import lag_signal
-
-if TYPE_CHECKING:
-    from pipeline.runs.signals import RunContext, Wheels
+from pipeline.runs.signals import RunContext, Wheels
 
 
 class SideLag(TwoLags):

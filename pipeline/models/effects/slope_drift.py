@@ -8,21 +8,13 @@ directions.
 Source: Seegmiller and Kelly, RSS 2014, the gravity term of the slip model.
 """
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 
-from pipeline.models.effect import Excitation, LinearEffect, Parameter, Plausible
-from pipeline.runs.signals import find_turning
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.models.effect import Column, Excitation, LinearEffect, Parameter, Plausible
+from pipeline.runs.signals import Rolling, RunContext, Velocity, find_turning
 
 
 class SlopeDrift(LinearEffect):

@@ -7,19 +7,12 @@ k [s/m], about 0.08 on loose ground. Drive at several speeds, forward and backwa
 Source: longitudinal slip growing with traction; see Wong, Theory of Ground Vehicles, chapter 2.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 
-from pipeline.models.effect import Excitation, LinearEffect, Parameter, Plausible
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.models.effect import Column, Excitation, LinearEffect, Parameter, Plausible
+from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class SpeedSlip(LinearEffect):

@@ -9,19 +9,12 @@ Source: Pentzer, Brennan and Reichard, Journal of Field Robotics 31 (2014): inst
 that move with speed.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 
-from pipeline.models.effect import SIDES, Excitation, Least, LinearEffect, Parameter, Plausible
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.models.effect import SIDES, Column, Excitation, Least, LinearEffect, Parameter, Plausible
+from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class SpeedTrack(LinearEffect):

@@ -7,16 +7,11 @@ g is a plain number, 0.85 for worn linkage. Steer to both sides at several angle
 Source: kinematic bicycle with an uncalibrated steering; Becker et al. 2023.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Plausible
 from pipeline.models.quantity import Quantity
-
-if TYPE_CHECKING:
-    from pipeline.runs.signals import RunContext, Wheels
+from pipeline.runs.signals import RunContext, Wheels
 
 
 class SteeringGain(DriveEffect):

@@ -7,17 +7,12 @@ tau [s], about 0.4. Change the steering often.
 Source: actuator model of a kinematic bicycle; Becker et al. 2023.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Search
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
-
-if TYPE_CHECKING:
-    from pipeline.runs.signals import RunContext, Wheels
+from pipeline.runs.signals import RunContext, Wheels
 
 
 class SteeringLag(DriveEffect):

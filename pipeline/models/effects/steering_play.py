@@ -8,16 +8,11 @@ large steps, while driving.
 Source: the play operator; Nordin and Gutman, Automatica 38 (2002): mechanical systems with backlash.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.filters import follow_with_play
-
-if TYPE_CHECKING:
-    from pipeline.runs.signals import RunContext, Wheels
+from pipeline.runs.signals import RunContext, Wheels
 
 
 class SteeringPlay(DriveEffect):

@@ -7,14 +7,8 @@ T is the length of the run, t the time since its start. k is a plain number, abo
 Source: first-order drift of a gain; measured on long deployments.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from pipeline.models.effect import Excitation, KinematicEffect, Least, Parameter, Plausible
-
-if TYPE_CHECKING:
-    from pipeline.runs.signals import Rolling, RunContext
+from pipeline.runs.signals import Rolling, RunContext
 
 
 class TimeDrift(KinematicEffect):

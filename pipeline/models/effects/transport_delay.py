@@ -8,18 +8,12 @@ of delay and lag.
 Source: dead time of a first order plus dead time process; Astrom and Hagglund, Advanced PID Control.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from pipeline.models.effect import CommandEffect, Excitation, Least, Parameter, Plausible, Search
-from pipeline.models.evidence import LEAST_DELAY_S
+from pipeline.models.evidence import LEAST_DELAY_S, Evidence
 from pipeline.models.quantity import Quantity
-
-if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Commands, RunContext
+from pipeline.runs.signals import Commands, RunContext
 
 
 class TransportDelay(CommandEffect):

@@ -10,18 +10,13 @@ turning separately.
 Source: measured on the DRIVE recordings; the powertrain model of DRIVE, Baril et al. 2024, split in two.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from pipeline.models.effect import SIDES, Excitation, Spread
 from pipeline.models.effects.drive_lag import TwoLags, time_constant
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
-
-if TYPE_CHECKING:
-    from pipeline.runs.signals import RunContext, Wheels
+from pipeline.runs.signals import RunContext, Wheels
 
 _SEEN = "wider than the 0.1 to 1.6 s of Husky and Warthog"
 

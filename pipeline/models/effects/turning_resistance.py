@@ -7,19 +7,12 @@ k [s], about 0.24 on a Husky in snow. Drive the same speed straight and in turns
 Source: DRIVE, Baril et al. 2024, learned slip terms; its other form is k sign(v0) abs(w0).
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 
-from pipeline.models.effect import Excitation, LinearEffect, Parameter, Plausible
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.models.effect import Column, Excitation, LinearEffect, Parameter, Plausible
+from pipeline.runs.signals import Rolling, RunContext, Velocity
 
 
 class TurningResistance(LinearEffect):

@@ -7,19 +7,14 @@ K [s^2/m], about 0.03. Take the same curve at several speeds.
 Source: Gillespie, Fundamentals of Vehicle Dynamics, steady-state cornering.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.models.effect import ACKERMANN, Excitation, KinematicEffect, Parameter, Plausible
 from pipeline.models.wording import describe_share
-
-if TYPE_CHECKING:
-    from pipeline.runs.signals import Rolling, RunContext
-    from pipeline.vehicles import Vehicle
+from pipeline.runs.signals import Rolling, RunContext
+from pipeline.vehicles import Vehicle
 
 
 class Understeer(KinematicEffect):

@@ -7,18 +7,13 @@ e is a plain number, 1 to 5 %; 8 % with one soft side. Drive straight forward an
 Source: unequal wheel diameters; Borenstein and Feng, IEEE T-RA 1996 (UMBmark).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from pipeline.models.effect import Excitation, KinematicEffect, Least, Parameter, Plausible, Spread
 from pipeline.models.quantity import Quantity
 from pipeline.models.wording import name_side
-
-if TYPE_CHECKING:
-    from pipeline.runs.signals import Rolling, RunContext
-    from pipeline.vehicles import Vehicle
+from pipeline.runs.signals import Rolling, RunContext
+from pipeline.vehicles import Vehicle
 
 
 class WheelAsymmetry(KinematicEffect):

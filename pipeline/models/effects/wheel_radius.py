@@ -7,16 +7,10 @@ k is a plain number, off one by 2 to 25 %. Drive at several speeds, straight and
 Source: Borenstein and Feng, IEEE T-RA 1996 (UMBmark), the common scale error.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from pipeline.models.effect import Excitation, KinematicEffect, Least, Parameter, Plausible, Spread
 from pipeline.models.level import Level, Reading
 from pipeline.models.quantity import Quantity
-
-if TYPE_CHECKING:
-    from pipeline.runs.signals import Rolling, RunContext
+from pipeline.runs.signals import Rolling, RunContext
 
 
 class WheelRadius(KinematicEffect):

@@ -8,18 +8,10 @@ wheels.
 Source: constant term of the slip model of Seegmiller and Kelly, RSS 2014.
 """
 
-from __future__ import annotations
+from collections.abc import Mapping
 
-from typing import TYPE_CHECKING
-
-from pipeline.models.effect import Excitation, LinearEffect, Parameter
-from pipeline.runs.signals import find_turning
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.models.effect import Column
-    from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.models.effect import Column, Excitation, LinearEffect, Parameter
+from pipeline.runs.signals import Rolling, RunContext, Velocity, find_turning
 
 
 class YawDrift(LinearEffect):

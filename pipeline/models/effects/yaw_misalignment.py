@@ -8,17 +8,12 @@ the sensor.
 Source: rotation of the reported frame; a crabbing vehicle moves alike.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from pipeline.models.effect import Excitation, Least, Parameter, Plausible, ReportEffect
 from pipeline.models.level import Level, Reading
-
-if TYPE_CHECKING:
-    from pipeline.runs.signals import RunContext, Velocity
+from pipeline.runs.signals import RunContext, Velocity
 
 
 class YawMisalignment(ReportEffect):

@@ -1,29 +1,21 @@
 """An effect that is a formula over named signals."""
 
-from __future__ import annotations
-
 import functools
 import keyword
 import math
 import unicodedata
-from typing import TYPE_CHECKING, Self
+from collections.abc import Callable, Iterable, Mapping
+from typing import Self
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.models.effect import AddedEffect, Excitation, Parameter
 from pipeline.models.formula.expression import Expression, parse_expression
-from pipeline.models.formula.units import parse_unit
+from pipeline.models.formula.units import Unit, parse_unit
 from pipeline.runs.errors import MotionError
-from pipeline.runs.signals import roll_ideally
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
-
-    from pipeline.models.formula.units import Unit
-    from pipeline.runs.signals import Rolling, RunContext, Velocity
-    from pipeline.vehicles import Vehicle
-
+from pipeline.runs.signals import Rolling, RunContext, Velocity, roll_ideally
+from pipeline.vehicles import Vehicle
 
 _BASE_UNITS = {
     "v0": "m/s",

@@ -83,9 +83,5 @@ def parse_unit(text: str, where: str) -> Unit:
     else:
         if not expect:
             return unit
-    raise MotionError(
-        "bad_unit",
-        f"{text[:_LONGEST]!r} is not a unit",
-        where=where,
-        hint=f"Write products and powers of {', '.join(_KNOWN)}, for example m/s^2.",
-    )
+    hint = f"Write products and powers of {', '.join(_KNOWN)}, for example m/s^2."
+    raise MotionError("bad_unit", f"{text[:_LONGEST]!r} is not a unit", where=where, hint=hint)

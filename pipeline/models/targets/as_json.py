@@ -7,11 +7,10 @@ import math
 from typing import TYPE_CHECKING
 
 from pipeline.models.formula.formula_effect import FormulaEffect
-from pipeline.models.target import Target
+from pipeline.models.target import Current, Target
 
 if TYPE_CHECKING:
     from pipeline.models.model_file import ModelFile
-    from pipeline.models.target import Current
 
 
 def write(file: ModelFile, current: Current) -> str:

@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
 from pipeline.models.quantity import Quantity
-from pipeline.models.settings import Facts, start_sheet
+from pipeline.models.settings import Facts, Sheet, start_sheet
 from pipeline.models.settings_text import list_comments, make_plain
-from pipeline.models.target import Target
+from pipeline.models.target import Current, Target
 
 if TYPE_CHECKING:
     from pipeline.models.model_file import ModelFile
-    from pipeline.models.settings import Sheet
-    from pipeline.models.target import Current
 
 _SYSTEMS = {
     "differential": ("gz-sim-diff-drive-system", "gz::sim::systems::DiffDrive"),

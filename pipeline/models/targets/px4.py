@@ -9,15 +9,13 @@ import operator
 from typing import TYPE_CHECKING
 
 from pipeline.models.quantity import Quantity
-from pipeline.models.settings import Amount, Facts, combine, start_sheet
+from pipeline.models.settings import Amount, Facts, Sheet, combine, start_sheet
 from pipeline.models.settings_text import list_comments, make_plain
-from pipeline.models.target import Target
+from pipeline.models.target import Current, Target
 from pipeline.runs.errors import MotionError
 
 if TYPE_CHECKING:
     from pipeline.models.model_file import ModelFile
-    from pipeline.models.settings import Sheet
-    from pipeline.models.target import Current
 
 _REAL32 = 9
 """MAV_PARAM_TYPE_REAL32: the type of all these parameters."""

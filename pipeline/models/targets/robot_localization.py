@@ -6,19 +6,17 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.models.effect import Place
+from pipeline.models.effect import Effect, Place
 from pipeline.models.quantity import Quantity
 from pipeline.models.settings import Amount, Setting, start_sheet
 from pipeline.models.settings_text import write_yaml
-from pipeline.models.target import Target
+from pipeline.models.target import Current, Target
 from pipeline.runs.errors import MotionError
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from pipeline.models.effect import Effect
     from pipeline.models.model_file import ModelFile
-    from pipeline.models.target import Current
 
 _FILTER = "ekf_filter_node.ros__parameters"
 _CONTROLLERS = {

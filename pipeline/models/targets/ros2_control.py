@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.models.quantity import Quantity
-from pipeline.models.settings import Facts, combine, start_sheet
+from pipeline.models.settings import Facts, Sheet, combine, start_sheet
 from pipeline.models.settings_text import write_yaml
-from pipeline.models.target import Target
+from pipeline.models.target import Current, Target
 
 if TYPE_CHECKING:
     from pipeline.models.model_file import ModelFile
-    from pipeline.models.settings import Sheet
-    from pipeline.models.target import Current
 
 
 def write(file: ModelFile, current: Current) -> str:

@@ -10,12 +10,11 @@ import yaml
 from pipeline.models.quantity import Quantity
 from pipeline.models.settings import Amount, Facts, combine, start_sheet
 from pipeline.models.settings_text import write_yaml
-from pipeline.models.target import Target
+from pipeline.models.target import Current, Target
 from pipeline.runs.errors import MotionError
 
 if TYPE_CHECKING:
     from pipeline.models.model_file import ModelFile
-    from pipeline.models.target import Current
 
 _ALL = "/**.ros__parameters"
 _SPEED_GAIN = "speed_to_erpm_gain"

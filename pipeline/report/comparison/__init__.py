@@ -5,5 +5,3 @@ an interval over runs), the pairs with their tests, and the measures of difficul
 """
 
 from pipeline.report.comparison.page import list_pictures, render_comparison
-
-__all__ = ["list_pictures", "render_comparison"]

@@ -1,17 +1,12 @@
 """The published figure, and the honest one beside it."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import altair as alt
 import polars as pl
 
 from pipeline.report import theme
 from pipeline.report.figures import Drawing
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 _ROW_HEIGHT = 34
 _GUTTER = 210

@@ -4,5 +4,3 @@ The literature by kind of model, bounds as arrows, doubtful rows hollow; own dat
 """
 
 from pipeline.report.deployments.page import picture_map, render_map
-
-__all__ = ["picture_map", "render_map"]

@@ -1,7 +1,5 @@
 """The map itself."""
 
-from __future__ import annotations
-
 import math
 
 import altair as alt

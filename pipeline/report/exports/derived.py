@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
+from pipeline.core.arrays import Floats
 from pipeline.logs import LogWriter
 from pipeline.report.exports import topics
 from pipeline.report.exports.markers import join_track, write_findings, write_trail
@@ -18,8 +19,6 @@ from pipeline.report.exports.stretches import ModelFeed
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from pipeline.identification import Prediction
     from pipeline.logs.normalize import Given
@@ -178,5 +177,5 @@ def _write_predictions(writer: LogWriter, source: ExportSource, prediction: Pred
     )
 
 
-def _turn(yaw: NDArray[np.float64], prefix: str) -> dict[str, NDArray[np.float64]]:
+def _turn(yaw: Floats, prefix: str) -> dict[str, Floats]:
     return {f"{prefix}z": np.sin(0.5 * yaw), f"{prefix}w": np.cos(0.5 * yaw)}

@@ -1,13 +1,8 @@
 """A stored table read once, from its beginning to its end, one stretch of time after the other."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import polars as pl
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 class Feed:

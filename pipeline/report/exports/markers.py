@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats, Ints
 from pipeline.report import theme
 from pipeline.report.exports import topics
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from pipeline.logs.normalize import Given
     from pipeline.report.exports.source import ExportSource
 
-Floats = NDArray[np.float64]
 
 _MARKER = "visualization_msgs/msg/Marker"
 _LINE_STRIP, _TEXT = 4, 9
@@ -93,7 +92,7 @@ def _write_texts(
     writer: LogWriter,
     source: ExportSource,
     rows: pl.DataFrame,
-    stamps: NDArray[np.int64],
+    stamps: Ints,
     places: pl.DataFrame,
 ) -> None:
     at = np.clip(np.searchsorted(places["stamp"].to_numpy(), stamps), 0, places.height - 1)

@@ -9,23 +9,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.identification import Comparison, choose_input, predict_at_from, predict_from
-from pipeline.models import Timing
+from pipeline.core.arrays import Floats
+from pipeline.identification import Comparison, Prediction, choose_input, predict_at_from, predict_from
+from pipeline.models import Effect, Model, Timing
 from pipeline.report.motion_run import COLUMNS, make_motion_run
-from pipeline.runs import MotionError
+from pipeline.runs import MotionError, MotionRun
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    from pipeline.identification import Prediction
-    from pipeline.models import Effect, Model
     from pipeline.report.exports.feed import Feed
     from pipeline.report.exports.source import ExportSource
-    from pipeline.runs import MotionRun
 
-    Floats = NDArray[np.float64]
 
 # States of an effect, a lag or a rate limit, have forgotten how they began after this long.
 _BEFORE_S = 60.0

@@ -1,7 +1,5 @@
 """Names of the topics in a derived log; layouts refer to them."""
 
-from __future__ import annotations
-
 MEASURED = "/slip/velocity/measured"
 MODEL = "/slip/velocity/model"
 POSE = "/slip/pose"

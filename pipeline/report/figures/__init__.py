@@ -5,6 +5,4 @@ else has to know of it. Its chart refers to rows by name (`alt.NamedData`) and s
 they are, so that several figures share one block of data on the page.
 """
 
-from pipeline.report.figures.figure import Drawing, Figure, list_figures
-
-__all__ = ["Drawing", "Figure", "list_figures"]
+from pipeline.report.figures.figure import Drawing, list_figures

@@ -7,23 +7,19 @@ from typing import TYPE_CHECKING
 import altair as alt
 import polars as pl
 
+from pipeline.core.arrays import Floats
 from pipeline.identification.correlation import FEWEST, LONGEST_S, autocorrelate
 from pipeline.report import theme
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.residuals import QUANTITIES
-from pipeline.report.motion_view import COMPONENTS
+from pipeline.report.motion_view import COMPONENTS, MotionView
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from pipeline.report.motion_view import MotionView
     from pipeline.report.scene import Scene
 
-    Floats = NDArray[np.float64]
     Correlation = tuple[Floats, Floats, float]
 
 

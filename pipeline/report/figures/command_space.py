@@ -1,9 +1,5 @@
 """Slip over what was asked: forward speed against yaw rate of the ideal velocity."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import altair as alt
 import polars as pl
 
@@ -12,9 +8,7 @@ from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.scales import round_up
-
-if TYPE_CHECKING:
-    from pipeline.report.scene import Scene
+from pipeline.report.scene import Scene
 
 _CELLS = 20
 _FEWEST_SAMPLES = 3

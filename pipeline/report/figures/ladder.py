@@ -1,8 +1,6 @@
 """The ladder: how the error on data not seen falls, effect by effect, down to the floor."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 import altair as alt
 import polars as pl
@@ -12,12 +10,8 @@ from pipeline.report import theme
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS, mapping_in, number_in, objects_in
+from pipeline.report.scene import Scene
 from pipeline.report.words import say_number
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.report.scene import Scene
 
 _SCHEMA = {
     "rung": pl.Int64,

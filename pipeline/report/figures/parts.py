@@ -1,20 +1,15 @@
 """Pieces that figures share: axes over time, shading, brushing, notes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import altair as alt
 import polars as pl
 
 from pipeline.report import theme
 from pipeline.report.run import INPUT_WORDS
+from pipeline.report.scales import Range
+from pipeline.report.scene import Scene, Thinned
 from pipeline.report.words import say_number
-
-if TYPE_CHECKING:
-    from pipeline.report.scales import Range
-    from pipeline.report.scene import Scene, Thinned
 
 WIDTH = 720
 GUTTER = 46

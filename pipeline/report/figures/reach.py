@@ -1,19 +1,12 @@
 """How far two-second predictions end from where the vehicle was, over time: the ideal model and the model."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import polars as pl
 
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scales import find_range, usual_ends
-from pipeline.report.scene import LINE_BINS
+from pipeline.report.scene import LINE_BINS, Scene
 from pipeline.report.thinning import break_lines, thin_series
-
-if TYPE_CHECKING:
-    from pipeline.report.scene import Scene
 
 
 def draw(scene: Scene) -> Drawing | None:

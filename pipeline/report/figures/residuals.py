@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import altair as alt
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.report import theme
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from pipeline.report.motion_view import MotionView
     from pipeline.report.scene import Scene
 
-Floats = NDArray[np.float64]
 
 QUANTITIES = {"x": ("forward", "m/s"), "y": ("sideways", "m/s"), "w": ("yaw rate", "rad/s")}
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import altair as alt
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
+from pipeline.core.arrays import Floats
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from pipeline.report.figures.figure import Picture
     from pipeline.report.scene import Scene
 
-Floats = NDArray[np.float64]
 
 _CHANNELS = {"x": ("forward velocity", 0.15), "w": ("yaw rate", 0.15)}
 _BEFORE_S, _AFTER_S, _RATE_HZ = 0.5, 3.0, 20.0

@@ -1,19 +1,13 @@
 """Where the vehicle went, coloured by how much it slipped there."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import altair as alt
 import polars as pl
 
 from pipeline.report import theme
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
+from pipeline.report.scene import Scene
 from pipeline.report.thinning import break_lines
-
-if TYPE_CHECKING:
-    from pipeline.report.scene import Scene
 
 _WIDTH, _LOWEST, _HIGHEST = 480, 260, 420
 _MARGIN = 0.05

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.report.figures.figure import Section
-from pipeline.report.run import objects_in
+from pipeline.report.run import RunReport, objects_in
 
 if TYPE_CHECKING:
-    from pipeline.report.run import RunReport
     from pipeline.report.sections import Page
 
 

@@ -8,14 +8,13 @@ from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.models.catalogue import list_effects
 from pipeline.report.elements import Cell, Column, Table
 from pipeline.report.figures.figure import Section
-from pipeline.report.run import mapping_in, number_in, objects_in
+from pipeline.report.run import RunReport, mapping_in, number_in, objects_in
 from pipeline.report.sections.health import list_findings
 from pipeline.report.words import begin_large, say_number, say_share, say_split
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from pipeline.report.run import RunReport
     from pipeline.report.sections import Page
 
 _MANY_FOLD = 10.0

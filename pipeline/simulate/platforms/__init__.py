@@ -4,8 +4,6 @@ A platform is one file here: its vehicle, and its topics. A topic is one of the 
 (``twist = TOPIC`` and what the function `twist` takes), or says its type, source, constants and quantities.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

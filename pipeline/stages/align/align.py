@@ -1,9 +1,7 @@
 """From extracted tables to aligned ones."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -26,13 +24,8 @@ from pipeline.stages.samples import Samples, gather_samples
 from pipeline.stages.slip import Ideal, cut_steps, keep_known, read_inputs
 from pipeline.stages.trust import check_independence
 from pipeline.stages.velocity import differentiate_poses
+from pipeline.vehicles import Vehicle
 from pipeline.vehicles.configuration import VelocitySection
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.vehicles import Vehicle
-
 
 _BESIDE = 0.6
 # Alignment looks at a run on a grid of its own, so that no setting of the later stages changes it.

@@ -1,19 +1,13 @@
 """Whether commands are on the scale of the wheels: another radius, another unit, a controller's own track."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.stages.finding import Finding
-
-if TYPE_CHECKING:
-    from pipeline.stages.samples import Samples
-    from pipeline.vehicles import Vehicle
-
+from pipeline.stages.samples import Samples
+from pipeline.vehicles import Vehicle
 
 _LIVE = 0.02
 _FEWEST_STEPS = 6

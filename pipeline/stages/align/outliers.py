@@ -7,21 +7,14 @@ catalogue. What is eight times as far off as is usual at that speed, and a quart
 up to a twentieth of the run.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from pipeline.core import timegrid
 from pipeline.core.arrays import Floats, Ints
 from pipeline.runs.heading import align_heading, has_barred, mark_barred
+from pipeline.runs.recording import DriveSeries, MotionRun
 from pipeline.runs.signals import name_inputs
-
-if TYPE_CHECKING:
-    from pipeline.runs.recording import DriveSeries, MotionRun
-    from pipeline.vehicles import Vehicle
-
+from pipeline.vehicles import Vehicle
 
 _WINDOW_S = 0.5
 _LONGEST_S = 1.2

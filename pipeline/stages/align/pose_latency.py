@@ -6,19 +6,13 @@ heading. What it says there is carried over to straight stretches by how long th
 of the stamps: a pose that came after a long wait is old. Positions and models have no part in it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats
 from pipeline.runs.heading import align_heading, fit_gyro, mark_barred
-
-if TYPE_CHECKING:
-    from pipeline.runs.recording import GyroFit, MotionRun, Track
-
+from pipeline.runs.recording import GyroFit, MotionRun, Track
 
 _ROUNDS = 3
 _FEWEST = 200

@@ -1,22 +1,14 @@
 """Numbers that no robot can have recorded: they are no numbers, and that is said."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.core.arrays import Flags
-from pipeline.logs import Ragged
+from pipeline.logs import Ragged, TopicColumns
 from pipeline.stages.finding import Finding
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from pipeline.logs import TopicColumns
 
 _LARGEST = 1e12
 """In SI units, beyond every position, angle, speed and acceleration on Earth; its powers stay finite."""

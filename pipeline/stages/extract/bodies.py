@@ -1,24 +1,17 @@
 """The vehicle among bodies whose poses come in one message: models and links of a simulator, joints."""
 
-from __future__ import annotations
-
 import re
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.logs import Ragged, RaggedStrings
+from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract.reading import PoseArrays, axis_fields, first_text
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.logs import TopicColumns
-    from pipeline.vehicles import Vehicle
-    from pipeline.vehicles.message_types import PoseFields
-
+from pipeline.vehicles import Vehicle
+from pipeline.vehicles.message_types import PoseFields
 
 _BASE: Final = re.compile(r"(::|/)base(_link|_footprint)?$")
 _MOVES_M: Final = 0.5

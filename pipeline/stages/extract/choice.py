@@ -5,11 +5,10 @@ comes and for how much of the log, whether it moves at all, and above all whethe
 wheels: then the wheels' way gives its way back, and it never moves sideways.
 """
 
-from __future__ import annotations
-
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import polars as pl
@@ -17,20 +16,14 @@ import polars as pl
 from pipeline.core import rigid, timegrid
 from pipeline.core.arrays import Floats
 from pipeline.core.errors import SlipError
+from pipeline.logs import LogData
 from pipeline.stages.extract.course import estimate_noise
 from pipeline.stages.extract.drive import read_speed
 from pipeline.stages.extract.tables import extract_tables
+from pipeline.stages.finding import Finding
 from pipeline.stages.trust import measure_rest
-from pipeline.vehicles import PoseContent, PoseSource
+from pipeline.vehicles import Configuration, PoseContent, PoseSource, Sources, Vehicle
 from pipeline.vehicles.candidates import DEAD_RECKONED, FILTERED, LOCALIZED
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.logs import LogData
-    from pipeline.stages.finding import Finding
-    from pipeline.vehicles import Configuration, Sources, Vehicle
-
 
 _FIXED_FRAME: Final = re.compile(
     r"(^|/)(map|world|earth|utm|enu|global|camera_init|mocap|vicon)$|lidar|slam|gps|gnss|local_origin"

@@ -196,12 +196,8 @@ def _mean_steering(position: Mapping[str, Floats], configured: str | None, topic
     names = [configured] if configured else [joint for joint in position if _STEERS.search(joint.lower())]
     found = [position[joint] for joint in names if joint in position]
     if not found:
-        raise StageError(
-            "no_steering",
-            f"{topic} needs a steering joint",
-            where=topic,
-            hint=f"Set steering_joint to one of: {', '.join(sorted(position)) or 'none it has'}.",
-        )
+        hint = f"Set steering_joint to one of: {', '.join(sorted(position)) or 'none it has'}."
+        raise StageError("no_steering", f"{topic} needs a steering joint", where=topic, hint=hint)
     mean: Floats = np.mean(found, axis=0)
     return mean
 

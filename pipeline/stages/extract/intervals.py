@@ -1,19 +1,13 @@
 """When commands are live: a state topic or given times."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats
 from pipeline.stages.errors import StageError
 from pipeline.vehicles import DEFAULT_INTERVAL
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.vehicles.configuration import IntervalSection
+from pipeline.vehicles.configuration import IntervalSection
 
 Span = tuple[float, float]
 

@@ -1,20 +1,14 @@
 """Poses of base_link in a fixed frame, from a pose topic or from transforms."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core import rigid, segments
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.stages.finding import Finding
-
-if TYPE_CHECKING:
-    from pipeline.vehicles.configuration import VelocitySection
-
+from pipeline.vehicles.configuration import VelocitySection
 
 _UNIT_FORGIVEN = 1e-3
 _FASTEST = 60.0

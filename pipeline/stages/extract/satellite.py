@@ -4,15 +4,14 @@ A receiver says where its antenna is and perhaps how fast it goes, never where t
 from its course and from what turns with the vehicle (see `course`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from pipeline.core import rigid, timegrid
 from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.logs import TopicColumns
 from pipeline.stages.extract import reading
 from pipeline.stages.extract.course import (
     Turning,
@@ -24,10 +23,6 @@ from pipeline.stages.extract.course import (
 from pipeline.stages.extract.reading import PoseArrays
 from pipeline.stages.finding import Finding
 from pipeline.vehicles.message_types import find_type
-
-if TYPE_CHECKING:
-    from pipeline.logs import TopicColumns
-
 
 _SEMI_MAJOR_M: Final = 6378137.0
 _FLATTENING: Final = 1.0 / 298.257223563

@@ -4,11 +4,9 @@ All times come to one base (see `clocks`); nothing is resampled here. Rows that 
 written all the same: the store moves them to quarantine, where they can be looked at.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -16,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.errors import SlipError
-from pipeline.logs import join_channels
+from pipeline.logs import LogData, TopicColumns, join_channels
 from pipeline.stages.errors import StageError
 from pipeline.stages.extract import localization, reading, transforms
 from pipeline.stages.extract.absurd import remove_absurd
@@ -48,11 +46,6 @@ from pipeline.vehicles import (
 )
 from pipeline.vehicles.configuration import IntervalSection
 from pipeline.vehicles.message_types import find_type
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.logs import LogData, TopicColumns
 
 Stamps = Ints
 

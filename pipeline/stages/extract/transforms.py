@@ -1,8 +1,6 @@
 """Poses out of chains of transforms, and poses of other frames moved to base_link."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -13,14 +11,10 @@ from pipeline.stages.errors import StageError
 from pipeline.stages.extract.localization import move_to_base, normalize_quaternions
 from pipeline.stages.extract.reading import PoseArrays
 from pipeline.stages.finding import Finding
+from pipeline.vehicles import PoseSource
 from pipeline.vehicles.candidates import LOCALIZED
 from pipeline.vehicles.message_types import plain_type
 from pipeline.vehicles.topics import TRANSFORM_TYPES
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.vehicles import PoseSource
 
 _BASES = ("base_link", "base_footprint", "base")
 _FIXED = ("map", "world", "odom")
@@ -70,12 +64,8 @@ def _choose_frames(buffer: TransformBuffer, where: str) -> tuple[str, str]:
         above.append(parents[above[-1]])
     named = [frame for fixed in _FIXED for frame in above[1:] if frame.rsplit("/", 1)[-1] == fixed]
     if not named and len(above) == 1:
-        raise StageError(
-            "no_base_frame",
-            f"the transforms give {child} no parent",
-            where=where,
-            hint=f"Name both: [pose] frames = [parent, child]. Known frames: {', '.join(frames)}.",
-        )
+        hint = f"Name both: [pose] frames = [parent, child]. Known frames: {', '.join(frames)}."
+        raise StageError("no_base_frame", f"the transforms give {child} no parent", where=where, hint=hint)
     return (named[0] if named else above[-1]), child
 
 
