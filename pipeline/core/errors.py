@@ -64,4 +64,4 @@ def naming_os_errors(
     try:
         yield
     except OSError as error:
-        raise make(code, f"{what}: {error.strerror}", where=str(where), hint=hint) from error
+        raise make(code, f"{what}: {error.strerror or error}", where=str(where), hint=hint) from error

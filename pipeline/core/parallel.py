@@ -33,8 +33,8 @@ Result = TypeVar("Result")
 
 _NUMBER = struct.Struct("Q")
 _END = 2**64 - 1
-_PIECES = 1000
-"""As many numbers fit into a pipe that nobody reads yet."""
+_PIECES = 500
+"""As many numbers fit into any pipe that nobody reads yet: the least is a page of 4096 bytes."""
 _DIE_WITH_PARENT = 1
 
 
@@ -103,21 +103,29 @@ def _may_fork() -> bool:
         and _depth[0] == 0
         and len(os.sched_getaffinity(0)) > 1
         and parent_process() is None
-        and threading.current_thread() is threading.main_thread()
+        and _is_main()
     )
+
+
+def _is_main() -> bool:
+    return threading.current_thread() is threading.main_thread()
 
 
 def _fork(shared: Sequence[object]) -> _Beside | None:
     from multiprocessing.connection import Pipe  # noqa: PLC0415 - few need it
 
-    waiting, numbers = os.pipe()
-    line, theirs = Pipe()
     parent = os.getpid()
+    ends: list[int] = []
     try:
+        ends += os.pipe()
+        line, theirs = Pipe()
         pid = os.fork()
     except OSError:
         # A machine without room for another process.
+        for end in ends:
+            os.close(end)
         return None
+    waiting, numbers = ends
     if pid == 0:
         try:
             _depth[0] = 1
@@ -141,7 +149,7 @@ def map_parallel(function: Callable[[Item], Result], items: Sequence[Item]) -> l
         function: without side effects that matter; one that can be pickled, else all is done here.
         items: what it is called with; whichever process is free takes the next.
     """
-    found = _share(_at_hand[0], function, items) if _at_hand and len(items) > 1 else {}
+    found = _share(_at_hand[0], function, items) if len(items) > 1 and _is_main() and _at_hand else {}
     # What failed beside is done here, where its error is seen.
     return [found[n] if n in found else function(item) for n, item in enumerate(items)]
 

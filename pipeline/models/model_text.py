@@ -13,6 +13,7 @@ from pipeline.models.model_file import FORMAT, ModelFile
 from pipeline.runs.errors import MotionError
 from pipeline.store.files import replace_file
 from pipeline.vehicles import Vehicle, find_preset
+from pipeline.vehicles.loading import FLEET_FILE, RUN_FILE, is_model
 
 _GEOMETRY = (
     "wheel_radius_m",
@@ -32,9 +33,30 @@ def write_model(file: ModelFile, path: Path) -> None:
     """Write a model file in one moment: a reader sees the old one or the new one.
 
     Raises:
-        MotionError: ``model_unwritable``; ``model_incomplete``, see `format_model`.
+        MotionError: ``model_unwritable``; ``model_misplaced``; ``model_incomplete``, see `format_model`.
     """
+    check_place(path)
     write_text(path, format_model(file), code="model_unwritable")
+
+
+def check_place(path: Path) -> None:
+    """Whether a model may be written there.
+
+    Raises:
+        MotionError: ``model_misplaced``, there stands the configuration of logs.
+    """
+    from pipeline.logs.index import SUFFIXES  # noqa: PLC0415 - heavy
+
+    if not path.is_file() or is_model(path):
+        return
+    for log in path.parent.glob("*"):
+        if log.suffix in SUFFIXES and path.name in {FLEET_FILE, RUN_FILE, f"{log.stem}.toml"}:
+            raise MotionError(
+                "model_misplaced",
+                f"it is the configuration of {log.name}, which a model would replace",
+                where=str(path),
+                hint="Give the model another name, for example model.toml.",
+            )
 
 
 def write_text(path: Path, text: str, *, code: str) -> None:

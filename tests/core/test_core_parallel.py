@@ -130,6 +130,29 @@ def test_threads_of_a_server_begin_no_process() -> None:
 
 
 @two_cores
+def test_threads_beside_the_main_one_do_not_use_its_process() -> None:
+    found: list[tuple[int, list[int]]] = []
+    with both_cores([]):
+        thread = threading.Thread(target=lambda: found.extend(map_parallel(_name_process, range(10))))
+        thread.start()
+        thread.join()
+    assert {pid for pid, _ in found} == {os.getpid()}
+
+
+@two_cores
+@pytest.mark.parametrize("call", ["pipe", "fork"])
+def test_without_room_for_a_process_all_is_done_here(call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> None:
+        raise OSError(call)
+
+    monkeypatch.setattr(os, call, refuse)
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    with both_cores([]):
+        assert map_parallel(_refuse, [0, 1]) == [0, 1]
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+@two_cores
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_signal_leaves_no_process(number: signal.Signals) -> None:
     code = (

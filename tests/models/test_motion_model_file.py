@@ -10,6 +10,7 @@ from pipeline.models.model_file import list_code, parse_model
 from pipeline.models.model_text import format_model
 from pipeline.models.trust import trust
 from pipeline.runs import MotionError
+from pipeline.vehicles import list_configuration_files, load_configuration
 
 HEAD = '[vehicle]\npreset = "husky_a200"\n\n'
 HERE = Path("model.toml")
@@ -97,6 +98,31 @@ def test_what_was_fitted_stands_in_the_file(tmp_path: Path) -> None:
     write_model(ModelFile(Model(vehicle_of("warthog")), fit=fit), path)
     assert read_model(path).fit == fit
     assert [item.name for item in tmp_path.iterdir()] == ["m.toml"]
+
+
+@pytest.mark.parametrize("name", ["may.toml", "run.toml", "fleet.toml"])
+def test_a_model_does_not_replace_a_log_s_configuration(name: str, tmp_path: Path) -> None:
+    path, model = tmp_path / name, ModelFile(Model(vehicle_of("warthog")))
+    path.write_text('[run]\nterrain = "ice"\n', encoding="utf-8")
+    write_model(model, tmp_path / "model.toml")
+    write_model(model, path)
+    path.write_text('[run]\nterrain = "ice"\n', encoding="utf-8")
+    (tmp_path / "may.mcap").touch()
+    with pytest.raises(MotionError, match=r"it is the configuration of may\.mcap") as caught:
+        write_model(model, path)
+    assert caught.value.code == "model_misplaced"
+    assert path.read_text(encoding="utf-8") == '[run]\nterrain = "ice"\n'
+
+
+@pytest.mark.parametrize("name", ["may.toml", "run.toml"])
+def test_a_model_beside_a_log_is_not_its_configuration(name: str, tmp_path: Path) -> None:
+    log, path = tmp_path / "may.mcap", tmp_path / name
+    log.touch()
+    for _ in range(2):
+        write_model(ModelFile(Model(vehicle_of("warthog"))), path)
+        assert path not in list_configuration_files(log)
+    path.write_text('# format = 1\n[run]\nterrain = "ice"\n', encoding="utf-8")
+    assert load_configuration(log).run.terrain == "ice"
 
 
 def test_a_vehicle_without_preset_keeps_its_geometry() -> None:
