@@ -16,8 +16,8 @@ from pipeline.models.effect import Effect, Excitation, Search
 
 _STANDARD_ERRORS = 4.0
 _DETECTED = 9.0
-"""Standard errors of a size that is seen: 14 of 17 hidden effects were named at it and 2 undecided, 6 named at
-half of it and 17 at twice (`make detection`, seeds 300 to 317)."""
+"""Standard errors of a size that is seen: 14 of 17 hidden effects were named at it and 2 undecided, 6 named
+at half of it and 17 at twice (`make detection`, seeds 300 to 317)."""
 
 MANOEUVRES: Mapping[Excitation, str] = {
     Excitation.DRIVING: "drive for a few minutes",
