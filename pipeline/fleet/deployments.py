@@ -101,13 +101,13 @@ def write_deployments(frame: pl.DataFrame, path: Path) -> None:
     Raises:
         ComparisonError: ``not_written``, the file cannot be written.
     """
+    from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
+
     plain = frame.with_columns(pl.col(pl.Enum).cast(pl.String), pl.col(pl.Float64).round_sig_figs(_DIGITS))
-    temporary = path.with_name(f".tmp-{path.name}")
     what, hint = "the table cannot be written", "Choose another file"
     with naming_os_errors(ComparisonError, "not_written", what, where=path, hint=hint):
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(plain.write_csv(), encoding="utf-8")
-        temporary.replace(path)
+        replace_file(path, plain.write_csv().encode())
 
 
 def _check(text: pl.DataFrame, where: str) -> pl.DataFrame:

@@ -7,6 +7,7 @@ from pathlib import Path
 import msgspec
 import tomlkit
 
+from pipeline.core.errors import naming_os_errors
 from pipeline.models.effect import Effect, Parameter
 from pipeline.models.formula.formula_effect import FormulaEffect
 from pipeline.models.model_file import FORMAT, ModelFile
@@ -65,11 +66,9 @@ def write_text(path: Path, text: str, *, code: str) -> None:
     Raises:
         MotionError: with this code, where the file cannot be written.
     """
-    try:
+    hint = "Check the folder and its permissions."
+    with naming_os_errors(MotionError, code, "cannot be written", where=path, hint=hint):
         replace_file(path, text.encode())
-    except OSError as error:
-        hint = "Check the folder and its permissions."
-        raise MotionError(code, f"cannot be written: {error.strerror}", where=str(path), hint=hint) from None
 
 
 def format_model(file: ModelFile) -> str:

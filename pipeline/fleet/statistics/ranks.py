@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pipeline.core.arrays import Floats
 from pipeline.fleet.statistics.arrays import check_values
 
 _WORDS = ((0.147, "negligible"), (0.33, "small"), (0.474, "medium"))
@@ -39,10 +40,9 @@ def cliffs_delta(a: ArrayLike, b: ArrayLike) -> float:
         StatisticsError: a side is empty or holds a value that is not finite.
     """
     first, second = check_values(a, what="values"), check_values(b, what="values")
-    ordered = np.sort(first)
-    below = np.searchsorted(ordered, second, side="left")
-    above = first.size - np.searchsorted(ordered, second, side="right")
-    return float((below.sum() - above.sum()) / (first.size * second.size))
+    pairs = first.size * second.size
+    below, ties = _count_pairs(first, second)
+    return (below - (pairs - below - ties)) / pairs
 
 
 def name_delta(delta: float) -> str:
@@ -71,10 +71,8 @@ def mann_whitney(a: ArrayLike, b: ArrayLike, *, effective: tuple[float, float] |
     """
     first, second = check_values(a, what="samples"), check_values(b, what="samples")
     n, m = float(first.size), float(second.size)
-    ordered = np.sort(first)
-    below = np.searchsorted(ordered, second, side="left").sum()
-    ties = np.searchsorted(ordered, second, side="right").sum() - below
-    share = (float(below) + 0.5 * float(ties)) / (n * m)
+    below, ties = _count_pairs(first, second)
+    share = (below + 0.5 * ties) / (n * m)
     _, repeats = np.unique(np.concatenate((first, second)), return_counts=True)
     total = n + m
     tied = float(np.sum(repeats.astype(np.float64) ** 3 - repeats)) / max(total**3 - total, 1.0)
@@ -84,6 +82,13 @@ def mann_whitney(a: ArrayLike, b: ArrayLike, *, effective: tuple[float, float] |
     spread = math.sqrt((rows + columns + 1.0) / (12.0 * rows * columns) * (1.0 - tied))
     distance = max(abs(share - 0.5) - 0.5 / (rows * columns), 0.0)
     return math.erfc(distance / spread / math.sqrt(2.0))
+
+
+def _count_pairs(first: Floats, second: Floats) -> tuple[int, int]:
+    """In how many pairs the first value is below the second, and in how many they are equal."""
+    ordered = np.sort(first)
+    below = int(np.searchsorted(ordered, second, side="left").sum())
+    return below, int(np.searchsorted(ordered, second, side="right").sum()) - below
 
 
 def kendall_tau(a: ArrayLike, b: ArrayLike) -> float:

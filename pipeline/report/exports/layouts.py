@@ -14,6 +14,7 @@ from pipeline.report import theme
 from pipeline.report.errors import writing_export
 from pipeline.report.exports import topics
 from pipeline.report.run import INPUT_WORDS
+from pipeline.store.files import replace_file
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -167,9 +168,7 @@ def write_text(path: Path, text: str) -> Path:
     Raises:
         ReportError: ``export_not_written``.
     """
-    part = path.with_name(f".{path.name}.part")
     with writing_export(where=path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
+        replace_file(path, text.encode())
     return path
