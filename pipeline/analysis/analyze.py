@@ -1,11 +1,10 @@
 """One log through all stages, its summary and its report."""
 
-from __future__ import annotations
-
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import msgspec
 
@@ -20,12 +19,8 @@ from pipeline.analysis.summary import summarize_run
 from pipeline.analysis.work import Progress, Work, read_wanted, stored_contexts, stored_keys
 from pipeline.core.version import read_version
 from pipeline.logs import LogData, spell_location, to_location
+from pipeline.report.run import RunReport
 from pipeline.store import JSON, Generation, LogIdentities, Manifest, Store, see_log
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.report.run import RunReport
 
 SUMMARY = "summary.json"
 REPORT = "report.html"

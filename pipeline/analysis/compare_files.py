@@ -1,19 +1,13 @@
 """What a comparison leaves behind: tables, a page, figures, and the JSON of `slip compare`."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import polars as pl
 
+from pipeline.analysis.options import FigureFormat
 from pipeline.fleet.measures import compare_orders
 from pipeline.fleet.tables import Answer, write_csv, write_latex
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.analysis.options import FigureFormat
-    from pipeline.store import Store
+from pipeline.store import Store
 
 
 def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = None) -> dict[str, Path]:

@@ -1,24 +1,19 @@
 """The fleet model of the results: fitted to the estimates of all runs, written, and read again."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math
-from typing import TYPE_CHECKING, cast
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import cast
 
 import polars as pl
 
 from pipeline.analysis.compared_runs import ComparedRuns, find_material, read_digest
 from pipeline.analysis.errors import JobError, lack_runs
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from pipeline.fleet.hierarchy import FleetModel, FleetNumber
-    from pipeline.fleet.statistics.intervals import Interval
-    from pipeline.store import Store
+from pipeline.fleet.hierarchy import FleetModel, FleetNumber
+from pipeline.fleet.statistics.intervals import Interval
+from pipeline.store import Store
 
 FLEET = "fleet.json"
 _TABLES = ("estimates",)

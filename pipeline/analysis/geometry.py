@@ -1,16 +1,11 @@
 """Whose geometry counts where a model and a run come from different vehicles."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Mapping, Sequence
+from typing import Literal
 
 from pipeline.analysis.errors import JobError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.vehicles import Vehicle
+from pipeline.vehicles import Vehicle
 
 Owner = Literal["model", "run"]
 _LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m", "base_to_rear_axle_m")

@@ -1,7 +1,5 @@
 """One log, its configuration, its vehicle and its name among the runs."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path

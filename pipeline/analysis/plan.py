@@ -1,25 +1,19 @@
 """What to drive next after stored runs: their diagnosis, its questions, and the topic that the run used."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.core.errors import SlipError
+from pipeline.diagnosis import Recording, RunDiagnosis
+from pipeline.fleet.forecast import Forecast
 from pipeline.plan.files import WHEELS, list_types
+from pipeline.plan.knowledge import Knowledge
 from pipeline.plan.limits import Area, Limits, is_steered
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.diagnosis import Recording, RunDiagnosis
-    from pipeline.fleet.forecast import Forecast
-    from pipeline.plan.knowledge import Knowledge
-    from pipeline.plan.plan import Plan
-    from pipeline.plan.questions import Question
-    from pipeline.store import Manifest
-    from pipeline.vehicles import Vehicle
+from pipeline.plan.plan import Plan
+from pipeline.plan.questions import Question
+from pipeline.store import Manifest
+from pipeline.vehicles import Vehicle
 
 UNDECIDED = "undecided"
 ALL = "all"

@@ -1,7 +1,5 @@
 """What computed the numbers of a run: this program, Python, and the packages that took part."""
 
-from __future__ import annotations
-
 import platform
 from collections.abc import Mapping
 from functools import cache

@@ -1,7 +1,5 @@
 """Slip relative to a model: how far the motion was from what a fitted model predicts."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The samples that tests look at, run by run."""
 
-from __future__ import annotations
-
 import numpy as np
 import polars as pl
 

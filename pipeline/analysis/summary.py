@@ -1,7 +1,5 @@
 """The JSON object of a run, made of its tables and of what the stages noted."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import polars as pl

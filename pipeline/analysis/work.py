@@ -3,16 +3,14 @@
 A stage whose key has not changed is not computed: its tables and findings are taken over as they are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import msgspec
 import polars as pl
 
 from pipeline.analysis.keys import EXTRACTED, TABLES
+from pipeline.analysis.log_setup import LogSetup
 from pipeline.analysis.options import STAGES, Options
 from pipeline.analysis.relative import add_model
 from pipeline.logs import LogData, Loss, read_topics
@@ -22,13 +20,10 @@ from pipeline.stages.align import align_tables
 from pipeline.stages.extract import extract_tables, list_wanted
 from pipeline.stages.finding import Finding, tabulate_findings
 from pipeline.stages.samples import gather_samples
+from pipeline.store import JSON, Generation, Manifest, TableReport
 from pipeline.store.tables import CheckedTable, check_table
 from pipeline.vehicles import DriveForm, Vehicle
 from schemas import contract_of
-
-if TYPE_CHECKING:
-    from pipeline.analysis.log_setup import LogSetup
-    from pipeline.store import JSON, Generation, Manifest, TableReport
 
 Progress = Callable[[str], None]
 

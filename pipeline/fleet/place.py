@@ -1,16 +1,11 @@
 """Deployments as points of the map: kinetic energy against terrain complexity."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import polars as pl
 
+from pipeline.fleet.measures import Measure
 from pipeline.fleet.terrain import complexity, rate_name
-
-if TYPE_CHECKING:
-    from pipeline.fleet.measures import Measure
 
 LOW_STATUSES = ("unconfirmed", "inferred", "placeholder", "second-hand")
 ZONES: tuple[tuple[str, float], ...] = (("low", 3.5), ("medium", 4.8), ("high", float("inf")))

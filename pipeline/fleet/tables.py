@@ -1,16 +1,11 @@
 """Comparisons as tables: for the store, for spreadsheets, and for papers."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import polars as pl
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.fleet.pairs import Pair
+from pipeline.fleet.pairs import Pair
 
 _INPUTS = pl.Enum(["command", "measured"])
 _UNITS = pl.Enum(["runs", "blocks"])

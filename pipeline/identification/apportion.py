@@ -7,25 +7,20 @@ whole. All orders are gone through for up to five effects; for more, those round
 effect comes at each place equally often, which is exact as long as effects interact in pairs.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, permutations
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.core.timegrid import nearest_indices
+from pipeline.identification.judgement import Judgement
+from pipeline.identification.problem import Problem
 from pipeline.identification.proposals import TERM
 from pipeline.identification.scoring import HeldOut, hold_out_models
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from pipeline.identification.judgement import Judgement
-    from pipeline.identification.problem import Problem
 
 Kind = Literal["effect", "disturbance", "localization_noise"]
 Subset = frozenset[str]

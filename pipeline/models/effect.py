@@ -9,21 +9,17 @@ from __future__ import annotations
 import enum
 import math
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
+from collections.abc import Iterable, Mapping
+from typing import ClassVar, Self, TypeVar
 
+from pipeline.models.evidence import Evidence, Largest
+from pipeline.models.level import Reading
 from pipeline.models.parameter import Excitation, Least, Parameter, Part, Plausible, Search, Spread  # noqa: F401 - what a file of an effect needs
 from pipeline.models.wording import describe_share
 from pipeline.runs.errors import MotionError
+from pipeline.runs.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
+from pipeline.vehicles import Vehicle
 from pipeline.vehicles.kinematics import list_kinds
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from pipeline.models.evidence import Evidence, Largest
-    from pipeline.models.level import Reading
-    from pipeline.runs.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
-    from pipeline.vehicles import Vehicle
-
 
 INF = math.inf
 NAN = math.nan

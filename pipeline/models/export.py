@@ -1,19 +1,13 @@
 """Exports of a fitted model to what people run; each target is one file of the folder `targets`."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import pkgutil
-from typing import TYPE_CHECKING
+from pathlib import Path
 
+from pipeline.models.model_file import ModelFile
+from pipeline.models.target import Current, Target
 from pipeline.runs.errors import MotionError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.models.model_file import ModelFile
-    from pipeline.models.target import Current, Target
 
 
 @functools.cache

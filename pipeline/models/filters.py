@@ -1,14 +1,10 @@
 """Filters of signals on cells: lag and rate limit, exact for inputs that are constant in a cell."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from pipeline.runs.signals import Floats, Integers, Resets, Signal
+from pipeline.runs.signals import Floats, Integers, Resets, Signal
 
 _INSTANT_S = 1e-9
 _SETTLED = 1e-9

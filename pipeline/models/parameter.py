@@ -1,17 +1,13 @@
 """The numbers of an effect: units, bounds, how they are searched, and what of them is worth a name."""
 
-from __future__ import annotations
-
 import enum
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from pipeline.models.evidence import Relative
-    from pipeline.models.quantity import Quantity
+from pipeline.models.evidence import Relative
+from pipeline.models.quantity import Quantity
 
 
 class Excitation(enum.Enum):

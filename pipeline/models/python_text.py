@@ -1,21 +1,17 @@
 """The text of a plain Python function that computes a model."""
 
-from __future__ import annotations
-
 import ast
 import copy
 import math
 from importlib import resources
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Place
 from pipeline.models.formula.formula_effect import FormulaEffect
+from pipeline.models.model import Model
 from pipeline.models.quantity import Quantity
 from pipeline.runs.errors import MotionError
-
-if TYPE_CHECKING:
-    from pipeline.models.model import Model
 
 _PLAIN_NAMES = ("abs", "min", "max", "sign")
 _PLACES = tuple(place for place in Place if place is not Place.LOCALIZATION)

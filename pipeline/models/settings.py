@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import math
 import operator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from pipeline.models.bounds import stands_at_bound
 from pipeline.models.catalogue import is_own
+from pipeline.models.effect import Effect, Parameter
 from pipeline.models.formula.formula_effect import FormulaEffect
+from pipeline.models.model_file import ModelFile
 from pipeline.models.quantity import Quantity
+from pipeline.models.target import Target
 from pipeline.runs.errors import MotionError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from pipeline.models.effect import Effect, Parameter
-    from pipeline.models.model_file import ModelFile
-    from pipeline.models.target import Target
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,9 @@
 """What a target is: a name, where its parameters are documented, and the text it makes of a model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from pipeline.models.model_file import ModelFile
-
+from pipeline.models.model_file import ModelFile
 
 Current = Mapping[str, float]
 

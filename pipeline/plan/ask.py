@@ -1,21 +1,15 @@
 """Questions: of what a diagnosis left undecided, of numbers that are not known well, of effects by name."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Container, Iterable, Sequence
 
 import numpy as np
 
 from pipeline.identification.growth import find_goal
 from pipeline.models import find_effect, list_effects
+from pipeline.models.evidence import Largest
 from pipeline.plan.errors import PlanError
+from pipeline.plan.knowledge import Hypothesis, Knowledge
 from pipeline.plan.questions import DECIDED_T, Precision, Separation
-
-if TYPE_CHECKING:
-    from collections.abc import Container, Iterable, Sequence
-
-    from pipeline.models.evidence import Largest
-    from pipeline.plan.knowledge import Hypothesis, Knowledge
 
 _NORMAL_95 = 1.96
 

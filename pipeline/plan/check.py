@@ -1,14 +1,10 @@
 """What a plan promised against what came out of driving it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from pipeline.diagnosis import RunDiagnosis
-    from pipeline.plan.files import Promised
-    from pipeline.plan.plan import Promise
+from pipeline.diagnosis import RunDiagnosis
+from pipeline.plan.files import Promised
+from pipeline.plan.plan import Promise
 
 _HALF = 0.5
 

@@ -1,21 +1,15 @@
 """What a plan may ask of a vehicle, and where it may drive."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Complex
+from pipeline.models.evidence import Largest
 from pipeline.plan.errors import PlanError
-
-if TYPE_CHECKING:
-    from pipeline.models.evidence import Largest
-    from pipeline.vehicles import Vehicle
-
+from pipeline.vehicles import Vehicle
 
 # Of a plan, where neither the user nor the vehicle's preset says more.
 _USUAL_YAW_RATE_RADPS = 1.0

@@ -5,21 +5,14 @@ reverse order and with the other sign of the speed. An ideal vehicle retraces it
 follow each other in any order inside a small area, and each has both signs of everything.
 """
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.plan.limits import Limits, is_steered
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.vehicles import Vehicle
-
+from pipeline.vehicles import Vehicle
 
 RATE_HZ = 20.0
 LEAD_S = 3.0

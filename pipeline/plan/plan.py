@@ -1,10 +1,9 @@
 """A plan: manoeuvres chosen for questions, and what the whole of it promises."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -12,19 +11,14 @@ import numpy as np
 from pipeline.core.arrays import Complex, Floats
 from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.models import Effect, find_effect, list_effects
+from pipeline.models.evidence import Largest
 from pipeline.plan.choose import Chooser, Shape
 from pipeline.plan.errors import PlanError
+from pipeline.plan.knowledge import Knowledge
 from pipeline.plan.limits import Area, Limits, is_steered
 from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, Commands, Manoeuvre, join, list_manoeuvres, wait
 from pipeline.plan.questions import DECIDED_T, STRETCHES, Answerable, Judge, Question, Separation
 from pipeline.plan.rehearsal import Rehearsal, drive, start_state
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.models.evidence import Largest
-    from pipeline.plan.knowledge import Knowledge
-
 
 _MODELS = 12
 # Of effects that may act unnoticed, times the usual one: the largest does not always lead farthest.

@@ -1,24 +1,17 @@
 """Whether a log is that of a plan's drive: its commands hold those of the plan."""
 
-from __future__ import annotations
-
 import csv
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.plan.errors import PlanError
 from pipeline.plan.manoeuvres import RATE_HZ
+from pipeline.runs.recording import DriveSeries, MotionRun
 from pipeline.runs.signals import name_inputs
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from pipeline.runs.recording import DriveSeries, MotionRun
-    from pipeline.vehicles import Vehicle
-
+from pipeline.vehicles import Vehicle
 
 _ALIKE = 0.6
 """Likeness of a drive that was stopped at a third; that of other driving stays below it."""

@@ -1,26 +1,20 @@
 """Other ways to drive, as commands within the same limits: what each would need for the same questions."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.plan.errors import PlanError
+from pipeline.plan.knowledge import Knowledge
 from pipeline.plan.limits import Limits, is_steered
 from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, Commands, hold_within, join, wait
 from pipeline.plan.plan import since_when
 from pipeline.plan.questions import Judge, Question
 from pipeline.plan.rehearsal import Rehearsal
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.plan.knowledge import Knowledge
-    from pipeline.vehicles import Vehicle
+from pipeline.vehicles import Vehicle
 
 Stages = list[tuple[float, float, float]]
 

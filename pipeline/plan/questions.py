@@ -7,23 +7,16 @@ as well as the information on it says (A-optimality). Both are sums over windows
 end at rest add up.
 """
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import chdtri, stdtrit
 
 from pipeline.core.arrays import Floats, Ints
+from pipeline.identification import Free, Problem
+from pipeline.plan.knowledge import Hypothesis, Knowledge
 from pipeline.plan.rehearsal import Rehearsal, start_state
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.identification import Free, Problem
-    from pipeline.plan.knowledge import Hypothesis, Knowledge
-
 
 # The diagnosis decides between two that were found at 1.6; a t scatters about its mean by one, and here it is
 # to be decided nearly always.

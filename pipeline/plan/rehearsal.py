@@ -4,10 +4,8 @@ Such a run is a run like any other: the one residual problem makes its windows, 
 The ground is taken to be level.
 """
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -16,17 +14,12 @@ from pipeline.core.arrays import Complex, Floats
 from pipeline.identification import Comparison, Input, Problem, State
 from pipeline.identification.problem import measure_largest
 from pipeline.models import Effect, Place, Timing
+from pipeline.models.evidence import Largest
 from pipeline.plan.limits import is_steered
+from pipeline.plan.manoeuvres import Commands
 from pipeline.runs.recording import Alignment, DriveSeries, GyroFit, MotionRun, Track
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.models.evidence import Largest
-    from pipeline.plan.manoeuvres import Commands
-    from pipeline.runs.signals import Velocity
-    from pipeline.vehicles import Vehicle
-
+from pipeline.runs.signals import Velocity
+from pipeline.vehicles import Vehicle
 
 _POSE_HZ = 20.0
 # Poses and encoders go on after the last command.

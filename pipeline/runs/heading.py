@@ -4,22 +4,16 @@ A gyro is a better heading and a better clock than a localization, once its sign
 it is brought into the map's frame by the slow part of its difference from the reported heading.
 """
 
-from __future__ import annotations
-
 import enum
 import itertools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core import timegrid
 from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.runs.grid import Grid
 from pipeline.runs.recording import GyroFit, MotionRun, Track
-
-if TYPE_CHECKING:
-    from pipeline.runs.grid import Grid
-
 
 _WINDOW_S = 0.5
 _LARGEST_DELAY = 0.7

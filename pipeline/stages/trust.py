@@ -1,8 +1,6 @@
 """Whether poses and commands are what they call themselves: a localization, and what the drive was told."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -10,13 +8,8 @@ from pipeline.core import segments, timegrid
 from pipeline.core.arrays import Flags, Floats
 from pipeline.core.robust import fit_robustly
 from pipeline.stages.finding import Finding
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.stages.samples import Samples
-    from pipeline.vehicles import Vehicle
-
+from pipeline.stages.samples import Samples
+from pipeline.vehicles import Vehicle
 
 _LIVE = 0.02
 _FEWEST = 100

@@ -5,23 +5,17 @@ says. Where one of them contradicts the two others, that one is wired or mounted
 left into right. Looked at on differential drives, whose sides are known.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from itertools import combinations
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.robust import fit_robustly
 from pipeline.stages.finding import Finding
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.stages.samples import Samples
-    from pipeline.vehicles import Vehicle
-
+from pipeline.stages.samples import Samples
+from pipeline.vehicles import Vehicle
 
 FAULTS: Final = ("sides_exchanged", "wheel_sign", "pose_mirrored", "wheel_dead")
 """Findings of which one makes every fit meaningless."""

@@ -9,19 +9,13 @@ Source: Newton's law of a body in viscous contact, written in its own turning fr
 al. 2024.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from pipeline.models.effect import BodyEffect, Excitation, Late, Least, Parameter, Plausible, Search, Spread
+from pipeline.models.evidence import Evidence
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Rolling, RunContext, Velocity
-
-if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence
 
 
 class BodyInertia(BodyEffect):

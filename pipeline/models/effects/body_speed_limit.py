@@ -7,18 +7,12 @@ limit [m/s], 1 on a Husky, 5 on a Warthog. A limit that no command reaches is on
 Source: velocity limits of a ros2_control diff_drive_controller; measured on the DRIVE recordings.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter, Search
+from pipeline.models.evidence import Evidence
 from pipeline.models.quantity import Quantity
-
-if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Commands, RunContext
+from pipeline.runs.signals import Commands, RunContext
 
 
 class BodySpeedLimit(CommandEffect):

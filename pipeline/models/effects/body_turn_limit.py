@@ -8,20 +8,15 @@ rate at the commanded speed. A limit that no command reaches is only bounded fro
 Source: velocity limits of a ros2_control diff_drive_controller; measured on the DRIVE recordings.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.models.effect import INF, CommandEffect, Effect, Excitation, Parameter, Search
 from pipeline.models.effects.turn_droop import TurnDroop
+from pipeline.models.evidence import Evidence, Largest
 from pipeline.models.quantity import Quantity
-
-if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence, Largest
-    from pipeline.runs.signals import Commands, RunContext
+from pipeline.runs.signals import Commands, RunContext
 
 _ON_A_CAR = """
         moving = max(abs(R * (left + right) / 2.0), 1e-9)

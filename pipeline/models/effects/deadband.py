@@ -7,18 +7,12 @@ d [m/s] at the rim, 0.04 to 0.3. Drive slowly, and turn slowly while driving.
 Source: static friction of a geared drive; Siciliano and Khatib, Springer Handbook of Robotics, chapter 24.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from pipeline.models.effect import WHEELED, CommandEffect, Excitation, Parameter, Search
+from pipeline.models.evidence import Evidence, Largest
 from pipeline.models.quantity import Quantity
-
-if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence, Largest
-    from pipeline.runs.signals import Commands, RunContext
+from pipeline.runs.signals import Commands, RunContext
 
 # Of the largest speed: less is passed through in one step of a command.
 _LEAST_SHARE = 0.02

@@ -7,18 +7,14 @@ tau [s]: 0.55 to 0.64 on a Husky on tile, 1.0 in snow, 1.05 to 1.2 on a Warthog.
 Source: the powertrain model of Samson et al. 2024 and of DRIVE, Baril et al. 2024.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from pipeline.models.effect import DriveEffect, Effect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.evidence import Evidence
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
-
-if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import RunContext, Wheels
+from pipeline.runs.signals import RunContext, Wheels
 
 
 class DriveLag(DriveEffect):

@@ -7,17 +7,12 @@ o [rad], about 0.04. Drive straight at several speeds.
 Source: kinematic bicycle with an uncalibrated steering; Becker et al. 2023.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter
+from pipeline.models.evidence import Evidence
 from pipeline.models.quantity import Quantity
-
-if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import RunContext, Wheels
+from pipeline.runs.signals import RunContext, Wheels
 
 
 class SteeringOffset(DriveEffect):

@@ -9,19 +9,14 @@ is steering_offset; from the command alone the two are one. Drive straight at se
 Source: kinematic bicycle with an uncalibrated steering; Becker et al. 2023.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.models.effect import ACKERMANN, Excitation, KinematicEffect, Least, Parameter
+from pipeline.models.evidence import Evidence
 from pipeline.models.quantity import Quantity
-
-if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Rolling, RunContext
+from pipeline.runs.signals import Rolling, RunContext
 
 
 class SteeringSensorOffset(KinematicEffect):

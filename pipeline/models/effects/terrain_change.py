@@ -9,19 +9,14 @@ ground. Both grounds need ten command steps with turning.
 Source: piecewise-constant slip; the deployments of Samson et al. 2024.
 """
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.models.effect import NAN, Excitation, KinematicEffect, Least, Parameter, Plausible, Search
-
-if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Rolling, RunContext
-    from pipeline.vehicles import Vehicle
+from pipeline.models.evidence import Evidence
+from pipeline.runs.signals import Rolling, RunContext
+from pipeline.vehicles import Vehicle
 
 _LEAST = Least(0.03, Least.DATA_SHEET)
 _PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")

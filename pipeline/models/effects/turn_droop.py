@@ -8,18 +8,13 @@ sign, 4 to 80 % after a change of sign. Turn slowly and quickly, on the spot and
 Source: measured on the DRIVE recordings.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.models.effect import NAN, SIDES, DriveEffect, Excitation, Least, Parameter, Plausible, Search
-
-if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence, Largest
-    from pipeline.runs.signals import RunContext, Wheels
+from pipeline.models.evidence import Evidence, Largest
+from pipeline.runs.signals import RunContext, Wheels
 
 # Of the largest difference that was asked for: a lower threshold makes a wider track, a higher one nothing.
 _THRESHOLDS = (0.1, 0.99)

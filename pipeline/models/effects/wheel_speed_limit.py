@@ -7,18 +7,12 @@ limit [rad/s], 12 to 12.8 on a Warthog. A limit that no command reaches is only 
 Source: saturation of the drive; measured on the DRIVE recordings.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from pipeline.models.effect import INF, WHEELED, CommandEffect, Excitation, Parameter, Search, Spread
+from pipeline.models.evidence import Evidence
 from pipeline.models.quantity import Quantity
-
-if TYPE_CHECKING:
-    from pipeline.models.evidence import Evidence
-    from pipeline.runs.signals import Commands, RunContext
+from pipeline.runs.signals import Commands, RunContext
 
 
 class WheelSpeedLimit(CommandEffect):

@@ -1,16 +1,11 @@
 """The whole model as one JSON object."""
 
-from __future__ import annotations
-
 import json
 import math
-from typing import TYPE_CHECKING
 
 from pipeline.models.formula.formula_effect import FormulaEffect
+from pipeline.models.model_file import ModelFile
 from pipeline.models.target import Current, Target
-
-if TYPE_CHECKING:
-    from pipeline.models.model_file import ModelFile
 
 
 def write(file: ModelFile, current: Current) -> str:

@@ -1,16 +1,10 @@
 """Parameters of Autoware: vehicle_info, the MPC and PID controllers, and the planning simulator."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
+from pipeline.models.model_file import ModelFile
 from pipeline.models.quantity import Quantity
 from pipeline.models.settings import Facts, Sheet, start_sheet
 from pipeline.models.settings_text import write_yaml
 from pipeline.models.target import Current, Target
-
-if TYPE_CHECKING:
-    from pipeline.models.model_file import ModelFile
 
 _ALL = "/**.ros__parameters"
 _INFO = "vehicle_info.param.yaml"

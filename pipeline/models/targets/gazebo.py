@@ -1,18 +1,13 @@
 """Gazebo's drive plugins, as an element for the model's SDF."""
 
-from __future__ import annotations
-
 import operator
-from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
+from pipeline.models.model_file import ModelFile
 from pipeline.models.quantity import Quantity
 from pipeline.models.settings import Facts, Sheet, start_sheet
 from pipeline.models.settings_text import list_comments, make_plain
 from pipeline.models.target import Current, Target
-
-if TYPE_CHECKING:
-    from pipeline.models.model_file import ModelFile
 
 _SYSTEMS = {
     "differential": ("gz-sim-diff-drive-system", "gz::sim::systems::DiffDrive"),

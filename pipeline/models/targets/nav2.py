@@ -1,15 +1,9 @@
 """Parameters of Nav2: MPPI, regulated pure pursuit and the velocity smoother."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
+from pipeline.models.model_file import ModelFile
 from pipeline.models.settings import Facts, Sheet, start_sheet
 from pipeline.models.settings_text import write_yaml
 from pipeline.models.target import Current, Target
-
-if TYPE_CHECKING:
-    from pipeline.models.model_file import ModelFile
 
 _CONTROLLER = "controller_server.ros__parameters.FollowPath"
 _SMOOTHER = "velocity_smoother.ros__parameters"

@@ -1,21 +1,16 @@
 """Parameters of PX4 rovers, as QGroundControl loads them."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math
 import operator
-from typing import TYPE_CHECKING
 
+from pipeline.models.model_file import ModelFile
 from pipeline.models.quantity import Quantity
 from pipeline.models.settings import Amount, Facts, Sheet, combine, start_sheet
 from pipeline.models.settings_text import list_comments, make_plain
 from pipeline.models.target import Current, Target
 from pipeline.runs.errors import MotionError
-
-if TYPE_CHECKING:
-    from pipeline.models.model_file import ModelFile
 
 _REAL32 = 9
 """MAV_PARAM_TYPE_REAL32: the type of all these parameters."""

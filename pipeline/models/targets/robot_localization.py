@@ -1,22 +1,16 @@
 """Wheel odometry for robot_localization: its covariance, and what the filter is to take of it."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Collection
 
 import msgspec
 
 from pipeline.models.effect import Effect, Place
+from pipeline.models.model_file import ModelFile
 from pipeline.models.quantity import Quantity
 from pipeline.models.settings import Amount, Setting, start_sheet
 from pipeline.models.settings_text import write_yaml
 from pipeline.models.target import Current, Target
 from pipeline.runs.errors import MotionError
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
-
-    from pipeline.models.model_file import ModelFile
 
 _FILTER = "ekf_filter_node.ros__parameters"
 _CONTROLLERS = {

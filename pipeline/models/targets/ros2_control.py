@@ -1,16 +1,10 @@
 """Parameters of ros2_control's wheeled controllers: diff_drive_controller, ackermann_steering_controller."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
+from pipeline.models.model_file import ModelFile
 from pipeline.models.quantity import Quantity
 from pipeline.models.settings import Facts, Sheet, combine, start_sheet
 from pipeline.models.settings_text import write_yaml
 from pipeline.models.target import Current, Target
-
-if TYPE_CHECKING:
-    from pipeline.models.model_file import ModelFile
 
 
 def write(file: ModelFile, current: Current) -> str:

@@ -1,20 +1,15 @@
 """Parameters of the VESC nodes of F1TENTH cars: vesc.yaml."""
 
-from __future__ import annotations
-
 import operator
-from typing import TYPE_CHECKING
 
 import yaml
 
+from pipeline.models.model_file import ModelFile
 from pipeline.models.quantity import Quantity
 from pipeline.models.settings import Amount, Facts, combine, start_sheet
 from pipeline.models.settings_text import write_yaml
 from pipeline.models.target import Current, Target
 from pipeline.runs.errors import MotionError
-
-if TYPE_CHECKING:
-    from pipeline.models.model_file import ModelFile
 
 _ALL = "/**.ros__parameters"
 _SPEED_GAIN = "speed_to_erpm_gain"
