@@ -37,12 +37,9 @@ def agree_on_vehicle(model: Vehicle, runs: Mapping[str, Vehicle], owner: Owner |
             continue
         if owner == "run":
             first = next(iter(runs))
-            raise JobError(
-                "vehicle_contradiction",
-                f"it is of a {_describe(vehicle, differing)}, {first} of a {_describe(chosen, differing)}",
-                where=name,
-                hint="Give runs of one vehicle, or --vehicle-of model.",
-            )
+            what = f"it is of a {_describe(vehicle, differing)}, {first} of a {_describe(chosen, differing)}"
+            hint = "Give runs of one vehicle, or --vehicle-of model."
+            raise JobError("vehicle_contradiction", what, where=name, hint=hint)
         raise JobError(
             "vehicle_contradiction",
             f"the run is of a {_describe(vehicle, differing)}, the model of a {_describe(model, differing)}",

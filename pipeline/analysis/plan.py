@@ -141,12 +141,9 @@ def study(
 
     diagnosis = diagnose_runs(recordings, vehicle).runs[0]
     if diagnosis.proposal is None:
-        raise SlipError(
-            "nothing_judged",
-            "the log cannot be judged, so that nothing can be planned from it",
-            where=recordings[0].name,
-            hint="See the findings of `slip diagnose`, or plan for the vehicle alone with --vehicle.",
-        )
+        what = "the log cannot be judged, so that nothing can be planned from it"
+        hint = "See the findings of `slip diagnose`, or plan for the vehicle alone with --vehicle."
+        raise SlipError("nothing_judged", what, where=recordings[0].name, hint=hint)
     # Terms without a name stand for this run's ground: nothing is known of them elsewhere.
     catalogue = {effect.id for effect in list_effects()}
     named = [effect for effect in diagnosis.proposal.model.effects if effect.id in catalogue]

@@ -65,12 +65,8 @@ def add_model(
     model = file.model
     found = [Finding("model_code_left_out", "warning", warning, where="model") for warning in file.warnings]
     if model.vehicle.kind != vehicle.kind:
-        raise JobError(
-            "wrong_model",
-            f"the model is of a vehicle of kind {model.vehicle.kind!r}, the run's is {vehicle.kind!r}",
-            where=str(path),
-            hint="Give a model of this vehicle.",
-        )
+        what = f"the model is of a vehicle of kind {model.vehicle.kind!r}, the run's is {vehicle.kind!r}"
+        raise JobError("wrong_model", what, where=str(path), hint="Give a model of this vehicle.")
     run = load_run({**tables, "slip": slip}, model.vehicle, name=str(path))
     parts = []
     for name in slip["input"].unique(maintain_order=True):

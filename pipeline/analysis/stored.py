@@ -114,12 +114,9 @@ def _find_recorded(stored: Manifest) -> Path:
     path = Path(recorded_path(stored))
     if path.exists():
         return path
-    raise JobError(
-        "log_gone",
-        "the log of this run is not there any more, and other choices than the run's need it",
-        where=str(path),
-        hint=f"Give the path it has now, or ask about {stored.run} without them.",
-    )
+    what = "the log of this run is not there any more, and other choices than the run's need it"
+    hint = f"Give the path it has now, or ask about {stored.run} without them."
+    raise JobError("log_gone", what, where=str(path), hint=hint)
 
 
 def _is_changed(path: Path, stored: Manifest, options: Options, *, asked: bool) -> bool:

@@ -187,12 +187,8 @@ def _apply(proposals: list[ModelFile | None], path: Path, *, quiet: bool) -> Non
 
     proposal = next((found for found in proposals if found is not None), None)
     if proposal is None:
-        raise SlipError(
-            "nothing_to_apply",
-            "no model can be proposed: nothing could be judged",
-            where=str(path),
-            hint="See the findings.",
-        )
+        what = "no model can be proposed: nothing could be judged"
+        raise SlipError("nothing_to_apply", what, where=str(path), hint="See the findings.")
     write_model(proposal, path)
     if not quiet:
         print_lines([f"{path}: {', '.join(proposal.model.ids) or 'the ideal model'}"])

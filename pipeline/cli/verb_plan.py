@@ -271,12 +271,9 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
     before = [name for name in promised.runs if name not in names]
     vehicle, recordings, _, _, lossy = _gather([*before, *names], options, quiet=quiet)
     if promised.vehicle != vehicle.id:
-        raise SlipError(
-            "other_vehicle",
-            f"the plan is for {promised.vehicle}, and what was driven is of {vehicle.id}",
-            where=str(path),
-            hint="Check a plan with logs of the vehicle it was made for.",
-        )
+        what = f"the plan is for {promised.vehicle}, and what was driven is of {vehicle.id}"
+        hint = "Check a plan with logs of the vehicle it was made for."
+        raise SlipError("other_vehicle", what, where=str(path), hint=hint)
     with show_progress(names[0], quiet=quiet or json) as progress:
         progress("diagnosis")
         driven = [load_recording(recording, vehicle) for recording in recordings[len(before) :]]

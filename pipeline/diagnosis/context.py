@@ -114,20 +114,13 @@ def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Conte
         if error.code != f"no_{source.value}":
             raise
         other = Input.MEASURED if source is Input.COMMAND else Input.COMMAND
-        raise DiagnosisError(
-            "no_input",
-            f"there is no {'command' if source is Input.COMMAND else 'measured wheel'} to diagnose from",
-            where=where,
-            hint=f"Try --input {other.value}.",
-        ) from error
+        what = f"there is no {'command' if source is Input.COMMAND else 'measured wheel'} to diagnose from"
+        raise DiagnosisError("no_input", what, where=where, hint=f"Try --input {other.value}.") from error
     windows = problem.whole.run.size
     if windows < _FEWEST_WINDOWS:
-        raise DiagnosisError(
-            "too_short",
-            f"only {windows} stretches of half a second have both a live input and good poses",
-            where=where,
-            hint=f"{_FEWEST_WINDOWS} are needed: drive longer, or check the poses with `slip inspect`.",
-        )
+        what = f"only {windows} stretches of half a second have both a live input and good poses"
+        hint = f"{_FEWEST_WINDOWS} are needed: drive longer, or check the poses with `slip inspect`."
+        raise DiagnosisError("too_short", what, where=where, hint=hint)
     return Context(problem)
 
 

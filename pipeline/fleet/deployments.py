@@ -27,12 +27,9 @@ def find_own_table() -> Path:
     for path in places:
         if path.is_file():
             return path
-    raise ComparisonError(
-        "no_deployments",
-        "the project's table of deployments is not installed",
-        where=str(places[0]),
-        hint="Install the package again, or give a table with --deployments",
-    )
+    what = "the project's table of deployments is not installed"
+    hint = "Install the package again, or give a table with --deployments"
+    raise ComparisonError("no_deployments", what, where=str(places[0]), hint=hint)
 
 
 def read_deployments(path: Path) -> pl.DataFrame:
@@ -69,12 +66,9 @@ def add_deployment(table: Path, entry: Path) -> pl.DataFrame:
     try:
         content = tomllib.loads(entry.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ComparisonError(
-            "bad_deployment",
-            f"the deployment cannot be read: {error}",
-            where=str(entry),
-            hint="Write one line `column = value` for each column known; key, year and drive are needed",
-        ) from error
+        what = f"the deployment cannot be read: {error}"
+        hint = "Write one line `column = value` for each column known; key, year and drive are needed"
+        raise ComparisonError("bad_deployment", what, where=str(entry), hint=hint) from error
     row = pl.DataFrame({name: [str(value)] for name, value in content.items()})
     there = (
         read_deployments(table)

@@ -146,11 +146,9 @@ def forecast_vehicle(
     known = estimates.filter(pl.col("terrain") != UNKNOWN)
     rows = take_numbers(known).filter(pl.col("vehicle") == vehicle)
     if rows.is_empty():
-        raise ComparisonError(
-            "no_such_vehicle",
-            f"no run of {vehicle} on a known terrain has estimates",
-            hint=f"There are runs of: {', '.join(sorted(set(known['vehicle']))) or 'no vehicle'}.",
-        )
+        what = f"no run of {vehicle} on a known terrain has estimates"
+        hint = f"There are runs of: {', '.join(sorted(set(known['vehicle']))) or 'no vehicle'}."
+        raise ComparisonError("no_such_vehicle", what, hint=hint)
     here = rows.filter(pl.col("terrain") == terrain)
     numbers = []
     for effect in _choose_effects(rows if here.is_empty() else here, source):

@@ -40,11 +40,9 @@ def label_runs(runs: pl.DataFrame, by: Sequence[str]) -> pl.DataFrame:
     """
     unknown = [name for name in by if name not in LABELS]
     if unknown or not by:
-        raise ComparisonError(
-            "no_such_column",
-            f"runs cannot be grouped by {', '.join(unknown) or 'nothing'}",
-            hint=f"Use one or several of {', '.join(LABELS)}, with commas between them",
-        )
+        what = f"runs cannot be grouped by {', '.join(unknown) or 'nothing'}"
+        hint = f"Use one or several of {', '.join(LABELS)}, with commas between them"
+        raise ComparisonError("no_such_column", what, hint=hint)
     known = [pl.col(name).is_not_null() & (pl.col(name) != UNKNOWN) for name in by]
     if "dataset" in by:
         known.append(pl.col("terrain") != UNKNOWN)

@@ -93,12 +93,8 @@ class Comparison:
         series = run.commands if source is Input.COMMAND else run.wheels
         if series is None:
             words = "commands" if source is Input.COMMAND else "measured wheels"
-            raise MotionError(
-                f"no_{source.value}",
-                f"the run has no {words} to feed a model with",
-                where=run.name,
-                hint="Choose the other input.",
-            )
+            what = f"the run has no {words} to feed a model with"
+            raise MotionError(f"no_{source.value}", what, where=run.name, hint="Choose the other input.")
         # Whoever's geometry counts, the controller is that of this recording.
         vehicle = run.correct_vehicle(vehicle)
         self.run = run
@@ -107,12 +103,9 @@ class Comparison:
         self.heading = choose_heading(run, self.cells, heading)
         self.nodes = gather_nodes(run.track, self.cells)
         if self.nodes.times.size == 0:
-            raise MotionError(
-                "no_poses",
-                "no pose falls into a stretch with a live command",
-                where=run.name,
-                hint="Mend [[interval]], or take all with --interval all.",
-            )
+            what = "no pose falls into a stretch with a live command"
+            hint = "Mend [[interval]], or take all with --interval all."
+            raise MotionError("no_poses", what, where=run.name, hint=hint)
         lead = find_lead(run, run.alignment.heading_delay_s)
         self.windows = join_windows(run, self.cells, self.nodes, lead)
         self.horizons = join_horizons(run, self.cells, self.nodes, lead)
@@ -157,12 +150,9 @@ class Comparison:
             else:
                 velocity = forward.run_wheels(effects, timing)
         if own and not all(np.isfinite(part).all() for part in (velocity.x, velocity.y, velocity.w)):
-            raise MotionError(
-                "not_finite",
-                "an effect of your own gives a velocity that is no finite number",
-                where=", ".join(own),
-                hint="Mend its Python: it must give a number for every cell of the run.",
-            )
+            what = "an effect of your own gives a velocity that is no finite number"
+            hint = "Mend its Python: it must give a number for every cell of the run."
+            raise MotionError("not_finite", what, where=", ".join(own), hint=hint)
         return velocity
 
     def _complete_timing(self, effects: Sequence[Effect], timing: Timing) -> Timing:

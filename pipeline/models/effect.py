@@ -236,12 +236,8 @@ class Effect(ABC):
             if parameter.name == name:
                 return parameter
         known = ", ".join(f"{p.name} [{p.unit}]" for p in self.parameters)
-        raise MotionError(
-            "unknown_parameter",
-            f"the effect {self.id} has no parameter {name!r}",
-            where=f"{self.id}.{name}",
-            hint=f"It has: {known}.",
-        )
+        what = f"the effect {self.id} has no parameter {name!r}"
+        raise MotionError("unknown_parameter", what, where=f"{self.id}.{name}", hint=f"It has: {known}.")
 
     def change(self, **values: float) -> Self:
         """The same effect with other values.
@@ -276,20 +272,14 @@ class Effect(ABC):
             low, high = parameter.bounds
             neutral = value == parameter.neutral or (math.isnan(value) and math.isnan(parameter.neutral))
             if not neutral and not math.isfinite(value):
-                raise MotionError(
-                    "out_of_bounds",
-                    f"{name} = {value:g} is no finite number",
-                    where=f"{self.id}.{name}",
-                    hint="Give a value inside the bounds.",
-                )
+                what = f"{name} = {value:g} is no finite number"
+                hint = "Give a value inside the bounds."
+                raise MotionError("out_of_bounds", what, where=f"{self.id}.{name}", hint=hint)
             if not neutral and not low <= value <= high:
                 unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-                raise MotionError(
-                    "out_of_bounds",
-                    f"{name} = {value:g}{unit} is outside of {low:g} to {high:g}",
-                    where=f"{self.id}.{name}",
-                    hint="Give a value inside the bounds.",
-                )
+                what = f"{name} = {value:g}{unit} is outside of {low:g} to {high:g}"
+                hint = "Give a value inside the bounds."
+                raise MotionError("out_of_bounds", what, where=f"{self.id}.{name}", hint=hint)
         return {p.name: float(given.get(p.name, p.neutral)) for p in self.parameters}
 
 

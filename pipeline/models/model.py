@@ -28,12 +28,9 @@ class Model:
         seen: set[str] = set()
         for effect in self.effects:
             if effect.id in seen:
-                raise MotionError(
-                    "effect_twice",
-                    f"the model has {effect.id} twice",
-                    where=effect.id,
-                    hint="Drop one of them, or change its parameters.",
-                )
+                what = f"the model has {effect.id} twice"
+                hint = "Drop one of them, or change its parameters."
+                raise MotionError("effect_twice", what, where=effect.id, hint=hint)
             seen.add(effect.id)
             if self.vehicle.kind not in effect.kinds:
                 raise MotionError(

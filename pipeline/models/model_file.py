@@ -123,19 +123,13 @@ def read_text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise MotionError(
-            "model_not_found",
-            "there is no such model file",
-            where=str(path),
-            hint=f"Make one: slip model new {path.name} --vehicle husky_a200.",
-        ) from None
+        what = "there is no such model file"
+        hint = f"Make one: slip model new {path.name} --vehicle husky_a200."
+        raise MotionError("model_not_found", what, where=str(path), hint=hint) from None
     except UnicodeDecodeError:
-        raise MotionError(
-            "model_unreadable",
-            "this is no model file: it is no text",
-            where=str(path),
-            hint="Give the TOML file that `slip diagnose --apply` or `slip model new` wrote.",
-        ) from None
+        what = "this is no model file: it is no text"
+        hint = "Give the TOML file that `slip diagnose --apply` or `slip model new` wrote."
+        raise MotionError("model_unreadable", what, where=str(path), hint=hint) from None
     except OSError as error:
         raise MotionError(
             "model_unreadable", f"cannot be read: {error}", where=str(path), hint="Check the file."

@@ -52,12 +52,9 @@ def check_place(path: Path) -> None:
         return
     for log in path.parent.glob("*"):
         if log.suffix in SUFFIXES and path.name in {FLEET_FILE, RUN_FILE, f"{log.stem}.toml"}:
-            raise MotionError(
-                "model_misplaced",
-                f"it is the configuration of {log.name}, which a model would replace",
-                where=str(path),
-                hint="Give the model another name, for example model.toml.",
-            )
+            what = f"it is the configuration of {log.name}, which a model would replace"
+            hint = "Give the model another name, for example model.toml."
+            raise MotionError("model_misplaced", what, where=str(path), hint=hint)
 
 
 def write_text(path: Path, text: str, *, code: str) -> None:
@@ -78,12 +75,9 @@ def format_model(file: ModelFile) -> str:
         MotionError: ``model_incomplete``, effects were left out when it was read and would be lost.
     """
     if file.left_out:
-        raise MotionError(
-            "model_incomplete",
-            f"{', '.join(file.left_out)} would be lost: {', '.join(file.effect_files)} is not trusted",
-            where=", ".join(file.left_out),
-            hint="Read it and trust it (slip model trust), or take its effects out of the file by hand.",
-        )
+        what = f"{', '.join(file.left_out)} would be lost: {', '.join(file.effect_files)} is not trusted"
+        hint = "Read it and trust it (slip model trust), or take its effects out of the file by hand."
+        raise MotionError("model_incomplete", what, where=", ".join(file.left_out), hint=hint)
     lines = [
         "# A motion model: a vehicle, and the physical effects by which it differs from the ideal one.",
         "# `slip effects ID` explains an effect; `slip model show` this file.",

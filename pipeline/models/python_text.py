@@ -46,12 +46,9 @@ def _write_step(effect: Effect, kind: str) -> str:
         return _formula(effect)
     text = None if is_own(type(effect)) else effect.choose_python(kind)
     if text is None:
-        raise MotionError(
-            "not_exportable",
-            f"{effect.id} is Python of your own and cannot be written out",
-            where=effect.id,
-            hint="Write it as a formula in the model file, or export without it (slip model drop).",
-        )
+        what = f"{effect.id} is Python of your own and cannot be written out"
+        hint = "Write it as a formula in the model file, or export without it (slip model drop)."
+        raise MotionError("not_exportable", what, where=effect.id, hint=hint)
     for name, value in effect.values.items():
         text = text.replace(f"{{{name}}}", _number(value))
     return text
@@ -100,12 +97,9 @@ def _formula(effect: FormulaEffect) -> str:
     lines = []
     for channel, expression in effect.expressions.items():
         if any(name.endswith("_rate") for name in expression.names):
-            raise MotionError(
-                "not_exportable",
-                f"{effect.id} uses the rate of a signal, which the exported function does not have",
-                where=effect.id,
-                hint="Export without it (slip model drop).",
-            )
+            what = f"{effect.id} uses the rate of a signal, which the exported function does not have"
+            hint = "Export without it (slip model drop)."
+            raise MotionError("not_exportable", what, where=effect.id, hint=hint)
         body = ast.unparse(ast.fix_missing_locations(_Writer(effect).visit(copy.deepcopy(expression.tree))))
         lines.append(f"\n        {channel} = {channel} + ({body})")
     return "".join(lines)

@@ -82,12 +82,8 @@ def ask_presence(knowledge: Knowledge, names: Iterable[str], largest: Largest) -
     for name in names:
         effect = find_effect(name)
         if knowledge.vehicle.kind not in effect.kinds:
-            raise PlanError(
-                "wrong_vehicle",
-                f"{name} exists on {' or '.join(effect.kinds)} vehicles only",
-                where=knowledge.vehicle.id,
-                hint="Choose another effect.",
-            )
+            what = f"{name} exists on {' or '.join(effect.kinds)} vehicles only"
+            raise PlanError("wrong_vehicle", what, where=knowledge.vehicle.id, hint="Choose another effect.")
         if name in knowledge.base.names:
             continue
         with_it = knowledge.base.extend(effect().make_usual(largest))

@@ -68,12 +68,9 @@ def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
     types = [*list_types(steered=plan.steered), *([WHEELS] if plan.wheels is not None else [])]
     topics = plan.topic.split(", ")
     if plan.type_name not in types or len(topics) != (_PAIR if plan.type_name == WHEELS else 1):
-        raise PlanError(
-            "wrong_type",
-            f"commands of this vehicle cannot be written as {plan.type_name}",
-            where=plan.topic,
-            hint=f"Give --type as one of {', '.join(types)}; {WHEELS} on --topic '/LEFT, /RIGHT'.",
-        )
+        what = f"commands of this vehicle cannot be written as {plan.type_name}"
+        hint = f"Give --type as one of {', '.join(types)}; {WHEELS} on --topic '/LEFT, /RIGHT'."
+        raise PlanError("wrong_type", what, where=plan.topic, hint=hint)
     toml, csv, mcap = (folder / name for name in _NAMES)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -82,12 +79,8 @@ def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
         for path, text in ((csv, _format_csv(plan)), (toml, _format_toml(plan)), *pages):
             replace_file(path, text.encode())
     except OSError as error:
-        raise PlanError(
-            "cannot_write",
-            f"the plan cannot be written ({error.strerror})",
-            where=str(folder),
-            hint="Choose another --out.",
-        ) from None
+        what = f"the plan cannot be written ({error.strerror})"
+        raise PlanError("cannot_write", what, where=str(folder), hint="Choose another --out.") from None
     return (toml, csv, mcap, *(path for path, _ in pages))
 
 

@@ -148,12 +148,9 @@ def learn(
     """
     for run in runs:
         if run.commands is None:
-            raise PlanError(
-                "no_command",
-                "the log has no commands, which a plan would be made of",
-                where=run.name,
-                hint="Record the command topic, or plan for the vehicle alone with --vehicle.",
-            )
+            what = "the log has no commands, which a plan would be made of"
+            hint = "Record the command topic, or plan for the vehicle alone with --vehicle."
+            raise PlanError("no_command", what, where=run.name, hint=hint)
     # The steering of a car that stands cannot be read off its motion: the whole way serves.
     used = [replace(run, wheels=None) for run in runs]
     if not is_steered(vehicle) and all(run.wheels is not None for run in runs):

@@ -33,12 +33,9 @@ def require_played(path: Path, runs: Sequence[MotionRun], vehicle: Vehicle) -> N
     asked = _read_plan(path, vehicle)
     likeness = max(find_likeness(asked, _sample(run.commands, vehicle)) for run in runs if run.commands)
     if likeness < _ALIKE:
-        raise PlanError(
-            "not_played",
-            f"no stretch of these commands is the plan's (likeness {likeness:.0%})",
-            where=", ".join(run.name for run in runs),
-            hint="Give the log in which the plan was driven.",
-        )
+        what = f"no stretch of these commands is the plan's (likeness {likeness:.0%})"
+        hint = "Give the log in which the plan was driven."
+        raise PlanError("not_played", what, where=", ".join(run.name for run in runs), hint=hint)
 
 
 def find_likeness(asked: Floats, seen: Floats) -> float:

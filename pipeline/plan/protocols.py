@@ -41,12 +41,9 @@ def parse_protocols(text: str) -> tuple[str, ...]:
     names = tuple(text.split(","))
     for name in names:
         if name not in PROTOCOLS:
-            raise PlanError(
-                "unknown_protocol",
-                f"no protocol is called {name!r}",
-                where="--compare",
-                hint=f"Give some of {', '.join(PROTOCOLS)}.",
-            )
+            what = f"no protocol is called {name!r}"
+            hint = f"Give some of {', '.join(PROTOCOLS)}."
+            raise PlanError("unknown_protocol", what, where="--compare", hint=hint)
     return names
 
 

@@ -31,12 +31,8 @@ def find_driven(run: MotionRun, driven_s: float) -> float:
     done = np.cumsum(np.where(counts, steps, 0.0))
     place = int(np.searchsorted(done, driven_s))
     if place >= done.size:
-        raise MotionError(
-            "too_short",
-            f"it was driven for {done[-1] if done.size else 0.0:.0f} s, not for {driven_s:g} s",
-            where=run.name,
-            hint="Take less of it, or drive longer.",
-        )
+        what = f"it was driven for {done[-1] if done.size else 0.0:.0f} s, not for {driven_s:g} s"
+        raise MotionError("too_short", what, where=run.name, hint="Take less of it, or drive longer.")
     return float(times[place + 1])
 
 

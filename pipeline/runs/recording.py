@@ -205,12 +205,8 @@ def load_run(
     """
     table = tables.get("alignments")
     if table is None or table.is_empty():
-        raise MotionError(
-            "not_aligned",
-            "the results were made by an earlier version, before recordings were aligned",
-            where=name,
-            hint="Analyze the log again with --force.",
-        )
+        what = "the results were made by an earlier version, before recordings were aligned"
+        raise MotionError("not_aligned", what, where=name, hint="Analyze the log again with --force.")
     return make_run(tables, vehicle, read_alignment(table), name=name, sha256=sha256)
 
 

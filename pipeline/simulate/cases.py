@@ -99,12 +99,8 @@ def simulate_case(
         run = simulate_run(scenario) if machine is None else simulate_skid_steer(scenario, machine)
         write_log(run, target)
     except OSError as problem:
-        raise SimulateError(
-            "cannot_write",
-            f"the log cannot be written ({problem.strerror})",
-            where=str(target),
-            hint="Choose another --out",
-        ) from problem
+        what = f"the log cannot be written ({problem.strerror})"
+        raise SimulateError("cannot_write", what, where=str(target), hint="Choose another --out") from problem
     return target
 
 

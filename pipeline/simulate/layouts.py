@@ -105,12 +105,8 @@ def find_layout(layout: str | Layout, vehicle: Vehicle) -> Layout:
         name, found = "layout", layout
     if found.kind != vehicle.kind:
         fitting = sorted(key for key, item in LAYOUTS.items() if item.kind == vehicle.kind)
-        raise SimulateError(
-            "wrong_vehicle",
-            f"this layout is for {found.kind} vehicles, this one is {vehicle.kind}",
-            where=name,
-            hint=f"Choose one of {', '.join(fitting)}",
-        )
+        what = f"this layout is for {found.kind} vehicles, this one is {vehicle.kind}"
+        raise SimulateError("wrong_vehicle", what, where=name, hint=f"Choose one of {', '.join(fitting)}")
     return found
 
 

@@ -130,24 +130,18 @@ def simulate_skid_steer(scenario: Scenario, machine: SkidSteer) -> SimulatedRun:
 
 def _refuse_formulas(scenario: Scenario, effects: Effects) -> None:
     if scenario.vehicle.kind != "differential":
-        raise SimulateError(
-            "wrong_vehicle",
-            "only skid-steer vehicles are built of rigid bodies",
-            where=scenario.vehicle.name,
-            hint="Choose a differential vehicle",
-        )
+        what = "only skid-steer vehicles are built of rigid bodies"
+        hint = "Choose a differential vehicle"
+        raise SimulateError("wrong_vehicle", what, where=scenario.vehicle.name, hint=hint)
     wrong = [name for name in effects.as_mapping() if name not in _ALLOWED]
     if scenario.extra is not None:
         wrong.append("extra")
     if scenario.ground.hill_m > 0.0:
         wrong.append("hills")
     if wrong:
-        raise SimulateError(
-            "not_physical",
-            f"{', '.join(wrong)} cannot be switched on where contact decides",
-            where="effects",
-            hint="Change the machine (friction, payload, radius) or the slope instead",
-        )
+        what = f"{', '.join(wrong)} cannot be switched on where contact decides"
+        hint = "Change the machine (friction, payload, radius) or the slope instead"
+        raise SimulateError("not_physical", what, where="effects", hint=hint)
 
 
 def _step_world(scenario: Scenario, machine: SkidSteer, asked: Drive) -> tuple[Floats, Floats, Floats]:

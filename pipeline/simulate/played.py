@@ -43,12 +43,9 @@ def read_played(path: Path, vehicle: Vehicle) -> Commands:
         turn = 0.5 * vehicle.wheel_radius_m * (rates[1] - rates[0]) / half
         return Commands((left.log_time - left.log_time[0]) * 1e-9, speed, turn, None)
     if topic is None:
-        raise SimulateError(
-            "nothing_to_play",
-            f"no topic has commands that a vehicle of kind {vehicle.kind} is driven with",
-            where=str(path),
-            hint=f"Give a recording with {' or '.join(types)}, or {_SIDE} for the left and the right wheels.",
-        )
+        what = f"no topic has commands that a vehicle of kind {vehicle.kind} is driven with"
+        hint = f"Give a recording with {' or '.join(types)}, or {_SIDE} for the left and the right wheels."
+        raise SimulateError("nothing_to_play", what, where=str(path), hint=hint)
     columns = read_topics(index, [Wanted(topic)]).of(topic)[0]
     speed, turn = (np.asarray(columns.fields[name], dtype=np.float64) for name in types[columns.type_name])
     times = (columns.log_time - columns.log_time[0]) * 1e-9

@@ -116,12 +116,9 @@ def record_truth(scenario: Scenario, truth: Truth) -> SimulatedRun:
     seen = truth.path
     if scenario.pose.source == "wheels":
         if wheels is None:
-            raise SimulateError(
-                "encoders_needed",
-                "a pose from wheels needs encoders",
-                where="pose.source",
-                hint="Add encoders to the scenario or let the pose come from localization",
-            )
+            what = "a pose from wheels needs encoders"
+            hint = "Add encoders to the scenario or let the pose come from localization"
+            raise SimulateError("encoders_needed", what, where="pose.source", hint=hint)
         seen = integrate_odometry(scenario.vehicle, wheels, start=scenario.start_pose)
     poses = report_poses(scenario.pose, seen, truth.effects, duration_s=duration, seed=seed)
     return SimulatedRun(scenario, truth, _as_recorded(scenario, truth.commands), poses, wheels, imu)
@@ -130,12 +127,9 @@ def record_truth(scenario: Scenario, truth: Truth) -> SimulatedRun:
 def _check_frame(scenario: Scenario) -> None:
     layout = find_layout(scenario.recording.layout, scenario.vehicle)
     if scenario.pose.child_frame != "base_link" and layout.pose.form != "odometry":
-        raise SimulateError(
-            "bad_value",
-            f"a pose as {layout.pose.form} cannot be of {scenario.pose.child_frame}",
-            where="pose.child_frame",
-            hint="Choose a layout whose pose is an odometry message",
-        )
+        what = f"a pose as {layout.pose.form} cannot be of {scenario.pose.child_frame}"
+        hint = "Choose a layout whose pose is an odometry message"
+        raise SimulateError("bad_value", what, where="pose.child_frame", hint=hint)
 
 
 def integrate_odometry(vehicle: Vehicle, wheels: WheelReadings, *, start: tuple[float, float, float]) -> Path:

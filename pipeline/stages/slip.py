@@ -81,18 +81,12 @@ def compute_slip(
     found = {name: ideal for name, ideal in known.items() if name in inputs}
     if not found:
         if whole and not any(ideal.active.any() for ideal in whole.values()):
-            raise StageError(
-                "empty_interval",
-                "no pose falls into the intervals in which commands are live",
-                where=where,
-                hint="Mend [[interval]] (seconds from the run's start), or take all with --interval all.",
-            )
-        raise StageError(
-            "no_command",
-            "no command and no measured wheel speed falls together with a pose",
-            where=where,
-            hint="Name the command in run.toml ([command] topic = ...); `slip inspect` lists the topics.",
-        )
+            what = "no pose falls into the intervals in which commands are live"
+            hint = "Mend [[interval]] (seconds from the run's start), or take all with --interval all."
+            raise StageError("empty_interval", what, where=where, hint=hint)
+        what = "no command and no measured wheel speed falls together with a pose"
+        hint = "Name the command in run.toml ([command] topic = ...); `slip inspect` lists the topics."
+        raise StageError("no_command", what, where=where, hint=hint)
     length = configuration.slip.length_scale_m
     cut = cut_steps(velocities, known, length, configuration.slip.transitory_s)
     base = velocities.select("t", "stamp", "segment", "v_x", "v_y", "v_w").with_columns(

@@ -62,12 +62,8 @@ def compute_velocities(
     table = table.with_columns(column)
     if settings.yaw == "imu":
         if rate is None:
-            raise StageError(
-                "no_gyro",
-                "--yaw imu was asked for, but the log has no gyro that agrees with the poses",
-                where=where,
-                hint="Use --yaw pose (the default).",
-            )
+            what = "--yaw imu was asked for, but the log has no gyro that agrees with the poses"
+            raise StageError("no_gyro", what, where=where, hint="Use --yaw pose (the default).")
         silent = table["v_w_imu"].null_count()
         if silent:
             text = f"the gyro is silent in {silent} time steps: the poses' yaw rate stands in there"
@@ -98,12 +94,9 @@ def differentiate_poses(
     ]
     made = [piece for piece in pieces if piece is not None]
     if not made:
-        raise StageError(
-            "no_segment",
-            "the poses hold no stretch of half a second without a gap or a jump",
-            where=where,
-            hint="Check the pose topic with `slip inspect`; or widen velocity.gap_s, velocity.jump_m.",
-        )
+        what = "the poses hold no stretch of half a second without a gap or a jump"
+        hint = "Check the pose topic with `slip inspect`; or widen velocity.gap_s, velocity.jump_m."
+        raise StageError("no_segment", what, where=where, hint=hint)
     return pl.concat(made), len(pieces) - len(made)
 
 

@@ -25,15 +25,10 @@ def check_values(values: ArrayLike, *, what: str, fewest: int = 1) -> Floats:
     checked = np.asarray(values, dtype=np.float64).ravel()
     wrong = int(np.count_nonzero(~np.isfinite(checked)))
     if wrong:
-        raise StatisticsError(
-            "not_finite",
-            f"{wrong} of {checked.size} {what} are not finite numbers",
-            hint="Leave them out before, and say so",
-        )
+        text = f"{wrong} of {checked.size} {what} are not finite numbers"
+        raise StatisticsError("not_finite", text, hint="Leave them out before, and say so")
     if checked.size < fewest:
-        raise StatisticsError(
-            "too_few_values",
-            f"there are {checked.size} {what}, and {fewest} are needed",
-            hint="Add runs, or compare what there is run against run",
-        )
+        text = f"there are {checked.size} {what}, and {fewest} are needed"
+        hint = "Add runs, or compare what there is run against run"
+        raise StatisticsError("too_few_values", text, hint=hint)
     return checked

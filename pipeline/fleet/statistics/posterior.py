@@ -60,11 +60,9 @@ def draw_run(
     """
     y, s = check_values(values, what="values"), check_values(errors, what="errors")
     if not y.size == s.size == len(groups) or min(s.min(), *usual) <= 0.0:
-        raise StatisticsError(
-            "bad_errors",
-            f"{y.size} values have {s.size} errors and {len(groups)} groups, usual spreads {usual}",
-            hint="Give every value a group and a positive error, and positive spreads.",
-        )
+        what = f"{y.size} values have {s.size} errors and {len(groups)} groups, usual spreads {usual}"
+        hint = "Give every value a group and a positive error, and positive spreads."
+        raise StatisticsError("bad_errors", what, hint=hint)
     names = sorted(set(groups))
     member = np.array([[name == label for label in groups] for name in names], dtype=np.float64)
     wide, narrow = (size * _GRID for size in usual)

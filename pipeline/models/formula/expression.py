@@ -142,11 +142,8 @@ def _require_tokens(text: str, where: str) -> None:
     while place < len(text):
         found = _TOKEN.match(text, place) or _WORD.match(text, place)
         if found is None:
-            raise _bad(
-                where,
-                f"{text!r} is no formula: {text[place : place + 8]!r} has no meaning there",
-                "Write arithmetic over signals, as k * sin(yaw).",
-            )
+            what = f"{text!r} is no formula: {text[place : place + 8]!r} has no meaning there"
+            raise _bad(where, what, "Write arithmetic over signals, as k * sin(yaw).")
         place = found.end()
 
 
@@ -191,11 +188,8 @@ class _Parser:
             return self._binary(node)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and not node.keywords:
             return self._call(node.func.id, [self.parse(argument) for argument in node.args])
-        raise _bad(
-            self.where,
-            f"{self.text!r} holds something that is no arithmetic",
-            "Use + - * / **, numbers, signals, parameters and functions such as sin.",
-        )
+        hint = "Use + - * / **, numbers, signals, parameters and functions such as sin."
+        raise _bad(self.where, f"{self.text!r} holds something that is no arithmetic", hint)
 
     def _constant(self, node: ast.Constant) -> _Node:
         value = node.value
@@ -213,12 +207,8 @@ class _Parser:
         if name == "pi":
             return _Node(PLAIN, lambda _values: np.float64(np.pi), float(np.pi))
         if name not in self.known:
-            raise _bad(
-                self.where,
-                f"there is no signal or parameter {name!r}",
-                f"There are: {', '.join(self.known)}.",
-                "unknown_signal",
-            )
+            hint = f"There are: {', '.join(self.known)}."
+            raise _bad(self.where, f"there is no signal or parameter {name!r}", hint, "unknown_signal")
         self.names.add(name)
         return _Node(self.known[name], lambda values: values[name])
 
@@ -260,17 +250,10 @@ class _Parser:
                 lambda values: combine(one.evaluate(values), two.evaluate(values)),
             )
         functions = ", ".join([*_PLAIN_FUNCTIONS, *_UNIT_FUNCTIONS, *_PAIR_FUNCTIONS])
-        raise _bad(
-            self.where,
-            f"there is no function {name} of {len(arguments)} arguments",
-            f"There are: {functions}.",
-        )
+        hint = f"There are: {functions}."
+        raise _bad(self.where, f"there is no function {name} of {len(arguments)} arguments", hint)
 
     def _require_same(self, one: Unit, two: Unit, done: str) -> None:
         if one != two:
-            raise _bad(
-                self.where,
-                f"in {self.text!r} {one} and {two} are {done} together",
-                "Mend the formula or the unit of a parameter.",
-                "wrong_units",
-            )
+            what = f"in {self.text!r} {one} and {two} are {done} together"
+            raise _bad(self.where, what, "Mend the formula or the unit of a parameter.", "wrong_units")

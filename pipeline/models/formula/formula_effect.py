@@ -52,12 +52,9 @@ def _parse(channel: str, text: str, own: tuple[tuple[str, str], ...], where: str
     expression = parse_expression(text, {**_parse_signal_units(), **units}, where)
     wanted = parse_unit(CHANNELS[channel], where)
     if expression.unit != wanted:
-        raise MotionError(
-            "wrong_units",
-            f"{channel} = {text!r} is in {expression.unit}, not in {wanted}",
-            where=where,
-            hint="Mend the formula or the unit of a parameter.",
-        )
+        what = f"{channel} = {text!r} is in {expression.unit}, not in {wanted}"
+        hint = "Mend the formula or the unit of a parameter."
+        raise MotionError("wrong_units", what, where=where, hint=hint)
     return expression
 
 

@@ -54,12 +54,9 @@ def read_current(text: str) -> Current:
             _, _, name, value, _ = line.split()
             found[name] = float(value)
         except ValueError:
-            raise MotionError(
-                "parameters_unreadable",
-                "is not vehicle, component, name, value and type",
-                where=f"--current:{number}",
-                hint="Save the parameters in QGroundControl and give that file.",
-            ) from None
+            what = "is not vehicle, component, name, value and type"
+            hint = "Save the parameters in QGroundControl and give that file."
+            raise MotionError("parameters_unreadable", what, where=f"--current:{number}", hint=hint) from None
     return found
 
 

@@ -76,12 +76,9 @@ def _find_step(file: ModelFile, known: Collection[Quantity]) -> _Step:
     for step in reversed(steps):
         if all(name in file.model and _is_seen(file.model.effect(name), known) for name in step.effects):
             return step
-    raise MotionError(
-        "not_fitted",
-        "the model was never fitted: it has no held-out errors to make a covariance of",
-        where="fit.ladder",
-        hint="Name a log: --on LOG, or fit it first: slip model fit MODEL --on LOG --input measured.",
-    )
+    what = "the model was never fitted: it has no held-out errors to make a covariance of"
+    hint = "Name a log: --on LOG, or fit it first: slip model fit MODEL --on LOG --input measured."
+    raise MotionError("not_fitted", what, where="fit.ladder", hint=hint)
 
 
 def _is_seen(effect: Effect, known: Collection[Quantity]) -> bool:

@@ -53,12 +53,9 @@ def read_current(text: str) -> Current:
     try:
         tree = yaml.safe_load(text)
     except yaml.YAMLError as error:
-        raise MotionError(
-            "parameters_unreadable",
-            f"is no YAML: {' '.join(str(error).split())}",
-            where="--current",
-            hint="Give the vesc.yaml that the car was driven with.",
-        ) from None
+        what = f"is no YAML: {' '.join(str(error).split())}"
+        hint = "Give the vesc.yaml that the car was driven with."
+        raise MotionError("parameters_unreadable", what, where="--current", hint=hint) from None
     found: dict[str, float] = {}
     groups = [tree]
     while groups:
@@ -76,12 +73,9 @@ def _find_current(facts: Facts, current: Current, name: str) -> Amount:
     unit = "erpm" if name == _SPEED_GAIN else "servo"
     part = "offset" if name == _STEERING_OFFSET else "per"
     if unit not in facts.vehicle.units:
-        raise MotionError(
-            "gains_unknown",
-            f"{name} with which the log was driven is not known",
-            where=facts.vehicle.id,
-            hint="Give the car's file: --current vesc.yaml.",
-        )
+        what = f"{name} with which the log was driven is not known"
+        hint = "Give the car's file: --current vesc.yaml."
+        raise MotionError("gains_unknown", what, where=facts.vehicle.id, hint=hint)
     value = float(getattr(facts.vehicle.units[unit], part))
     return Amount(value, (f"{name} = {value:g} of the preset {facts.vehicle.id}; others in use: --current",))
 

@@ -157,12 +157,9 @@ def _mean_sideways(
         name = joint.lower()
         is_front = joint in section.front if section.front is not None else bool(_FRONT.search(name))
         if section.front is None and is_front == bool(_REAR.search(name)):
-            raise StageError(
-                "no_wheels",
-                f"{joint} of {topic} cannot be told to be a front or a rear wheel",
-                where=topic,
-                hint=f"Set front to the names of the front wheels; it has: {', '.join(wheels)}.",
-            )
+            what = f"{joint} of {topic} cannot be told to be a front or a rear wheel"
+            hint = f"Set front to the names of the front wheels; it has: {', '.join(wheels)}."
+            raise StageError("no_wheels", what, where=topic, hint=hint)
         parts.append(speed if is_front != (joint in left) else -speed)
     mean: Floats = np.mean(parts, axis=0)
     return mean
@@ -396,19 +393,13 @@ def read_pair(
 def read_sides(left: Floats, right: Floats, vehicle: Vehicle) -> Drive:
     """A signal a side, already at common times."""
     if vehicle.kinematics.has_inputs("steering"):
-        raise StageError(
-            "no_steering",
-            "a pair of wheel speeds has no steering angle",
-            where="configuration",
-            hint="Configure speed_topic and steering_topic, or an AckermannDrive topic.",
-        )
+        what = "a pair of wheel speeds has no steering angle"
+        hint = "Configure speed_topic and steering_topic, or an AckermannDrive topic."
+        raise StageError("no_steering", what, where="configuration", hint=hint)
     if vehicle.kinematics.has_inputs("sideways"):
-        raise StageError(
-            "no_sideways",
-            f"a pair of wheel speeds does not say how {vehicle.name} ({vehicle.kind}) moves sideways",
-            where="configuration",
-            hint="Configure a topic of body motion with linear.y, or a JointState of all wheels.",
-        )
+        what = f"a pair of wheel speeds does not say how {vehicle.name} ({vehicle.kind}) moves sideways"
+        hint = "Configure a topic of body motion with linear.y, or a JointState of all wheels."
+        raise StageError("no_sideways", what, where="configuration", hint=hint)
     return Drive(left=left, right=right)
 
 
@@ -422,12 +413,9 @@ def read_body(forward: Floats, yaw_rate: Floats, vehicle: Vehicle, sideways: Flo
 def read_steering(speed: Floats, steering: Floats, vehicle: Vehicle) -> Drive:
     """Speed and steering angle, as recorded."""
     if not vehicle.kinematics.has_inputs("speed", "steering"):
-        raise StageError(
-            "wrong_kind",
-            f"speed and steering cannot drive {vehicle.name}, which is {vehicle.kind}",
-            where="configuration",
-            hint='Set vehicle.kind = "ackermann" and vehicle.wheelbase_m.',
-        )
+        what = f"speed and steering cannot drive {vehicle.name}, which is {vehicle.kind}"
+        hint = 'Set vehicle.kind = "ackermann" and vehicle.wheelbase_m.'
+        raise StageError("wrong_kind", what, where="configuration", hint=hint)
     return Drive(speed=speed, steering=steering)
 
 

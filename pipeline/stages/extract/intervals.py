@@ -49,12 +49,9 @@ def find_spans_given(sections: Sequence[IntervalSection], where: str) -> list[Sp
     for section in sections:
         start, end = _limits_of(section)
         if end <= start:
-            raise StageError(
-                "bad_interval",
-                f"an interval ends at {end} s, before it starts at {start} s",
-                where=where,
-                hint="Give [[interval]] a start_s below its end_s, in seconds from the run's start.",
-            )
+            what = f"an interval ends at {end} s, before it starts at {start} s"
+            hint = "Give [[interval]] a start_s below its end_s, in seconds from the run's start."
+            raise StageError("bad_interval", what, where=where, hint=hint)
         if section.topic is None:
             spans.append((start, end))
     return spans

@@ -161,12 +161,8 @@ def with_texts(columns: TopicColumns) -> TopicColumns:
     if text is None or column is None:
         return columns
     if not isinstance(column, Strings):
-        raise StageError(
-            "field_not_a_text",
-            f"the field {text.field!r} is no text",
-            where=columns.topic,
-            hint="Name another topic.",
-        )
+        what = f"the field {text.field!r} is no text"
+        raise StageError("field_not_a_text", what, where=columns.topic, hint="Name another topic.")
     # The last row is that of messages without a text, whose code is -1.
     table = np.array([_read_numbers(value, text.keys) for value in (*column.values, "")])[column.codes]
     here = (numbers(columns, text.tag) == text.value) & np.isfinite(table).all(axis=1)
@@ -324,12 +320,8 @@ def numbers(columns: TopicColumns, name: str) -> Floats:
     """
     column = columns.fields[name]
     if not isinstance(column, np.ndarray) or column.ndim != 1:
-        raise StageError(
-            "field_not_a_number",
-            f"the field {name!r} is not one number a message",
-            where=columns.topic,
-            hint="Name one element: field[0].",
-        )
+        what = f"the field {name!r} is not one number a message"
+        raise StageError("field_not_a_number", what, where=columns.topic, hint="Name one element: field[0].")
     return column.astype(np.float64)
 
 

@@ -225,12 +225,9 @@ class _Extraction:
                 said_so = f"{source.topic} never says {values}"
                 if self.data.losses:
                     said_so = f"what is left of {source.topic} does not say {values}{self._blame_damage()}"
-                raise StageError(
-                    "no_interval",
-                    f"{said_so}, so that no command counts",
-                    where=self.where,
-                    hint="Set another `equals` in [[interval]], or take everything with --interval all.",
-                )
+                what = f"{said_so}, so that no command counts"
+                hint = "Set another `equals` in [[interval]], or take everything with --interval all."
+                raise StageError("no_interval", what, where=self.where, hint=hint)
             text = f"only stretches in which {source.topic} says {values} were used ({len(spans)} of them)"
             self.findings.append(
                 Finding("interval_applied", "info", text, where=source.topic, count=len(spans))
@@ -410,12 +407,9 @@ class _Extraction:
         moves = self.vehicle.kinematics.has_inputs("sideways")
         if signal is None:
             if moves and not held:
-                raise StageError(
-                    "no_sideways",
-                    f"{source} does not say how {self.vehicle.name} moves sideways",
-                    where=topic,
-                    hint="Configure an odometry, or a JointState of all wheels.",
-                )
+                what = f"{source} does not say how {self.vehicle.name} moves sideways"
+                hint = "Configure an odometry, or a JointState of all wheels."
+                raise StageError("no_sideways", what, where=topic, hint=hint)
             return None
         columns, _, order = self._require(topic, held=held)
         sideways = reading.numbers(columns, signal.field)[order]
