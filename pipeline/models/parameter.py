@@ -98,7 +98,7 @@ class Parameter:
         neutral: value at which the effect changes nothing; NaN for a number that only says where it acts.
         about: what it is.
         typical: a usual size.
-        search: how it is found.
+        search: how it is found; with `starts` from these, unless it says a grid.
         starts: values to start or to begin the grid from.
         relative_to: what the starts are shares of: the largest commanded `speed`, `turn` or `wheel` speed,
             or the run's `duration`; empty where they are values.
@@ -127,6 +127,10 @@ class Parameter:
     instead_of: str = ""
     quantities: tuple[Quantity, ...] = ()
     between_runs: Spread | None = None
+
+    def __post_init__(self) -> None:
+        if self.starts and self.search is Search.DIRECT:
+            object.__setattr__(self, "search", Search.STARTS)
 
     @property
     def usual_size(self) -> float:

@@ -2,6 +2,7 @@
 
 import ast
 import copy
+import inspect
 import math
 from importlib import resources
 from typing import cast
@@ -51,7 +52,7 @@ def _write_step(effect: Effect, kind: str) -> str:
         raise MotionError("not_exportable", what, where=effect.id, hint=hint)
     for name, value in effect.values.items():
         text = text.replace(f"{{{name}}}", _number(value))
-    return text
+    return "".join(f"\n        {line}" for line in inspect.cleandoc(text).splitlines())
 
 
 def _write_head(model: Model) -> str:

@@ -7,7 +7,7 @@ limit [rad/s^2]. Ask for large steps of speed: small ones are reached at once an
 Source: acceleration limits of a ros2_control diff_drive_controller; torque limit of the motor.
 """
 
-from pipeline.models.effect import INF, WHEELED, DriveEffect, Excitation, Parameter, Search
+from pipeline.models.effect import INF, WHEELED, DriveEffect, Excitation, Parameter
 from pipeline.models.evidence import Evidence, Largest
 from pipeline.models.filters import limit_rate
 from pipeline.models.quantity import Quantity
@@ -31,7 +31,6 @@ class AccelerationLimit(DriveEffect):
             INF,
             "largest wheel acceleration",
             3.0,
-            search=Search.STARTS,
             starts=(1.0, 2.5, 6.0, 12.0, 25.0),
             step=1e-2,
             quantities=(Quantity.WHEEL_ACCELERATION_LIMIT,),

@@ -9,9 +9,12 @@ Source: Newton's law of a body in viscous contact, written in its own turning fr
 al. 2024.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
-from pipeline.models.effect import BodyEffect, Excitation, Late, Least, Parameter, Plausible, Search, Spread
+from pipeline.models.effect import BodyEffect, Excitation, Late, Least, Plausible, Spread
+from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.evidence import Evidence
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
@@ -23,16 +26,10 @@ class BodyInertia(BodyEffect):
 
     id = "body_inertia"
     parameters = (
-        Parameter(
-            "tau",
-            "s",
-            (0.0, 10.0),
-            0.0,
-            "time constant of the body on the ground",
-            0.5,
-            search=Search.STARTS,
+        replace(
+            TIME_CONSTANT,
+            about="time constant of the body on the ground",
             starts=(0.15, 0.4, 0.9, 1.6),
-            step=5e-3,
             least=Least(0.02, Least.STAMPS),
             plausible=Plausible(0.0, 3.0, "wider than the 0.2 to 1 s of ice"),
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),

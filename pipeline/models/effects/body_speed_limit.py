@@ -9,7 +9,7 @@ Source: velocity limits of a ros2_control diff_drive_controller; measured on the
 
 import numpy as np
 
-from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter, Search
+from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter
 from pipeline.models.evidence import Evidence
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Commands, RunContext
@@ -28,7 +28,6 @@ class BodySpeedLimit(CommandEffect):
             INF,
             "largest commanded speed",
             0.7,
-            search=Search.STARTS,
             starts=(0.3, 0.5, 0.7, 0.85, 0.95),
             relative_to="speed",
             step=1e-3,

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.models.effect import INF, CommandEffect, Effect, Excitation, Parameter, Search
+from pipeline.models.effect import INF, CommandEffect, Effect, Excitation, Parameter
 from pipeline.models.effects.turn_droop import TurnDroop
 from pipeline.models.evidence import Evidence, Largest
 from pipeline.models.quantity import Quantity
@@ -37,7 +37,6 @@ class BodyTurnLimit(CommandEffect):
             INF,
             "largest commanded yaw rate",
             0.6,
-            search=Search.STARTS,
             starts=(0.3, 0.5, 0.7, 0.85, 0.95),
             relative_to="turn",
             step=1e-3,

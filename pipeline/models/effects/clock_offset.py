@@ -10,7 +10,7 @@ their own tell it from a delay of the drive; without them d > 0 and such a delay
 Source: header stamps against log times; measured on the DRIVE recordings.
 """
 
-from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect, Search, Spread
+from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect, Spread
 from pipeline.models.evidence import LEAST_DELAY_S, Evidence
 from pipeline.models.level import Level, Reading
 from pipeline.runs.signals import RunContext, Velocity
@@ -29,7 +29,6 @@ class ClockOffset(ReportEffect):
             0.0,
             "how late poses are stamped",
             -0.15,
-            search=Search.STARTS,
             starts=(-0.3, -0.1, 0.1, 0.3),
             step=5e-3,
             least=Least(LEAST_DELAY_S, Least.STAMPS, sampled=True),

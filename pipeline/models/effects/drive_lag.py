@@ -10,11 +10,24 @@ Source: the powertrain model of Samson et al. 2024 and of DRIVE, Baril et al. 20
 from dataclasses import replace
 from typing import ClassVar
 
-from pipeline.models.effect import DriveEffect, Effect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import DriveEffect, Effect, Excitation, Least, Parameter, Plausible
 from pipeline.models.evidence import Evidence
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import RunContext, Wheels
+
+TIME_CONSTANT = Parameter(
+    "tau",
+    "s",
+    (0.0, 10.0),
+    0.0,
+    "time constant",
+    0.5,
+    starts=(0.1, 0.3, 0.7, 1.4),
+    step=5e-3,
+    plausible=Plausible(0.0, 3.0, "as of a drive lag"),
+)
+"""That of any first-order system; what is known of one beyond that is put in by `replace`."""
 
 
 class DriveLag(DriveEffect):
@@ -23,16 +36,8 @@ class DriveLag(DriveEffect):
     id = "drive_lag"
     rank = 20
     parameters = (
-        Parameter(
-            "tau",
-            "s",
-            (0.0, 10.0),
-            0.0,
-            "time constant",
-            0.5,
-            search=Search.STARTS,
-            starts=(0.1, 0.3, 0.7, 1.4),
-            step=5e-3,
+        replace(
+            TIME_CONSTANT,
             least=Least(0.015, Least.STAMPS, sampled=True),
             plausible=Plausible(0.0, 3.0, "wider than the 0.55 to 1.2 s of Husky and Warthog"),
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
@@ -99,19 +104,6 @@ class TwoLags(DriveEffect):
         return DriveLag(tau=0.5 * sum(self.taus))
 
 
-def time_constant(
-    name: str, about: str, typical: float, starts: tuple[float, ...], plausible: str = "as of a drive lag"
-) -> Parameter:
-    """One of the numbers of `TwoLags`; what is known of it beyond that is put in by `replace`."""
-    return Parameter(
-        name,
-        "s",
-        (0.0, 10.0),
-        0.0,
-        about,
-        typical,
-        search=Search.STARTS,
-        starts=starts,
-        step=5e-3,
-        plausible=Plausible(0.0, 3.0, plausible),
-    )
+def time_constant(name: str, about: str, typical: float, starts: tuple[float, ...]) -> Parameter:
+    """One of the numbers of `TwoLags`."""
+    return replace(TIME_CONSTANT, name=name, about=about, typical=typical, starts=starts)

@@ -47,8 +47,7 @@ class EffectiveTrack(KinematicEffect):
     )
     needs = (Excitation.TURNING,)
     confused_with = ("wheel_radius", "terrain_change")
-    python = """
-        w0 = w0 / {k}"""
+    python = "w0 = w0 / {k}"
     readings = (
         Reading(Level.VEHICLE, "geometry", "wheels and wheelbase as they are, or a wrong track width"),
         Reading(Level.TERRAIN, "effective_track", "skidding in turns as this ground makes it"),

@@ -36,8 +36,7 @@ class IcrLateral(LinearEffect):
     confused_with = ("wheel_asymmetry",)
     equivalent_to = ("lever_arm",)
     equivalent_when = "always: a pose of a point l_y = -y_icr to the left moves alike"
-    python = """
-        v_x = v_x + {y_icr} * v_w"""
+    python = "v_x = v_x + {y_icr} * v_w"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

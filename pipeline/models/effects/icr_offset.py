@@ -53,8 +53,7 @@ class IcrOffset(LinearEffect):
     confused_with = ("lateral_skid", "heading_skew")
     equivalent_to = ("lever_arm",)
     equivalent_when = "always: a pose of a point l_x = -x_icr ahead moves alike"
-    python = """
-        v_y = v_y - {x_icr} * v_w"""
+    python = "v_y = v_y - {x_icr} * v_w"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

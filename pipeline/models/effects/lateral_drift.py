@@ -21,8 +21,7 @@ class LateralDrift(LinearEffect):
     motion = "drifts to the {way} at {size:.2g} m/s while its wheels turn"
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("yaw_misalignment", "slope_drift")
-    python = """
-        v_y = v_y + {c} * turning"""
+    python = "v_y = v_y + {c} * turning"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

@@ -39,8 +39,7 @@ class LateralScale(KinematicEffect):
     motion = "travels {share} sideways than its wheels turn"
     needs = (Excitation.SIDEWAYS,)
     confused_with = ("roller_slip", "wheel_radius")
-    python = """
-        s0 = {k} * s0"""
+    python = "s0 = {k} * s0"
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

@@ -10,7 +10,7 @@ Source: Nordin and Gutman, Automatica 38 (2002): mechanical systems with backlas
 
 import numpy as np
 
-from pipeline.models.effect import WHEELED, DriveEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import WHEELED, DriveEffect, Excitation, Least, Parameter, Plausible
 from pipeline.models.filters import wait_at_reversal
 from pipeline.runs.signals import RunContext, Wheels
 
@@ -29,7 +29,6 @@ class ReversalPause(DriveEffect):
             0.0,
             "how long a wheel stands before it reverses",
             0.4,
-            search=Search.STARTS,
             starts=(0.15, 0.5),
             step=1e-2,
             least=Least(0.03, Least.STAMPS, sampled=True),

@@ -37,8 +37,7 @@ class RollerSlip(LinearEffect):
     share_of = (1.0, -0.5)
     needs = (Excitation.SIDEWAYS, Excitation.SPEED_SPREAD)
     confused_with = ("lateral_scale",)
-    python = """
-        v_y = v_y - {k} * s0 * abs(s0)"""
+    python = "v_y = v_y - {k} * s0 * abs(s0)"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

@@ -35,8 +35,7 @@ class SpeedSlip(LinearEffect):
     share_of = (1.0, -1.0)
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("wheel_radius", "turning_resistance")
-    python = """
-        v_x = v_x - {k} * v0 * abs(v0)"""
+    python = "v_x = v_x - {k} * v0 * abs(v0)"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

@@ -38,8 +38,7 @@ class SpeedTrack(LinearEffect):
     share_of = (1.0, 1.0)
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("effective_track", "turn_lag")
-    python = """
-        v_w = v_w + {k} * abs(v0) * w0"""
+    python = "v_w = v_w + {k} * abs(v0) * w0"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

@@ -36,8 +36,7 @@ class SteeringGain(DriveEffect):
     motion = "steers {g:.2f} times what is asked"
     needs = (Excitation.STEERING,)
     confused_with = ("understeer",)
-    python = """
-        steering = {g} * steering"""
+    python = "steering = {g} * steering"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -9,7 +9,8 @@ Source: actuator model of a kinematic bicycle; Becker et al. 2023.
 
 from dataclasses import replace
 
-from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Search
+from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least
+from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import RunContext, Wheels
@@ -22,17 +23,11 @@ class SteeringLag(DriveEffect):
     rank = 60
     kinds = ACKERMANN
     parameters = (
-        Parameter(
-            "tau",
-            "s",
-            (0.0, 10.0),
-            0.0,
-            "time constant",
-            0.4,
-            search=Search.STARTS,
-            starts=(0.1, 0.3, 0.7, 1.4),
-            step=5e-3,
+        replace(
+            TIME_CONSTANT,
+            typical=0.4,
             least=Least(0.015, Least.STAMPS, sampled=True),
+            plausible=None,
             quantities=(Quantity.STEERING_LAG,),
         ),
     )

@@ -38,8 +38,7 @@ class SteeringOffset(DriveEffect):
     confused_with = ("yaw_drift",)
     equivalent_to = ("steering_sensor_offset",)
     equivalent_when = "only the way from the command to the body counts"
-    python = """
-        steering = steering + {o}"""
+    python = "steering = steering + {o}"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

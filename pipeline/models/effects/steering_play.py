@@ -10,7 +10,7 @@ Source: the play operator; Nordin and Gutman, Automatica 38 (2002): mechanical s
 
 from dataclasses import replace
 
-from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Plausible
 from pipeline.models.filters import follow_with_play
 from pipeline.runs.signals import RunContext, Wheels
 
@@ -29,7 +29,6 @@ class SteeringPlay(DriveEffect):
             0.0,
             "half of the play, at the tyres",
             0.05,
-            search=Search.STARTS,
             starts=(0.02, 0.06),
             step=1e-3,
             least=Least(0.004, Least.DATA_SHEET),
@@ -41,8 +40,7 @@ class SteeringPlay(DriveEffect):
     needs = (Excitation.STEERING, Excitation.CHANGES)
     confused_with = ("steering_gain", "steering_lag")
     python_state = ("played",)
-    python = """
-        steering = played = min(max(played, steering - {g}), steering + {g})"""
+    python = "steering = played = min(max(played, steering - {g}), steering + {g})"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.models.effect import ACKERMANN, Excitation, KinematicEffect, Least, Parameter
+from pipeline.models.effect import ACKERMANN, KinematicEffect
+from pipeline.models.effects.steering_offset import SteeringOffset
 from pipeline.models.evidence import Evidence
-from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Rolling, RunContext
 
 
@@ -27,25 +27,15 @@ class SteeringSensorOffset(KinematicEffect):
     rank = 0
     kinds = ACKERMANN
     parameters = (
-        Parameter(
-            "o",
-            "rad",
-            (-0.5, 0.5),
-            0.0,
-            "steering of the tyres less that of the sensor",
-            0.02,
-            least=Least(0.002, Least.DATA_SHEET),
-            quantities=(Quantity.STEERING_OFFSET,),
+        replace(
+            SteeringOffset.parameters[0], about="steering of the tyres less that of the sensor", typical=0.02
         ),
     )
     motion = "steers {size:.2g} rad to the {way} of what its steering sensor reads"
-    needs = (Excitation.SPEED_SPREAD,)
-    confused_with = ("yaw_drift",)
+    needs, confused_with = SteeringOffset.needs, SteeringOffset.confused_with
     equivalent_to = ("steering_offset",)
-    equivalent_when = "only the way from the command to the body counts"
-
-    python = """
-        w0 = w0 + v0 * (math.tan(steering + {o}) - math.tan(steering)) / WHEELBASE"""
+    equivalent_when = SteeringOffset.equivalent_when
+    python = "w0 = w0 + v0 * (math.tan(steering + {o}) - math.tan(steering)) / WHEELBASE"
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

@@ -10,7 +10,7 @@ Source: dead time of a first order plus dead time process; Astrom and Hagglund, 
 
 from dataclasses import replace
 
-from pipeline.models.effect import CommandEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import CommandEffect, Excitation, Least, Parameter, Plausible
 from pipeline.models.evidence import LEAST_DELAY_S, Evidence
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Commands, RunContext
@@ -29,7 +29,6 @@ class TransportDelay(CommandEffect):
             0.0,
             "age of the command that acts",
             0.2,
-            search=Search.STARTS,
             starts=(0.05, 0.15, 0.3, 0.5),
             step=5e-3,
             least=Least(LEAST_DELAY_S, Least.STAMPS, sampled=True),

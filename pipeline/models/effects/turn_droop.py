@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.models.effect import NAN, SIDES, DriveEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import NAN, SIDES, DriveEffect, Excitation, Least, Parameter, Plausible
 from pipeline.models.evidence import Evidence, Largest
 from pipeline.runs.signals import RunContext, Wheels
 
@@ -37,7 +37,6 @@ class TurnDroop(DriveEffect):
             NAN,
             "wheel difference from which it falls short",
             1.5,
-            search=Search.STARTS,
             starts=(0.5, 1.5, 4.0, 10.0),
             step=1e-2,
         ),

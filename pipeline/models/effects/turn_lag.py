@@ -12,13 +12,13 @@ Source: measured on the DRIVE recordings; the powertrain model of DRIVE, Baril e
 
 from dataclasses import replace
 
-from pipeline.models.effect import SIDES, Excitation, Spread
+from pipeline.models.effect import SIDES, Excitation, Plausible, Spread
 from pipeline.models.effects.drive_lag import TwoLags, time_constant
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import RunContext, Wheels
 
-_SEEN = "wider than the 0.1 to 1.6 s of Husky and Warthog"
+_SEEN = Plausible(0.0, 3.0, "wider than the 0.1 to 1.6 s of Husky and Warthog")
 
 
 class TurnLag(TwoLags):
@@ -30,12 +30,14 @@ class TurnLag(TwoLags):
     apart, least_apart_s = 0.08, 0.02
     parameters = (
         replace(
-            time_constant("tau_mean", "time constant of the mean", 0.3, (0.1, 0.4), _SEEN),
+            time_constant("tau_mean", "time constant of the mean", 0.3, (0.1, 0.4)),
+            plausible=_SEEN,
             quantities=(Quantity.SPEED_LAG,),
             between_runs=Spread(0.12),
         ),
         replace(
-            time_constant("tau_diff", "time constant of the difference", 1.0, (0.3, 1.2), _SEEN),
+            time_constant("tau_diff", "time constant of the difference", 1.0, (0.3, 1.2)),
+            plausible=_SEEN,
             quantities=(Quantity.TURN_LAG,),
             between_runs=Spread(0.24),
         ),

@@ -35,8 +35,7 @@ class TurningResistance(LinearEffect):
     share_of = (1.0, -1.0)
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("speed_slip", "wheel_radius")
-    python = """
-        v_x = v_x - {k} * v0 * abs(w0)"""
+    python = "v_x = v_x - {k} * v0 * abs(w0)"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

@@ -36,8 +36,7 @@ class Understeer(KinematicEffect):
     )
     needs = (Excitation.SPEED_SPREAD, Excitation.STEERING)
     confused_with = ("steering_gain",)
-    python = """
-        w0 = w0 / max(1.0 + {K} / WHEELBASE * v0 * v0, 0.05)"""
+    python = "w0 = w0 / max(1.0 + {K} / WHEELBASE * v0 * v0, 0.05)"
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""

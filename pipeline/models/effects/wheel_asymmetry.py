@@ -38,8 +38,7 @@ class WheelAsymmetry(KinematicEffect):
     )
     needs = (Excitation.BOTH_SIGNS, Excitation.SPEED_SPREAD)
     confused_with = ("yaw_drift", "lever_arm", "icr_lateral")
-    python = """
-        v0, w0 = v0 + {e} * B * w0 / 4.0, w0 + {e} * v0 / B"""
+    python = "v0, w0 = v0 + {e} * B * w0 / 4.0, w0 + {e} * v0 / B"
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""

@@ -35,8 +35,7 @@ class WheelRadius(KinematicEffect):
     motion = "travels {share} than its wheels turn"
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("speed_slip", "effective_track")
-    python = """
-        v0, s0, w0 = {k} * v0, {k} * s0, {k} * w0"""
+    python = "v0, s0, w0 = {k} * v0, {k} * s0, {k} * w0"
     readings = (
         Reading(Level.VEHICLE, "wheel_radius", "wheels smaller or larger than configured"),
         Reading(Level.TERRAIN, "longitudinal_slip", "wheels that turn on without grip on this ground"),

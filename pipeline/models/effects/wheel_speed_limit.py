@@ -9,7 +9,7 @@ Source: saturation of the drive; measured on the DRIVE recordings.
 
 import numpy as np
 
-from pipeline.models.effect import INF, WHEELED, CommandEffect, Excitation, Parameter, Search, Spread
+from pipeline.models.effect import INF, WHEELED, CommandEffect, Excitation, Parameter, Spread
 from pipeline.models.evidence import Evidence
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Commands, RunContext
@@ -29,7 +29,6 @@ class WheelSpeedLimit(CommandEffect):
             INF,
             "largest wheel speed",
             4.5,
-            search=Search.STARTS,
             starts=(0.3, 0.5, 0.7, 0.85, 0.95),
             relative_to="wheel",
             step=1e-2,

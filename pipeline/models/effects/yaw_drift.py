@@ -22,8 +22,7 @@ class YawDrift(LinearEffect):
     motion = "turns to the {way} at {size:.2g} rad/s by itself while its wheels turn"
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("wheel_asymmetry", "steering_offset")
-    python = """
-        v_w = v_w + {c} * turning"""
+    python = "v_w = v_w + {c} * turning"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
