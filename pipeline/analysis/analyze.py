@@ -240,8 +240,6 @@ def update_datasets(store: Store) -> None:
 
     What only `slip compare` works out is null until it is asked for.
     """
-    import polars as pl  # noqa: PLC0415 - heavy
-
     from pipeline.analysis.compared_runs import find_material  # noqa: PLC0415 - heavy
     from pipeline.fleet.datasets import pool_runs  # noqa: PLC0415 - heavy
     from pipeline.fleet.runs import gather_runs  # noqa: PLC0415 - heavy
@@ -252,7 +250,5 @@ def update_datasets(store: Store) -> None:
     compared = find_material(store, ("dataset",), trusted_only=False, tables=("aggregates",))
     if not compared.manifests and not compared.notes:
         return
-    runs = list(compared.manifests)
-    aggregates = compared.scan("aggregates").filter(pl.col("run").is_in(runs)).collect()
-    pooled = pool_runs(gather_runs(aggregates, compared.labels), ("dataset",))
+    pooled = pool_runs(gather_runs(compared.scan("aggregates").collect(), compared.labels), ("dataset",))
     store.write_results_table("datasets", pooled)

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import polars as pl
 
+from pipeline.analysis.compare_files import write_figures, write_tables
 from pipeline.analysis.compared_runs import find_material, keep_runs
 from pipeline.analysis.errors import lack_runs
 from pipeline.analysis.fleet import fit_results
 from pipeline.analysis.options import FigureFormat
 from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
-from pipeline.fleet.tables import write_csv, write_latex
 from pipeline.store import Store
 
 _EFFECT = "effect"
@@ -133,24 +133,18 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
     from pipeline.report.causes import draw_causes, render_causes  # noqa: PLC0415 - heavy
     from pipeline.report.pages import write_page  # noqa: PLC0415 - heavy
 
-    written = {}
+    written: dict[str, Path] = {}
     for name, frame in (
         ("causes", _tabulate_budgets(causes)),
         ("cause_differences", _tabulate_pairs(causes)),
     ):
-        written[f"{name}.csv"] = store.write_results_text(f"{name}.csv", write_csv(frame))
-        written[f"{name}.tex"] = store.write_results_text(f"{name}.tex", write_latex(name, frame))
+        written |= write_tables(store, name, frame, frame)
     sentences = [
         say_difference(one, causes.names) + (f" ({one.note})" if one.note else "")
         for one in causes.differences
     ]
     written["causes.html"] = write_page(store, "causes.html", render_causes(causes, sentences))
-    if figures:
-        from pipeline.report.export import write_pictures  # noqa: PLC0415 - heavy
-
-        picture = draw_causes(causes.budgets, causes.names)
-        written |= {path.name: path for path in write_pictures([picture], store.root / "figures", figures)}
-    return written
+    return written | write_figures(store, lambda: [draw_causes(causes.budgets, causes.names)], figures)
 
 
 def _tabulate_budgets(causes: Causes) -> pl.DataFrame:

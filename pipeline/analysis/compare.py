@@ -94,15 +94,13 @@ def measure_runs(compared: ComparedRuns) -> tuple[ComparedRuns, pl.DataFrame, li
         return compared, runs, notes
     scales = runs.unique("run").select("run", "length_scale")
     vehicles = compared.labels.select("run", "mass", "squared_gyration").join(scales, on="run")
-    slip = compared.scan("slip").filter(pl.col("run").is_in(list(compared.manifests)))
-    return compared, add_measures(runs, measure_difficulty(slip, vehicles)), notes
+    return compared, add_measures(runs, measure_difficulty(compared.scan("slip"), vehicles)), notes
 
 
 def _gather(compared: ComparedRuns) -> pl.DataFrame:
     if not compared.manifests:
         return pl.DataFrame()
-    aggregates = compared.scan("aggregates").filter(pl.col("run").is_in(list(compared.manifests))).collect()
-    return gather_runs(aggregates, compared.labels).filter(
+    return gather_runs(compared.scan("aggregates").collect(), compared.labels).filter(
         pl.col("median_modulus").is_not_null(), pl.col("median_modulus").is_finite()
     )
 
@@ -130,9 +128,7 @@ def choose_input(runs: pl.DataFrame) -> str:
 
 def _doubt_commands(compared: ComparedRuns) -> list[str]:
     """Runs whose recorded command is known to be scaled wrongly: their slip on it is no slip."""
-    found = compared.scan("findings").filter(
-        pl.col("id") == "command_scale", pl.col("run").is_in(list(compared.manifests))
-    )
+    found = compared.scan("findings").filter(pl.col("id") == "command_scale")
     runs = found.select("run").unique().sort("run").collect()["run"].to_list()
     if not runs:
         return []

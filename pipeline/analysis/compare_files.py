@@ -1,5 +1,6 @@
 """What a comparison leaves behind: tables, a page, figures, and the JSON of `slip compare`."""
 
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import polars as pl
@@ -7,6 +8,7 @@ import polars as pl
 from pipeline.analysis.options import FigureFormat
 from pipeline.fleet.measures import compare_orders
 from pipeline.fleet.tables import Answer, write_csv, write_latex
+from pipeline.report.elements import Picture
 from pipeline.store import Store
 
 
@@ -26,18 +28,28 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
 
     store.write_results_table("datasets", answer.datasets)
     store.write_results_table("comparisons", answer.comparisons)
-    written = {}
+    written: dict[str, Path] = {}
     for name, frame in (("datasets", answer.datasets), ("comparisons", answer.comparisons)):
-        written[f"{name}.csv"] = store.write_results_text(f"{name}.csv", write_csv(frame))
-        shown = frame.filter(pl.col("input") == answer.input)
-        written[f"{name}.tex"] = store.write_results_text(f"{name}.tex", write_latex(name, shown))
+        written |= write_tables(store, name, frame, frame.filter(pl.col("input") == answer.input))
     written["comparison.html"] = write_page(store, "comparison.html", render_comparison(answer))
-    if figures:
-        from pipeline.report.export import write_pictures  # noqa: PLC0415 - heavy
+    return written | write_figures(store, lambda: list_pictures(answer), figures)
 
-        pictures = list_pictures(answer)
-        written |= {path.name: path for path in write_pictures(pictures, store.root / "figures", figures)}
-    return written
+
+def write_tables(store: Store, name: str, frame: pl.DataFrame, shown: pl.DataFrame) -> dict[str, Path]:
+    """A table as CSV, and the rows that a paper shows as LaTeX; the files by name."""
+    texts = {f"{name}.csv": write_csv(frame), f"{name}.tex": write_latex(name, shown)}
+    return {file: store.write_results_text(file, text) for file, text in texts.items()}
+
+
+def write_figures(
+    store: Store, draw: Callable[[], Iterable[Picture]], figures: FigureFormat | None
+) -> dict[str, Path]:
+    """Draw to `figures/` where a format is asked for; the files by name."""
+    if figures is None:
+        return {}
+    from pipeline.report.export import write_pictures  # noqa: PLC0415 - heavy
+
+    return {path.name: path for path in write_pictures(draw(), store.root / "figures", figures)}
 
 
 def describe_answer(answer: Answer) -> dict[str, object]:

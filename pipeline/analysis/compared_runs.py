@@ -46,7 +46,8 @@ class ComparedRuns:
 
     def scan(self, table: str) -> pl.LazyFrame:
         """A table over these runs."""
-        return scan_table(table, root=self.store.root, manifests=list(self.manifests.values()))
+        rows = scan_table(table, root=self.store.root, manifests=list(self.manifests.values()))
+        return rows.filter(pl.col("run").is_in(list(self.manifests)))
 
 
 def find_material(
@@ -119,7 +120,7 @@ def _leave_out_untrusted(compared: ComparedRuns) -> ComparedRuns:
         return compared
     grave = (
         compared.scan("findings")
-        .filter(pl.col("severity") == "error", pl.col("run").is_in(list(compared.manifests)))
+        .filter(pl.col("severity") == "error")
         .select("run", "id")
         .unique()
         .sort("run", "id")

@@ -6,6 +6,7 @@ from pathlib import Path
 import polars as pl
 
 from pipeline.analysis.compare import choose_input, measure_runs
+from pipeline.analysis.compare_files import write_figures
 from pipeline.analysis.compared_runs import find_material, read_digest
 from pipeline.analysis.options import FigureFormat
 from pipeline.fleet.datasets import pool_runs
@@ -89,10 +90,7 @@ def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None =
     from pipeline.report.pages import write_page  # noqa: PLC0415 - heavy
 
     path = write_page(store, "map.html", render_map(drawn))
-    if figures:
-        from pipeline.report.export import write_pictures  # noqa: PLC0415 - heavy
-
-        write_pictures([picture_map(drawn)], store.root / "figures", figures)
+    write_figures(store, lambda: [picture_map(drawn)], figures)
     return path
 
 

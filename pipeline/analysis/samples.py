@@ -42,7 +42,6 @@ def _split_by_run(
             pl.col("input") == input_name,
             ~pl.col("suspect"),
             pl.col(value).is_finite(),
-            pl.col("run").is_in(list(compared.manifests)),
         )
         .select("run", time, "segment", "step", value)
         .collect()

@@ -167,10 +167,7 @@ def describe_trend(trend: Trend) -> dict[str, object]:
 
 
 def _read_slip(compared: ComparedRuns) -> pl.DataFrame:
-    names = list(compared.manifests)
-    runs = gather_runs(
-        compared.scan("aggregates").filter(pl.col("run").is_in(names)).collect(), compared.labels
-    )
+    runs = gather_runs(compared.scan("aggregates").collect(), compared.labels)
     long = runs.unpivot(list(_SLIP), index=["run", "input"], variable_name="quantity", value_name="value")
     return long.drop_nulls("value").select(
         "run",
@@ -182,13 +179,7 @@ def _read_slip(compared: ComparedRuns) -> pl.DataFrame:
 
 def _read_health(compared: ComparedRuns) -> pl.DataFrame:
     """Findings by their value, the number of warnings, and the share of suspect samples."""
-    names = list(compared.manifests)
-    findings = (
-        compared.scan("findings")
-        .filter(pl.col("run").is_in(names))
-        .select("run", "id", "severity", "value")
-        .collect()
-    )
+    findings = compared.scan("findings").select("run", "id", "severity", "value").collect()
     told = (
         findings.drop_nulls("value")
         .group_by("run", "id")
@@ -202,7 +193,7 @@ def _read_health(compared: ComparedRuns) -> pl.DataFrame:
     )
     warnings = findings.filter(pl.col("severity") != "info").group_by("run").len()
     counted = (
-        pl.DataFrame({"run": names}, schema={"run": pl.String})
+        pl.DataFrame({"run": list(compared.manifests)}, schema={"run": pl.String})
         .join(warnings, on="run", how="left")
         .select(
             "run",
@@ -213,7 +204,6 @@ def _read_health(compared: ComparedRuns) -> pl.DataFrame:
     )
     suspect = (
         compared.scan("slip")
-        .filter(pl.col("run").is_in(names))
         .group_by("run")
         .agg(pl.col("suspect").mean().alias("value"))
         .select("run", pl.lit("suspect share").alias("quantity"), pl.lit("1").alias("unit"), "value")
