@@ -138,7 +138,7 @@ def drive(task: Task) -> list[dict[str, object]]:
         print(f"  {name}: {error}", flush=True)
         return []
     common = {"run": name, "dataset": f"{vehicle}_{terrain}", "vehicle": vehicle, "terrain": terrain}
-    return [{**common, **row} for row in diagnosis.tabulate_estimates(name).to_dicts()]
+    return [{**common, **row} for row in diagnosis.tabulate("estimates", name).to_dicts()]
 
 
 def list_tasks(fleet: Fleet, seed: int) -> list[Task]:

@@ -11,10 +11,12 @@ from pipeline.analysis.compared_runs import find_material, keep_runs
 from pipeline.analysis.errors import lack_runs
 from pipeline.analysis.fleet import fit_results
 from pipeline.analysis.options import FigureFormat
+from pipeline.core.numbers import finite_or_none
 from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
 from pipeline.store import Store
 
 _EFFECT = "effect"
+_SPREAD = ("low", "high", "p", "p_adjusted")
 
 
 def find_causes(store: Store, by: Sequence[str], chosen: str | None) -> Causes:
@@ -82,7 +84,10 @@ def describe_causes(causes: Causes) -> dict[str, object]:
                         _EFFECT: part.name,
                         "name": causes.names.get(part.name, part.name),
                         "difference": part.difference,
-                        **{key: _clean(getattr(part, key)) for key in ("low", "high", "p", "p_adjusted")},
+                        **{
+                            key: finite_or_none(getattr(part, key))
+                            for key in ("low", "high", "p", "p_adjusted")
+                        },
                     }
                     for part in one.parts
                 ],
@@ -98,7 +103,7 @@ def describe_causes(causes: Causes) -> dict[str, object]:
 
 def _describe_budget(budget: Budget, names: Mapping[str, str]) -> dict[str, object]:
     numbers = {
-        part.name: {"share": part.share, "low": _clean(part.low), "high": _clean(part.high)}
+        part.name: {"share": part.share, "low": finite_or_none(part.low), "high": finite_or_none(part.high)}
         for part in budget.parts
     }
     return {
@@ -149,8 +154,8 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
 
 def _tabulate_budgets(causes: Causes) -> pl.DataFrame:
     rows = [
-        (one.dataset, one.runs, causes.names.get(part.name, part.name), part.share, _clean(part.low),
-         _clean(part.high), math.sqrt(one.total))
+        (one.dataset, one.runs, causes.names.get(part.name, part.name), part.share, finite_or_none(part.low),
+         finite_or_none(part.high), math.sqrt(one.total))
         for one in causes.budgets
         for part in one.parts
     ]  # fmt: skip
@@ -161,15 +166,11 @@ def _tabulate_budgets(causes: Causes) -> pl.DataFrame:
 
 def _tabulate_pairs(causes: Causes) -> pl.DataFrame:
     rows = [
-        (one.a, one.b, causes.names.get(part.name, part.name), part.difference, _clean(part.low),
-         _clean(part.high), _clean(part.p), _clean(part.p_adjusted), one.unit)
+        (one.a, one.b, causes.names.get(part.name, part.name), part.difference, finite_or_none(part.low),
+         finite_or_none(part.high), finite_or_none(part.p), finite_or_none(part.p_adjusted), one.unit)
         for one in causes.differences
         for part in one.parts
     ]  # fmt: skip
     numbers = dict.fromkeys(("difference", "low", "high", "p", "p_adjusted"), pl.Float64)
     texts = dict.fromkeys(("a", "b", "cause"), pl.String)
     return pl.DataFrame(rows, schema={**texts, **numbers, "unit_of_analysis": pl.String}, orient="row")
-
-
-def _clean(value: float) -> float | None:
-    return value if math.isfinite(value) else None

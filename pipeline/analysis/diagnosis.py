@@ -134,12 +134,8 @@ def _diagnose(work: Work) -> dict[str, JSON]:
         finding = {"id": error.code, "severity": "warning", "text": str(error), "where": "diagnosis"}
         return {"run": work.run, "effects": [], "undecided": [], "findings": [finding], "ladder": [],
                 "lines": [["missing", f"nothing can be named: {error.what}"]]}  # fmt: skip
-    for table, frame in (
-        ("ladder", diagnosis.tabulate_ladder(work.run)),
-        ("parameters", diagnosis.tabulate_parameters(work.run)),
-        ("budget", diagnosis.tabulate_budget(work.run)),
-        ("estimates", diagnosis.tabulate_estimates(work.run)),
-    ):
+    for table in DIAGNOSED:
+        frame = diagnosis.tabulate(table, work.run)
         if not frame.is_empty():
             work.write(table, frame)
     return {**diagnosis.to_json()[0], LINES: [list(line) for line in list_lines(diagnosis.runs[0])]}

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
@@ -11,6 +10,7 @@ import polars as pl
 
 from pipeline.analysis.compared_runs import ComparedRuns, find_material, read_digest
 from pipeline.analysis.errors import JobError, lack_runs
+from pipeline.core.numbers import finite_or_none
 from pipeline.fleet.hierarchy import FleetModel, FleetNumber
 from pipeline.fleet.statistics.intervals import Interval
 from pipeline.store import Store
@@ -143,10 +143,10 @@ def _describe_number(number: FleetNumber) -> dict[str, object]:
         "because": number.because,
         "value": fit.value,
         **_bounds(number, fit.interval),
-        "spread_terrain": _clean(fit.spread_group),
-        "spread_run": _clean(fit.spread_run),
-        "chi_square": _clean(fit.chi_square),
-        "p_terrain": _clean(fit.p_groups),
+        "spread_terrain": finite_or_none(fit.spread_group),
+        "spread_run": finite_or_none(fit.spread_run),
+        "chi_square": finite_or_none(fit.chi_square),
+        "p_terrain": finite_or_none(fit.p_groups),
         "terrains": {
             name: {"value": mean.value, **_bounds(number, mean.interval), "runs": mean.runs}
             for name, mean in fit.groups.items()
@@ -182,7 +182,3 @@ def _bounds(number: FleetNumber, interval: Interval | None) -> dict[str, float |
         return {"low": None, "high": None}
     least, most = find_effect(number.effect)().parameter(number.parameter).bounds
     return {"low": max(interval.low, least), "high": min(interval.high, most)}
-
-
-def _clean(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -22,6 +22,7 @@ from pipeline.cli.output import (
     show_progress,
 )
 from pipeline.core.errors import SlipError
+from pipeline.core.numbers import finite_or_none
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -135,7 +136,9 @@ def plan(  # noqa: D417 - the runs document themselves
         return FAILED
     if json:
         told = {
-            one.protocol: {text: _finite(second) for text, second in zip(asked, one.seconds, strict=True)}
+            one.protocol: {
+                text: finite_or_none(second) for text, second in zip(asked, one.seconds, strict=True)
+            }
             for one in others
         }
         written = {**_known_as_json(forecast), "files": [str(file) for file in files], "errors": []}
@@ -174,10 +177,6 @@ def _tell_known(forecast: Forecast | None) -> list[str]:
     here = f"{len(forecast.here)} run{'s' * (len(forecast.here) != 1)} there"
     runs = f"{here}, {len(forecast.elsewhere)} elsewhere"
     return [f"known        of {forecast.vehicle} on {forecast.terrain}: {runs}"]
-
-
-def _finite(seconds: float) -> float | None:
-    return seconds if math.isfinite(seconds) else None
 
 
 def _list_others(made: Plan, asked: Sequence[str], others: Sequence[Needed]) -> list[str]:

@@ -125,7 +125,6 @@ def summarize(
         ladder=() if judgement is None else tuple(_rungs(judgement)),
         noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
         explained_share=math.nan if last is None else last,
-        regions=tuple(regions),
         where=tuple(pick_regions(regions, residual, part.noise)),
         timing={"runs": cast("Json", list(clocks.timing))},
         by_way=_describe_ways(ways, source, judgements.get("measured")),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
+from pipeline.core.numbers import finite_or_none
 from pipeline.diagnosis.enough import Growth, describe_enough
-from pipeline.diagnosis.error_regions import Region, tabulate_regions
+from pipeline.diagnosis.error_regions import Region
 from pipeline.diagnosis.materiality import LEAST_TURN_RAD, LEAST_WAY_SHARE, Moves
 from pipeline.models.catalogue import find_effect
 from pipeline.models.level import Level, Reading
@@ -20,12 +21,13 @@ if TYPE_CHECKING:
 
     from pipeline.diagnosis.excitation import Detectable, Unobservable
     from pipeline.diagnosis.undecided import Undecided
-    from pipeline.identification.apportion import Share, SlipBudget
+    from pipeline.identification.apportion import SlipBudget
     from pipeline.models import ModelFile
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 
 _DIGITS = 6
+_ENDS = ("share", "low", "high")
 
 
 @dataclass(frozen=True)
@@ -52,13 +54,7 @@ class Value:
 
     def to_json(self) -> dict[str, Json]:
         """What this run says."""
-        return {
-            "value": _clean(self.value),
-            "low": _clean(self.low),
-            "high": _clean(self.high),
-            "unit": self.unit,
-            "at_bound": self.at_bound,
-        }
+        return {**_numbers(self, "value", "low", "high"), "unit": self.unit, "at_bound": self.at_bound}
 
 
 @dataclass(frozen=True)
@@ -137,13 +133,7 @@ class Named:
             "could_be": [
                 {"level": one.level.value, "name": one.name, "text": one.text} for one in self.readings
             ],
-            "moves": None
-            if self.moves is None
-            else {
-                "position_m": _clean(self.moves.position_m),
-                "heading_rad": _clean(self.moves.heading_rad),
-                "way_share": _clean(self.moves.way_share),
-            },
+            "moves": None if self.moves is None else _numbers(self.moves, *vars(self.moves)),
             "growth": None if self.growth is None else self.growth.to_json(),
         }
 
@@ -227,7 +217,6 @@ class RunDiagnosis:
         ladder: rungs with their held-out errors.
         noise_floor: how well motion repeats itself under the same input, as errors.
         explained_share: of the removable error; NaN without room.
-        regions: every region with its part of the ideal model's error.
         where: the few that carry most of it.
         timing: delays, and whose heading was used.
         by_way: ladders of the drivetrain and of the ground apart, where there are encoders.
@@ -251,7 +240,6 @@ class RunDiagnosis:
     ladder: tuple[Mapping[str, Json], ...] = ()
     noise_floor: Mapping[str, Json] = field(default_factory=dict)
     explained_share: float = math.nan
-    regions: tuple[Region, ...] = ()
     where: tuple[Region, ...] = ()
     timing: Mapping[str, Json] = field(default_factory=dict)
     by_way: Mapping[str, Json] = field(default_factory=dict)
@@ -296,12 +284,7 @@ class RunDiagnosis:
                 item.id: {"reason": item.reason, "manoeuvre": item.manoeuvre} for item in self.unobservable
             },
             "detectable": [
-                {
-                    "effect": one.id,
-                    "parameter": one.parameter,
-                    "size": _clean(one.size),
-                    "unit": one.unit,
-                }
+                {"effect": one.id, "parameter": one.parameter, **_numbers(one, "size"), "unit": one.unit}
                 for one in self.detectable
             ],
             "unexplained": None if self.unexplained is None else self.unexplained.to_json(),
@@ -314,9 +297,7 @@ class RunDiagnosis:
                     "channel": region.channel,
                     "kind": region.kind,
                     "region": region.text,
-                    "share": _clean(region.share),
-                    "time_share": _clean(region.time_share),
-                    "rms": _clean(region.rms),
+                    **_numbers(region, "share", "time_share", "rms"),
                     "text": region.sentence,
                 }
                 for region in self.where
@@ -340,94 +321,15 @@ class Diagnosis:
         """One object a run."""
         return [run.to_json() for run in self.runs]
 
-    def tabulate_ladder(self, run: str) -> pl.DataFrame:
-        """Rungs of one run as table `ladder` (without the run's own columns)."""
-        import polars as pl  # noqa: PLC0415 - heavy
+    def tabulate(self, table: str, run: str) -> pl.DataFrame:
+        """One run's rows of `ladder`, `parameters`, `budget` or `estimates` (without the run's own columns).
 
-        rows = []
-        for item in self.runs:
-            if item.run == run:
-                rows += list(_ladder_rows(item))
-        schema: dict[str, pl.DataType | type[pl.DataType]] = {
-            "input": pl.Enum(["command", "measured"]), "rung": pl.Int32,
-            "added": pl.String, "effects": pl.String,
-            "rms_x": pl.Float64, "rms_y": pl.Float64, "rms_w": pl.Float64,
-            "t_mrmse": pl.Float64, "r_mrmse": pl.Float64, "explained_share": pl.Float64,
-            "kind": pl.Enum(["rung", "floor"]),
-        }  # fmt: skip
-        return pl.DataFrame(rows, schema=schema, orient="row")
+        Rungs with the noise floor, numbers of the effects that were named, causes of the slip and of the
+        errors, and numbers of all effects.
+        """
+        from pipeline.core.tables import tabulate  # noqa: PLC0415 - heavy
 
-    def tabulate_parameters(self, run: str) -> pl.DataFrame:
-        """Numbers of the effects named in one run as table `parameters` (without the run's own columns)."""
-        import polars as pl  # noqa: PLC0415 - heavy
-
-        rows = [
-            {
-                "input": item.input,
-                "effect": effect.id,
-                "parameter": name,
-                "value": _clean(value.value),
-                "low": _clean(value.low),
-                "high": _clean(value.high),
-                "unit": value.unit,
-                "at_bound": value.at_bound,
-            }
-            for item in self.runs
-            if item.run == run
-            for effect in item.effects
-            for name, value in effect.parameters.items()
-            if math.isfinite(value.value)
-        ]
-        schema: dict[str, pl.DataType | type[pl.DataType]] = {
-            "input": pl.Enum(["command", "measured"]), "effect": pl.String, "parameter": pl.String,
-            "value": pl.Float64, "low": pl.Float64, "high": pl.Float64, "unit": pl.String,
-            "at_bound": pl.Boolean,
-        }  # fmt: skip
-        return pl.DataFrame(rows, schema=schema, orient="row")
-
-    def tabulate_budget(self, run: str) -> pl.DataFrame:
-        """Budgets of one run as table `budget` (without the run's own columns)."""
-        import polars as pl  # noqa: PLC0415 - heavy
-
-        rows = [
-            {
-                "input": budget.input,
-                "quantity": budget.quantity,
-                "kind": share.kind,
-                "name": share.name,
-                "mean_square": share.share * budget.total,
-                "unit": budget.unit,
-                **{key: _clean(getattr(share, key)) for key in ("share", "low", "high", "alone", "last")},
-                "stretches": budget.stretches,
-            }
-            for item in self.runs
-            if item.run == run
-            for budget in item.budgets
-            for share in budget.shares
-        ]
-        schema: dict[str, pl.DataType | type[pl.DataType]] = {
-            "input": pl.Enum(["command", "measured"]), "quantity": pl.Enum(["slip", "position", "heading"]),
-            "kind": pl.Enum(["effect", "disturbance", "localization_noise"]), "name": pl.String,
-            "mean_square": pl.Float64, "unit": pl.String, "share": pl.Float64, "low": pl.Float64,
-            "high": pl.Float64, "alone": pl.Float64, "last": pl.Float64, "stretches": pl.Int32,
-        }  # fmt: skip
-        return pl.DataFrame(rows, schema=schema, orient="row")
-
-    def tabulate_estimates(self, run: str) -> pl.DataFrame:
-        """Numbers of all effects in one run as table `estimates` (without the run's own columns)."""
-        import polars as pl  # noqa: PLC0415 - heavy
-
-        rows = [vars(number) for item in self.runs if item.run == run for number in item.estimates]
-        schema: dict[str, pl.DataType | type[pl.DataType]] = {
-            "input": pl.Enum(["command", "measured"]), "effect": pl.String, "parameter": pl.String,
-            "unit": pl.String, "value": pl.Float64, "standard_error": pl.Float64, "named": pl.Boolean,
-            "at_bound": pl.Boolean,
-        }  # fmt: skip
-        return pl.DataFrame(rows, schema=schema, orient="row")
-
-    def tabulate_where(self, run: str) -> pl.DataFrame:
-        """All regions of one run with their part of the ideal model's error."""
-        return tabulate_regions([region for item in self.runs if item.run == run for region in item.regions])
+        return tabulate(table, [row for item in self.runs if item.run == run for row in _ROWS[table](item)])
 
 
 def _ladder_rows(item: RunDiagnosis) -> list[dict[str, Json]]:
@@ -458,13 +360,45 @@ def _ladder_rows(item: RunDiagnosis) -> list[dict[str, Json]]:
     return rows
 
 
+def _parameter_rows(item: RunDiagnosis) -> list[dict[str, Json]]:
+    return [
+        {"input": item.input, "effect": effect.id, "parameter": name, **value.to_json()}
+        for effect in item.effects
+        for name, value in effect.parameters.items()
+        if math.isfinite(value.value)
+    ]
+
+
+def _budget_rows(item: RunDiagnosis) -> list[dict[str, Json]]:
+    return [
+        {
+            "input": budget.input,
+            "quantity": budget.quantity,
+            "kind": share.kind,
+            "name": share.name,
+            "mean_square": share.share * budget.total,
+            "unit": budget.unit,
+            **_numbers(share, *_ENDS, "alone", "last"),
+            "stretches": budget.stretches,
+        }
+        for budget in item.budgets
+        for share in budget.shares
+    ]
+
+
+_ROWS: Mapping[str, Callable[[RunDiagnosis], list[dict[str, Json]]]] = {
+    "ladder": _ladder_rows,
+    "parameters": _parameter_rows,
+    "budget": _budget_rows,
+    "estimates": lambda item: [vars(number) for number in item.estimates],
+}
+
+
 def _budget_as_json(budget: SlipBudget) -> dict[str, Json]:
     """The keys of `slip compare --causes` for one run, for each input and quantity."""
-
-    def numbers(share: Share, *keys: str) -> dict[str, Json]:
-        return {key: _clean(getattr(share, key)) for key in ("share", "low", "high", *keys)}
-
-    left: dict[str, Json] = {share.kind: numbers(share) for share in budget.shares if share.kind != "effect"}
+    left: dict[str, Json] = {
+        share.kind: _numbers(share, *_ENDS) for share in budget.shares if share.kind != "effect"
+    }
     return {
         "input": budget.input,
         "quantity": budget.quantity,
@@ -472,7 +406,7 @@ def _budget_as_json(budget: SlipBudget) -> dict[str, Json]:
         "unit": budget.unit,
         "stretches": budget.stretches,
         "shares": [
-            {"effect": share.name, **numbers(share, "alone", "last")}
+            {"effect": share.name, **_numbers(share, *_ENDS, "alone", "last")}
             for share in budget.shares
             if share.kind == "effect"
         ],
@@ -482,4 +416,8 @@ def _budget_as_json(budget: SlipBudget) -> dict[str, Json]:
 
 def _clean(value: float) -> float | None:
     """A number for JSON: six digits, null where there is none."""
-    return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
+    return finite_or_none(value, _DIGITS)
+
+
+def _numbers(item: object, *names: str) -> dict[str, Json]:
+    return {name: _clean(getattr(item, name)) for name in names}

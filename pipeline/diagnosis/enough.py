@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.numbers import finite_or_none
 from pipeline.identification.growth import INTERVAL_SHARE, Curve, extrapolate, find_goal, last_until
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def _list_points(curve: Curve, name: str) -> dict[str, Json]:
     places = np.unique(np.linspace(0, curve.seconds.size - 1, _POINTS).round().astype(int))
     return {
         "seconds": [round(float(one), 1) for one in curve.seconds[places]],
-        name: [float(f"{one:.{_DIGITS}g}") if math.isfinite(one) else None for one in curve.values[places]],
+        name: [finite_or_none(one, _DIGITS) for one in curve.values[places]],
     }
 
 

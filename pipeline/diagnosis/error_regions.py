@@ -1,20 +1,12 @@
 """Where a model fails, in words: by command, transitory or steady, by time and by place."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats
-
-if TYPE_CHECKING:
-    import polars as pl
-
-    from pipeline.identification.parts import Part
-
+from pipeline.identification.parts import Part
 
 CHANNELS = ("x", "y", "w")
 _WORDS = {"x": "forward error", "y": "sideways error", "w": "yaw error"}
@@ -168,21 +160,3 @@ def _cut_sideways(aside: Floats) -> list[tuple[str, str, Flags]]:
         found.append(("command", f"driving to the right faster than {least:.2g} m/s", -aside > least))
         found.append(("command", f"driving sideways faster than {least:.2g} m/s", np.abs(aside) > least))
     return found
-
-
-def tabulate_regions(regions: list[Region]) -> pl.DataFrame:
-    """Regions as a table."""
-    import polars as pl  # noqa: PLC0415 - heavy
-
-    return pl.DataFrame(
-        [vars(region) for region in regions],
-        schema={
-            "channel": pl.String,
-            "kind": pl.String,
-            "text": pl.String,
-            "share": pl.Float64,
-            "time_share": pl.Float64,
-            "rms": pl.Float64,
-        },
-        orient="row",
-    )

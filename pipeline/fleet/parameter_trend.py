@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
+from pipeline.core.numbers import finite_or_none
 from pipeline.fleet.hierarchy import leave_out_odd, list_numbers
 from pipeline.fleet.runs import UNKNOWN
 from pipeline.fleet.statistics.shifts import FEWEST_FREE, find_shifts, guess_shift
@@ -228,7 +229,7 @@ def describe_parameter(trend: ParameterTrend) -> Mapping[str, object]:
         "unit": trend.unit,
         "points": trend.points.drop("order").to_dicts(),
         "changes": [change.describe(describe_change(trend, change)) for change in trend.changes],
-        "least_change": trend.least if math.isfinite(trend.least) else None,
+        "least_change": finite_or_none(trend.least),
         "need": trend.need or None,
         "odd": list(trend.odd),
     }

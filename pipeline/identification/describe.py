@@ -5,6 +5,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
+from pipeline.core.numbers import finite_or_none
 from pipeline.identification.intervals import NOTHING as NOT_FITTED
 from pipeline.identification.intervals import Estimates
 from pipeline.identification.ladder import ERRORS_OVER_2S, NOTHING, Ladder, Rung, list_rises
@@ -278,4 +279,4 @@ def _show(value: object) -> str:
 
 
 def _round(value: float) -> float | None:
-    return None if not math.isfinite(value) else float(f"{value:.{_DIGITS}g}")
+    return finite_or_none(value, _DIGITS)

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from pipeline.core.arrays import Complex, Floats
+from pipeline.core.numbers import finite_or_none
 from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.models import Effect, find_effect, list_effects
 from pipeline.models.evidence import Largest
@@ -142,7 +143,7 @@ class Plan:
             "home_m": self.home_m,
             "spare_s": self.spare_s,
             "spare_gain": self.spare_gain,
-            "limits": asdict(self.limits) | {"yaw_rate_radps": _finite(self.limits.yaw_rate_radps)},
+            "limits": asdict(self.limits) | {"yaw_rate_radps": finite_or_none(self.limits.yaw_rate_radps)},
             "area": asdict(self.area),
             "safety": list(SAFETY),
             "topic": self.topic,
@@ -162,10 +163,6 @@ class Plan:
                 for one in self.impossible
             ],
         }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 @dataclass(frozen=True)

@@ -6,19 +6,9 @@ from typing import Literal
 
 import polars as pl
 
-Severity = Literal["info", "warning", "error"]
+from pipeline.core.tables import tabulate
 
-_TYPES: dict[str, pl.DataType | type[pl.DataType]] = {
-    "stage": pl.String,
-    "id": pl.String,
-    "severity": pl.Enum(["info", "warning", "error"]),
-    "text": pl.String,
-    "where": pl.String,
-    "t_start": pl.Float64,
-    "t_end": pl.Float64,
-    "value": pl.Float64,
-    "count": pl.Int64,
-}
+Severity = Literal["info", "warning", "error"]
 
 
 @dataclass(frozen=True)
@@ -49,4 +39,4 @@ class Finding:
 def tabulate_findings(stage: str, findings: Sequence[Finding]) -> pl.DataFrame:
     """Findings of one stage as a table (without the run's columns)."""
     rows = [{"stage": stage, **vars(finding)} for finding in findings]
-    return pl.DataFrame(rows, schema=_TYPES, orient="row")
+    return tabulate("findings", rows)

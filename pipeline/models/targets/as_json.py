@@ -3,6 +3,7 @@
 import json
 import math
 
+from pipeline.core.numbers import finite_or_none
 from pipeline.models.formula.formula_effect import FormulaEffect
 from pipeline.models.model_file import ModelFile
 from pipeline.models.target import Current, Target
@@ -18,7 +19,7 @@ def write(file: ModelFile, current: Current) -> str:
             low, high = file.intervals.get(f"{effect.id}.{parameter.name}", (math.nan, math.nan))
             numbers = {"value": effect.values[parameter.name], "low": low, "high": high}
             parameters[parameter.name] = {
-                **{key: number if math.isfinite(number) else None for key, number in numbers.items()},
+                **{key: finite_or_none(number) for key, number in numbers.items()},
                 "unit": parameter.unit,
             }
         item: dict[str, object] = {
