@@ -1,20 +1,38 @@
-"""Runs for the model verbs: stored runs are read, logs without results are analyzed first."""
+"""Runs for the verbs: stored runs are read, logs without results are analyzed first."""
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.cli.output import say, show_progress
 from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from pipeline.analysis.geometry import Owner
+    from pipeline.analysis.options import Options
+    from pipeline.analysis.stored import OpenedRun
     from pipeline.models.model_file import ModelFile
     from pipeline.runs.recording import MotionRun
     from pipeline.vehicles import Vehicle
+
+
+@contextmanager
+def open_shown(name: str, options: Options, *, quiet: bool) -> Iterator[OpenedRun]:
+    """A run, opened as `open_run` does while its progress is shown; what is to be noted is said afterwards."""
+    from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
+
+    with (
+        show_progress(Path(name).name, quiet=quiet) as progress,
+        open_run(name, options, progress) as opened,
+    ):
+        yield opened
+    if opened.note and not quiet:
+        say(f"slip: {opened.note}")
 
 
 def gather_runs(
@@ -37,24 +55,15 @@ def gather_runs(
     """
     from pipeline.analysis.model_fit import read_runs  # noqa: PLC0415 - heavy
     from pipeline.analysis.options import Options  # noqa: PLC0415
-    from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
-    from pipeline.cli.output import say, show_progress  # noqa: PLC0415
 
     if not names:
         raise SlipError("no_runs", "--on names no run", hint="Give logs, or runs of the results folder")
     options = Options(out=out, report=False, diagnosis=True)
-    manifests, notes = [], []
+    manifests = []
     for name in names:
-        with (
-            show_progress(Path(name).name, quiet=quiet) as progress,
-            open_run(name, options, progress) as opened,
-        ):
+        with open_shown(name, options, quiet=quiet) as opened:
             manifests.append(opened.manifest)
-        notes += [opened.note] if opened.note and not quiet else []
-    found = read_runs(manifests, vehicle, owner)
-    for note in notes:
-        say(f"slip: {note}")
-    return found
+    return read_runs(manifests, vehicle, owner)
 
 
 def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path) -> ModelFile:

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from pipeline.cli.choices import Choices, build_options, spell_choices, spell_flags
 from pipeline.cli.memory_limit import limited_memory
+from pipeline.cli.model_runs import open_shown
 from pipeline.cli.model_trust import TrustCode, open_model
 from pipeline.cli.output import (
     describe_error,
@@ -17,7 +18,6 @@ from pipeline.cli.output import (
     print_error,
     print_json,
     print_lines,
-    say,
     show_progress,
 )
 from pipeline.core.errors import SlipError
@@ -121,7 +121,6 @@ def _gather(
     ``at_work`` is told which log it is, ``chosen`` what was chosen in each run.
     """
     from pipeline.analysis.diagnosis import read_choices, read_recording  # noqa: PLC0415 - heavy
-    from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
 
     gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
     errors: list[dict[str, str]] = []
@@ -129,18 +128,13 @@ def _gather(
     for log in logs:
         at_work[0] = log
         try:
-            with (
-                show_progress(Path(log).name, quiet=quiet) as progress,
-                open_run(log, options, progress) as opened,
-            ):
+            with open_shown(log, options, quiet=quiet) as opened:
                 vehicle, recording = read_recording(opened.manifest)
                 chosen[recording.name] = read_choices(opened.manifest)
         except SlipError as error:
             print_error(error)
             errors.append(describe_error(log, error))
             continue
-        if opened.note and not quiet:
-            say(f"slip: {opened.note}")
         lossy |= opened.lossy
         gathered.setdefault(repr(vehicle), (vehicle, []))[1].append(recording)
     return gathered, errors, lossy

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.choices import Choices, build_options
+from pipeline.cli.model_runs import open_shown
 from pipeline.cli.output import (
     CLEAN,
     FAILED,
@@ -136,10 +137,7 @@ def plan(  # noqa: D417 - the runs document themselves
         return FAILED
     if json:
         told = {
-            one.protocol: {
-                text: finite_or_none(second) for text, second in zip(asked, one.seconds, strict=True)
-            }
-            for one in others
+            one.protocol: dict(zip(asked, map(finite_or_none, one.seconds), strict=True)) for one in others
         }
         written = {**_known_as_json(forecast), "files": [str(file) for file in files], "errors": []}
         print_json({**made.to_json(), **({"compare": told} if others else {}), **written})
@@ -206,7 +204,6 @@ def _gather(names: Sequence[str], options: Options, *, quiet: bool) -> _Gathered
     """Runs of one vehicle, each once."""
     from pipeline.analysis.diagnosis import read_recording  # noqa: PLC0415 - heavy
     from pipeline.analysis.plan import read_command  # noqa: PLC0415 - heavy
-    from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
 
     vehicles: list[Vehicle] = []
     recordings: list[Recording] = []
@@ -214,14 +211,9 @@ def _gather(names: Sequence[str], options: Options, *, quiet: bool) -> _Gathered
     chosen: dict[str, object] = {}
     lossy = False
     for name in names:
-        with (
-            show_progress(Path(name).name, quiet=quiet) as progress,
-            open_run(name, options, progress) as opened,
-        ):
+        with open_shown(name, options, quiet=quiet) as opened:
             vehicle, recording = read_recording(opened.manifest)
             chosen = chosen or read_command(opened.manifest)
-        if opened.note and not quiet:
-            say(f"slip: {opened.note}")
         lossy |= opened.lossy
         if recording.sha256 and any(recording.sha256 == known.sha256 for known in recordings):
             continue
@@ -231,12 +223,9 @@ def _gather(names: Sequence[str], options: Options, *, quiet: bool) -> _Gathered
     if other := next((vehicle for vehicle in vehicles if vehicle != vehicles[0]), None):
         fields = other.__struct_fields__
         differing = [name for name in fields if getattr(other, name) != getattr(vehicles[0], name)]
-        raise SlipError(
-            "several_vehicles",
-            f"the runs are of different vehicles (in {', '.join(differing)}), and a plan is for one",
-            where=", ".join(recording.name for recording in recordings),
-            hint="Give runs of one vehicle.",
-        )
+        what = f"the runs are of different vehicles (in {', '.join(differing)}), and a plan is for one"
+        where = ", ".join(recording.name for recording in recordings)
+        raise SlipError("several_vehicles", what, where=where, hint="Give runs of one vehicle.")
     return _Gathered(vehicles[0], recordings, manifests, chosen, lossy)
 
 
@@ -246,11 +235,8 @@ def _find_vehicle(name: str | None) -> Vehicle:
     vehicle = None if name is None else find_preset(name)
     if vehicle is None:
         known = ", ".join(preset.id for preset in list_presets())
-        raise SlipError(
-            "no_vehicle",
-            "a plan needs a run or a vehicle" if name is None else f"no preset is called {name!r}",
-            hint=f"Give a log, a run, or --vehicle as one of {known}.",
-        )
+        what = "a plan needs a run or a vehicle" if name is None else f"no preset is called {name!r}"
+        raise SlipError("no_vehicle", what, hint=f"Give a log, a run, or --vehicle as one of {known}.")
     return vehicle
 
 
@@ -264,9 +250,8 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
 
     promised = read_promises(path)
     if not names:
-        raise SlipError(
-            "no_log", "a check needs the log that was driven", where=str(path), hint="Give it as well."
-        )
+        what = "a check needs the log that was driven"
+        raise SlipError("no_log", what, where=str(path), hint="Give it as well.")
     before = [name for name in promised.runs if name not in names]
     vehicle, recordings, _, _, lossy = _gather([*before, *names], options, quiet=quiet)
     if promised.vehicle != vehicle.id:
