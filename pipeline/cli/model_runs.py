@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def open_shown(name: str, options: Options, *, quiet: bool) -> Iterator[OpenedRun]:
-    """A run, opened as `open_run` does while its progress is shown; what is to be noted is said afterwards."""
+    """A run as `open_run` gives it, its progress shown; what there is to note is said afterwards."""
     from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
 
     with (

@@ -19,8 +19,7 @@ from pipeline.models.effect import (
     ReportEffect,
 )
 from pipeline.runs.grid import Grid, HeldDrive, MeasuredDrive
-from pipeline.runs.recording import DriveSeries
-from pipeline.runs.signals import Rolling, RunContext, Velocity, Wheels, roll_ideally
+from pipeline.runs.signals import DriveSeries, Rolling, RunContext, Velocity, Wheels, roll_ideally
 
 Result = TypeVar("Result")
 

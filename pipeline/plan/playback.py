@@ -9,8 +9,8 @@ import numpy as np
 from pipeline.core.arrays import Floats
 from pipeline.plan.errors import PlanError
 from pipeline.plan.manoeuvres import RATE_HZ
-from pipeline.runs.recording import DriveSeries, MotionRun
-from pipeline.runs.signals import name_inputs
+from pipeline.runs.recording import MotionRun
+from pipeline.runs.signals import DriveSeries, name_inputs
 from pipeline.vehicles import Vehicle
 
 _ALIKE = 0.6

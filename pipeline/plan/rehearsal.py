@@ -17,8 +17,8 @@ from pipeline.models import Effect, Place, Timing
 from pipeline.models.evidence import Largest
 from pipeline.plan.limits import is_steered
 from pipeline.plan.manoeuvres import Commands
-from pipeline.runs.recording import Alignment, DriveSeries, GyroFit, MotionRun, Track
-from pipeline.runs.signals import Velocity
+from pipeline.runs.recording import Alignment, GyroFit, MotionRun, Track
+from pipeline.runs.signals import DriveSeries, Velocity
 from pipeline.vehicles import Vehicle
 
 _POSE_HZ = 20.0

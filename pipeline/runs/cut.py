@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.runs.errors import MotionError
-from pipeline.runs.recording import DriveSeries, MotionRun
-from pipeline.runs.signals import find_fastest_wheel
+from pipeline.runs.recording import MotionRun
+from pipeline.runs.signals import DriveSeries, find_fastest_wheel
 
 # Between poses farther apart than that nobody knows whether the vehicle drove [s].
 _LONGEST_STEP_S = 1.0
@@ -54,10 +54,4 @@ def cut_run(run: MotionRun, begin_s: float = -np.inf, end_s: float = np.inf) -> 
 
 def _cut_series(series: DriveSeries, end_s: float) -> DriveSeries:
     rows = series.times <= end_s
-    return DriveSeries(
-        series.times[rows],
-        series.left[rows],
-        series.right[rows],
-        series.steering[rows],
-        None if series.sideways is None else series.sideways[rows],
-    )
+    return series.change(series.times[rows], lambda signal: signal[rows])

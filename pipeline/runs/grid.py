@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.arrays import Floats, Ints
-from pipeline.runs.recording import DriveSeries, MotionRun
-from pipeline.runs.signals import Commands, Signal, Wheels
+from pipeline.runs.recording import MotionRun
+from pipeline.runs.signals import Commands, DriveSeries, Signal, Wheels
 
 Number = TypeVar("Number", np.float64, np.int64)
 

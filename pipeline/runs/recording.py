@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.core import rigid, segments, timegrid
 from pipeline.core.arrays import Complex, Flags, Floats, Ints
 from pipeline.runs.errors import MotionError
-from pipeline.runs.signals import find_fastest_wheel
+from pipeline.runs.signals import DriveSeries, find_fastest_wheel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -42,20 +42,6 @@ _NUMBERS = (
     "recorded_modulus_measured",
 )
 _INPUTS = ("command", "measured")
-
-
-@dataclass(frozen=True)
-class DriveSeries:
-    """Wheel speeds (rear axle on a car) [rad/s] and steering [rad] at stamps [s], each of shape (n,).
-
-    ``sideways`` [rad/s] is None on a vehicle that cannot move so.
-    """
-
-    times: Floats
-    left: Floats
-    right: Floats
-    steering: Floats
-    sideways: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -408,13 +394,8 @@ def _stop_when_silent(commands: DriveSeries, hold_s: float) -> DriveSeries:
     times = commands.times
     silent = np.flatnonzero(np.diff(times, append=np.inf) > hold_s)
     at = silent + 1
-    return DriveSeries(
-        np.insert(times, at, times[silent] + hold_s),
-        np.insert(commands.left, at, 0.0),
-        np.insert(commands.right, at, 0.0),
-        np.insert(commands.steering, at, 0.0),
-        None if commands.sideways is None else np.insert(commands.sideways, at, 0.0),
-    )
+    stopped = np.insert(times, at, times[silent] + hold_s)
+    return commands.change(stopped, lambda signal: np.insert(signal, at, 0.0))
 
 
 def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Floats]:

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from pipeline.runs.recording import DriveSeries
     from pipeline.vehicles import Vehicle
 
-    Drive: TypeAlias = "Commands | DriveSeries | Wheels"
+    Drive: TypeAlias = "DriveSeries | Wheels"
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -31,8 +30,8 @@ Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 
 
 @dataclass(frozen=True)
-class Commands:
-    """Held commands: each value counts from its stamp to the next.
+class DriveSeries:
+    """What wheels were told, or did, at stamps.
 
     Attributes:
         times: stamps [s], increasing, shape (n,).
@@ -47,6 +46,15 @@ class Commands:
     right: Floats
     steering: Floats
     sideways: Floats | None = None
+
+    def change(self, times: Floats, change: Callable[[Floats], Floats]) -> DriveSeries:
+        """The series at other stamps, each signal changed alike."""
+        sideways = None if self.sideways is None else change(self.sideways)
+        return DriveSeries(times, change(self.left), change(self.right), change(self.steering), sideways)
+
+
+class Commands(DriveSeries):
+    """Held commands: each value counts from its stamp to the next."""
 
     def change_wheels(self, left: Floats, right: Floats) -> Commands:
         """The same commands with other mean wheel speeds of the sides."""

@@ -12,8 +12,8 @@ import numpy as np
 from pipeline.core import timegrid
 from pipeline.core.arrays import Floats, Ints
 from pipeline.runs.heading import align_heading, has_barred, mark_barred
-from pipeline.runs.recording import DriveSeries, MotionRun
-from pipeline.runs.signals import name_inputs
+from pipeline.runs.recording import MotionRun
+from pipeline.runs.signals import DriveSeries, name_inputs
 from pipeline.vehicles import Vehicle
 
 _WINDOW_S = 0.5
