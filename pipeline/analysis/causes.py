@@ -11,7 +11,7 @@ from pipeline.analysis.compared_runs import find_material, keep_runs
 from pipeline.analysis.errors import lack_runs
 from pipeline.analysis.fleet import fit_results
 from pipeline.analysis.options import FigureFormat
-from pipeline.core.numbers import finite_or_none
+from pipeline.core.numbers import finite_or_none, pick, pick_finite
 from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
 from pipeline.store import Store
 
@@ -75,19 +75,14 @@ def describe_causes(causes: Causes) -> dict[str, object]:
         "budgets": [_describe_budget(budget, causes.names) for budget in causes.budgets],
         "differences": [
             {
-                "a": one.a,
-                "b": one.b,
-                "total": one.total,
+                **pick(one, "a", "b", "total"),
                 "unit": "m/s",
                 "by_effect": [
                     {
                         _EFFECT: part.name,
                         "name": causes.names.get(part.name, part.name),
                         "difference": part.difference,
-                        **{
-                            key: finite_or_none(getattr(part, key))
-                            for key in ("low", "high", "p", "p_adjusted")
-                        },
+                        **pick_finite(part, "low", "high", "p", "p_adjusted"),
                     }
                     for part in one.parts
                 ],
@@ -102,14 +97,9 @@ def describe_causes(causes: Causes) -> dict[str, object]:
 
 
 def _describe_budget(budget: Budget, names: Mapping[str, str]) -> dict[str, object]:
-    numbers = {
-        part.name: {"share": part.share, "low": finite_or_none(part.low), "high": finite_or_none(part.high)}
-        for part in budget.parts
-    }
+    numbers = {part.name: {"share": part.share, **pick_finite(part, "low", "high")} for part in budget.parts}
     return {
-        "dataset": budget.dataset,
-        "runs": budget.runs,
-        "total": budget.total,
+        **pick(budget, "dataset", "runs", "total"),
         "unit": "m^2/s^2",
         "rms": math.sqrt(budget.total),
         "shares": [

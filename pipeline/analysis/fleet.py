@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.analysis.compared_runs import ComparedRuns, find_material, read_digest
 from pipeline.analysis.errors import JobError, lack_runs
-from pipeline.core.numbers import finite_or_none
+from pipeline.core.numbers import finite_or_none, pick
 from pipeline.fleet.hierarchy import FleetModel, FleetNumber
 from pipeline.fleet.statistics.intervals import Interval
 from pipeline.store import Store
@@ -134,10 +134,7 @@ def describe_fleet(model: FleetModel) -> dict[str, object]:
 def _describe_number(number: FleetNumber) -> dict[str, object]:
     fit = number.fit
     return {
-        "effect": number.effect,
-        "parameter": number.parameter,
-        "unit": number.unit,
-        "vehicle": number.vehicle,
+        **pick(number, "effect", "parameter", "unit", "vehicle"),
         "level": None if number.level is None else number.level.value,
         "name": number.name,
         "because": number.because,

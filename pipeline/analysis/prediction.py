@@ -12,6 +12,7 @@ from pipeline.analysis.diagnosis import read_length_scale
 from pipeline.analysis.errors import lack_runs
 from pipeline.analysis.fleet import find_estimates
 from pipeline.core.arrays import Complex, Flags, Floats
+from pipeline.core.numbers import pick
 from pipeline.fleet.datasets import read_day
 from pipeline.fleet.forecast import DRAWS, Forecast, make_effects
 from pipeline.fleet.statistics.intervals import Interval
@@ -231,14 +232,11 @@ def describe_prediction(prediction: Prediction) -> dict[str, object]:
     effects: dict[str, dict[str, object]] = {}
     for number in forecast.numbers:
         low, high = number.ends
-        effects.setdefault(number.effect, {})[number.parameter] = {
-            "value": number.value, "low": low, "high": high, "unit": number.unit, "runs": number.runs,
-            "at_bound": number.at_bound,
-        }  # fmt: skip
+        ends = {"value": number.value, "low": low, "high": high}
+        numbers = effects.setdefault(number.effect, {})
+        numbers[number.parameter] = {**ends, **pick(number, "unit", "runs", "at_bound")}
     return {
-        "vehicle": forecast.vehicle,
-        "terrain": forecast.terrain,
-        "input": forecast.input,
+        **pick(forecast, "vehicle", "terrain", "input"),
         "effects": [{"id": effect.id, "parameters": effects[effect.id]} for effect in forecast.effects],
         "t_mrmse_m": _describe(prediction.t_mrmse_m),
         "ideal_t_mrmse_m": _describe(prediction.ideal_t_mrmse_m),

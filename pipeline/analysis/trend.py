@@ -10,6 +10,7 @@ import polars as pl
 
 from pipeline.analysis.compared_runs import ComparedRuns, find_material
 from pipeline.analysis.errors import JobError, lack_runs
+from pipeline.core.numbers import pick
 from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.parameter_trend import (
     ParameterTrend,
@@ -153,9 +154,7 @@ def describe_trend(trend: Trend) -> dict[str, object]:
         "alerts": [vars(alert) for alert in trend.alerts],
         "series": [
             {
-                "group": one.group,
-                "quantity": one.quantity,
-                "unit": one.unit,
+                **pick(one, "group", "quantity", "unit"),
                 "points": one.points.drop("order").to_dicts(),
                 "changes": [step.describe(describe_step(one, step)) for step in one.steps],
             }

@@ -13,6 +13,7 @@ from pipeline.analysis.keys import EXTRACTED, TABLES
 from pipeline.analysis.log_setup import LogSetup
 from pipeline.analysis.options import STAGES, Options
 from pipeline.analysis.relative import add_model
+from pipeline.core.numbers import pick
 from pipeline.logs import LogData, Loss, read_topics
 from pipeline.runs.recording import Alignment, read_alignment
 from pipeline.stages import aggregate, checks, slip, velocity
@@ -302,9 +303,7 @@ def describe_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:
         return None if stamp is None else round((stamp - start_ns) / 1e9, 6)
 
     return {
-        "kind": loss.kind,
-        "bytes": loss.bytes,
-        "chunks": loss.chunks,
+        **pick(loss, "kind", "bytes", "chunks"),
         "start_s": since(loss.start_ns),
         "end_s": since(loss.end_ns),
         "text": loss.text,

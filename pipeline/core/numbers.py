@@ -1,6 +1,7 @@
 """Numbers for JSON and tables, which have none that are not finite."""
 
 import math
+from typing import Any
 
 
 def finite_or_none(value: float, digits: int | None = None) -> float | None:
@@ -8,3 +9,13 @@ def finite_or_none(value: float, digits: int | None = None) -> float | None:
     if not math.isfinite(value):
         return None
     return value if digits is None else float(f"{value:.{digits}g}")
+
+
+def pick(item: object, *names: str) -> dict[str, Any]:
+    """Some of an object's fields by name."""
+    return {name: getattr(item, name) for name in names}
+
+
+def pick_finite(item: object, *names: str, digits: int | None = None) -> dict[str, float | None]:
+    """Some of an object's numbers by name, as `finite_or_none`."""
+    return {name: finite_or_none(getattr(item, name), digits) for name in names}

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
-from pipeline.core.numbers import finite_or_none
+from pipeline.core.numbers import finite_or_none, pick_finite
 from pipeline.diagnosis.enough import Growth, describe_enough
 from pipeline.diagnosis.error_regions import Region
 from pipeline.diagnosis.materiality import LEAST_TURN_RAD, LEAST_WAY_SHARE, Moves
@@ -420,4 +420,4 @@ def _clean(value: float) -> float | None:
 
 
 def _numbers(item: object, *names: str) -> dict[str, Json]:
-    return {name: _clean(getattr(item, name)) for name in names}
+    return {**pick_finite(item, *names, digits=_DIGITS)}

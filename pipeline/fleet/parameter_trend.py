@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.core.numbers import finite_or_none
+from pipeline.core.numbers import finite_or_none, pick
 from pipeline.fleet.hierarchy import leave_out_odd, list_numbers
 from pipeline.fleet.runs import UNKNOWN
 from pipeline.fleet.statistics.shifts import FEWEST_FREE, find_shifts, guess_shift
@@ -223,10 +223,7 @@ def say_power(trend: ParameterTrend) -> str:
 def describe_parameter(trend: ParameterTrend) -> Mapping[str, object]:
     """The JSON object of a parameter."""
     return {
-        "vehicle": trend.vehicle,
-        "effect": trend.effect,
-        "parameter": trend.parameter,
-        "unit": trend.unit,
+        **pick(trend, "vehicle", "effect", "parameter", "unit"),
         "points": trend.points.drop("order").to_dicts(),
         "changes": [change.describe(describe_change(trend, change)) for change in trend.changes],
         "least_change": finite_or_none(trend.least),

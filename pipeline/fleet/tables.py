@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
+from pipeline.core.numbers import pick
 from pipeline.fleet.pairs import Pair
 
 _INPUTS = pl.Enum(["command", "measured"])
@@ -86,17 +87,11 @@ def tabulate_pairs(
             "runs_a": len(pair.a.runs),
             "runs_b": len(pair.b.runs),
             "shift": pair.comparison.shift,
-            "low": None if pair.comparison.interval is None else pair.comparison.interval.low,
-            "high": None if pair.comparison.interval is None else pair.comparison.interval.high,
+            **(pick(pair.comparison.interval, "low", "high") if pair.comparison.interval else {}),
             "cliffs_delta": pair.comparison.delta,
-            "size": pair.size,
             "p": pair.comparison.test.p,
-            "p_adjusted": pair.p_adjusted,
-            "smallest_p": pair.smallest_p,
-            "method": pair.method,
             "unit_of_analysis": pair.unit,
-            "p_uncorrected": pair.p_uncorrected,
-            "note": pair.note,
+            **pick(pair, "size", "p_adjusted", "smallest_p", "method", "p_uncorrected", "note"),
             "keys": f"{keys[pair.a.name]} {keys[pair.b.name]}",
         }
         for pair in pairs

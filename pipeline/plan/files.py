@@ -1,6 +1,7 @@
 """A plan's files: `plan.toml` to read, `plan.csv`, and `plan.mcap` to play."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 
 import msgspec
@@ -155,14 +156,7 @@ def _format_toml(plan: Plan) -> str:
         }
     )
     lines += ["", "# The start is the middle; the first side lies along the heading at the start.", "[area]"]
-    lines += _format_table(
-        {
-            "length_m": plan.area.length_m,
-            "width_m": plan.area.width_m,
-            "margin_m": plan.area.margin_m,
-            "home_m": plan.home_m,
-        }
-    )
+    lines += _format_table({**asdict(plan.area), "home_m": plan.home_m})
     for name, start in plan.manoeuvres:
         lines += ["", "[[manoeuvre]]", *_format_table({"name": name, "start_s": start})]
     for key, items in (("promises", plan.promises), ("impossible", plan.impossible)):

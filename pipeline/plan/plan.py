@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from pipeline.core.arrays import Complex, Floats
-from pipeline.core.numbers import finite_or_none
+from pipeline.core.numbers import finite_or_none, pick
 from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.models import Effect, find_effect, list_effects
 from pipeline.models.evidence import Largest
@@ -140,9 +140,7 @@ class Plan:
             "duration_s": self.commands.duration_s if self.manoeuvres else 0.0,
             "vehicle": self.vehicle,
             "runs": list(self.runs),
-            "home_m": self.home_m,
-            "spare_s": self.spare_s,
-            "spare_gain": self.spare_gain,
+            **pick(self, "home_m", "spare_s", "spare_gain"),
             "limits": asdict(self.limits) | {"yaw_rate_radps": finite_or_none(self.limits.yaw_rate_radps)},
             "area": asdict(self.area),
             "safety": list(SAFETY),

@@ -3,10 +3,12 @@
 import json
 import math
 
-from pipeline.core.numbers import finite_or_none
+from pipeline.core.numbers import finite_or_none, pick
 from pipeline.models.formula.formula_effect import FormulaEffect
 from pipeline.models.model_file import ModelFile
 from pipeline.models.target import Current, Target
+
+_GEOMETRY = ("wheel_radius_m", "track_width_m", "wheelbase_m", "controller_track_multiplier")
 
 
 def write(file: ModelFile, current: Current) -> str:
@@ -31,14 +33,7 @@ def write(file: ModelFile, current: Current) -> str:
             item["formulas"] = effect.formulas
         effects.append(item)
     content = {
-        "vehicle": {
-            "id": vehicle.id,
-            "kind": vehicle.kind,
-            "wheel_radius_m": vehicle.wheel_radius_m,
-            "track_width_m": vehicle.track_width_m,
-            "wheelbase_m": vehicle.wheelbase_m,
-            "controller_track_multiplier": vehicle.controller_track_multiplier,
-        },
+        "vehicle": pick(vehicle, "id", "kind", *_GEOMETRY),
         "effects": effects,
         "fit": _plain(file.fit),
         **({"warnings": list(file.warnings)} if file.warnings else {}),
