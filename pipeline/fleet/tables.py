@@ -4,12 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import polars as pl
+import polars.selectors as cs
 
 from pipeline.core.numbers import pick
 from pipeline.fleet.pairs import Pair
-
-_INPUTS = pl.Enum(["command", "measured"])
-_UNITS = pl.Enum(["runs", "blocks"])
+from schemas import contract_of
 
 _LATEX: dict[str, tuple[tuple[str, str, int], ...]] = {
     "datasets": (
@@ -96,29 +95,8 @@ def tabulate_pairs(
         }
         for pair in pairs
     ]
-    numbers = ("shift", "low", "high", "cliffs_delta", "p", "p_adjusted", "smallest_p", "p_uncorrected")
-    texts = (
-        "run",
-        "dataset",
-        "vehicle",
-        "terrain",
-        "by",
-        "quantity",
-        "a",
-        "b",
-        "size",
-        "method",
-        "note",
-        "keys",
-    )
-    schema = {
-        **dict.fromkeys(texts, pl.String()),
-        **dict.fromkeys(numbers, pl.Float64()),
-        **dict.fromkeys(("runs_a", "runs_b"), pl.Int64()),
-        "input": _INPUTS,
-        "unit_of_analysis": _UNITS,
-    }
-    return pl.DataFrame(rows, schema=pl.Schema(schema), orient="row")
+    frame = pl.DataFrame(rows, schema=contract_of("comparisons").schema.create_empty().schema)
+    return frame.select(cs.string(), cs.float(), cs.integer(), cs.enum())
 
 
 def write_csv(frame: pl.DataFrame) -> str:
@@ -138,7 +116,7 @@ def write_latex(name: str, frame: pl.DataFrame) -> str:
     columns = [
         column for column in _LATEX[name] if frame.is_empty() or frame[column[0]].null_count() < frame.height
     ]
-    kinds = "".join("l" if frame.schema[column] in (pl.String, _UNITS) else "r" for column, _, _ in columns)
+    kinds = "".join("l" if frame.schema[column] in (pl.String, pl.Enum) else "r" for column, _, _ in columns)
     lines = [
         f"\\begin{{tabular}}{{{kinds}}}",
         "\\toprule",

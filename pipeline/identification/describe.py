@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from pipeline.core.numbers import finite_or_none
+from pipeline.core.numbers import finite_or_none, pick_finite
 from pipeline.identification.intervals import NOTHING as NOT_FITTED
 from pipeline.identification.intervals import Estimates
 from pipeline.identification.ladder import ERRORS_OVER_2S, NOTHING, Ladder, Rung, list_rises
@@ -26,12 +26,10 @@ def errors_as_json(errors: Errors) -> dict[str, object]:
     return {
         "velocity_rms": [_round(value) for value in errors.velocity_rms],
         "velocity_spread": [_round(value) for value in errors.velocity_spread],
-        "t_mrmse_m": _round(errors.t_mrmse_m),
-        "r_mrmse_rad": _round(errors.r_mrmse_rad),
+        **pick_finite(errors, "t_mrmse_m", "r_mrmse_rad", digits=_DIGITS),
         "published_t_mean_m": _round(errors.t_mean_m),
         "published_r_mean_rad": _round(errors.r_mean_rad),
-        "t_median_m": _round(errors.t_median_m),
-        "r_median_rad": _round(errors.r_median_rad),
+        **pick_finite(errors, "t_median_m", "r_median_rad", digits=_DIGITS),
         "windows": errors.windows,
     }
 
@@ -82,9 +80,7 @@ def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str
             continue
         label = item.free.label
         entry: dict[str, object] = {
-            "value": _round(item.value),
-            "low": _round(item.low),
-            "high": _round(item.high),
+            **pick_finite(item, "value", "low", "high", digits=_DIGITS),
             "unit": item.free.unit,
             "fitted": True,
             "at_bound": item.at_bound,

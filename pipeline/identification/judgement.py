@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from pipeline.core.numbers import pick
 from pipeline.identification.describe import errors_as_json
 from pipeline.identification.fit import Fitted, fit_model
 from pipeline.identification.intervals import Estimates, estimate_intervals
@@ -102,9 +103,7 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
         {
             "run": problem.names[item.free.run],
             "parameter": item.free.label,
-            "value": item.value,
-            "low": item.low,
-            "high": item.high,
+            **pick(item, "value", "low", "high"),
         }
         for item in estimates.items
         if item.free.effect and item.free.run is not None
