@@ -8,9 +8,8 @@ from pipeline.core.arrays import Floats
 from pipeline.core.rigid import quaternions_from_yaw
 from pipeline.simulate.drivetrain import CORNERS, apply_ideal_model, invert_ideal_model
 from pipeline.simulate.layouts import CommandTopic, Layout, PoseTopic, WheelTopic
-from pipeline.simulate.programs import Commands, make_commands
+from pipeline.simulate.programs import Commands, make_wishes
 from pipeline.simulate.run import SimulatedRun, integrate_odometry
-from pipeline.simulate.scenario import Program
 from pipeline.simulate.streams import open_stream, spread_times
 
 Field = Floats | float | str | list[str]
@@ -52,9 +51,7 @@ def _write_command(run: SimulatedRun, layout: Layout, topic: CommandTopic, comma
     if topic.form in {"twist", "twist_stamped"}:
         stamped = topic.form == "twist_stamped"
         prefix = "twist." if stamped else ""
-        rate = commands.turn
-        if vehicle.kind == "ackermann":
-            rate = commands.speed_mps * np.tan(commands.turn) / vehicle.wheelbase_m
+        rate = commands.yaw_rate(vehicle)
         fields: dict[str, Field] = {f"{prefix}linear.x": commands.speed_mps, f"{prefix}angular.z": rate}
         if commands.sideways_mps is not None:
             fields[f"{prefix}linear.y"] = commands.sideways_mps
@@ -242,12 +239,7 @@ def decoy_sheets(run: SimulatedRun) -> list[Sheet]:
     scenario = run.scenario
     sheets: list[Sheet] = []
     if scenario.recording.decoys in {"commands", "both"}:
-        wished = make_commands(
-            Program("smooth", rate_hz=10.0),
-            scenario.vehicle,
-            duration_s=scenario.duration_s,
-            generator=open_stream(scenario.seed, "decoy"),
-        )
+        wished = make_wishes(scenario, "decoy")
         fields: dict[str, Field] = {"linear.x": wished.speed_mps, "angular.z": wished.turn}
         sheets.append(Sheet("/navigation/cmd_vel", "geometry_msgs/msg/Twist", wished.time_s, None, fields))
     if scenario.recording.decoys in {"odometry", "both"} and run.wheels is not None:

@@ -15,14 +15,12 @@ import numpy as np
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import invert_quaternions, multiply_quaternions, rotate, rotation_vectors
 from pipeline.simulate.body import BodyMotion
-from pipeline.simulate.drivetrain import Drive, apply_ideal_model, drive_wheels
+from pipeline.simulate.drivetrain import Drive, apply_ideal_model
 from pipeline.simulate.effects import Effects, resolve_effects
 from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.path import Path
-from pipeline.simulate.programs import make_commands
-from pipeline.simulate.run import SimulatedRun, Truth, record_truth
+from pipeline.simulate.run import SimulatedRun, Truth, ask_wheels, record_truth
 from pipeline.simulate.scenario import Scenario
-from pipeline.simulate.streams import open_stream
 from pipeline.simulate.surface import tilt_quaternion
 from pipeline.simulate.vehicles import Vehicle
 
@@ -99,20 +97,7 @@ def simulate_skid_steer(scenario: Scenario, machine: SkidSteer) -> SimulatedRun:
     vehicle = scenario.vehicle
     effects = resolve_effects(scenario.effects, vehicle.kind)
     _refuse_formulas(scenario, effects)
-    commands = make_commands(
-        scenario.program,
-        vehicle,
-        duration_s=scenario.duration_s,
-        generator=open_stream(scenario.seed, "program"),
-    )
-    asked = drive_wheels(
-        commands,
-        vehicle,
-        effects,
-        hold_s=scenario.program.hold_s,
-        step_s=_STEP_S,
-        cells=round(scenario.duration_s / _STEP_S),
-    )
+    commands, asked = ask_wheels(scenario, effects, _STEP_S)
     position, quaternion, wheels = _step_world(scenario, machine, asked)
     tilt = tilt_quaternion(scenario.ground)
     count = position.shape[0]

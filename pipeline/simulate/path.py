@@ -11,7 +11,7 @@ from pipeline.simulate.body import BodyMotion
 from pipeline.simulate.drivetrain import Drive
 from pipeline.simulate.effects import Effects
 from pipeline.simulate.scenario import ExtraPhysics, Ground, State
-from pipeline.simulate.signals import integrate_cells
+from pipeline.simulate.signals import integrate_cells, walk_in_plane
 from pipeline.simulate.surface import Surface, Vector, cross, make_surface, slide_onto_plane, tilt_quaternion
 
 _SLOW_STEP_S = 0.005
@@ -70,9 +70,9 @@ def _cross_plane(
     tilt = tilt_quaternion(ground)
     velocity = motion.velocity
     heading = start[2] + integrate_cells(velocity[:, 2], step_s=step_s)
-    middle = 0.5 * (heading[:-1] + heading[1:])
-    cosine, sine = np.cos(middle), np.sin(middle)
     if slope_gain != 0.0:
+        middle = 0.5 * (heading[:-1] + heading[1:])
+        cosine, sine = np.cos(middle), np.sin(middle)
         up_x, up_y, _ = rotate(tilt * np.array([-1.0, -1.0, -1.0, 1.0]), np.array([0.0, 0.0, 1.0])).tolist()
         downhill = -slope_gain * motion.turning
         velocity = velocity + np.stack(
@@ -83,14 +83,8 @@ def _cross_plane(
             ),
             axis=1,
         )
-    in_plane = np.stack(
-        (
-            start[0] + integrate_cells(velocity[:, 0] * cosine - velocity[:, 1] * sine, step_s=step_s),
-            start[1] + integrate_cells(velocity[:, 0] * sine + velocity[:, 1] * cosine, step_s=step_s),
-            np.zeros_like(heading),
-        ),
-        axis=1,
-    )
+    walked = walk_in_plane(velocity[:, 0], velocity[:, 1], heading, step_s=step_s)
+    in_plane = np.array([*start[:2], 0.0]) + walked
     time = np.arange(heading.size, dtype=np.float64) * step_s
     quaternion = multiply_quaternions(np.broadcast_to(tilt, (heading.size, 4)), quaternions_from_yaw(heading))
     return Path(time, rotate(tilt, in_plane), quaternion, velocity)

@@ -11,8 +11,9 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.simulate.errors import SimulateError, unknown_name
-from pipeline.simulate.scenario import Program
+from pipeline.simulate.scenario import Program, Scenario
 from pipeline.simulate.signals import make_coloured_noise
+from pipeline.simulate.streams import open_stream
 from pipeline.simulate.vehicles import Vehicle
 
 
@@ -36,6 +37,12 @@ class Commands:
     def sideways(self) -> Floats:
         """Speed to the left [m/s], zero on a vehicle that cannot, shape (n,)."""
         return np.zeros_like(self.speed_mps) if self.sideways_mps is None else self.sideways_mps
+
+    def yaw_rate(self, vehicle: Vehicle) -> Floats:
+        """The yaw rate that is asked for [rad/s], which a car's steering stands for."""
+        if vehicle.kind != "ackermann":
+            return self.turn
+        return self.speed_mps * np.tan(self.turn) / vehicle.wheelbase_m
 
 
 @dataclass(frozen=True)
@@ -98,6 +105,13 @@ def make_commands(
     if sideways is not None:
         sideways = (sideways * moving)[live]
     return Commands(stamps[live], speed[live], turn[live], sideways)
+
+
+def make_wishes(scenario: Scenario, purpose: str) -> Commands:
+    """Smooth commands of a planner that the vehicle is not driven by; `purpose` names their random stream."""
+    generator = open_stream(scenario.seed, purpose)
+    smooth = Program("smooth", rate_hz=10.0)
+    return make_commands(smooth, scenario.vehicle, duration_s=scenario.duration_s, generator=generator)
 
 
 def _jitter_stamps(time: Floats, program: Program, generator: np.random.Generator) -> Floats:

@@ -13,10 +13,9 @@ from pipeline.simulate.drivetrain import apply_ideal_model, invert_ideal_model
 from pipeline.simulate.errors import SimulateError
 from pipeline.simulate.geodesy import to_earth
 from pipeline.simulate.messages import Field, Sheet
-from pipeline.simulate.programs import make_commands
+from pipeline.simulate.programs import make_wishes
 from pipeline.simulate.run import SimulatedRun
-from pipeline.simulate.scenario import Program
-from pipeline.simulate.signals import integrate_cells
+from pipeline.simulate.signals import integrate_cells, walk_in_plane
 from pipeline.simulate.streams import open_stream
 
 Series = dict[str, Floats]
@@ -123,12 +122,9 @@ def _take(quantity: Q, series: Series, kept: slice) -> Floats:
 def _of_command(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     commands, vehicle = run.commands, run.scenario.vehicle
     left, right = invert_ideal_model(vehicle, commands.speed_mps, commands.turn)
-    rate = commands.turn
-    if vehicle.kind == "ackermann":
-        rate = commands.speed_mps * np.tan(commands.turn) / vehicle.wheelbase_m
     series = {
         "speed": commands.speed_mps,
-        "yaw_rate": rate,
+        "yaw_rate": commands.yaw_rate(vehicle),
         "steering": commands.turn,
         "left": left,
         "right": right,
@@ -138,13 +134,7 @@ def _of_command(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
 
 
 def _of_wish(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
-    scenario = run.scenario
-    wished = make_commands(
-        Program("smooth", rate_hz=10.0),
-        scenario.vehicle,
-        duration_s=scenario.duration_s,
-        generator=open_stream(scenario.seed, "wish"),
-    )
+    wished = make_wishes(run.scenario, "wish")
     series = {"speed": wished.speed_mps, "yaw_rate": wished.turn, "sideways": wished.sideways}
     return wished.time_s, wished.time_s, series
 
@@ -179,13 +169,10 @@ def _of_odometry(run: SimulatedRun, *, gyro: bool = False) -> tuple[Floats, Floa
         rate = np.interp(stamp, run.imu.time_s, run.imu.rates[:, 2])
     step = float(np.median(np.diff(stamp)))
     heading = integrate_cells(rate, step_s=step)
-    middle = 0.5 * (heading[:-1] + heading[1:])
-    cosine, sine, aside = np.cos(middle), np.sin(middle), series["sideways"]
-    along = (series["speed"] * cosine - aside * sine, series["speed"] * sine + aside * cosine)
-    way = [integrate_cells(rates, step_s=step)[:-1] for rates in along]
-    position = np.stack((*way, np.zeros_like(stamp)), axis=1)
+    speed, aside = series["speed"], series["sideways"]
+    position = walk_in_plane(speed, aside, heading, step_s=step)[:-1]
     named = _name(position, rigid.quaternions_from_yaw(heading[:-1]))
-    return stamp, log, named | {"speed": series["speed"], "yaw_rate": rate, "sideways": aside}
+    return stamp, log, named | {"speed": speed, "yaw_rate": rate, "sideways": aside}
 
 
 def _of_filter(run: SimulatedRun) -> tuple[Floats, Floats, Series]:

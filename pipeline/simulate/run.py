@@ -15,7 +15,7 @@ from pipeline.simulate.path import Path, integrate_path
 from pipeline.simulate.programs import Commands, make_commands
 from pipeline.simulate.scenario import Scenario
 from pipeline.simulate.sensors import ImuReadings, WheelReadings, read_encoders, read_imu
-from pipeline.simulate.signals import integrate_cells
+from pipeline.simulate.signals import integrate_cells, walk_in_plane
 from pipeline.simulate.streams import open_stream
 from pipeline.simulate.vehicles import Vehicle
 
@@ -69,13 +69,7 @@ def simulate_run(scenario: Scenario) -> SimulatedRun:
     """
     vehicle, seed = scenario.vehicle, scenario.seed
     effects = resolve_effects(scenario.effects, vehicle.kind)
-    cells = round(scenario.duration_s / scenario.step_s)
-    commands = scenario.played or make_commands(
-        scenario.program, vehicle, duration_s=scenario.duration_s, generator=open_stream(seed, "program")
-    )
-    drive = drive_wheels(
-        commands, vehicle, effects, hold_s=scenario.program.hold_s, step_s=scenario.step_s, cells=cells
-    )
+    commands, drive = ask_wheels(scenario, effects, scenario.step_s)
     if scenario.machinery is not None:
         drive = scenario.machinery(drive)
     motion = move_body(
@@ -96,6 +90,16 @@ def simulate_run(scenario: Scenario) -> SimulatedRun:
         generator=open_stream(seed, "hills"),
     )
     return record_truth(scenario, Truth(commands, drive, motion, path, effects))
+
+
+def ask_wheels(scenario: Scenario, effects: Effects, step_s: float) -> tuple[Commands, Drive]:
+    """The commands of a scenario, and what its drive makes of them in steps of so many seconds."""
+    vehicle, duration, hold_s = scenario.vehicle, scenario.duration_s, scenario.program.hold_s
+    commands = scenario.played or make_commands(
+        scenario.program, vehicle, duration_s=duration, generator=open_stream(scenario.seed, "program")
+    )
+    cells = round(duration / step_s)
+    return commands, drive_wheels(commands, vehicle, effects, hold_s=hold_s, step_s=step_s, cells=cells)
 
 
 def record_truth(scenario: Scenario, truth: Truth) -> SimulatedRun:
@@ -139,15 +143,7 @@ def integrate_odometry(vehicle: Vehicle, wheels: WheelReadings, *, start: tuple[
     speed, rate = apply_ideal_model(vehicle, wheels.left, wheels.right, wheels.steering)
     aside = wheels.sideways_mps(vehicle)
     heading = start[2] + integrate_cells(rate, step_s=step)
-    middle = 0.5 * (heading[:-1] + heading[1:])
-    position = np.stack(
-        (
-            start[0] + integrate_cells(speed * np.cos(middle) - aside * np.sin(middle), step_s=step),
-            start[1] + integrate_cells(speed * np.sin(middle) + aside * np.cos(middle), step_s=step),
-            np.zeros_like(heading),
-        ),
-        axis=1,
-    )
+    position = np.array([*start[:2], 0.0]) + walk_in_plane(speed, aside, heading, step_s=step)
     edges = np.append(time, time[-1] + step)
     velocity = np.stack((speed, aside, rate), axis=1)
     return Path(edges, position, quaternions_from_yaw(heading), velocity)

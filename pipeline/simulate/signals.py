@@ -96,6 +96,22 @@ def make_coloured_noise(
     return filter_pole(drive * deviation, pole)
 
 
+def walk_in_plane(along: Floats, aside: Floats, heading: Floats, *, step_s: float) -> Floats:
+    """Places from the origin on of a body that moves so [m/s], shape (n,), in the plane, shape (n + 1, 3).
+
+    Args:
+        along: its speed ahead.
+        aside: its speed to the left.
+        heading: at the edges of the steps [rad], shape (n + 1,).
+        step_s: length of a step [s].
+    """
+    middle = 0.5 * (heading[:-1] + heading[1:])
+    cosine, sine = np.cos(middle), np.sin(middle)
+    x = integrate_cells(along * cosine - aside * sine, step_s=step_s)
+    y = integrate_cells(along * sine + aside * cosine, step_s=step_s)
+    return np.stack((x, y, np.zeros_like(heading)), axis=1)
+
+
 def integrate_cells(signal: Floats, *, step_s: float) -> Floats:
     """Integral at the cell edges, shape (n + 1,), starting from zero."""
     total: Floats = np.concatenate(([0.0], np.cumsum(signal) * step_s))
