@@ -165,10 +165,7 @@ def tabulate_fleet(model: FleetModel, keys: tuple[str, ...]) -> pl.DataFrame:
         rows.append({**told, **whose, "level": told["level"] or "open"})
         terrains = cast("Mapping[str, Mapping[str, object]]", told["terrains"])
         rows += [{**rows[-1], "named": None, "terrain": name, **mean} for name, mean in terrains.items()]
-    empty = contract_of("fleet").schema.create_empty()
-    return pl.DataFrame(
-        [[row[name] for name in empty.schema] for row in rows], schema=empty.schema, orient="row"
-    )
+    return pl.DataFrame(rows, schema=contract_of("fleet").schema.create_empty().schema)
 
 
 def _bounds(number: FleetNumber, interval: Interval | None) -> dict[str, float | None]:

@@ -30,17 +30,6 @@ _LONGEST_WAIT = 1.5
 _REPEATED_SHARE = 0.2
 _ROUNDING_S = 1e-6
 _ROLLS = 0.3
-_NUMBERS = (
-    "hold_time",
-    "gyro_scale",
-    "gyro_bias",
-    "heading_delay",
-    "heading_delay_error",
-    "wheel_delay",
-    "gyro_residual",
-    "recorded_modulus_command",
-    "recorded_modulus_measured",
-)
 _INPUTS = ("command", "measured")
 
 
@@ -248,13 +237,8 @@ def read_alignment(table: pl.DataFrame) -> Alignment:
     row = table.row(0, named=True)
     gyro = None
     if row["gyro_scale"] is not None:
-        gyro = GyroFit(
-            row["gyro_scale"],
-            row["gyro_bias"],
-            0.0,
-            row["heading_delay_error"],
-            row["gyro_residual"],
-        )
+        told = row["gyro_scale"], row["gyro_bias"]
+        gyro = GyroFit(*told, 0.0, row["heading_delay_error"], row["gyro_residual"])
     return Alignment(
         row["hold_time"],
         row["command_scale"],
@@ -270,27 +254,27 @@ def read_alignment(table: pl.DataFrame) -> Alignment:
 
 def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
     """Table `alignments` of one run, without the run's columns."""
-    import polars as pl  # noqa: PLC0415 - only where tables are written
+    from pipeline.core.tables import tabulate  # noqa: PLC0415 - only where tables are written
 
+    row = {
+        "hold_time": alignment.hold_s,
+        "command_scale": alignment.command_scale,
+        "track_multiplier": alignment.track_multiplier,
+        "wheel_delay": alignment.wheel_delay_s,
+        "latency_spread": alignment.latency_spread_s,
+        "outlier_time": alignment.outlier_s,
+        **{f"recorded_modulus_{name}": alignment.recorded_moduli.get(name) for name in _INPUTS},
+    }
     fit = alignment.gyro
-    known = fit is not None and np.isfinite(fit.delay_error_s)
-    return pl.DataFrame(
-        {
-            "hold_time": [alignment.hold_s],
-            "command_scale": [alignment.command_scale],
-            "track_multiplier": [alignment.track_multiplier],
-            "gyro_scale": [fit.signed_scale if fit and known else None],
-            "gyro_bias": [fit.bias if fit and known else None],
-            "heading_delay": [alignment.heading_delay_s if fit and known else None],
-            "heading_delay_error": [fit.delay_error_s if fit and known else None],
-            "wheel_delay": [alignment.wheel_delay_s],
-            "gyro_residual": [fit.residual if fit and known else None],
-            "latency_spread": [alignment.latency_spread_s],
-            "outlier_time": [alignment.outlier_s],
-            **{f"recorded_modulus_{name}": [alignment.recorded_moduli.get(name)] for name in _INPUTS},
-        },
-        schema_overrides=dict.fromkeys(_NUMBERS, pl.Float64),
-    )
+    if fit is not None and np.isfinite(fit.delay_error_s):
+        row |= {
+            "gyro_scale": fit.signed_scale,
+            "gyro_bias": fit.bias,
+            "heading_delay": alignment.heading_delay_s,
+            "heading_delay_error": fit.delay_error_s,
+            "gyro_residual": fit.residual,
+        }
+    return tabulate("alignments", [row])
 
 
 def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> Track:

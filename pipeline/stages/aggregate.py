@@ -3,9 +3,9 @@
 import numpy as np
 import polars as pl
 
+from pipeline.core.tables import tabulate
 from pipeline.vehicles import Vehicle
 
-_SUBSETS = pl.Enum(["all", "transitory", "steady"])
 _ROUGHNESS_S = 1.0
 
 
@@ -44,20 +44,7 @@ def aggregate_run(
                     "length_scale": length,
                 }
             )
-    schema = {"input": pl.Enum(["command", "measured"]), "subset": _SUBSETS}
-    frame = pl.DataFrame(rows, infer_schema_length=None).with_columns(
-        pl.col(column).cast(kind) for column, kind in schema.items()
-    )
-    numbers = (
-        "median_modulus",
-        "median_residual_modulus", "median_window_norm", "rms_x", "rms_y", "rms_w", "mean_square",
-        "drivetrain_mean_square", "ground_mean_square", "cross_mean_square",
-        "distance", "duration", "height_rate", "largest_kinetic_energy",
-    )  # fmt: skip
-    return frame.with_columns(
-        pl.col(name).cast(pl.Float64) if name in frame.columns else pl.lit(None, pl.Float64).alias(name)
-        for name in numbers
-    )
+    return tabulate("aggregates", rows)
 
 
 def _in_subset(subset: str) -> pl.Expr:
@@ -67,20 +54,14 @@ def _in_subset(subset: str) -> pl.Expr:
 
 
 def _describe_slip(slip: pl.DataFrame, windows: pl.DataFrame) -> dict[str, float | int | None]:
-    def root(column: str) -> float | None:
-        return _root_mean_square(slip[column])
-
-    mean_square = (slip["modulus"] ** 2).mean()
     return {
         "samples": slip.height,
         "windows": windows.height,
         "median_modulus": _number(slip["modulus"].median()),
         "median_residual_modulus": _number(slip["residual_modulus"].median()),
         "median_window_norm": _number(windows["window_norm"].median()),
-        "rms_x": root("g_x"),
-        "rms_y": root("g_y"),
-        "rms_w": root("g_w"),
-        "mean_square": _number(mean_square),
+        **{f"rms_{axis}": _root_mean_square(slip[f"g_{axis}"]) for axis in "xyw"},
+        "mean_square": _number((slip["modulus"] ** 2).mean()),
     }
 
 

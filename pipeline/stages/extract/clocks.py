@@ -222,14 +222,8 @@ def _read_clock(times: Recorded) -> TopicClock:
     if times.clock == "log" or header is None or not header.any():
         found: list[Finding] = []
         if header is not None and not header.any():
-            found.append(
-                Finding(
-                    "no_header_stamp",
-                    "warning",
-                    f"the header stamps of {times.topic} are all zero: log times were used",
-                    where=times.topic,
-                )
-            )
+            text = f"the header stamps of {times.topic} are all zero: log times were used"
+            found.append(Finding("no_header_stamp", "warning", text, where=times.topic))
         found += _flag_unset(times.topic, ~log_known)
         return TopicClock(times.topic, "log", times.log_time, log_known, findings=tuple(found))
     stamp, usable, breaks, found = _mend_jumps(times.topic, header, times.log_time, log_known)
@@ -354,9 +348,7 @@ def _join_time_bases(
             )
         name = find_late_effect(Late.POSES).id
         findings.append(Finding(name, "warning", text, where=clock.topic, value=away))
-        joined[key] = TopicClock(
-            clock.topic, clock.clock, clock.stamp + shift, clock.usable, clock.breaks, clock.latency_s
-        )
+        joined[key] = replace(clock, stamp=clock.stamp + shift, findings=())
     return joined, findings
 
 

@@ -104,14 +104,8 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     found: list[Finding] = []
     missing = [joint for joint in (*left, *right) if not _is_known(velocity, joint)]
     if missing:
-        found.append(
-            Finding(
-                "velocity_from_position",
-                "info",
-                f"{columns.topic} has no velocity of {', '.join(missing)}: positions were differentiated",
-                where=columns.topic,
-            )
-        )
+        text = f"{columns.topic} has no velocity of {', '.join(missing)}: positions were differentiated"
+        found.append(Finding("velocity_from_position", "info", text, where=columns.topic))
     for joint in missing:
         if not _is_known(position, joint):
             raise _no_wheels(columns.topic, joints)

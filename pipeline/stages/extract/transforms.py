@@ -71,14 +71,8 @@ def _choose_frames(buffer: TransformBuffer, where: str) -> tuple[str, str]:
 
 def describe_chain(series: TransformSeries, topic: str) -> list[Finding]:
     """What is worth knowing about a chain."""
-    findings = [
-        Finding(
-            "transforms",
-            "info",
-            f"poses are the transform from {series.parent} to {series.child}",
-            where=topic,
-        )
-    ]
+    text = f"poses are the transform from {series.parent} to {series.child}"
+    findings = [Finding("transforms", "info", text, where=topic)]
     if series.parent.rsplit("/", 1)[-1] == "odom":
         text = (
             "the transforms end at odom: the poses are an odometry, which drifts and may come from the wheels"
