@@ -236,15 +236,13 @@ def _leave_out_silent(
 
 def _is_silent(index: LogIndex, command: DriveSource) -> bool:
     """Whether a command that nobody named is a topic of texts which all say something else."""
-    types = {channel.topic: channel.type_name for channel in index.channels}
-    if command.reason == CONFIGURED or find_type(types[command.signals[0].topic]).text is None:
+    if command.reason == CONFIGURED or find_type(index.types[command.signals[0].topic]).text is None:
         return False
     return not any(with_texts(columns).log_time.size for columns in _read_command(index, command))
 
 
 def _read_command(index: LogIndex, command: DriveSource) -> Sequence[TopicColumns]:
-    types = {channel.topic: channel.type_name for channel in index.channels}
-    wanted = list_wanted(Sources(command, None, None, None, None), types)
+    wanted = list_wanted(Sources(command, None, None, None, None), index.types)
     return read_topics(index, wanted, sha256="unused").topics
 
 
@@ -286,8 +284,7 @@ def _check_contradiction(told: Recognized | None, vehicle: Vehicle, source: Vehi
 def _compare(
     chosen: Choice, index: LogIndex, configuration: Configuration, rivals: list[PoseSource]
 ) -> Choice:
-    types = {channel.topic: channel.type_name for channel in index.channels}
-    data = read_topics(index, list_wanted(chosen.sources, types, rivals))
+    data = read_topics(index, list_wanted(chosen.sources, index.types, rivals))
     ratings = rate_poses(data, chosen.sources, configuration, chosen.vehicle, where=str(index.path))
     findings = chosen.findings
     if ratings and ratings[0].from_wheels:

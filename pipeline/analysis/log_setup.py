@@ -8,6 +8,7 @@ from pipeline.analysis.choice import Choice, choose
 from pipeline.analysis.errors import JobError
 from pipeline.analysis.options import Options
 from pipeline.logs import LogIndex, open_log, spell_location
+from pipeline.stages.errors import blame_damage
 from pipeline.store import Store
 from pipeline.vehicles import Configuration, Sources, Vehicle, load_configuration
 
@@ -47,14 +48,10 @@ def set_up_log(path: Path, options: Options) -> LogSetup:
     )
     recorded = index.deployment
     if not index.channels:
-        raise JobError(
-            "log_without_messages",
-            f"no message of the log can be read{_blame_damage(index)}"
-            if index.losses
-            else "the log holds no message",
-            where=str(path),
-            hint="Check that the recording was not cut off before its first message.",
-        )
+        what = "no message of the log can be read" if index.losses else "the log holds no message"
+        hint = "Check that the recording was not cut off before its first message."
+        what += blame_damage(index.losses)
+        raise JobError("log_without_messages", what, where=str(path), hint=hint)
     chosen = choose(index, configuration, options.overrides)
     _require_sources(chosen.sources, index, options)
     vehicle = chosen.vehicle
@@ -69,28 +66,15 @@ def _require_sources(sources: Sources, index: LogIndex, options: Options) -> Non
     there = ", ".join(text for topic, text in sorted(topics.items()) if topic not in empty)
     there += f". Without any message: {', '.join(sorted(empty))}" if empty else ""
     if sources.pose is None:
-        raise JobError(
-            "no_pose",
-            "no topic can serve as pose (an odometry, a pose, or transforms)" + _blame_damage(index),
-            where=str(index.path),
-            hint=f"Name it in run.toml ([pose] topic = ...). The log has: {there}.",
-        )
+        what = "no topic can serve as pose (an odometry, a pose, or transforms)" + blame_damage(index.losses)
+        hint = f"Name it in run.toml ([pose] topic = ...). The log has: {there}."
+        raise JobError("no_pose", what, where=str(index.path), hint=hint)
     wanted = {"command": sources.command, "measured": sources.wheels}
     if all(wanted[name] is None for name in options.inputs):
         roles = " or ".join("command" if name == "command" else "measured wheels" for name in options.inputs)
-        raise JobError(
-            "no_command",
-            f"no topic can serve as {roles}{_blame_damage(index)}",
-            where=str(index.path),
-            hint="Name it in run.toml ([command] topic = ..., or left_topic and right_topic). "
-            f"The log has: {there}.",
-        )
-
-
-def _blame_damage(index: LogIndex) -> str:
-    """What was lost of the log, for sentences about what is not there; empty where nothing was."""
-    more = f" and {len(index.losses) - 1} more" if len(index.losses) > 1 else ""
-    return f" (the log is damaged: {index.losses[0].text}{more})" if index.losses else ""
+        what = f"no topic can serve as {roles}{blame_damage(index.losses)}"
+        where_to = "Name it in run.toml ([command] topic = ..., or left_topic and right_topic)."
+        raise JobError("no_command", what, where=str(index.path), hint=f"{where_to} The log has: {there}.")
 
 
 def name_plainly(path: Path) -> str:

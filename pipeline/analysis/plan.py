@@ -242,7 +242,7 @@ def choose_topic(vehicle: Vehicle, choices: Mapping[str, object], log: str) -> t
         asked = [str(command.get("topic")), *(str(other["topic"]) for other in command.get("others", []))]
     found: dict[str, str] = {}
     if asked and Path(log).exists():
-        found = {channel.topic: channel.type_name for channel in open_log(log).channels}
+        found = open_log(log).types
     for topic in asked:
         if found.get(topic) in types:
             return topic, found[topic]

@@ -36,8 +36,7 @@ def list_versions(work: Work) -> dict[str, str]:
 def _list_readers(setup: LogSetup) -> set[str]:
     """Packages that inflate or decode what a run takes from its log."""
     index = setup.index
-    types = {channel.topic: channel.type_name for channel in index.channels}
-    wanted = {one.topic for one in list_wanted(setup.sources, types)}
+    wanted = {one.topic for one in list_wanted(setup.sources, index.types)}
     encodings = {channel.message_encoding for channel in index.channels if channel.topic in wanted}
     used = [_CONTAINER.get(name, ()) for name in index.containers]
     used += [_COMPRESSION.get(name, ()) for name in index.compressions]

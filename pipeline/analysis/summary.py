@@ -55,7 +55,7 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
         },
         "quarantined": work.contexts["extract"].get("quarantined"),
         "topics": _describe_topics(work),
-        **setup.choice.to_json({channel.topic: channel.type_name for channel in setup.index.channels}),
+        **setup.choice.to_json(setup.index.types),
         "findings": list_findings(generation.read_table("findings")),
     }
 

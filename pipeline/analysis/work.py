@@ -292,8 +292,7 @@ def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:
 
 def read_wanted(setup: LogSetup, sha256: str | None = None) -> LogData:
     """Read the columns that a run needs; the hash is computed beside it unless it is known."""
-    types = {channel.topic: channel.type_name for channel in setup.index.channels}
-    return read_topics(setup.index, list_wanted(setup.sources, types), sha256=sha256)
+    return read_topics(setup.index, list_wanted(setup.sources, setup.index.types), sha256=sha256)
 
 
 def describe_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:

@@ -118,6 +118,11 @@ class LogIndex:
         return (self.end_ns - self.start_ns) * 1e-9
 
     @property
+    def types(self) -> dict[str, str]:
+        """Message type by topic."""
+        return {channel.topic: channel.type_name for channel in self.channels}
+
+    @property
     def containers(self) -> frozenset[str]:
         """What kinds of file its parts are: empty for MCAP, else the name of a kind of bag."""
         return frozenset(part.catalog.container for part in self.parts)

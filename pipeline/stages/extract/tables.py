@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.errors import SlipError
 from pipeline.logs import LogData, TopicColumns, join_channels
-from pipeline.stages.errors import StageError
+from pipeline.stages.errors import StageError, blame_damage
 from pipeline.stages.extract import localization, reading, transforms
 from pipeline.stages.extract.absurd import remove_absurd
 from pipeline.stages.extract.bodies import read_bodies
@@ -224,7 +224,7 @@ class _Extraction:
             if not spans:
                 said_so = f"{source.topic} never says {values}"
                 if self.data.losses:
-                    said_so = f"what is left of {source.topic} does not say {values}{self._blame_damage()}"
+                    said_so = f"what is left of {source.topic} does not say {values}{blame_damage(self.data.losses)}"
                 what = f"{said_so}, so that no command counts"
                 hint = "Set another `equals` in [[interval]], or take everything with --interval all."
                 raise StageError("no_interval", what, where=self.where, hint=hint)
@@ -326,16 +326,10 @@ class _Extraction:
     def _time_columns(self, times: Floats, stamp: Stamps, log_time: Stamps) -> dict[str, NDArray[np.generic]]:
         return {"t": times, "stamp": stamp, "log_time": log_time}
 
-    def _blame_damage(self) -> str:
-        """What was lost of the log, for sentences about what is not there; empty where nothing was."""
-        losses = self.data.losses
-        more = f" and {len(losses) - 1} more" if len(losses) > 1 else ""
-        return f" (the log is damaged: {losses[0].text}{more})" if losses else ""
-
     def _nothing(self, role: str, topic: str) -> StageError:
         return StageError(
             f"no_{role}",
-            f"the topic {topic!r} chosen as {role} has no readable message{self._blame_damage()}",
+            f"the topic {topic!r} chosen as {role} has no readable message{blame_damage(self.data.losses)}",
             where=self.where,
             hint=f"Choose another with {role}.topic in run.toml; `slip inspect` lists what there is.",
         )
