@@ -222,9 +222,9 @@ class _Extraction:
                     spans += find_spans_of_state(times, said, section)
             values = " or ".join(repr(section.equals or DEFAULT_INTERVAL[1]) for section in asked)
             if not spans:
-                said_so = f"{source.topic} never says {values}"
-                if self.data.losses:
-                    said_so = f"what is left of {source.topic} does not say {values}{blame_damage(self.data.losses)}"
+                said_so, lost = f"{source.topic} never says {values}", blame_damage(self.data.losses)
+                if lost:
+                    said_so = f"what is left of {source.topic} does not say {values}{lost}"
                 what = f"{said_so}, so that no command counts"
                 hint = "Set another `equals` in [[interval]], or take everything with --interval all."
                 raise StageError("no_interval", what, where=self.where, hint=hint)
