@@ -170,8 +170,7 @@ def _bound(draws: Floats) -> Expected:
 def _predict(run: _Driven, effects: Sequence[Effect]) -> Complex:
     """Positions of predictions over 2 s [m], by prediction and time since its start."""
     poses = predict_from(run.comparison, effects, Timing()).poses
-    positions: Complex = poses[:, 1:, 0] + 1j * poses[:, 1:, 1]
-    return positions
+    return poses[:, 1:, 0] + 1j * poses[:, 1:, 1]
 
 
 def _measure_gap(one: Complex, other: Complex) -> float:

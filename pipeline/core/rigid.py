@@ -13,14 +13,12 @@ _TINY = 1e-12
 
 def wrap_angle(angle: Floats) -> Floats:
     """Bring angles [rad] into (-pi, pi]."""
-    wrapped: Floats = np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
-    return wrapped
+    return np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
 
 
 def unwrap_yaw(yaw: Floats) -> Floats:
     """Remove the 2 pi jumps of a yaw series [rad], shape (n,)."""
-    unwrapped: Floats = np.unwrap(yaw)
-    return unwrapped
+    return np.unwrap(yaw)
 
 
 def multiply_quaternions(first: Floats, second: Floats) -> Floats:
@@ -48,8 +46,7 @@ def rotate(quaternion: Floats, vector: Floats) -> Floats:
     """Rotate vectors (n, 3) by unit quaternions (n, 4)."""
     axis, scalar = quaternion[..., :3], quaternion[..., 3:]
     twice = 2.0 * np.cross(axis, vector)
-    rotated: Floats = vector + scalar * twice + np.cross(axis, twice)
-    return rotated
+    return vector + scalar * twice + np.cross(axis, twice)
 
 
 def rotation_vectors(quaternion: Floats) -> Floats:
@@ -58,8 +55,7 @@ def rotation_vectors(quaternion: Floats) -> Floats:
     sine = np.linalg.norm(flipped[..., :3], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, flipped[..., 3:])
     scale = np.where(sine > _TINY, angle / np.maximum(sine, _TINY), 2.0)
-    vectors: Floats = flipped[..., :3] * scale
-    return vectors
+    return flipped[..., :3] * scale
 
 
 def quaternions_from_vectors(vector: Floats) -> Floats:

@@ -173,8 +173,7 @@ def measure_increments(position: Floats, quaternion: Floats) -> tuple[Floats, Fl
 
 def number_segments(breaks: Flags) -> Ints:
     """Segment number of each sample from flags that say a break lies before it."""
-    numbers: Ints = np.cumsum(breaks, dtype=np.int64)
-    return numbers
+    return np.cumsum(breaks, dtype=np.int64)
 
 
 def find_runs(flags: Flags) -> list[tuple[int, int]]:

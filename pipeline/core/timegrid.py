@@ -18,8 +18,7 @@ _SHORTEST_PERIOD = 1e-3
 def make_grid(start: float, end: float, rate: float) -> Floats:
     """Uniform times from ``start`` in steps of 1/``rate`` to ``end`` inclusive, rounding forgiven."""
     count = int(np.floor((end - start) * rate + 1e-6)) + 1
-    grid: Floats = start + np.arange(max(count, 0)) / rate
-    return grid
+    return start + np.arange(max(count, 0)) / rate
 
 
 def hold_indices(at: Floats, times: Floats) -> Ints:
@@ -110,8 +109,7 @@ def _fit_slopes(at: Floats, times: Floats, values: Floats, first: Ints, last: In
     normal[:, 2, 2] += 1e-9
     reference = values[np.clip(first, 0, times.size - 1)]
     right = np.einsum("mwi,mwk->mik", powers, (values[index] - reference[:, None, :]) * inside[..., None])
-    solved: Floats = np.linalg.solve(normal, right)[:, 1, :] / window
-    return solved
+    return np.linalg.solve(normal, right)[:, 1, :] / window
 
 
 def interpolate_linearly(at: Floats, times: Floats, values: Floats) -> Floats:

@@ -115,8 +115,7 @@ def suggest_manoeuvre(*effects: Effect) -> str:
 
 def _shift(selection: Selection, final: CandidateModel, candidate: Candidate) -> Floats:
     changed = selection.part.find_residuals(final.state.add(candidate().make_usual(selection.largest)))
-    shift: Floats = final.fit.residual - changed
-    return shift
+    return final.fit.residual - changed
 
 
 def _evidence(selection: Selection, final: CandidateModel, shift: Floats) -> tuple[float, float]:

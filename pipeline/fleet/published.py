@@ -63,8 +63,7 @@ class _Steps:
 
     def lay_out(self, values: Floats) -> Floats:
         """Values (n, 2) as (steps, longest, 2); beyond a step's end its last sample goes on."""
-        laid: Floats = values[np.where(self.index < 0, self.index.max(axis=1, keepdims=True), self.index)]
-        return laid
+        return values[np.where(self.index < 0, self.index.max(axis=1, keepdims=True), self.index)]
 
 
 def follow_published(

@@ -88,5 +88,4 @@ def _leave_out(folds: pl.DataFrame, channel: str, names: list[str]) -> Floats:
 
 
 def _stack(folds: pl.DataFrame, column: str) -> Floats:
-    stacked: Floats = np.array(folds[column].to_list(), dtype=np.float64)
-    return stacked
+    return np.array(folds[column].to_list(), dtype=np.float64)

@@ -194,8 +194,7 @@ def _sum_stretches(problem: Problem, held: HeldOut, length_scale_m: float) -> Fl
 def _add_up(stretch: Ints, squares: Floats, unit: Ints) -> Floats:
     known = np.isfinite(squares)
     sums = np.bincount(stretch[known], squares[known], minlength=int(unit.max()) + 1)
-    parts: Floats = sums / max(int(known.sum()), 1)
-    return parts
+    return sums / max(int(known.sum()), 1)
 
 
 def _make_budget(source: str, quantity: str, split: Split, floor: float, column: int) -> SlipBudget:

@@ -24,14 +24,12 @@ def pick_columns(columns: Floats, places: Sequence[int]) -> Floats:
     """The columns at these places; the same array where it is all of them."""
     if list(places) == list(range(columns.shape[2])):
         return columns
-    picked: Floats = columns.transpose(2, 0, 1)[list(places)].transpose(1, 2, 0)
-    return picked
+    return columns.transpose(2, 0, 1)[list(places)].transpose(1, 2, 0)
 
 
 def pick_windows(columns: Floats, windows: Flags) -> Floats:
     """The rows of some windows, flags of shape (n,)."""
-    picked: Floats = columns.transpose(2, 0, 1)[:, windows].transpose(1, 2, 0)
-    return picked
+    return columns.transpose(2, 0, 1)[:, windows].transpose(1, 2, 0)
 
 
 def flatten(columns: Floats) -> Floats:
@@ -46,5 +44,4 @@ def weigh_columns(columns: Floats, factor: Floats) -> Floats:
 
 def combine_columns(columns: Floats, step: Floats) -> Floats:
     """Sum of the columns, each times its part of a step of shape (p,), shape (n, 3)."""
-    combined: Floats = (flatten(columns) @ step).reshape(columns.shape[:2])
-    return combined
+    return (flatten(columns) @ step).reshape(columns.shape[:2])

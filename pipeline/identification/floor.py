@@ -90,8 +90,7 @@ def estimate_floor(problem: Problem) -> Errors:
 def _share_lever(w: Makeup, turned: Floats) -> Floats:
     """Variance of the mean heading error on the way: of the pose it began with, and of a walk since then."""
     start = np.full(turned.size, w.pose_noise**2)
-    lever: Floats = start + np.maximum(turned - 2.0 * start, 0.0) / 3.0
-    return lever
+    return start + np.maximum(turned - 2.0 * start, 0.0) / 3.0
 
 
 def _describe(comparison: Comparison) -> tuple[Floats, Floats]:
@@ -170,5 +169,4 @@ def _hold(values: Floats) -> Floats:
     """Values held at three spreads: what a jump of the poses or a late transient leaves is no noise."""
     size = np.abs(values)
     spread = np.maximum(1.4826 * np.median(size, axis=0), _SHARE_OF_RMS * np.sqrt(np.mean(size**2, axis=0)))
-    held: Floats = np.clip(values, -_CLIP * spread, _CLIP * spread)
-    return held
+    return np.clip(values, -_CLIP * spread, _CLIP * spread)

@@ -230,8 +230,7 @@ def _find_spread(part: Part, blocks: Blocks, total: Floats, rows: Ints, size: Fl
     """Covariance of the observable numbers; None where nothing tells it."""
     if rows.size and part.prior.numbers:
         scale = np.outer(size[rows], size[rows])
-        spread: Floats = part.prior.excess * np.linalg.inv(total[np.ix_(rows, rows)] / scale) / scale
-        return spread
+        return part.prior.excess * np.linalg.inv(total[np.ix_(rows, rows)] / scale) / scale
     if rows.size and blocks.count > 1:
         return _jackknife(blocks.normals, blocks.gradients, rows, size)
     return None

@@ -235,8 +235,7 @@ class WheelPart(Part):
             self._seen[run, late] = average_windows(comparison, wheels, self._spans[run])
         drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
         driven = comparison.predict_velocity(drive, _NO_DELAY)
-        residual: Floats = self._seen[run, late] - average_windows(comparison, driven, self._spans[run])
-        return residual
+        return self._seen[run, late] - average_windows(comparison, driven, self._spans[run])
 
     def list_clock_errors(self) -> Floats:
         """See `Part`: wheels that are read now and then step somewhere between two readings."""
@@ -290,8 +289,7 @@ class Spans:
         total = comparison.cells.sum_up(signal)
         end = total[self.last] + self.into_last * (total[self.last + 1] - total[self.last])
         start = total[self.first] + self.into_first * (total[self.first + 1] - total[self.first])
-        means: Signal = (end - start) / self.width
-        return means
+        return (end - start) / self.width
 
 
 def locate_windows(comparison: Comparison, late: float = 0.0) -> Spans:

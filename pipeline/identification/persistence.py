@@ -76,8 +76,7 @@ class Makeup:
         if lasting:
             for share, time in zip(self.lasting.tolist(), _LASTING_S, strict=True):
                 total = total + share * _grow(seconds, time) / _grow(np.array([WINDOW_S]), time) * WINDOW_S**2
-        grown: Floats = total
-        return grown
+        return total
 
 
 def split_residuals(comparisons: Sequence[Comparison], residuals: Floats) -> tuple[Makeup, Makeup, Makeup]:
@@ -114,8 +113,7 @@ def _covary(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
             kept = good[first] & good[second]
             sums[:, lag] += (mine[first[kept]] * mine[second[kept]]).sum(axis=0)
             counts[lag] += int(kept.sum())
-    means: Floats = sums / np.maximum(counts, 1.0)
-    return means
+    return sums / np.maximum(counts, 1.0)
 
 
 def take_own_past(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
@@ -223,5 +221,4 @@ def _repeat(time: float) -> Floats:
 def _grow(seconds: Floats, time: float) -> Floats:
     """Variance of the integral of such a signal of variance one."""
     ratio = seconds / time
-    grown: Floats = 2.0 * time**2 * (ratio - 1.0 + np.exp(-ratio))
-    return grown
+    return 2.0 * time**2 * (ratio - 1.0 + np.exp(-ratio))

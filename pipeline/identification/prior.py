@@ -45,13 +45,11 @@ class Prior:
         """Information on each of all free numbers, zero where nothing is known, shape (p,)."""
         away, known = self._compare(state, free)
         held = (_FREEDOM + np.count_nonzero(known)) / (_FREEDOM + known @ away**2)
-        information: Floats = self.excess * held * known
-        return information
+        return self.excess * held * known
 
     def pull(self, state: State, free: Sequence[Free]) -> Floats:
         """Half the fall of the cost with each of all free numbers, shape (p,)."""
-        pull: Floats = self.weigh(state, free) * self._compare(state, free)[0]
-        return pull
+        return self.weigh(state, free) * self._compare(state, free)[0]
 
     def _compare(self, state: State, free: Sequence[Free]) -> tuple[Floats, Floats]:
         """Way from each number to its mean, and one over its variance; zeros where nothing is known."""

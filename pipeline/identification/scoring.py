@@ -136,8 +136,7 @@ def _score_fold(
 def _find_tested(comparison: Comparison, times: Floats, test: Flags) -> Flags:
     """Predictions of which the middle lies nearest to a tested window: each is tested in one fold."""
     middle, windows = comparison.horizons.times.mean(axis=1), times.mean(axis=1)
-    tested: Flags = test[nearest_indices(middle, windows)]
-    return tested
+    return test[nearest_indices(middle, windows)]
 
 
 def score(problem: Problem, state: State) -> HeldOut:

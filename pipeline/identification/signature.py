@@ -208,8 +208,7 @@ class _Bins:
     def regress(self, residual: Floats) -> Floats:
         """Least squares factor of the scale in every bin: the mean where the scale is one, shape (k,)."""
         power = np.bincount(self.number, self.scale**2)
-        factors: Floats = np.bincount(self.number, residual * self.scale) / np.maximum(power, 1e-12)
-        return factors
+        return np.bincount(self.number, residual * self.scale) / np.maximum(power, 1e-12)
 
     def explain(self, curve: Floats) -> float:
         """Share of the mean square of a curve, over all windows, that is a function of the variable."""

@@ -35,22 +35,19 @@ class Weights:
         """Residuals in units of their spread, square-rooted Huber weights included, shape (n, 3)."""
         scaled = residual / self.scale
         size = np.abs(scaled)
-        shrunk: Floats = scaled * np.sqrt(self.clip / np.maximum(size, self.clip))
-        return shrunk
+        return scaled * np.sqrt(self.clip / np.maximum(size, self.clip))
 
     def factors(self, residual: Floats) -> Floats:
         """Factors that turn rows of a Jacobian into those of `weigh`, shape (n, 3)."""
         size = np.abs(residual / self.scale)
-        factors: Floats = np.sqrt(self.clip / np.maximum(size, self.clip)) / self.scale
-        return factors
+        return np.sqrt(self.clip / np.maximum(size, self.clip)) / self.scale
 
     def cost(self, residual: Floats) -> Floats:
         """Huber cost of every window, shape (n,)."""
         size = np.abs(residual / self.scale)
         held = np.minimum(size, self.clip)
         each = held * (2.0 * size - held)
-        total: Floats = each[:, 0] + each[:, 1] + each[:, 2]
-        return total
+        return each[:, 0] + each[:, 1] + each[:, 2]
 
     def loss(self, residual: Floats) -> float:
         """Mean cost of a window."""

@@ -41,8 +41,7 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
     else:
         before += (signal[resets.first] - before[resets.first])[resets.number] * from_first
         before += (known - before[resets.at])[resets.number] * from_set
-    lagged: Signal = signal + (before - signal) * (tau / step_s * (1.0 - decay))
-    return lagged
+    return signal + (before - signal) * (tau / step_s * (1.0 - decay))
 
 
 def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, start: Floats) -> Floats:

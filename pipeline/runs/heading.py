@@ -146,8 +146,7 @@ def _refine(
     scale, bias, delay = values
 
     def turn(late: float) -> Floats:
-        change: Floats = np.interp(end - late, times, angle) - np.interp(start - late, times, angle)
-        return change
+        return np.interp(end - late, times, angle) - np.interp(start - late, times, angle)
 
     error = np.inf
     unit = np.unique(((start - times[0]) // _UNIT_S).astype(np.int64), return_inverse=True)[1]
@@ -194,8 +193,7 @@ def _pair_up(track: Track, run: MotionRun) -> tuple[Ints, Ints]:
 
 def has_barred(barred: Floats, start: Floats, end: Floats) -> Flags:
     """Whether a barred sample lies in each closed interval."""
-    inside: Flags = np.searchsorted(barred, end + 1e-9) > np.searchsorted(barred, start - 1e-9)
-    return inside
+    return np.searchsorted(barred, end + 1e-9) > np.searchsorted(barred, start - 1e-9)
 
 
 def mark_barred(run: MotionRun, times: Floats) -> Flags:

@@ -76,8 +76,7 @@ class GyroFit:
 
     def turn(self, times: Floats, rate: Floats) -> Floats:
         """Angle that the gyro has turned by [rad], of its own rate [rad/s] at times [s], shape (n,)."""
-        angle: Floats = self.signed_scale * timegrid.integrate_rate(times, rate) + self.bias * times
-        return angle
+        return self.signed_scale * timegrid.integrate_rate(times, rate) + self.bias * times
 
 
 @dataclass(frozen=True)

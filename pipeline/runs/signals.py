@@ -192,8 +192,7 @@ class Resets:
     @cached_property
     def since_first(self) -> Integers:
         """How many cells after its reset each cell comes, shape (n,)."""
-        since: Integers = np.arange(self.number.size) - self.first[self.number]
-        return since
+        return np.arange(self.number.size) - self.first[self.number]
 
     @cached_property
     def since_set(self) -> Integers:

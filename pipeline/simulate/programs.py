@@ -120,8 +120,7 @@ def _jitter_stamps(time: Floats, program: Program, generator: np.random.Generato
     noise = np.clip(generator.standard_normal(time.size) * program.jitter_s, -bound, bound)
     # A phase keeps commands off the instants of the poses, as on any robot.
     phase = 0.37 / program.rate_hz
-    stamps: Floats = time + phase + noise
-    return stamps
+    return time + phase + noise
 
 
 def _steps(time: Floats, space: _Space) -> Drawn:
@@ -142,8 +141,7 @@ def _ramps(time: Floats, space: _Space) -> Drawn:
 
 
 def _triangle(cycles: Floats) -> Floats:
-    wave: Floats = 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * cycles))
-    return wave
+    return 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * cycles))
 
 
 def _smooth(time: Floats, space: _Space) -> Drawn:

@@ -123,8 +123,7 @@ def _turn_rates(path: Path, time: Floats, step: float) -> Floats:
     turned = rigid.multiply_quaternions(
         rigid.invert_quaternions(path.quaternion[before]), path.quaternion[after]
     )
-    rates: Floats = rigid.rotation_vectors(turned) / ((after - before) * step)[:, None]
-    return rates
+    return rigid.rotation_vectors(turned) / ((after - before) * step)[:, None]
 
 
 def _specific_forces(path: Path, time: Floats, step: float) -> Floats:

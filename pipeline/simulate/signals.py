@@ -48,16 +48,14 @@ def lag_signal(signal: Floats, *, tau_s: float, step_s: float) -> Floats:
         return signal
     decay = float(np.exp(-step_s / tau_s))
     at_end = filter_pole(signal * (1.0 - decay), decay)
-    means: Floats = 0.5 * (at_end + np.concatenate(([0.0], at_end[:-1])))
-    return means
+    return 0.5 * (at_end + np.concatenate(([0.0], at_end[:-1])))
 
 
 def filter_pole(signal: Floats, pole: float) -> Floats:
     """The recurrence y_k = pole y_(k-1) + u_k from rest."""
     from scipy.signal import lfilter  # noqa: PLC0415 - heavy, and the room is imported by the command line
 
-    filtered: Floats = np.asarray(lfilter([1.0], [1.0, -pole], signal), dtype=np.float64)
-    return filtered
+    return np.asarray(lfilter([1.0], [1.0, -pole], signal), dtype=np.float64)
 
 
 def follow(signal: Floats, step: Callable[[float, float], float]) -> Floats:
@@ -114,5 +112,4 @@ def walk_in_plane(along: Floats, aside: Floats, heading: Floats, *, step_s: floa
 
 def integrate_cells(signal: Floats, *, step_s: float) -> Floats:
     """Integral at the cell edges, shape (n + 1,), starting from zero."""
-    total: Floats = np.concatenate(([0.0], np.cumsum(signal) * step_s))
-    return total
+    return np.concatenate(([0.0], np.cumsum(signal) * step_s))

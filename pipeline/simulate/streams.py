@@ -18,5 +18,4 @@ def open_stream(seed: int, purpose: str) -> np.random.Generator:
 def spread_times(count: int, *, duration_s: float, generator: np.random.Generator) -> Floats:
     """One random time [s] in each of ``count`` equal parts of the middle 80 %, so that faults stay apart."""
     part = 0.8 * duration_s / max(count, 1)
-    times: Floats = 0.1 * duration_s + (np.arange(count) + generator.uniform(0.2, 0.8, count)) * part
-    return times
+    return 0.1 * duration_s + (np.arange(count) + generator.uniform(0.2, 0.8, count)) * part

@@ -81,12 +81,10 @@ def number_steps(times: Floats, segment: NDArray[np.int32], changes: Flags) -> N
     starts = np.zeros(times.size, dtype=bool)
     starts[places[held | np.concatenate(([True], held[:-1]))]] = True
     starts[1:] |= np.diff(segment) != 0
-    numbers: NDArray[np.int32] = (np.cumsum(starts) - 1).astype(np.int32)
-    return numbers
+    return (np.cumsum(starts) - 1).astype(np.int32)
 
 
 def mark_transitory(times: Floats, changes: Flags, span: float) -> Flags:
     """Whether each sample lies within ``span`` [s] of the last change of the command."""
     last = np.maximum.accumulate(np.where(changes, np.arange(times.size), 0))
-    marked: Flags = times - times[last] < span - 1e-6
-    return marked
+    return times - times[last] < span - 1e-6

@@ -78,5 +78,4 @@ def number_blocks(ticks: ArrayLike, pieces: ArrayLike, length: float) -> Ints:
 
 def _autocorrelate(signal: Floats, size: int) -> Floats:
     spectrum = np.fft.rfft(signal, size)
-    product: Floats = np.fft.irfft(spectrum * np.conj(spectrum), size)
-    return product
+    return np.fft.irfft(spectrum * np.conj(spectrum), size)

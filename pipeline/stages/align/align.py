@@ -241,8 +241,7 @@ def _spread_to_poses(grid: _Grid, times: Floats) -> Flags:
     """Whether the sample of the grid nearest to each pose is in a bad stretch, shape (m,)."""
     if not grid.bad.any():
         return np.zeros(times.size, dtype=bool)
-    found: Flags = grid.bad[timegrid.nearest_indices(times, grid.velocities["t"].to_numpy())]
-    return found
+    return grid.bad[timegrid.nearest_indices(times, grid.velocities["t"].to_numpy())]
 
 
 def _describe_wheels(late: float) -> list[Finding]:

@@ -58,8 +58,7 @@ def _fill(begin: Floats, end: Floats, origin: float) -> Floats:
     first = np.floor((begin - origin) / SAMPLE_S + _ROUNDING)
     last = np.ceil((end - origin) / SAMPLE_S - _ROUNDING)
     ticks = [np.arange(a, b + 1) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
-    times: Floats = origin + np.unique(np.concatenate(ticks)) * SAMPLE_S if ticks else np.zeros(0)
-    return times
+    return origin + np.unique(np.concatenate(ticks)) * SAMPLE_S if ticks else np.zeros(0)
 
 
 def _pair_up(run: MotionRun) -> tuple[Ints, Ints]:
@@ -86,8 +85,7 @@ def _measure_misfit(run: MotionRun, wheels: DriveSeries, vehicle: Vehicle, first
     def drive(rate: Floats, late: float) -> Floats:
         way = timegrid.integrate_rate(wheels.times, rate)
         at = track.times - delay - late
-        whole: Floats = np.interp(at[last], wheels.times, way) - np.interp(at[first], wheels.times, way)
-        return whole
+        return np.interp(at[last], wheels.times, way) - np.interp(at[first], wheels.times, way)
 
     own = (heading[last] - heading[first]) / span
     along = [drive(forward, late) for late in _LAGS_S]
@@ -105,8 +103,7 @@ def _measure_misfit(run: MotionRun, wheels: DriveSeries, vehicle: Vehicle, first
     gap = np.column_stack([_fit_robustly(columns, part) for part in (moved.real, moved.imag)])
     size = np.hypot(gap[:, 0], gap[:, 1])
     usual = _spread_by_speed(size, speed / span)
-    misfit: Floats = size / np.maximum(_FAR * usual, _LEAST_M)
-    return misfit
+    return size / np.maximum(_FAR * usual, _LEAST_M)
 
 
 def _choose_heading(run: MotionRun) -> tuple[Floats, float]:
@@ -144,5 +141,4 @@ def _spread_by_speed(size: Floats, speed: Floats) -> Floats:
     usual = np.array([np.median(size[place == k]) if (place == k).any() else np.nan for k in range(_BINS)])
     known = np.isfinite(middle)
     # The median of the length of two normal parts is 1.18 times the spread of either.
-    spread: Floats = np.interp(speed, middle[known], np.maximum.accumulate(usual[known])) / 1.18
-    return spread
+    return np.interp(speed, middle[known], np.maximum.accumulate(usual[known])) / 1.18

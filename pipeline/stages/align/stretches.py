@@ -233,5 +233,4 @@ def _fit_angle(turned: Floats, angle: Floats) -> tuple[float, float]:
 
 
 def _wrap(angle: Floats) -> Floats:
-    wrapped: Floats = np.mod(angle + np.pi, 2.0 * np.pi) - np.pi
-    return wrapped
+    return np.mod(angle + np.pi, 2.0 * np.pi) - np.pi

@@ -241,8 +241,7 @@ def _put_on_course(times: Floats, turned: Callable[[Floats], Floats], course: Co
         offset = np.angle(add_up(np.exp(1j * (off - skid * rate))))
         rest = rigid.wrap_angle(off - skid * rate - offset)
         skid += float(np.sum(weight * rest * varying)) / max(float(np.sum(weight * varying**2)), 1e-12)
-    yaw: Floats = turned(times) + np.interp(times, clock, np.unwrap(offset))
-    return yaw
+    return turned(times) + np.interp(times, clock, np.unwrap(offset))
 
 
 def _turn_rate(turned: Callable[[Floats], Floats], at: Floats) -> Floats:
