@@ -77,29 +77,13 @@ class _Node:
     constant: float | None = None
 
 
-def _keep(unit: Unit) -> Unit:
-    return unit
-
-
-def _root(unit: Unit) -> Unit:
-    return unit.power(Fraction(1, 2))
-
-
 # Functions of plain numbers give plain numbers; the others say what they do to the unit.
 _PLAIN_FUNCTIONS: dict[str, Callable[[Floats | float], Floats | float]] = {
-    "sin": np.sin,
-    "cos": np.cos,
-    "tan": np.tan,
-    "asin": np.arcsin,
-    "acos": np.arccos,
-    "atan": np.arctan,
-    "tanh": np.tanh,
-    "exp": np.exp,
-    "log": np.log,
+    name: getattr(np, name) for name in ("sin", "cos", "tan", "asin", "acos", "atan", "tanh", "exp", "log")
 }
 _UNIT_FUNCTIONS: dict[str, tuple[Callable[[Floats | float], Floats | float], Callable[[Unit], Unit]]] = {
-    "abs": (np.abs, _keep),
-    "sqrt": (np.sqrt, _root),
+    "abs": (np.abs, lambda unit: unit),
+    "sqrt": (np.sqrt, lambda unit: unit.power(Fraction(1, 2))),
     "sign": (np.sign, lambda _unit: PLAIN),
 }
 _PAIR_FUNCTIONS: dict[str, tuple[Callable[[Floats | float, Floats | float], Floats | float], bool]] = {

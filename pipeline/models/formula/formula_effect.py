@@ -5,6 +5,7 @@ import keyword
 import math
 import unicodedata
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -17,21 +18,37 @@ from pipeline.runs.errors import MotionError
 from pipeline.runs.signals import Rolling, RunContext, Velocity, roll_ideally
 from pipeline.vehicles import Vehicle
 
-_BASE_UNITS = {
-    "v0": "m/s",
-    "w0": "rad/s",
-    "s0": "m/s",
-    "f_x": "m/s",
-    "f_w": "rad/s",
-    "roll": "rad",
-    "pitch": "rad",
-    "yaw": "rad",
-    "x": "m",
-    "y": "m",
-    "left": "rad/s",
-    "right": "rad/s",
-    "steering": "rad",
+
+@dataclass(frozen=True)
+class _Driven:
+    """What signals are read from."""
+
+    rolling: Rolling
+    around: RunContext
+
+    @functools.cached_property
+    def ideal(self) -> Rolling:
+        """Ideal motion of the same wheels."""
+        return roll_ideally(self.rolling.wheels, self.around)
+
+
+# Signals that have a rate too, with their units.
+_SIGNALS: Mapping[str, tuple[str, Callable[[_Driven], Floats]]] = {
+    "v0": ("m/s", lambda now: now.rolling.v0),
+    "w0": ("rad/s", lambda now: now.rolling.w0),
+    "s0": ("m/s", lambda now: now.rolling.velocity.y),
+    "f_x": ("m/s", lambda now: now.ideal.v0),
+    "f_w": ("rad/s", lambda now: now.ideal.w0),
+    "roll": ("rad", lambda now: now.around.attitude[:, 0]),
+    "pitch": ("rad", lambda now: now.around.attitude[:, 1]),
+    "yaw": ("rad", lambda now: now.around.attitude[:, 2]),
+    "x": ("m", lambda now: now.around.place[:, 0]),
+    "y": ("m", lambda now: now.around.place[:, 1]),
+    "left": ("rad/s", lambda now: now.rolling.wheels.left),
+    "right": ("rad/s", lambda now: now.rolling.wheels.right),
+    "steering": ("rad", lambda now: now.rolling.wheels.steering),
 }
+_BASE_UNITS = {name: unit for name, (unit, _) in _SIGNALS.items()}
 SIGNAL_UNITS: Mapping[str, str] = {
     **_BASE_UNITS,
     **{f"{name}_rate": f"{unit}/s" if "/" not in unit else f"{unit}^2" for name, unit in _BASE_UNITS.items()},
@@ -129,11 +146,11 @@ class FormulaEffect(AddedEffect):
 
     def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
         """Add the formulas' values."""
-        signals = _Signals(rolling, around)
+        now = _Driven(rolling, around)
         added = {}
         for channel, expression in self.expressions.items():
             known: dict[str, Floats | float] = {
-                name: self.values[name] if name in self.values else signals.read(name)
+                name: self.values[name] if name in self.values else _read(now, name)
                 for name in expression.names
             }
             added[channel] = expression.evaluate(known)
@@ -184,38 +201,16 @@ def _parse_signal_units() -> Mapping[str, Unit]:
     return {name: parse_unit(unit, name) for name, unit in SIGNAL_UNITS.items()}
 
 
-class _Signals:
-    """Named signals of a run, made when they are asked for."""
-
-    def __init__(self, rolling: Rolling, around: RunContext) -> None:
-        ideal = roll_ideally(rolling.wheels, around)
-        self._around = around
-        self._makers: Mapping[str, Callable[[], Floats]] = {
-            "v0": lambda: rolling.v0,
-            "w0": lambda: rolling.w0,
-            "s0": lambda: rolling.velocity.y,
-            "f_x": lambda: ideal.v0,
-            "f_w": lambda: ideal.w0,
-            "roll": lambda: around.attitude[:, 0],
-            "pitch": lambda: around.attitude[:, 1],
-            "yaw": lambda: around.attitude[:, 2],
-            "x": lambda: around.place[:, 0],
-            "y": lambda: around.place[:, 1],
-            "left": lambda: rolling.wheels.left,
-            "right": lambda: rolling.wheels.right,
-            "steering": lambda: rolling.wheels.steering,
-            "t": lambda: around.times,
-        }
-
-    def read(self, name: str) -> Floats:
-        """A signal on the cells."""
-        if name in self._makers:
-            return self._makers[name]()
-        rate = np.gradient(self._makers[name.removesuffix("_rate")]()) / self._around.step_s
-        # Between spans there is no rate.
-        rate[self._around.spans.first] = 0.0
-        rate[np.maximum(self._around.spans.first - 1, 0)] = 0.0
-        return np.where(np.isfinite(rate), rate, 0.0)
+def _read(now: _Driven, name: str) -> Floats:
+    if name == "t":
+        return now.around.times
+    if name in _SIGNALS:
+        return _SIGNALS[name][1](now)
+    rate = np.gradient(_SIGNALS[name.removesuffix("_rate")][1](now)) / now.around.step_s
+    # Between spans there is no rate.
+    rate[now.around.spans.first] = 0.0
+    rate[np.maximum(now.around.spans.first - 1, 0)] = 0.0
+    return np.where(np.isfinite(rate), rate, 0.0)
 
 
 def make_parameter(name: str, unit: str, bounds: tuple[float, float], *, neutral: float = 0.0) -> Parameter:
