@@ -1,14 +1,13 @@
-"""The named scenarios: what ``cases.toml`` says, on the bases here."""
+"""The named scenarios: what ``cases.toml`` says, on the bases of ``bases.toml``."""
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass, replace
-from importlib import resources
 from typing import Any, TypeVar
 
+from pipeline.simulate.facts import read_facts
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer
-from pipeline.simulate.scenario import Disturbance, PoseSensor, Program, Scenario, State
+from pipeline.simulate.scenario import Scenario, State
 from pipeline.simulate.vehicles import VEHICLES
 
 Made = TypeVar("Made")
@@ -24,37 +23,11 @@ class Case:
     machine: SkidSteer | None = None
 
 
-_ICP = PoseSensor(
-    noise_m=0.004,
-    noise_rad=0.002,
-    noise_z_m=0.004,
-    noise_tilt_rad=0.001,
-    drift_m=0.01,
-    drift_rad=0.002,
-    latency_s=0.06,
-    latency_jitter_s=0.008,
-)
-_HUSKY = Scenario(pose=_ICP, disturbance=Disturbance(0.01, 0.015), duration_s=180.0)
-_WARTHOG = replace(
-    _HUSKY,
-    vehicle=VEHICLES["warthog"],
-    program=Program(speed_scale=0.6, turn_scale=0.7),
-    disturbance=Disturbance(0.03, 0.04),
-)
-_CAR = replace(
-    _HUSKY,
-    vehicle=VEHICLES["car"],
-    program=Program(speed_scale=0.5),
-    disturbance=Disturbance(0.02, 0.02),
-)
-_BASES = {"husky": _HUSKY, "warthog": _WARTHOG, "car": _CAR}
-
-
 def _ride_oval_wheel(state: State) -> tuple[float, float, float]:
     # An out-of-round left wheel: 4 % of radius, once a turn.
-    uneven = 0.04 * math.sin(state.left_angle)
-    rim = _HUSKY.vehicle.wheel_radius_m * state.left_speed
-    return 0.5 * uneven * rim, 0.0, -uneven * rim / _HUSKY.vehicle.track_width_m
+    vehicle, uneven = VEHICLES["husky"], 0.04 * math.sin(state.left_angle)
+    rim = vehicle.wheel_radius_m * state.left_speed
+    return 0.5 * uneven * rim, 0.0, -uneven * rim / vehicle.track_width_m
 
 
 _EXTRAS = {"oval_wheel": _ride_oval_wheel}
@@ -70,21 +43,25 @@ def _change(base: Made, changes: Mapping[str, Any]) -> Made:
     return replace(base, **fields)  # type: ignore[type-var]
 
 
-def _make_case(name: str, given: dict[str, Any]) -> Case:
-    shows, base, machine = given.pop("shows"), _BASES[given.pop("base")], given.pop("machine", None)
-    if isinstance(machine, str):
-        machine = {"base": machine}
+def _change_scenario(base: Scenario, given: dict[str, Any]) -> Scenario:
     if isinstance(given.get("vehicle"), str):
         given["vehicle"] = VEHICLES[given["vehicle"]]
     if "extra" in given:
         given["extra"] = _EXTRAS[given["extra"]]
+    return _change(base, given)
+
+
+_BASES: dict[str, Scenario] = {}
+for _name, _given in read_facts("bases.toml").items():
+    _BASES[_name] = _change_scenario(_BASES.get(_given.pop("base", ""), Scenario()), _given)
+
+
+def _make_case(name: str, given: dict[str, Any]) -> Case:
+    shows, base, machine = given.pop("shows"), _BASES[given.pop("base")], given.pop("machine", None)
+    if isinstance(machine, str):
+        machine = {"base": machine}
     made = None if machine is None else _change(MACHINES[machine.pop("base")], machine)
-    return Case(name, shows, _change(base, given), made)
+    return Case(name, shows, _change_scenario(base, given), made)
 
 
-CASES: tuple[Case, ...] = tuple(
-    _make_case(name, given)
-    for name, given in tomllib.loads(
-        resources.files("pipeline.simulate").joinpath("cases.toml").read_text("utf-8")
-    ).items()
-)
+CASES = tuple(_make_case(name, given) for name, given in read_facts("cases.toml").items())

@@ -5,13 +5,12 @@ velocity) and ``localization`` (what the pose reports). Signs follow REP-103: x 
 """
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any
 
 from pipeline.simulate.errors import SimulateError, unknown_name
+from pipeline.simulate.facts import read_facts
 from pipeline.simulate.vehicles import Kind
 
 _INF = math.inf
@@ -47,10 +46,7 @@ def _read_effect(name: str, given: dict[str, Any]) -> EffectSpec:
 
 
 CATALOGUE: dict[str, EffectSpec] = {
-    name: _read_effect(name, given)
-    for name, given in tomllib.loads(
-        resources.files("pipeline.simulate").joinpath("effects.toml").read_text("utf-8")
-    ).items()
+    name: _read_effect(name, given) for name, given in read_facts("effects.toml").items()
 }
 
 

@@ -5,14 +5,13 @@ The names are those of the published recordings and of common robot configuratio
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
-from importlib import resources
 from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 
 from pipeline.simulate.errors import SimulateError, unknown_name
+from pipeline.simulate.facts import read_facts
 
 if TYPE_CHECKING:
     from pipeline.simulate.published import Published
@@ -78,12 +77,7 @@ def _read_layout(given: dict[str, Any]) -> Layout:
     return Layout(given.pop("kind"), commands, wheels, PoseTopic(**given.pop("pose")), **given)
 
 
-LAYOUTS: dict[str, Layout] = {
-    name: _read_layout(given)
-    for name, given in tomllib.loads(
-        resources.files("pipeline.simulate").joinpath("layouts.toml").read_text("utf-8")
-    ).items()
-}
+LAYOUTS: dict[str, Layout] = {name: _read_layout(given) for name, given in read_facts("layouts.toml").items()}
 
 
 def find_layout(layout: str | Layout, vehicle: Vehicle) -> Layout:

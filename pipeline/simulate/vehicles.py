@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pipeline.simulate.errors import SimulateError, unknown_name
+from pipeline.simulate.facts import read_facts
 
 Kind = Literal["differential", "ackermann", "mecanum", "omni"]
 
@@ -61,20 +62,7 @@ class Vehicle:
         return 0.5 * reach
 
 
-VEHICLES: dict[str, Vehicle] = {
-    "husky": Vehicle("husky_a200", "differential", 0.165, 0.55, 0.512, 1.0, max_turn_radps=1.0),
-    "warthog": Vehicle("warthog", "differential", 0.30, 1.08, 0.916, 5.0, max_turn_radps=2.0),
-    "jackal": Vehicle("jackal", "differential", 0.098, 0.37559, 0.262, 2.0, max_turn_radps=2.0),
-    "marmotte": Vehicle(
-        "marmotte_hd2", "differential", 0.116, 0.5927, 0.6, 1.2, max_turn_radps=1.5, wheels_per_side=1
-    ),
-    "turtlebot3": Vehicle(
-        "turtlebot3_burger", "differential", 0.033, 0.16, 0.08, 0.22, max_turn_radps=2.0, wheels_per_side=1
-    ),
-    "youbot": Vehicle("youbot", "mecanum", 0.0475, 0.3, 0.47, 0.8, max_turn_radps=1.2, max_sideways_mps=0.8),
-    "omni": Vehicle("omni_base", "omni", 0.05, 0.36, 0.36, 0.8, max_turn_radps=1.5, max_sideways_mps=0.8),
-    "car": Vehicle("ackermann_car", "ackermann", 0.31, 1.5, 2.6, 8.0, max_steering_rad=0.5),
-}
+VEHICLES = {name: Vehicle(**given) for name, given in read_facts("vehicles.toml").items()}
 _ALIASES = {vehicle.name: key for key, vehicle in VEHICLES.items()} | {"ackermann": "car"}
 
 
