@@ -8,7 +8,7 @@ from pipeline.identification.fit import Fitted, fit_model
 from pipeline.identification.inputs import InputChoice, choose_input
 from pipeline.identification.intervals import Estimates, estimate_intervals
 from pipeline.identification.ladder import climb
-from pipeline.identification.predict import Prediction, predict, predict_at, predict_at_from, predict_from
+from pipeline.identification.predict import Prediction, predict_at, predict_at_from, predict_from
 from pipeline.identification.problem import Problem
 from pipeline.identification.scoring import Errors, HeldOut, hold_out, score
 from pipeline.identification.state import Free, State

@@ -1,17 +1,17 @@
-"""Predicting: velocities and poses of a run from a model, over a horizon from measured states."""
+"""Predicting: velocities of a run from a model, and its poses over a horizon from measured states."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core.arrays import Floats
 from pipeline.identification.comparison import Comparison, Input
 from pipeline.models.effect import Effect
 from pipeline.models.forward import Timing
 from pipeline.models.model import Model
-from pipeline.runs.heading import HeadingSource
 from pipeline.runs.recording import MotionRun
+from pipeline.runs.windows import HORIZON_S
 
 
 @dataclass(frozen=True)
@@ -19,77 +19,34 @@ class Prediction:
     """What a model says of a run.
 
     Attributes:
-        times: times of the grid [s], shape (n,).
-        span: number of the stretch without a hole in the recording, shape (n,).
-        velocity: body velocity (v_x [m/s], v_y [m/s], v_w [rad/s]) as the localization would report it,
-            shape (n, 3).
         start_times: times at which predictions begin [s], shape (k,).
         poses: (x [m], y [m], yaw [rad]) in the map, by prediction and time since its start, shape (k, m, 3).
         horizon_times: times since a prediction's start [s], shape (m,).
     """
 
-    times: Floats
-    span: Ints
-    velocity: Floats
     start_times: Floats
     poses: Floats
     horizon_times: Floats
 
 
-def predict(
-    model: Model,
-    run: MotionRun,
-    source: Input,
-    *,
-    timing: Timing | None = None,
-    heading: HeadingSource = HeadingSource.AUTO,
-    horizon_s: float = 2.0,
-    rate_hz: float = 20.0,
-) -> Prediction:
-    """Predict a run.
-
-    Args:
-        model: with its values.
-        run: whose commands or wheels are followed, and from whose poses predictions begin.
-        source: what the model is fed with.
-        timing: delays of the recording; none by default.
-        heading: whose heading predictions begin with.
-        horizon_s: length of a prediction.
-        rate_hz: grid of the result; the model itself runs at `choose_rate`.
-
-    Raises:
-        MotionError: the run lacks the input.
-    """
-    comparison = Comparison(run, model.vehicle, source, heading=heading)
-    return predict_from(comparison, model.effects, timing or Timing(), horizon_s=horizon_s, rate_hz=rate_hz)
-
-
 def predict_from(
-    comparison: Comparison,
-    effects: Sequence[Effect],
-    timing: Timing,
-    *,
-    horizon_s: float = 2.0,
-    rate_hz: float = 20.0,
+    comparison: Comparison, effects: Sequence[Effect], timing: Timing, *, rate_hz: float = 20.0
 ) -> Prediction:
-    """Predict a run that has been made ready already: much cheaper for the second model on.
+    """Predict a run over `HORIZON_S` from where it was measured to be, again and again.
 
     Args:
         comparison: the run and its input.
         effects: of the model, with their values.
         timing: delays of the recording.
-        horizon_s: length of a prediction.
         rate_hz: grid of the result; the model itself runs at `choose_rate`.
     """
     velocity = comparison.predict_velocity(effects, timing)
     cells = comparison.cells
-    every = max(round(1.0 / (rate_hz * cells.step_s)), 1)
-    kept = slice(every // 2, None, every)
     start_times, start = comparison.list_starts()
     turned = cells.sum_up(velocity.w)
     own = np.exp(0.5j * (turned[1:] + turned[:-1]))
     travelled = cells.sum_up((velocity.x + 1j * velocity.y) * own)
-    since = np.arange(0.0, horizon_s + 0.5 / rate_hz, 1.0 / rate_hz)
+    since = np.arange(0.0, HORIZON_S + 0.5 / rate_hz, 1.0 / rate_hz)
     at = cells.locate_edges((start_times[:, None] + since).ravel())
     index = np.arange(turned.size, dtype=np.float64)
     yaw = np.interp(at, index, turned).reshape(start_times.size, since.size)
@@ -97,27 +54,11 @@ def predict_from(
     path = path.reshape(yaw.shape)
     turn = np.exp(1j * (start[:, 2] - yaw[:, 0]))
     moved = turn[:, None] * (path - path[:, :1])
-    poses = np.stack(
-        (
-            start[:, :1] + moved.real,
-            start[:, 1:2] + moved.imag,
-            start[:, 2:] + yaw - yaw[:, :1],
-        ),
-        axis=-1,
-    )
-    return Prediction(
-        times=cells.times[kept],
-        span=cells.span[kept],
-        velocity=np.column_stack((velocity.x[kept], velocity.y[kept], velocity.w[kept])),
-        start_times=start_times,
-        poses=poses,
-        horizon_times=since,
-    )
+    x, y, heading = start[:, :1] + moved.real, start[:, 1:2] + moved.imag, start[:, 2:] + yaw - yaw[:, :1]
+    return Prediction(start_times, np.stack((x, y, heading), axis=-1), since)
 
 
-def predict_at(
-    model: Model, run: MotionRun, source: Input, at: Floats, *, timing: Timing | None = None
-) -> Floats:
+def predict_at(model: Model, run: MotionRun, source: Input, at: Floats) -> Floats:
     """Body velocities of a model at given times, to set measured ones against: slip relative to the model.
 
     Args:
@@ -125,7 +66,6 @@ def predict_at(
         run: whose commands or wheels are followed.
         source: what the model is fed with.
         at: times of aligned poses [s], shape (n,).
-        timing: delays of the recording; none by default.
 
     Returns:
         (v_x [m/s], v_y [m/s], v_w [rad/s]) as the localization would report them, NaN in holes of the
@@ -135,7 +75,7 @@ def predict_at(
         MotionError: the run lacks the input.
     """
     comparison = Comparison(run, model.vehicle, source)
-    return predict_at_from(comparison, model.effects, timing or Timing(), at)
+    return predict_at_from(comparison, model.effects, Timing(), at)
 
 
 def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: Timing, at: Floats) -> Floats:

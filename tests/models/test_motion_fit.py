@@ -7,14 +7,15 @@ import pytest
 from motion_runs import WANDERING, simulate, vehicle_of
 
 from pipeline.identification import (
+    Comparison,
     Input,
     Problem,
     climb,
     estimate_intervals,
     fit_model,
     hold_out,
-    predict,
     predict_at,
+    predict_from,
     score,
 )
 from pipeline.identification.folds import GAP_S
@@ -229,13 +230,13 @@ def test_motion_that_lasts_is_no_noise_though_nothing_recorded_tells_of_it() -> 
 def test_predictions_begin_at_measured_poses_and_follow_the_true_motion() -> None:
     run = simulate({"effective_track": 1.8, "drive_lag": 0.3}, duration_s=60.0, disturbance=Disturbance())
     model = Model(HUSKY, (find_effect("effective_track")(k=1.8), find_effect("drive_lag")(tau=0.3)))
-    made = predict(model, run, Input.COMMAND, timing=Timing())
+    comparison = Comparison(run, HUSKY, Input.COMMAND)
+    made = predict_from(comparison, model.effects, Timing())
     assert made.poses.shape == (made.start_times.size, made.horizon_times.size, 3)
-    assert made.velocity.shape == (made.times.size, 3)
     ends = made.start_times + made.horizon_times[-1]
     seen = np.interp(ends, run.track.times, run.track.place[:, 0])
     assert np.sqrt(np.mean((made.poses[:, -1, 0] - seen) ** 2)) < 0.02
-    ideal = predict(model.ideal, run, Input.COMMAND, timing=Timing())
+    ideal = predict_from(comparison, (), Timing())
     turned = np.abs(ideal.poses[:, -1, 2] - made.poses[:, -1, 2])
     assert turned.max() > 0.3
 
@@ -246,12 +247,11 @@ def test_slip_against_the_true_model_is_noise_where_slip_against_the_ideal_is_no
     at = 0.5 * (run.track.times[2:] + run.track.times[:-2])
     turned = (run.track.heading[2:] - run.track.heading[:-2]) / (run.track.times[2:] - run.track.times[:-2])
     slips = [
-        np.nanstd(predict_at(model, run, Input.COMMAND, at, timing=Timing())[:, 2] - turned)
-        for model in (true, true.ideal)
+        np.nanstd(predict_at(model, run, Input.COMMAND, at)[:, 2] - turned) for model in (true, true.ideal)
     ]
     assert slips[0] < 0.03
     assert slips[1] > 0.1
-    outside = predict_at(true, run, Input.COMMAND, np.array([-5.0, 1e6]), timing=Timing())
+    outside = predict_at(true, run, Input.COMMAND, np.array([-5.0, 1e6]))
     assert np.isnan(outside).all()
 
 

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 from report_synthesis import make_report
 
-from pipeline.identification import Input, Problem, State, predict
+from pipeline.identification import Comparison, Input, Problem, State
 from pipeline.identification.correlation import autocorrelate, cross_correlate
 from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.models.model_text import format_model
@@ -132,10 +132,11 @@ def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFa
     view = MotionStage(Problem([run], vehicle(), Input.COMMAND), places).view(
         State(model.effects, (Timing(),)), (), None
     )
-    made = predict(model, run, Input.COMMAND)
+    comparison = Comparison(run, vehicle(), Input.COMMAND)
+    velocity = comparison.predict_velocity(model.effects, Timing())
 
     shown = view.velocity.sort("t")
-    expected = np.interp(shown["t"], made.times, made.velocity[:, 2])
+    expected = np.interp(shown["t"], comparison.cells.times, velocity.w)
     assert np.allclose(shown["v_w"], expected, atol=1e-9)
     starts = view.arcs.group_by("piece", maintain_order=True).first()
     for axis in "xy":
