@@ -4,14 +4,19 @@ A key is a hash of the keys above it, of the stage's own configuration and of th
 that is raised by whoever changes what the stage computes.
 """
 
+from __future__ import annotations
+
 import hashlib
 import json
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.analysis.log_setup import LogSetup
 from pipeline.analysis.options import STAGES
+
+if TYPE_CHECKING:
+    from pipeline.analysis.log_setup import LogSetup  # numerics that batches look up keys without
 
 VERSIONS: Mapping[str, int] = {"extract": 6, "align": 5, "velocity": 4, "slip": 6, "aggregate": 1}
 EXTRACTED = ("commands", "wheels", "poses", "imu")

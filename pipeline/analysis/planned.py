@@ -1,16 +1,21 @@
 """Drives that were planned for stored runs: where the report and the workbench show them."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from pipeline.core.paths import PathError, resolve_inside
-from pipeline.plan.plan import Plan
 from pipeline.report.pages import PLANS, lead_to, lead_up
 from pipeline.store import Manifest, Store
 from pipeline.store.files import make_folder, replace_file
 from pipeline.store.names import encode_run
+
+if TYPE_CHECKING:
+    from pipeline.plan.plan import Plan  # numerics that the workbench's pages do without
 
 PREVIEW = "plan.json"
 

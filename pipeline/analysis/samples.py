@@ -4,6 +4,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.analysis.compared_runs import ComparedRuns
+from pipeline.core.arrays import Ints
 from pipeline.fleet.pairs import Samples
 from pipeline.fleet.published import WINDOW_S, follow_published, read_limits
 
@@ -38,11 +39,7 @@ def _split_by_run(
     """Rows of a table on one input by run: suspect ones and numbers that are none left out."""
     frame = (
         compared.scan(table)
-        .filter(
-            pl.col("input") == input_name,
-            ~pl.col("suspect"),
-            pl.col(value).is_finite(),
-        )
+        .filter(pl.col("input") == input_name, ~pl.col("suspect"), pl.col(value).is_finite())
         .select("run", time, "segment", "step", value)
         .collect()
     )
@@ -85,15 +82,8 @@ def follow_published_runs(
 def _take_samples(part: pl.DataFrame) -> Samples:
     times = part["t"].to_numpy()
     period = float(np.median(np.diff(times)))
-    steps = part["step"].to_numpy()
-    sizes = np.unique(steps, return_counts=True)[1]
     ticks = np.round((times - times[0]) / max(period, 1e-6)).astype(np.int64)
-    return Samples(
-        values=part["modulus"].to_numpy(),
-        ticks=ticks,
-        pieces=part["segment"].to_numpy().astype(np.int64),
-        step=float(np.median(sizes)),
-    )
+    return _as_samples(part, "modulus", ticks)
 
 
 def _take_windows(norms: pl.DataFrame) -> Samples:
@@ -103,10 +93,14 @@ def _take_windows(norms: pl.DataFrame) -> Samples:
     ticks = np.maximum.accumulate(np.round((times - times[0]) / WINDOW_S).astype(np.int64))
     # Windows start where steps do, so two may round to one tick: count on from the last then.
     ticks = np.maximum.accumulate(ticks - np.arange(ticks.size)) + np.arange(ticks.size)
-    sizes = np.unique(order["step"].to_numpy(), return_counts=True)[1]
+    return _as_samples(order, "window_norm", ticks)
+
+
+def _as_samples(rows: pl.DataFrame, value: str, ticks: Ints) -> Samples:
+    sizes = np.unique(rows["step"].to_numpy(), return_counts=True)[1]
     return Samples(
-        values=order["window_norm"].to_numpy(),
+        values=rows[value].to_numpy(),
         ticks=ticks,
-        pieces=order["segment"].to_numpy().astype(np.int64),
+        pieces=rows["segment"].to_numpy().astype(np.int64),
         step=float(np.median(sizes)),
     )

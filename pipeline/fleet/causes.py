@@ -16,12 +16,12 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
+from pipeline.fleet.pairs import ABOUT_BLOCKS, BLOCKS, RUNS
 from pipeline.fleet.statistics.families import adjust_holm, runs_needed
 from pipeline.fleet.statistics.intervals import bound_difference
 from pipeline.fleet.statistics.permutation import permute_means
 from pipeline.identification.apportion import jackknife_ratio
 
-RUNS, BLOCKS = "runs", "blocks"
 _LEVEL = 0.05
 _WORTH_SAYING = 0.05
 _NO_PART = 0.01
@@ -196,7 +196,7 @@ def _compare(a: _Group, b: _Group) -> Difference:
         ends = (scale * (difference - half), scale * (difference + half))
         parts.append(CauseDifference(name, kind, scale * difference, *ends, p, q))
     parts.sort(key=lambda part: -abs(part.difference))
-    note = "this run against that run, not the terrain" if single else ""
+    note = ABOUT_BLOCKS if single else ""
     if not single and smallest * len(causes) > _LEVEL:
         note = (
             f"no cause can be significant with {a.table.shape[0]} and {b.table.shape[0]} runs; "
