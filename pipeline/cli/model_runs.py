@@ -11,19 +11,22 @@ from pipeline.cli.output import say, show_progress
 from pipeline.core.errors import SlipError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from pipeline.analysis.geometry import Owner
     from pipeline.analysis.options import Options
     from pipeline.analysis.stored import OpenedRun
     from pipeline.models.model_file import ModelFile
     from pipeline.runs.recording import MotionRun
+    from pipeline.store import Manifest
     from pipeline.vehicles import Vehicle
 
 
 @contextmanager
-def open_shown(name: str, options: Options, *, quiet: bool) -> Iterator[OpenedRun]:
-    """A run as `open_run` gives it, its progress shown; what there is to note is said afterwards."""
+def open_shown(
+    name: str, options: Options, *, quiet: bool, tell: Callable[[str], None] = say
+) -> Iterator[OpenedRun]:
+    """A run as `open_run` gives it, its progress shown; ``tell`` is given its note afterwards."""
     from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
 
     with (
@@ -32,7 +35,7 @@ def open_shown(name: str, options: Options, *, quiet: bool) -> Iterator[OpenedRu
     ):
         yield opened
     if opened.note and not quiet:
-        say(f"slip: {opened.note}")
+        tell(f"slip: {opened.note}")
 
 
 def gather_runs(
@@ -59,11 +62,15 @@ def gather_runs(
     if not names:
         raise SlipError("no_runs", "--on names no run", hint="Give logs, or runs of the results folder")
     options = Options(out=out, report=False, diagnosis=True)
-    manifests = []
+    manifests: list[Manifest] = []
+    notes: list[str] = []
     for name in names:
-        with open_shown(name, options, quiet=quiet) as opened:
+        with open_shown(name, options, quiet=quiet, tell=notes.append) as opened:
             manifests.append(opened.manifest)
-    return read_runs(manifests, vehicle, owner)
+    found = read_runs(manifests, vehicle, owner)
+    for note in notes:
+        say(note)
+    return found
 
 
 def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path) -> ModelFile:
