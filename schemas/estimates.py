@@ -19,7 +19,7 @@ class Estimates(Table):
     parameter = dy.String(min_length=1, metadata={"description": "name of the parameter"})
     unit = fields.text("unit of value and standard_error")
     value = fields.number("1", "its estimate, in the unit of the column `unit`")
-    standard_error = fields.bounded("1", "standard deviation of the estimate", 0.0)
+    standard_error = fields.bounded("1", "half of its 95 % interval over 1.96", 0.0)
     named = fields.flag(
         "the diagnosis names the effect; else the estimate is what one step of a joint fit gives"
     )

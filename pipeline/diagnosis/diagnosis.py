@@ -146,7 +146,7 @@ class EstimatedNumber:
         input: what the model was fed with.
         effect, parameter, unit: which number.
         value: the estimate; of an effect that was not named what one step of a joint fit gives it.
-        standard_error: standard deviation of the estimate.
+        standard_error: half of its 95 % interval over 1.96.
         named: whether the diagnosis names the effect.
         at_bound: whether it stopped at a bound of the search.
     """

@@ -5,13 +5,11 @@ from collections.abc import Iterator, Sequence
 
 from pipeline.diagnosis.context import Context
 from pipeline.diagnosis.diagnosis import EstimatedNumber, Named
+from pipeline.identification.intervals import NORMAL_95
 from pipeline.identification.judgement import Judgement
 from pipeline.identification.unnamed import estimate_unnamed
 from pipeline.models import Effect, Model
 from pipeline.models.catalogue import list_effects
-
-# Half of a 95 % interval is so many standard errors.
-_HALF = 1.959964
 
 
 def list_estimates(
@@ -47,7 +45,7 @@ def list_estimates(
             )  # fmt: skip
     for effect in named:
         for name, value in effect.parameters.items():
-            error = (value.high - value.low) / (2.0 * _HALF)
+            error = (value.high - value.low) / (2.0 * NORMAL_95)
             if effect.id not in model and effect.corrected and math.isfinite(error) and error > 0.0:
                 yield EstimatedNumber(
                     source.value, effect.id, name, value.unit, value.value, error,

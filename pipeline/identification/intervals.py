@@ -24,8 +24,8 @@ _DELAY_STEP = 5e-3
 _RISEN = 1.92
 _LONGEST_S = 20.0
 _STRONG = 0.8
-# So many degrees of freedom are as good as a normal distribution.
-_NORMAL = 1e9
+NORMAL_95 = 1.959964
+"""Half of a normal distribution's 95 % interval, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,6 @@ class Estimate:
         standard_error: of the estimate.
         at_bound: whether it stopped at a bound, so that the interval means little.
         observable: whether the data move with it at all.
-        freedom: degrees of freedom of Student's t that the interval was made with.
         clock_error: part of the standard error that comes from not knowing when poses were taken.
     """
 
@@ -50,7 +49,6 @@ class Estimate:
     standard_error: float
     at_bound: bool
     observable: bool
-    freedom: float = np.inf
     clock_error: float = 0.0
 
     @property
@@ -60,8 +58,8 @@ class Estimate:
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of the estimate, few blocks allowed for: Student's t of it is the interval."""
-        return 0.5 * (self.high - self.low) / _find_quantile(self.freedom)
+        """Standard deviation of the normal distribution that has this interval: of few blocks a wide one."""
+        return 0.5 * (self.high - self.low) / NORMAL_95
 
 
 @dataclass(frozen=True)
@@ -110,8 +108,9 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
     makes the interval wide (delete-a-group jackknife; Shao and Tu, The Jackknife and Bootstrap, 1995, and
     CR3 of cluster-robust regression). Blocks are command steps; where those are short against the
     correlation of the residuals, several are joined, to at least five integrated autocorrelation times and
-    six seconds. The interval is symmetric, with Student's t for the number of blocks. With a prior, which is
-    for runs of few blocks, it is that of the posterior, normal at its top (Laplace).
+    six seconds. The interval is symmetric, with Student's t for what the blocks tell of the number: two turns
+    in ten blocks tell of the track twice, not ten times (Bell and McCaffrey, Survey Methodology 28, 2002).
+    With a prior, which is for runs of few blocks, it is that of the posterior, normal at its top (Laplace).
 
     Args:
         problem: the runs.
@@ -143,22 +142,21 @@ def estimate_part(part: Part, fit: PartFit, step: Floats | None = None) -> Estim
     if step is not None:
         blocks, moved = blocks.move(step), step
     total, rows, size = _find_observable(part, fit, blocks)
-    freedom = _count_freedom(part, blocks.count)
     correlation = np.full((count, count), np.nan)
-    errors = np.full(count, np.nan)
+    errors, wide = np.full(count, np.nan), np.full(count, np.nan)
     spread = _find_spread(part, blocks, total, rows, size)
     if spread is not None:
         errors[rows] = np.sqrt(np.diag(spread))
         deviation = np.maximum(np.outer(errors[rows], errors[rows]), 1e-300)
         correlation[np.ix_(rows, rows)] = spread / deviation
-    wide = _find_quantile(freedom)
+        wide[rows] = _find_quantiles(part, blocks, rows, size)
     carried = np.zeros(count)
     carried[rows] = _carry_clocks(blocks, total, rows, size)
     errors = np.hypot(errors, carried)
     items = []
     for index, number in enumerate(fit.free):
         value = fit.state.get(number) + float(moved[index])
-        half = wide * float(errors[index]) if number.is_smooth else _widen(part, fit, number)
+        half = float(wide[index] * errors[index]) if number.is_smooth else _widen(part, fit, number)
         items.append(
             Estimate(
                 number,
@@ -168,7 +166,6 @@ def estimate_part(part: Part, fit: PartFit, step: Floats | None = None) -> Estim
                 float(errors[index]),
                 at_bound=stands_at_bound(value, number.bounds),
                 observable=index in rows,
-                freedom=freedom if number.is_smooth else np.inf,
                 clock_error=float(carried[index]) if part.dates_poses else 0.0,
             )
         )
@@ -204,7 +201,7 @@ def narrow_part(part: Part, fit: PartFit, order: Sequence[int] | None = None) ->
         spread = _find_spread(part, first, total, rows, size)
         if spread is not None:
             errors = np.hypot(np.sqrt(np.diag(spread)), _carry_clocks(first, total, rows, size))
-            halves[count - 1, rows] = _find_quantile(_count_freedom(part, count)) * errors
+            halves[count - 1, rows] = _find_quantiles(part, first, rows, size) * errors
     halves[:, ~smooth] = np.inf
     return np.asarray(seconds, dtype=np.float64), halves
 
@@ -216,14 +213,37 @@ def _find_observable(part: Part, fit: PartFit, blocks: Blocks) -> tuple[Floats, 
     return total, np.flatnonzero(size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)), size
 
 
-def _count_freedom(part: Part, blocks: int) -> float:
-    return np.inf if part.prior.numbers else float(max(blocks - 1, 1))
-
-
-def _find_quantile(freedom: float) -> float:
+def _find_quantiles(part: Part, blocks: Blocks, rows: Ints, size: Floats) -> Floats:
+    """Half-widths of 95 % intervals of the observable numbers in standard errors, shape (rows,)."""
     from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
 
-    return float(stdtrit(min(freedom, _NORMAL), 0.975))
+    if part.prior.numbers:
+        return np.full(rows.size, NORMAL_95)
+    quantiles: Floats = stdtrit(count_freedom(*_scale(blocks.normals, rows, size)), 0.975)
+    return quantiles
+
+
+def count_freedom(normals: Floats, without: Floats) -> Floats:
+    """Degrees of freedom of the jackknife's variances, were residuals alike in all blocks, shape (p,).
+
+    Variances of the fits without each block are a quadratic form of the blocks' gradients: twice the square
+    of its mean over its variance (Satterthwaite).
+
+    Args:
+        normals: normal matrix of each block, shape (k, p, p).
+        without: of all others, shape (k, p, p).
+    """
+    count = normals.shape[0]
+    moved = np.linalg.inv(without)
+    pull = np.swapaxes(moved @ normals, 0, 1)
+    form = -pull @ np.linalg.pinv(normals.sum(axis=0)) @ np.swapaxes(pull, 1, 2)
+    form[:, range(count), range(count)] += np.einsum("pkq,kqp->pk", pull, moved)
+    form -= form.mean(axis=1, keepdims=True)
+    form -= form.mean(axis=2, keepdims=True)
+    power = np.sum(form**2, axis=(1, 2))
+    # One block alone leaves nothing to vary.
+    freedom: Floats = np.trace(form, axis1=1, axis2=2) ** 2 / np.where(power > 0.0, power, np.inf)
+    return np.maximum(freedom, 1.0)
 
 
 def _find_spread(part: Part, blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> Floats | None:
@@ -232,7 +252,7 @@ def _find_spread(part: Part, blocks: Blocks, total: Floats, rows: Ints, size: Fl
         scale = np.outer(size[rows], size[rows])
         return part.prior.excess * np.linalg.inv(total[np.ix_(rows, rows)] / scale) / scale
     if rows.size and blocks.count > 1:
-        return _jackknife(blocks.normals, blocks.gradients, rows, size)
+        return _jackknife(blocks, rows, size)
     return None
 
 
@@ -388,12 +408,17 @@ def sum_blocks(part: Part, fit: PartFit) -> Blocks:
     return Blocks(label, normals, gradients, _pull_clocks(part, fit, label, pieces))
 
 
-def _jackknife(normals: Floats, gradients: Floats, rows: Ints, size: Floats) -> Floats:
+def _scale(normals: Floats, rows: Ints, size: Floats) -> tuple[Floats, Floats]:
+    """Normal matrices of each block and of all others, in units of the sizes, shape (k, rows, rows)."""
+    small = normals[:, rows][:, :, rows] / np.outer(size[rows], size[rows])
+    return small, small.sum(axis=0) - small + 1e-9 * np.eye(rows.size)
+
+
+def _jackknife(blocks: Blocks, rows: Ints, size: Floats) -> Floats:
     """Covariance of the numbers from the fits without each block, shape (rows, rows)."""
-    scale = size[rows]
-    small = normals[:, rows][:, :, rows] / np.outer(scale, scale)
-    without = small.sum(axis=0) - small + 1e-9 * np.eye(rows.size)
-    moved = np.linalg.solve(without, (gradients[:, rows] / scale)[:, :, None])[:, :, 0] / scale
+    _, without = _scale(blocks.normals, rows, size)
+    pull = blocks.gradients[:, rows] / size[rows]
+    moved = np.linalg.solve(without, pull[:, :, None])[:, :, 0] / size[rows]
     moved -= moved.mean(axis=0)
     pieces = moved.shape[0]
     spread: Floats = (pieces - 1.0) / pieces * moved.T @ moved

@@ -186,7 +186,7 @@ def test_a_parameter_put_into_simulated_data_comes_back(effect: type[Effect]) ->
     if effect.late is Late.POSES:
         # A gyro tells how late poses are before any model is fitted; slow encoders know when only by halves.
         more |= {"imu": None, "encoders": Encoders(rate_hz=50.0)}
-    run = simulate({effect.id: truth}, duration_s=150.0, **more)
+    run = simulate({effect.id: truth}, duration_s=240.0, **more)
     source = Input.COMMAND if effect.id in DRIVETRAIN else Input.MEASURED
     problem = Problem([run], vehicle_of(KIND_OF[effect.kinds[0]]), source)
     fitted = fit_model(problem, Model(problem.vehicle, (effect(),)))

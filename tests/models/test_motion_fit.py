@@ -19,6 +19,7 @@ from pipeline.identification import (
     score,
 )
 from pipeline.identification.folds import GAP_S
+from pipeline.identification.intervals import count_freedom
 from pipeline.identification.judgement import judge_model
 from pipeline.identification.persistence import split_residuals
 from pipeline.identification.scoring import measure_by_terrain
@@ -253,6 +254,28 @@ def test_slip_against_the_true_model_is_noise_where_slip_against_the_ideal_is_no
     assert slips[1] > 0.1
     outside = predict_at(true, run, Input.COMMAND, np.array([-5.0, 1e6]))
     assert np.isnan(outside).all()
+
+
+def test_information_in_two_blocks_of_ten_is_that_of_two() -> None:
+    """Student's t knows what the blocks say of a number, not how many there are."""
+    alike = np.ones((10, 1, 1))
+    two = np.where(np.arange(10)[:, None, None] < 2, 1.0, 1e-3)
+    for normals, low, high in ((alike, 8.99, 9.01), (two, 1.0, 1.5)):
+        (freedom,) = count_freedom(normals, normals.sum(axis=0) - normals)
+        assert low <= freedom <= high
+
+
+@pytest.mark.long
+def test_intervals_of_forty_seconds_hold_the_truth() -> None:
+    """The track is told by the few seconds that turn: with a t of all blocks, 91 of 100 held it."""
+    held = 0
+    for seed in range(100):
+        track = float(np.random.default_rng(seed).uniform(1.3, 2.2))
+        run = simulate({"effective_track": track}, seed=seed, duration_s=40.0)
+        problem = Problem([run], HUSKY, Input.MEASURED)
+        item = estimate_intervals(problem, fit_model(problem, model_of("effective_track"))).items[0]
+        held += item.low <= track <= item.high
+    assert held >= 93
 
 
 @pytest.mark.long
