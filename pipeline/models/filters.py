@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +12,6 @@ if TYPE_CHECKING:
     from pipeline.runs.signals import Floats, Integers, Resets, Signal
 
 _INSTANT_S = 1e-9
-_SETTLED = 1e-9
 _ROUND = 100
 """Plateaus that are followed one by one in the time that a step of all at once takes."""
 
@@ -130,45 +130,51 @@ def lag_unevenly(
         resets: where the state begins anew.
         start: the state there; the input's own value where it is NaN, shape (k,).
     """
-    from scipy.linalg.blas import dtbsv  # noqa: PLC0415 - heavy
-
     up, down = taus
     keeps = [math.exp(-step_s / tau) if tau > 0.0 else 0.0 for tau in taus]
+    known = np.where(np.isfinite(start), start, signal[resets.at])
+    begun = dict(zip(resets.first.tolist(), signal[resets.first].tolist(), strict=True))
+    begun |= dict(zip(resets.at.tolist(), known.tolist(), strict=True))
+    before = _follow_unevenly(signal.tolist(), begun, (*keeps, max(up, _INSTANT_S), down), step_s)
     size = np.abs(signal)
-    least = _SETTLED * float(size.max(initial=0.0))
-    begins = np.concatenate((resets.first, resets.at))
-    begun = np.concatenate((signal[resets.first], np.where(np.isfinite(start), start, signal[resets.at])))
-
-    def solve(keep: Floats, source: Floats) -> Floats:
-        """States before each cell of y = keep * (y before) + source: a band of two diagonals."""
-        band = np.vstack((np.ones_like(keep), -np.append(keep[1:], 0.0)))
-        band[1, begins[begins > 0] - 1] = 0.0
-        source[begins] += keep[begins] * begun
-        before = np.concatenate(([0.0], dtbsv(1, band, source, lower=1, diag=1)[:-1]))
-        before[begins] = begun
-        return before
-
-    # Which cells slow down, and when they pass zero and speed up again, follows from the round before: each
-    # knows some more from the first on. It begins with one time constant.
-    one = np.full(signal.size, 0.5 * sum(keeps))
-    before = solve(one, signal * (1.0 - one))
-    for _ in range(_ROUND):
-        crosses = before * signal < 0.0
-        slows = crosses | (size < np.abs(before))
-        keep = np.where(slows, keeps[1], keeps[0])
-        source = signal * (1.0 - keep)
-        turns = np.flatnonzero(crosses)
-        passed = down * (np.log(size[turns] + np.abs(before[turns])) - np.log(size[turns]))
-        turns, passed = turns[passed < step_s], passed[passed < step_s]
-        sped = -np.expm1((passed - step_s) / max(up, _INSTANT_S))
-        keep[turns], source[turns] = 0.0, signal[turns] * sped
-        last, before = before, solve(keep, source)
-        if np.abs(before - last).max(initial=0.0) <= least:
-            break
+    crosses = before * signal < 0.0
+    slows = crosses | (size < np.abs(before))
+    # Where it passes zero within a cell it speeds up for the rest of it.
+    turns = np.flatnonzero(crosses)
+    passed = down * (np.log(size[turns] + np.abs(before[turns])) - np.log(size[turns]))
+    turns, passed = turns[passed < step_s], passed[passed < step_s]
+    sped = -np.expm1((passed - step_s) / max(up, _INSTANT_S))
     share_up, share_down = (tau / step_s * (1.0 - keep) for tau, keep in zip(taus, keeps, strict=True))
     lagged: Floats = signal + (before - signal) * np.where(slows, share_down, share_up)
     lagged[turns] = signal[turns] + (down * before[turns] - up * signal[turns] * sped) / step_s
     return lagged
+
+
+def _follow_unevenly(
+    signal: list[float], begun: dict[int, float], rates: tuple[float, float, float, float], step_s: float
+) -> Floats:
+    """States before each cell of `lag_unevenly`, cell by cell: each decides how the next one is reached.
+
+    Args:
+        signal: cell means of the input, n of them.
+        begun: states by cell before which they are set.
+        rates: what a cell leaves of a difference when speeding up and slowing down, and the time constants.
+        step_s: width of a cell [s].
+    """
+    keep_up, keep_down, up, down = rates
+    before, cells = list[float](), sorted(begun)
+    for first, end in pairwise([*cells, len(signal)]):
+        now = begun[first]
+        for asked in signal[first:end]:
+            before.append(now)
+            gap = now - asked
+            if not now * gap > 0.0:
+                now = asked + gap * keep_up
+            elif now * asked < 0.0 and (passed := down * math.log1p(-now / asked)) < step_s:
+                now = -asked * math.expm1((passed - step_s) / up)
+            else:
+                now = asked + gap * keep_down
+    return np.array(before)
 
 
 def wait_at_reversal(signal: Floats, wait_s: float, step_s: float, resets: Resets) -> Floats:
