@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.arrays import join_parts
+
 if TYPE_CHECKING:
     from pipeline.runs.signals import Floats, Integers, Resets, Signal
 
 _INSTANT_S = 1e-9
+_BLOCK = 16
 _ROUND = 100
 """Plateaus that are followed one by one in the time that a step of all at once takes."""
 
@@ -31,12 +34,12 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
     """
     if tau <= 0.0:
         return signal
-    from scipy.signal import lfilter  # noqa: PLC0415 - heavy
-
-    decay = float(np.exp(-step_s / tau))
-    end = lfilter([1.0 - decay], [1.0, -decay], signal)
-    before = np.concatenate((np.zeros(1, dtype=signal.dtype), end[:-1]))
-    # The filter ran through the resets: what it carried over is taken back, and the state put in its place.
+    decay = math.exp(-step_s / tau)
+    parts = [signal.real, signal.imag] if np.iscomplexobj(signal) else [signal.real]
+    end = (1.0 - decay) * _sum_fading(np.array(parts), decay)[:, :-1]
+    before = np.zeros_like(signal)
+    before[1:] = join_parts(*end) if len(end) > 1 else end[0]
+    # The sum ran through the resets: what it carried over is taken back, and the state put in its place.
     # One reset after the other, in closed form: what is missing at each fades until the next.
     from_first, from_set = resets.fade(step_s / tau)
     known = np.where(np.isfinite(start), start, signal[resets.at])
@@ -47,6 +50,27 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
         before += (known - before[resets.at])[resets.number] * from_set
     lagged: Signal = signal + (before - signal) * (tau / step_s * (1.0 - decay))
     return lagged
+
+
+def _sum_fading(signals: Floats, keep: float) -> Floats:
+    """What y_k = keep y_(k-1) + u_k comes to: within blocks by a matrix, over their ends as over cells.
+
+    Args:
+        signals: u of each, shape (m, n); y is zero before.
+        keep: at least zero, below one.
+    """
+    count, cells = signals.shape
+    size = min(cells, _BLOCK)
+    blocks = -(-cells // size)
+    padded = np.zeros((count, blocks * size))
+    padded[:, :cells] = signals
+    ages = np.arange(size) - np.arange(size)[:, None]
+    inside = padded.reshape(count, blocks, size) @ np.triu(keep ** np.abs(ages))
+    if blocks > 1:
+        carried = _sum_fading(inside[:, :-1, -1], keep**size)
+        inside[:, 1:] += carried[:, :, None] * keep ** np.arange(1, size + 1)
+    summed: Floats = inside.reshape(count, -1)[:, :cells]
+    return summed
 
 
 def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, start: Floats) -> Floats:
@@ -131,11 +155,11 @@ def lag_unevenly(
         start: the state there; the input's own value where it is NaN, shape (k,).
     """
     up, down = taus
-    keeps = [math.exp(-step_s / tau) if tau > 0.0 else 0.0 for tau in taus]
+    keeps = keep_up, keep_down = [math.exp(-step_s / tau) if tau > 0.0 else 0.0 for tau in taus]
     known = np.where(np.isfinite(start), start, signal[resets.at])
     begun = dict(zip(resets.first.tolist(), signal[resets.first].tolist(), strict=True))
     begun |= dict(zip(resets.at.tolist(), known.tolist(), strict=True))
-    before = _follow_unevenly(signal.tolist(), begun, (*keeps, max(up, _INSTANT_S), down), step_s)
+    before = _follow_unevenly(signal.tolist(), begun, (keep_up, keep_down, max(up, _INSTANT_S), down), step_s)
     size = np.abs(signal)
     crosses = before * signal < 0.0
     slows = crosses | (size < np.abs(before))
