@@ -11,17 +11,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise, permutations
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
-from pipeline.core.parallel import map_parallel
 from pipeline.core.timegrid import nearest_indices
 from pipeline.identification.proposals import TERM
-from pipeline.identification.scoring import HeldOut, score
+from pipeline.identification.scoring import HeldOut, hold_out_models
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -89,8 +87,7 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
     """The budgets of a judged model: of the slip, and of the 2 s errors of position and heading.
 
     The ideal model and the whole model are those of the ladder and its top, so that totals and remainders
-    are the numbers of the ladder; in between, effects are left out of the whole model's fit: its numbers
-    differ far less from fold to fold than models with and without an effect.
+    are the numbers of the ladder; in between, effects are left out of the fits of the whole model's folds.
 
     Args:
         judgement: the model on its runs.
@@ -108,11 +105,8 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
     known[frozenset()] = judgement.ladder.rungs[0].held_out
     # Models that begin alike follow each other: what they have in common is predicted once.
     asked = sorted(list_subsets(tuple(players)) - known.keys(), key=lambda one: [p in one for p in players])
-    left = [
-        fitted.state.drop([n for player in players if player not in one for n in players[player]])
-        for one in asked
-    ]
-    scored = map_parallel(partial(score, problem), left)
+    dropped = [[n for player in players if player not in one for n in players[player]] for one in asked]
+    scored = hold_out_models(problem, fitted, dropped)
     known |= dict(zip(asked, scored, strict=True))
     split = share_out(tuple(players), {one: sum_stretches(held) for one, held in known.items()})
     floor = judgement.floor
