@@ -16,8 +16,6 @@ _ALWAYS = ("numpy", "scipy", "polars", "pyarrow")
 _CONTAINER: _Packages = {"": ("mcap",), ROS1_BAG: ("rosbags", "lz4"), SQLITE_BAG: ("rosbags", "apsw")}
 _COMPRESSION: _Packages = {"zstd": ("zstandard",), "lz4": ("pyarrow",)}
 _ENCODING: _Packages = {"protobuf": ("mcap", "mcap-protobuf-support")}
-# How much of the error can be explained at all is found by boosted trees, wherever there is a ladder.
-_CEILING = ("scikit-learn",)
 
 
 def list_versions(work: Work) -> dict[str, str]:
@@ -27,8 +25,6 @@ def list_versions(work: Work) -> dict[str, str]:
         work: after its stages and its diagnosis.
     """
     names = {*_ALWAYS, *_list_readers(work.setup)}
-    if "ladder" in work.generation.table_names:
-        names.update(_CEILING)
     versions = {name: _look_up(name) for name in sorted(names)}
     return {"python": platform.python_version(), PACKAGE: read_version(), **versions}
 

@@ -85,10 +85,6 @@ def diagnose_runs(
     context = prepare(runs, vehicle, chosen.source)
     driven = sum(run.duration_s for run in runs)
     budget = Budget(usual_budget(driven) if budget_s is None else budget_s, tell)
-    # Here once, not in each of two processes.
-    import scipy.signal  # noqa: F401, PLC0415 - heavy
-    import sklearn.ensemble  # noqa: F401, PLC0415 - heavy
-
     with both_cores(context.list_shared()):
         ways, clocks = _explore(context, chosen.source, known, budget)
         return _conclude(recordings, context, chosen, ways, clocks)

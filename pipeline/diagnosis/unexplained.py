@@ -8,8 +8,9 @@ from typing import cast
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.parallel import map_parallel
+from pipeline.diagnosis.boosting import bin_features, boost
 from pipeline.diagnosis.library import is_term, list_terms, list_waves
 from pipeline.diagnosis.search import prune
 from pipeline.diagnosis.selection import CandidateModel, Selection
@@ -37,7 +38,6 @@ _HARD = 0.25
 _LONGEST_S = 10.0
 LEAST_OF_DRIVE = 0.03
 """Of the motion that was asked for: stamps and steps of encoders come to 0.013 on logs that lack nothing."""
-_TREES = 60
 _FOLDS = 4
 _STRETCH_S = 20.0
 
@@ -158,31 +158,21 @@ def measure_asked(selection: Selection) -> Floats:
 def _boost(part: Part, rest: Floats, features: Floats, channels: Sequence[int]) -> Floats:
     """What trees that have not seen a stretch predict of residuals there, shape (n, 3)."""
     asked = [(fold, channel) for fold in range(_FOLDS) for channel in channels]
-    found = map_parallel(partial(_boost_fold, part, rest, features), asked)
+    found = map_parallel(partial(_boost_fold, part, rest, bin_features(features)), asked)
     stretch, predicted = part.number_stretches(_STRETCH_S), np.zeros(rest.shape)
     for (fold, channel), values in zip(asked, found, strict=True):
         predicted[stretch % _FOLDS == fold, channel] = values
     return predicted
 
 
-def _boost_fold(part: Part, rest: Floats, features: Floats, asked: tuple[int, int]) -> Floats:
+def _boost_fold(part: Part, rest: Floats, bins: Ints, asked: tuple[int, int]) -> Floats:
     """What is predicted of one channel in one fold."""
-    from sklearn.ensemble import HistGradientBoostingRegressor  # noqa: PLC0415 - heavy
-    from threadpoolctl import threadpool_limits  # noqa: PLC0415 - heavy
-
     fold, channel = asked
     test = part.number_stretches(_STRETCH_S) % _FOLDS == fold
     train = ~test & ~find_near(part, part, test)
     if not test.any() or train.sum() < 50:  # noqa: PLR2004 - too few to learn from
         return np.zeros(int(test.sum()))
-    model = HistGradientBoostingRegressor(
-        max_iter=_TREES, learning_rate=0.1, max_leaf_nodes=10, min_samples_leaf=25,
-        l2_regularization=5.0, early_stopping=False, random_state=0,
-    )  # fmt: skip
-    # Threads that wait for each other on a busy machine cost ten times the work itself.
-    with threadpool_limits(limits=1, user_api="openmp"):
-        model.fit(features[train], rest[train, channel])
-        return np.asarray(model.predict(features[test]), dtype=np.float64)
+    return boost(bins[train], rest[train, channel], bins[test])
 
 
 def is_explainable(explainable: Explainable) -> bool:

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from pipeline.core.arrays import Complex, Floats, Ints
+from pipeline.core.arrays import Complex, Floats, Ints, join_parts, turn_units
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Late, ReportEffect
 from pipeline.models.forward import Forward, Timing, replace_context
@@ -180,7 +180,7 @@ class Comparison:
         velocity = self.predict_velocity(effects, timing)
         delay = late_s + self._find_delay(effects)
         seen = self._measure(delay)
-        along = (velocity.x + 1j * velocity.y) * self._frame(delay)
+        along = join_parts(velocity.x, velocity.y) * self._frame(delay)
         travelled = self._at_nodes(self.cells.sum_up(along), seen.place)
         turned = self._at_nodes(self.cells.sum_up(velocity.w), seen.place)
         start, end = self.windows.start, self.windows.end
@@ -238,8 +238,8 @@ class Comparison:
         velocity = self._run(self._reaching, effects, timing)
         place = self._find_place(delay)
         edges = self.cells.sum_up(velocity.w)
-        own = np.exp(0.5j * (edges[1:] + edges[:-1]))
-        travelled = self._at_nodes(self.cells.sum_up((velocity.x + 1j * velocity.y) * own), place)
+        own = turn_units(0.5 * (edges[1:] + edges[:-1]))
+        travelled = self._at_nodes(self.cells.sum_up(join_parts(velocity.x, velocity.y) * own), place)
         turned = self._at_nodes(edges, place)
         origin, node = self.horizons.origin, self.horizons.node
         back: Complex = np.exp(-1j * turned[self._begins])[self.horizons.number]
@@ -270,7 +270,7 @@ class Comparison:
         if delay not in self._measured:
             heading = self._node_headings(delay)
             start, end = self.windows.start, self.windows.end
-            frame = np.exp(-0.5j * (heading[start] + heading[end]))
+            frame = turn_units(-0.5 * (heading[start] + heading[end]))
             moved = frame * (self._path[end] - self._path[start])
             _forget(self._measured)
             place = self._find_place(delay)
@@ -305,7 +305,7 @@ class Comparison:
             else:
                 heading = np.interp(self.cells.times + delay, times, offset)
             _forget(self._frames)
-            self._frames[key] = np.exp(1j * heading)
+            self._frames[key] = turn_units(heading)
         return self._frames[key]
 
     def _look_around(self, vehicle: Vehicle) -> RunContext:

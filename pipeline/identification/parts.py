@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.arrays import Flags, Floats, Ints, join_parts
 from pipeline.identification.columns import make_columns
 from pipeline.identification.comparison import Comparison
 from pipeline.identification.prior import NO_PRIOR, Prior
@@ -306,7 +306,7 @@ def average_windows(comparison: Comparison, velocity: Velocity, spans: Spans) ->
     """Mean of (x, y, w) over every window, shape (n, 3)."""
     means, y = np.zeros((spans.first.size, 3)), velocity.y
     # Two real signals as one complex one: summing up takes as long for both as for either.
-    both = spans.average(comparison, velocity.x + 1j * velocity.w)
+    both = spans.average(comparison, join_parts(velocity.x, velocity.w))
     means[:, 0], means[:, 2] = both.real, both.imag
     if y.any():
         means[:, 1] = spans.average(comparison, y)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
+from pipeline.core.arrays import Floats, join_parts, turn_units
 from pipeline.identification.comparison import Comparison, Input
 from pipeline.models.effect import Effect
 from pipeline.models.forward import Timing
@@ -44,8 +44,8 @@ def predict_from(
     cells = comparison.cells
     start_times, start = comparison.list_starts()
     turned = cells.sum_up(velocity.w)
-    own = np.exp(0.5j * (turned[1:] + turned[:-1]))
-    travelled = cells.sum_up((velocity.x + 1j * velocity.y) * own)
+    own = turn_units(0.5 * (turned[1:] + turned[:-1]))
+    travelled = cells.sum_up(join_parts(velocity.x, velocity.y) * own)
     since = np.arange(0.0, HORIZON_S + 0.5 / rate_hz, 1.0 / rate_hz)
     at = cells.locate_edges((start_times[:, None] + since).ravel())
     index = np.arange(turned.size, dtype=np.float64)

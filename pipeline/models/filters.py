@@ -1,13 +1,15 @@
 """Filters of signals on cells: lag and rate limit, exact for inputs that are constant in a cell."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 
+from pipeline.core.arrays import join_parts
 from pipeline.runs.signals import Floats, Integers, Resets, Signal
 
 _INSTANT_S = 1e-9
-_SETTLED = 1e-9
+_BLOCK = 16
 _ROUND = 100
 """Plateaus that are followed one by one in the time that a step of all at once takes."""
 
@@ -27,12 +29,12 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
     """
     if tau <= 0.0:
         return signal
-    from scipy.signal import lfilter  # noqa: PLC0415 - heavy
-
-    decay = float(np.exp(-step_s / tau))
-    end = lfilter([1.0 - decay], [1.0, -decay], signal)
-    before = np.concatenate((np.zeros(1, dtype=signal.dtype), end[:-1]))
-    # The filter ran through the resets: what it carried over is taken back, and the state put in its place.
+    decay = math.exp(-step_s / tau)
+    parts = [signal.real, signal.imag] if np.iscomplexobj(signal) else [signal.real]
+    end = (1.0 - decay) * _sum_fading(np.array(parts), decay)[:, :-1]
+    before = np.zeros_like(signal)
+    before[1:] = join_parts(*end) if len(end) > 1 else end[0]
+    # The sum ran through the resets: what it carried over is taken back, and the state put in its place.
     # One reset after the other, in closed form: what is missing at each fades until the next.
     from_first, from_set = resets.fade(step_s / tau)
     known = np.where(np.isfinite(start), start, signal[resets.at])
@@ -42,6 +44,27 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
         before += (signal[resets.first] - before[resets.first])[resets.number] * from_first
         before += (known - before[resets.at])[resets.number] * from_set
     return signal + (before - signal) * (tau / step_s * (1.0 - decay))
+
+
+def _sum_fading(signals: Floats, keep: float) -> Floats:
+    """What y_k = keep y_(k-1) + u_k comes to: within blocks by a matrix, over their ends as over cells.
+
+    Args:
+        signals: u of each, shape (m, n); y is zero before.
+        keep: at least zero, below one.
+    """
+    count, cells = signals.shape
+    size = min(cells, _BLOCK)
+    blocks = -(-cells // size)
+    padded = np.zeros((count, blocks * size))
+    padded[:, :cells] = signals
+    ages = np.arange(size) - np.arange(size)[:, None]
+    inside = padded.reshape(count, blocks, size) @ np.triu(keep ** np.abs(ages))
+    if blocks > 1:
+        carried = _sum_fading(inside[:, :-1, -1], keep**size)
+        inside[:, 1:] += carried[:, :, None] * keep ** np.arange(1, size + 1)
+    summed: Floats = inside.reshape(count, -1)[:, :cells]
+    return summed
 
 
 def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, start: Floats) -> Floats:
@@ -125,45 +148,51 @@ def lag_unevenly(
         resets: where the state begins anew.
         start: the state there; the input's own value where it is NaN, shape (k,).
     """
-    from scipy.linalg.blas import dtbsv  # noqa: PLC0415 - heavy
-
     up, down = taus
-    keeps = [math.exp(-step_s / tau) if tau > 0.0 else 0.0 for tau in taus]
+    keeps = keep_up, keep_down = [math.exp(-step_s / tau) if tau > 0.0 else 0.0 for tau in taus]
+    known = np.where(np.isfinite(start), start, signal[resets.at])
+    begun = dict(zip(resets.first.tolist(), signal[resets.first].tolist(), strict=True))
+    begun |= dict(zip(resets.at.tolist(), known.tolist(), strict=True))
+    before = _follow_unevenly(signal.tolist(), begun, (keep_up, keep_down, max(up, _INSTANT_S), down), step_s)
     size = np.abs(signal)
-    least = _SETTLED * float(size.max(initial=0.0))
-    begins = np.concatenate((resets.first, resets.at))
-    begun = np.concatenate((signal[resets.first], np.where(np.isfinite(start), start, signal[resets.at])))
-
-    def solve(keep: Floats, source: Floats) -> Floats:
-        """States before each cell of y = keep * (y before) + source: a band of two diagonals."""
-        band = np.vstack((np.ones_like(keep), -np.append(keep[1:], 0.0)))
-        band[1, begins[begins > 0] - 1] = 0.0
-        source[begins] += keep[begins] * begun
-        before = np.concatenate(([0.0], dtbsv(1, band, source, lower=1, diag=1)[:-1]))
-        before[begins] = begun
-        return before
-
-    # Which cells slow down, and when they pass zero and speed up again, follows from the round before: each
-    # knows some more from the first on. It begins with one time constant.
-    one = np.full(signal.size, 0.5 * sum(keeps))
-    before = solve(one, signal * (1.0 - one))
-    for _ in range(_ROUND):
-        crosses = before * signal < 0.0
-        slows = crosses | (size < np.abs(before))
-        keep = np.where(slows, keeps[1], keeps[0])
-        source = signal * (1.0 - keep)
-        turns = np.flatnonzero(crosses)
-        passed = down * (np.log(size[turns] + np.abs(before[turns])) - np.log(size[turns]))
-        turns, passed = turns[passed < step_s], passed[passed < step_s]
-        sped = -np.expm1((passed - step_s) / max(up, _INSTANT_S))
-        keep[turns], source[turns] = 0.0, signal[turns] * sped
-        last, before = before, solve(keep, source)
-        if np.abs(before - last).max(initial=0.0) <= least:
-            break
+    crosses = before * signal < 0.0
+    slows = crosses | (size < np.abs(before))
+    # Where it passes zero within a cell it speeds up for the rest of it.
+    turns = np.flatnonzero(crosses)
+    passed = down * (np.log(size[turns] + np.abs(before[turns])) - np.log(size[turns]))
+    turns, passed = turns[passed < step_s], passed[passed < step_s]
+    sped = -np.expm1((passed - step_s) / max(up, _INSTANT_S))
     share_up, share_down = (tau / step_s * (1.0 - keep) for tau, keep in zip(taus, keeps, strict=True))
     lagged: Floats = signal + (before - signal) * np.where(slows, share_down, share_up)
     lagged[turns] = signal[turns] + (down * before[turns] - up * signal[turns] * sped) / step_s
     return lagged
+
+
+def _follow_unevenly(
+    signal: list[float], begun: dict[int, float], rates: tuple[float, float, float, float], step_s: float
+) -> Floats:
+    """States before each cell of `lag_unevenly`, cell by cell: each decides how the next one is reached.
+
+    Args:
+        signal: cell means of the input, n of them.
+        begun: states by cell before which they are set.
+        rates: what a cell leaves of a difference when speeding up and slowing down, and the time constants.
+        step_s: width of a cell [s].
+    """
+    keep_up, keep_down, up, down = rates
+    before, cells = list[float](), sorted(begun)
+    for first, end in pairwise([*cells, len(signal)]):
+        now = begun[first]
+        for asked in signal[first:end]:
+            before.append(now)
+            gap = now - asked
+            if not now * gap > 0.0:
+                now = asked + gap * keep_up
+            elif now * asked < 0.0 and (passed := down * math.log1p(-now / asked)) < step_s:
+                now = -asked * math.expm1((passed - step_s) / up)
+            else:
+                now = asked + gap * keep_down
+    return np.array(before)
 
 
 def wait_at_reversal(signal: Floats, wait_s: float, step_s: float, resets: Resets) -> Floats:

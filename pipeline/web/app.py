@@ -252,8 +252,7 @@ def build_app(
 
 def _load_heavy() -> None:
     """Load what the first fit needs while somebody still looks for a run."""
-    for name in ("scipy.signal", "scipy.special"):
-        import_module(name)
+    import_module("scipy.special")
 
 
 def _serve_own(package: str, name: str, kind: str) -> Answer:

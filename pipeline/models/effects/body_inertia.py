@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.core.arrays import join_parts, turn_units
 from pipeline.models.effect import BodyEffect, Excitation, Late, Least, Plausible, Spread
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.evidence import Evidence
@@ -60,9 +61,10 @@ class BodyInertia(BodyEffect):
         w = lag_signal(rolling.w0, tau, step, resets, resets.start[:, 2])
         heading = (np.cumsum(w) - 0.5 * w) * step
         # In a frame that does not turn the two equations of v_x and v_y are one lag of a complex number.
-        frame = np.exp(1j * heading)
+        frame = turn_units(heading)
         start = (resets.start[:, 0] + 1j * resets.start[:, 1]) * frame[resets.at]
-        slide = lag_signal((rolling.v0 + 1j * rolling.s0) * frame, tau, step, resets, start) * np.conj(frame)
+        along = join_parts(rolling.v0, rolling.s0) * frame
+        slide = lag_signal(along, tau, step, resets, start) * np.conj(frame)
         return Velocity(slide.real, slide.imag, w)
 
     def is_equivalent(self, evidence: Evidence) -> bool:
