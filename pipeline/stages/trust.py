@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import segments, timegrid
-from pipeline.core.arrays import Flags, Floats
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.robust import fit_robustly
 from pipeline.stages.finding import Finding
 
@@ -51,13 +51,14 @@ def check_independence(samples: Samples, vehicle: Vehicle, periods_s: Sequence[f
     if samples.measured is None:
         return []
     known: Flags = np.all(np.isfinite(samples.measured), axis=1)
+    first, last = _list_spans(samples, known)
     moving = known & (np.abs(np.nan_to_num(samples.measured)) > _LIVE).any(axis=1)
-    sideways = samples.velocity[moving, 1] - samples.measured[moving, 1]
     is_driven = vehicle.kinematics.has_inputs("sideways")
-    swing = samples.measured[moving, 0] * samples.measured[moving, 2]
-    if sideways.size < _FEWEST or not (is_driven or _keeps_straight(sideways, swing, periods_s)):
+    if min(int(moving.sum()) - _FEWEST, first.size - _FEWEST_SPANS) < 0:
         return []
-    ahead, aside, turning = _share_beside_wheels(samples, samples.measured, known)
+    if not is_driven and not _keeps_straight(samples, samples.measured, moving, (first, last), periods_s):
+        return []
+    ahead, aside, turning = _share_beside_wheels(samples, samples.measured, first, last)
     moved = [share for share in (ahead, aside if is_driven else None) if share is not None]
     share = max(moved) if moved else turning
     if share is None or share > (_ROUNDING_ANY_WAY if is_driven else _ROUNDING):
@@ -71,42 +72,59 @@ def check_independence(samples: Samples, vehicle: Vehicle, periods_s: Sequence[f
     return [Finding("pose_from_wheels", "error", text, where="pose", value=share)]
 
 
-def _keeps_straight(sideways: Floats, swing: Floats, periods_s: Sequence[float]) -> bool:
+def _keeps_straight(
+    samples: Samples, measured: Floats, moving: Flags, spans: tuple[Ints, Ints], periods_s: Sequence[float]
+) -> bool:
     """Whether there is no motion sideways, but for that of steps along the heading before or after each turn.
 
+    Such steps drift by half a step's time of the speed times the yaw rate. Over half seconds, because what
+    the steps between two poses leave of that does not add up, while a skid does.
+
     Args:
-        sideways: speed beside the wheels' [m/s], shape (n,).
-        swing: speed times yaw rate of the wheels: such steps drift by half a step's time of it, shape (n,).
+        samples: of the run.
+        measured: velocity of the wheels, shape (n, 3).
+        moving: whether they turn, shape (n,).
+        spans: first and last samples of half seconds, each of shape (m,).
         periods_s: that steps may have [s].
     """
-    if float(np.median(np.abs(sideways))) <= _SIDEWAYS:
+    sideways = samples.velocity[:, 1] - measured[:, 1]
+    if float(np.median(np.abs(sideways[moving]))) <= _SIDEWAYS:
         return True
-    (half_step,), rest = fit_robustly(swing[:, None], sideways)
+    first, last = spans
+    drifted, swing = (
+        (way[last] - way[first])[moving[first] & moving[last]]
+        for rate in (sideways, measured[:, 0] * measured[:, 2])
+        for way in (timegrid.integrate_rate(samples.times, np.nan_to_num(rate)),)
+    )
+    if drifted.size < _FEWEST_SPANS:
+        return False
+    (half_step,), rest = fit_robustly(swing[:, None], drifted)
     drift = float(np.median(np.abs(half_step * swing)))
     known = any(abs(2.0 * abs(half_step) / period - 1.0) <= _UNEVEN for period in periods_s if period > 0.0)
-    regular = float(np.median(np.abs(rest))) <= max(_UNEVEN * drift, _SIDEWAYS)
+    regular = float(np.median(np.abs(rest))) <= max(_UNEVEN * drift, _SIDEWAYS * _SPAN)
     return regular and (known or abs(half_step) <= _FAST_STEP)
 
 
+def _list_spans(samples: Samples, known: Flags) -> tuple[Ints, Ints]:
+    """First and last samples of half seconds in one segment with known wheels, each of shape (m,)."""
+    span = timegrid.count_steps(samples.times, _SPAN)
+    first = np.arange(0, samples.times.size - span, span)
+    last = first + span
+    counted = np.concatenate(([0], np.cumsum(known)))
+    whole = (counted[last + 1] - counted[first] == span + 1) & (
+        samples.segment[first] == samples.segment[last]
+    )
+    return first[whole], last[whole]
+
+
 def _share_beside_wheels(
-    samples: Samples, measured: Floats, known: Flags
+    samples: Samples, measured: Floats, first: Ints, last: Ints
 ) -> tuple[float | None, float | None, float | None]:
     """Shares of the ways ahead and aside and of the turning over half seconds that are not the wheels'.
 
     Any gain is allowed (another radius, another track width), and a small delay, to first order. A share is
     None where there is nothing to share.
     """
-    times = samples.times
-    span = timegrid.count_steps(times, _SPAN)
-    first = np.arange(0, times.size - span, span)
-    last = first + span
-    counted = np.concatenate(([0], np.cumsum(known)))
-    whole = (counted[last + 1] - counted[first] == span + 1) & (
-        samples.segment[first] == samples.segment[last]
-    )
-    first, last = first[whole], last[whole]
-    if first.size < _FEWEST_SPANS:
-        return None, None, None
     turned = samples.yaw[last] - samples.yaw[first]
     heading = samples.yaw[first] + 0.5 * turned
     step = samples.position[last] - samples.position[first]
@@ -117,7 +135,7 @@ def _share_beside_wheels(
     shares = []
     for moved, axis in ((ahead / arc, 0), (aside / arc, 1), (turned, 2)):
         rate = np.nan_to_num(measured[:, axis])
-        driven = timegrid.integrate_rate(times, rate)
+        driven = timegrid.integrate_rate(samples.times, rate)
         shares.append(measure_rest(moved, driven[last] - driven[first], rate[last] - rate[first]))
     return shares[0], shares[1], shares[2]
 

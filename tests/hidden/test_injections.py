@@ -121,6 +121,18 @@ def test_a_heading_that_is_late_is_that_of_before(tables: Tables) -> None:
     assert yaw[-1] == pytest.approx(0.3 + 0.5 * (late["t"][-1] - 0.1), abs=1e-6)
 
 
+def test_a_slow_localization_is_late_by_as_much_and_the_wheels_are_not_slow(tables: Tables) -> None:
+    """Every fourth pose is new and stands until the next."""
+    rows = np.arange(400) // 4 * 4
+    own = pl.col("x", "y", "q_z", "q_w").gather(rows)
+    slow = {**tables, "poses": tables["poses"].with_columns(own, pl.Series("held", np.arange(400) % 4 != 0))}
+    late = BY_NAME["heading .1 s late"].change(slow, DRIVE)["poses"]
+    fresh = late.filter(~pl.col("held"))
+    yaw = np.unwrap(2.0 * np.arctan2(fresh["q_z"].to_numpy(), fresh["q_w"].to_numpy()))
+    assert yaw[1:] == pytest.approx(0.3 + 0.5 * (fresh["t"].to_numpy()[1:] - 0.1), abs=1e-6)
+    assert not BY_NAME["poses from the wheels"].change(slow, DRIVE)["poses"]["held"].any()
+
+
 def test_answers_are_judged() -> None:
     track = Injection("t", lambda tables, _: tables, (), {"effective_track.k": lambda k: 1.2 * k})
     plain = Answer({"effective_track.k": (1.5, 0.01)})
