@@ -26,7 +26,7 @@ LINES = "lines"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 11
+VERSION = 12
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
 
 
