@@ -29,7 +29,7 @@ _FAST_STEP = 0.015
 """Half the time between two steps of fast odometry [s]: no skid worth a name drifts as little."""
 _ROUNDING = 5e-3
 _ROUNDING_ANY_WAY = 1e-3
-"""Of a vehicle that moves sideways no lack of such motion tells an odometry: its ways must fit better."""
+"""Where the poses move sideways, no lack of such motion tells an odometry: its ways must fit better."""
 _SHORTEST_SILENCE = 3.0
 _SETTLED = 2.0
 _MOVES = 0.1
@@ -56,12 +56,19 @@ def check_independence(samples: Samples, vehicle: Vehicle, periods_s: Sequence[f
     is_driven = vehicle.kinematics.has_inputs("sideways")
     if min(int(moving.sum()) - _FEWEST, first.size - _FEWEST_SPANS) < 0:
         return []
-    if not is_driven and not _keeps_straight(samples, samples.measured, moving, (first, last), periods_s):
-        return []
+    sideways = samples.velocity[:, 1] - samples.measured[:, 1]
+    keeps_straight = not is_driven and float(np.median(np.abs(sideways[moving]))) <= _SIDEWAYS
+    if not (is_driven or keeps_straight):
+        whole = moving[first] & moving[last]
+        swing = samples.measured[:, 0] * samples.measured[:, 2]
+        ways = (timegrid.integrate_rate(samples.times, np.nan_to_num(rate)) for rate in (sideways, swing))
+        drifted, swung = ((way[last] - way[first])[whole] for way in ways)
+        if not _steps_evenly(drifted, swung, periods_s):
+            return []
     ahead, aside, turning = _share_beside_wheels(samples, samples.measured, first, last)
     moved = [share for share in (ahead, aside if is_driven else None) if share is not None]
     share = max(moved) if moved else turning
-    if share is None or share > (_ROUNDING_ANY_WAY if is_driven else _ROUNDING):
+    if share is None or share > (_ROUNDING if keeps_straight else _ROUNDING_ANY_WAY):
         return []
     elsewhere = turning is not None and turning > _ROUNDING
     but = " but for their heading, which may be a gyro's" if elsewhere else ""
@@ -72,34 +79,21 @@ def check_independence(samples: Samples, vehicle: Vehicle, periods_s: Sequence[f
     return [Finding("pose_from_wheels", "error", text, where="pose", value=share)]
 
 
-def _keeps_straight(
-    samples: Samples, measured: Floats, moving: Flags, spans: tuple[Ints, Ints], periods_s: Sequence[float]
-) -> bool:
-    """Whether there is no motion sideways, but for that of steps along the heading before or after each turn.
+def _steps_evenly(drifted: Floats, swung: Floats, periods_s: Sequence[float]) -> bool:
+    """Whether all motion sideways is that of steps along the heading before or after each turn.
 
     Such steps drift by half a step's time of the speed times the yaw rate. Over half seconds, because what
-    the steps between two poses leave of that does not add up, while a skid does.
+    single steps leave of that does not add up, while a skid does.
 
     Args:
-        samples: of the run.
-        measured: velocity of the wheels, shape (n, 3).
-        moving: whether they turn, shape (n,).
-        spans: first and last samples of half seconds, each of shape (m,).
+        drifted: way beside the wheels' in each half second [m], shape (n,).
+        swung: integral of the wheels' speed times yaw rate [m/s], shape (n,).
         periods_s: that steps may have [s].
     """
-    sideways = samples.velocity[:, 1] - measured[:, 1]
-    if float(np.median(np.abs(sideways[moving]))) <= _SIDEWAYS:
-        return True
-    first, last = spans
-    drifted, swing = (
-        (way[last] - way[first])[moving[first] & moving[last]]
-        for rate in (sideways, measured[:, 0] * measured[:, 2])
-        for way in (timegrid.integrate_rate(samples.times, np.nan_to_num(rate)),)
-    )
     if drifted.size < _FEWEST_SPANS:
         return False
-    (half_step,), rest = fit_robustly(swing[:, None], drifted)
-    drift = float(np.median(np.abs(half_step * swing)))
+    (half_step,), rest = fit_robustly(swung[:, None], drifted)
+    drift = float(np.median(np.abs(half_step * swung)))
     known = any(abs(2.0 * abs(half_step) / period - 1.0) <= _UNEVEN for period in periods_s if period > 0.0)
     regular = float(np.median(np.abs(rest))) <= max(_UNEVEN * drift, _SIDEWAYS * _SPAN)
     return regular and (known or abs(half_step) <= _FAST_STEP)
