@@ -4,8 +4,9 @@ Run: python benchmarks/inject.py [--logs WORD ...] [--only WORD ...] [--out FILE
 prints the table of what was asked. Every recording under ../shared/logs that moves, the shortest first, with
 every change of `injections.py`. A number is recovered where what was injected, put on top of what the
 unchanged recording says, lies within the two intervals together, or where both cancel and nothing is named.
-An answer is the same where the names are, and the numbers within the same measure. `cannot`: the log is said
-not to tell of it, or only of larger ones.
+An answer is the same where the names are, and the numbers within the same measure; it is at the `edge` where
+one of the two has a name for a number that the other one estimates alike and away from nothing, but does not
+name. `cannot`: the log is said not to tell of it, or only of larger ones.
 Exit code 0; the table says what was missed.
 """
 
@@ -45,7 +46,7 @@ STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96
 # Relative change of a finding's number that is news.
 _OTHER = 0.02
-_VERDICTS = ("recovered", "told", "one of", "undecided", "cannot", "number", "missed")
+_VERDICTS = ("recovered", "told", "one of", "edge", "undecided", "cannot", "number", "missed")
 Number = tuple[float, float]
 _UNCHANGED = Injection("nothing", lambda tables, _: tables)
 Json = dict[str, Any]
@@ -95,9 +96,22 @@ class Answer:
 
     def find_number(self, label: str) -> Number:
         """What is known of a number: as told, as estimated, or that it is less than would have been seen."""
-        effect, parameter = label.split(".")
-        neutral = (find_effect(effect)().parameter(parameter).neutral, self.detectable.get(label, 0.0))
+        neutral = (find_neutral(label), self.detectable.get(label, 0.0))
         return self.find_told(label) or self.estimates.get(label, neutral)
+
+    def list_labels(self, effects: Iterable[str]) -> list[str]:
+        """Labels of the numbers of these of its effects."""
+        return [label for label in self.numbers if label.split(".")[0] in {*effects}]
+
+    def cannot_see(self, label: str, other: Answer) -> bool:
+        """Whether it says that it does not tell of a number, or not of one as small as another answer's."""
+        (effect, _), size = label.split("."), abs(other.numbers[label][0] - find_neutral(label))
+        return effect in self.unobservable or size < self.detectable.get(label, 0.0)
+
+    def nearly_names(self, label: str, other: Answer) -> bool:
+        """Whether its estimate, away from nothing, is the number that another answer has a name for."""
+        value, half = self.estimates.get(label, (math.nan, 0.0))
+        return abs(value - find_neutral(label)) > half and is_close((value, half), other.numbers[label])
 
 
 def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
@@ -151,13 +165,13 @@ def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, lis
     effects = {label.split(".")[0] for label in injection.numbers}
     extra = sorted(after.names - before.mentioned - effects)
     if injection.same:
-        close = all(is_close(before.numbers[label], after.numbers[label]) for label in shared(before, after))
-        lost = before.names - after.mentioned
-        return ("recovered" if close and not lost and not extra else "missed"), extra
+        return _judge_same(before, after, extra), extra
     for effect in effects:
         labels = [label for label in injection.numbers if label.split(".")[0] == effect]
         if all(is_recovered(injection, label, before, after) for label in labels):
             return ("one of" if effect in after.undecided else "recovered"), extra
+    if len(effects) > 1 and is_recovered_together(injection, before, after):
+        return ("one of" if effects & {*after.undecided} else "recovered"), extra
     unseen = {
         label.split(".")[0]
         for label, change in injection.numbers.items()
@@ -169,6 +183,21 @@ def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, lis
         if effects & {*ids}:
             return verdict, extra
     return "missed", extra
+
+
+def _judge_same(before: Answer, after: Answer, extra: Sequence[str]) -> str:
+    """Whether an answer is the same, or the same but for names that one of the two does not dare to say."""
+    lost = before.names - after.mentioned
+    if not all(is_close(before.numbers[label], after.numbers[label]) for label in shared(before, after)):
+        return "missed"
+    if not lost and not extra:
+        return "recovered"
+    if not extra and all(after.cannot_see(label, before) for label in before.list_labels(lost)):
+        return "cannot"
+    known = all(before.nearly_names(label, after) for label in after.list_labels(extra)) and all(
+        after.nearly_names(label, before) for label in before.list_labels(lost)
+    )
+    return "edge" if known else "missed"
 
 
 def _is_news(finding: str, before: Answer, after: Answer) -> bool:
@@ -184,8 +213,7 @@ def is_recovered(injection: Injection, label: str, before: Answer, after: Answer
 
     Where the two cancel nothing is left to be named.
     """
-    effect, parameter = label.split(".")
-    neutral, change = find_effect(effect)().parameter(parameter).neutral, injection.numbers[label]
+    (effect, _), neutral, change = label.split("."), find_neutral(label), injection.numbers[label]
     value, half = before.find_number(label)
     gain = injection.beside.get(label)
     if gain is not None and label not in before.numbers:
@@ -199,10 +227,30 @@ def is_recovered(injection: Injection, label: str, before: Answer, after: Answer
     found = after.find_told(label)
     if found is None:
         was_there = before.find_told(label) and abs(value - neutral) > max(half, abs(expected[0] - neutral))
-        unseen = (neutral, after.detectable.get(label, 0.0))
+        # Of what the changed recording does not speak it knows as much as the unchanged one.
+        unseen = (neutral, after.detectable.get(label, half))
         return bool(was_there) and is_close(expected, unseen) and effect not in after.mentioned
     # Of what the unchanged recording does not speak it knows as much as the changed one.
     return is_close(expected if before.knows(label) else (expected[0], max(expected[1], found[1])), found)
+
+
+def is_recovered_together(injection: Injection, before: Answer, after: Answer) -> bool:
+    """Whether effects that are one to first order add up to what was injected, each by its own sign."""
+    if not any(after.find_told(label) for label in injection.numbers):
+        return False
+    moves = [change(0.0) for change in injection.numbers.values()]
+    sums = []
+    for answer in (before, after):
+        numbers = [answer.find_number(label) for label in injection.numbers]
+        value = sum(math.copysign(1.0, move) * one for move, (one, _) in zip(moves, numbers, strict=True))
+        sums.append((value, math.hypot(*(half for _, half in numbers))))
+    return is_close((sums[0][0] + abs(moves[0]), sums[0][1]), sums[1])
+
+
+def find_neutral(label: str) -> float:
+    """The number at which an effect does nothing."""
+    effect, parameter = label.split(".")
+    return find_effect(effect)().parameter(parameter).neutral
 
 
 def shared(before: Answer, after: Answer) -> list[str]:
@@ -221,7 +269,9 @@ def is_close(one: tuple[float, float], other: tuple[float, float]) -> bool:
 
 
 def score(rows: Iterable[Json]) -> list[Json]:
-    """For each answer a verdict, extra names, those that no recording of the vehicle has, and a note."""
+    """For each answer a verdict, a note, and extra names: all, those that no recording of the vehicle has,
+    and their numbers that the unchanged recording does not estimate alike.
+    """
     rows = list(rows)
     plain = {
         (row["log"], row["both"]): Answer(**row["answer"])
@@ -239,12 +289,16 @@ def score(rows: Iterable[Json]) -> list[Json]:
             verdict, extra = judge(injection, before, after)
             text = note(injection, before, after)
         else:
-            verdict, extra, text = "missed", [], row["error"]
+            after, verdict, extra, text = before, "missed", [], row["error"]
+        news = [label for label in after.list_labels(extra) if not before.nearly_names(label, after)]
         vehicle = row["log"].split("_")[0]
         usual = {name for (log, _), one in plain.items() if log.startswith(vehicle) for name in one.mentioned}
         scored.append(
-            {**row, "verdict": verdict, "extra": extra, "foreign": [*{*extra} - usual], "note": text}
-        )
+            {
+                **row, "verdict": verdict, "extra": extra, "foreign": [*{*extra} - usual], "news": news,
+                "note": text,
+            }
+        )  # fmt: skip
     return scored
 
 
@@ -261,16 +315,19 @@ def describe(rows: Iterable[Json]) -> str:
         ]
         lines.append("")
     total, asked = _count(scored), max(len(scored), 1)
-    right, foreign = total["recovered"] + total["told"], sum(bool(row["foreign"]) for row in scored)
+    right = total["recovered"] + total["told"]
+    foreign, news = (sum(bool(row[key]) for row in scored) for key in ("foreign", "news"))
     can = max(asked - total["cannot"], 1)
     lines += [
         f"{right} of {asked} recovered or told ({right / asked:.0%}),",
         f"{right} of the {can} of which the log is not said not to tell ({right / can:.0%});",
         f"{total['one of']} told as one of several explanations, with the number that was put in",
         f"({(right + total['one of']) / asked:.0%} with them); {total['undecided']} so with another number;",
+        f"{total['edge']} the same but for a name at the edge of the evidence;",
         f"{total['number']} named with another number; {total['missed']} missed;",
         f"a name that the unchanged recording lacks in {total['extra']} ({total['extra'] / asked:.0%}),",
-        f"that no recording of the vehicle has in {foreign} ({foreign / asked:.0%}).",
+        f"that no recording of the vehicle has in {foreign} ({foreign / asked:.0%}),",
+        f"whose number the unchanged recording does not estimate alike in {news} ({news / asked:.0%}).",
         "",
     ]
     for row in scored:

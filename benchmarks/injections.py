@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Tables = Mapping[str, pl.DataFrame]
 Change = Callable[[Tables, "Drive"], Tables]
+_AT_REST_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -239,12 +240,18 @@ def _heading_late(tables: Tables, _: Drive) -> Tables:
     change = np.zeros(poses.height)
     for rows in _list_segments(poses):
         times, yaw = poses["t"].to_numpy()[rows], np.unwrap(_read_yaw(poses)[rows])
-        change[rows] = np.interp(times - 0.1, times, yaw) - yaw
+        fresh = ~poses["held"].to_numpy()[rows] | (np.arange(rows.size) == 0)
+        waited = times - np.maximum.accumulate(np.where(fresh, times, -np.inf))
+        # A pose that a slow localization repeats is not of its own moment, one of a vehicle at rest is.
+        known = fresh | (waited > _AT_REST_S)
+        change[rows] = np.interp(times - 0.1, times[known], yaw[known]) - yaw
     return {**tables, "poses": _turn(poses, change, in_map=True)}
 
 
 def _from_wheels(share: float) -> Change:
-    """Poses that are integrated wheels under another name.
+    """Poses that are integrated wheels under another name, looked up between their steps as tf2 does.
+
+    Every one of them is new while the wheels turn, however slow the localization was in whose place they are.
 
     Args:
         share: of each turn before a step is taken: a half goes along the arc, a whole one is Euler's way.
@@ -266,7 +273,10 @@ def _from_wheels(share: float) -> Change:
             "x": np.interp(at, times, place.real), "y": np.interp(at, times, place.imag), "z": none,
             "q_x": none, "q_y": none, "q_z": np.sin(0.5 * seen), "q_w": np.cos(0.5 * seen),
         }  # fmt: skip
-        made = poses.with_columns(pl.Series(name, values) for name, values in columns.items())
+        repeats = np.all([np.diff(values, prepend=np.nan) == 0.0 for values in columns.values()], axis=0)
+        made = poses.with_columns(
+            pl.Series("held", repeats), *(pl.Series(name, values) for name, values in columns.items())
+        )
         return {**tables, "poses": made}
 
     return change

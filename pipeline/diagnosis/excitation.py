@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.diagnosis.selection import CandidateModel, Selection
-from pipeline.diagnosis.verdict import LEAST_STRETCHES, SHORT_S, measure_repeated
+from pipeline.diagnosis.verdict import LEAST_GAIN, LEAST_STRETCHES, SHORT_S, measure_repeated
 from pipeline.identification.columns import weigh_columns
 from pipeline.identification.proposals import Candidate
 from pipeline.models.effect import Effect, Excitation, Search
@@ -81,10 +81,10 @@ def find_unobservable(
         if final.state.find(candidate.id) is not None:
             continue
         column = _shift(selection, final, candidate)
-        alone, beside = _evidence(selection, final, column)
+        alone, beside, share = _evidence(selection, final, column)
         rare = _count_stretches(selection, column) < LEAST_STRETCHES
         if beside >= _STANDARD_ERRORS and not rare:
-            seen += _find_detectable(candidate().make_usual(selection.largest), beside)
+            seen += _find_detectable(candidate().make_usual(selection.largest), beside, share)
             continue
         reason: Literal["no excitation", "collinear with what was named"] = (
             "no excitation" if alone < _STANDARD_ERRORS or rare else "collinear with what was named"
@@ -93,13 +93,19 @@ def find_unobservable(
     return found, seen
 
 
-def _find_detectable(usual: Effect, standard_errors: float) -> list[Detectable]:
-    """The size of an effect of one number that would be seen; its motion grows with it."""
+def _find_detectable(usual: Effect, standard_errors: float, share: float) -> list[Detectable]:
+    """The size of an effect of one number that would be seen; its motion grows with it.
+
+    Args:
+        usual: the effect at a usual size.
+        standard_errors: that it is then.
+        share: of the model's loss that it then takes away: what takes less than a name must is not named.
+    """
     (parameter, *more) = usual.parameters
     distance = abs(usual.values[parameter.name] - parameter.neutral)
     if more or parameter.search is not Search.DIRECT or not math.isfinite(distance):
         return []
-    size = distance * _DETECTED / standard_errors
+    size = distance * max(_DETECTED / standard_errors, math.sqrt(max(LEAST_GAIN, usual.price) / share))
     if parameter.least is not None:
         size = max(size, parameter.least.size)
     return [Detectable(usual.id, parameter.name, parameter.unit, size)]
@@ -118,8 +124,8 @@ def _shift(selection: Selection, final: CandidateModel, candidate: Candidate) ->
     return final.fit.residual - changed
 
 
-def _evidence(selection: Selection, final: CandidateModel, shift: Floats) -> tuple[float, float]:
-    """How many standard errors the shift is, alone and beside the model's own numbers."""
+def _evidence(selection: Selection, final: CandidateModel, shift: Floats) -> tuple[float, float, float]:
+    """How many standard errors a shift is, alone and beside the model's numbers, and its share of loss."""
     fit, weights = final.fit, selection.weights
     factor = weights.factors(fit.residual)
     column = shift * factor
@@ -130,7 +136,7 @@ def _evidence(selection: Selection, final: CandidateModel, shift: Floats) -> tup
         beside = (column.reshape(-1) - rows @ solution).reshape(column.shape)
     repeated = measure_repeated(selection.part, weights.weigh(fit.residual))
     alone, left = (_weigh_noise((one**2).sum(axis=0), repeated) for one in (column, beside))
-    return alone, left
+    return alone, left, float((beside**2).sum() / weights.cost(fit.residual).sum())
 
 
 def _weigh_noise(information: Floats, repeated: Floats) -> float:

@@ -32,14 +32,16 @@ _SURE = 5.0
 def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     """All checks; where the vehicle does not move, only the ones that say so.
 
-    Wheels on a wrong scale may look as if nothing moved: the scale is judged first.
+    Wheels on a wrong scale, or one side that counts backward, may look as if nothing moved: scale and wiring
+    are judged first.
     """
-    scaled = check_scale(samples, vehicle)
-    stuck = check_dead_wheels(samples, vehicle) + ([] if scaled else check_motion(samples, vehicle))
+    scaled, wired = check_scale(samples, vehicle), check_wiring(samples, vehicle)
+    is_faulty = any(finding.severity == "error" for finding in wired)
+    stuck = check_dead_wheels(samples, vehicle)
+    stuck += [] if scaled or is_faulty else check_motion(samples, vehicle)
     if stuck:
         return stuck
-    wired = check_wiring(samples, vehicle)
-    if any(finding.severity == "error" for finding in wired):
+    if is_faulty:
         return scaled + wired
     checks: tuple[Callable[[Samples, Vehicle], list[Finding]], ...] = (
         check_live_commands,

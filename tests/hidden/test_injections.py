@@ -121,6 +121,18 @@ def test_a_heading_that_is_late_is_that_of_before(tables: Tables) -> None:
     assert yaw[-1] == pytest.approx(0.3 + 0.5 * (late["t"][-1] - 0.1), abs=1e-6)
 
 
+def test_a_slow_localization_is_late_by_as_much_and_the_wheels_are_not_slow(tables: Tables) -> None:
+    """Every fourth pose is new and stands until the next."""
+    rows = np.arange(400) // 4 * 4
+    own = pl.col("x", "y", "q_z", "q_w").gather(rows)
+    slow = {**tables, "poses": tables["poses"].with_columns(own, pl.Series("held", np.arange(400) % 4 != 0))}
+    late = BY_NAME["heading .1 s late"].change(slow, DRIVE)["poses"]
+    fresh = late.filter(~pl.col("held"))
+    yaw = np.unwrap(2.0 * np.arctan2(fresh["q_z"].to_numpy(), fresh["q_w"].to_numpy()))
+    assert yaw[1:] == pytest.approx(0.3 + 0.5 * (fresh["t"].to_numpy()[1:] - 0.1), abs=1e-6)
+    assert not BY_NAME["poses from the wheels"].change(slow, DRIVE)["poses"]["held"].any()
+
+
 def test_answers_are_judged() -> None:
     track = Injection("t", lambda tables, _: tables, (), {"effective_track.k": lambda k: 1.2 * k})
     plain = Answer({"effective_track.k": (1.5, 0.01)})
@@ -149,6 +161,15 @@ def test_answers_are_judged() -> None:
     assert judge(same, plain, Answer({}))[0] == "missed"
     assert judge(same, plain, name(1.6))[0] == "missed"
     assert judge(same, plain, name(1.5, speed_slip=0.1)) == ("missed", ["speed_slip"])
+    for estimate, verdict in (((0.1, 0.05), "edge"), ((0.1, 0.2), "missed"), ((0.05, 0.02), "missed")):
+        nearly = replace(plain, estimates={"speed_slip.k": estimate})
+        assert judge(same, nearly, name(1.5, speed_slip=0.1)) == (verdict, ["speed_slip"])
+        assert judge(same, name(1.5, speed_slip=0.1), nearly) == (verdict, [])
+    assert (
+        judge(same, name(1.5, speed_slip=0.1), replace(plain, detectable={"speed_slip.k": 0.2}))[0]
+        == "cannot"
+    )
+    assert judge(same, name(1.5, speed_slip=0.1), replace(plain, unobservable=("speed_slip",)))[0] == "cannot"
 
 
 def test_what_an_effect_cancels_is_not_named() -> None:
@@ -159,6 +180,27 @@ def test_what_an_effect_cancels_is_not_named() -> None:
     # Of what the unchanged recording did not speak silence recovers nothing.
     unsure = Answer({}, estimates={"lateral_skid.c": (-0.1, 0.01)})
     assert judge(skid, unsure, Answer({}, detectable={"lateral_skid.c": 0.03}))[0] == "missed"
+
+
+def test_effects_that_are_one_to_first_order_add_up() -> None:
+    skid = BY_NAME["skid .1 s"]
+    numbers = {"lateral_skid.c": (0.19, 0.02), "heading_skew.d": (0.06, 0.02)}
+    plain = Answer({}, estimates={"lateral_skid.c": (0.02, 0.01)})
+    assert judge(skid, plain, Answer(numbers))[0] == "recovered"
+    assert judge(skid, plain, Answer(numbers, undecided=("lateral_skid",)))[0] == "one of"
+    assert judge(skid, plain, Answer({**numbers, "heading_skew.d": (-0.06, 0.02)}))[0] == "number"
+    assert judge(skid, plain, Answer({}, estimates=numbers))[0] == "missed"
+
+
+def test_what_cancels_is_known_as_well_as_before() -> None:
+    """A frame's offset has two numbers, of which no least size is told."""
+    ahead = BY_NAME["turning about a point .15 m ahead"]
+    mounted = Answer({"lever_arm.l_x": (0.147, 0.002), "lever_arm.l_y": (0.02, 0.003)})
+    assert judge(ahead, mounted, Answer({"icr_lateral.y_icr": (-0.02, 0.003)}))[0] == "missed"
+    assert (
+        judge(ahead, replace(mounted, numbers={"lever_arm.l_x": (0.149, 0.002)}), Answer({}))[0]
+        == "recovered"
+    )
 
 
 def test_a_gain_holds_the_one_that_is_not_named_beside_it() -> None:

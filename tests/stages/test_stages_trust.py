@@ -12,12 +12,19 @@ from pipeline.vehicles import find_preset
 PERIODS_S = (0.05, 0.1)
 
 
-def make_samples(drift_s: float) -> Samples:
-    """Wheels that drive curves of all kinds, and poses that follow them but for v_y = drift_s v w."""
+def make_samples(drift_s: float, uneven_m: float = 0.0) -> Samples:
+    """Wheels that drive curves of all kinds, and poses that follow them but for v_y = drift_s v w.
+
+    Args:
+        drift_s: by which they go beside them.
+        uneven_m: spread of what single steps are beside that, and the next ones make good.
+    """
     times = np.arange(0.0, 60.0, 0.05)
     speed, turn = 1.0 + 0.5 * np.sin(0.7 * times), 0.6 * np.sin(0.4 * times)
     yaw = np.cumsum(turn) * 0.05
     velocity = np.column_stack((speed, drift_s * speed * turn, turn))
+    beside = np.random.default_rng(1).normal(0.0, uneven_m, times.size)
+    velocity[:, 1] += np.diff(beside, prepend=0.0) / 0.05
     moved = np.cumsum((velocity[:, 0] + 1j * velocity[:, 1]) * np.exp(1j * yaw)) * 0.05
     measured = np.column_stack((speed, np.zeros(times.size), turn))
     return Samples(
@@ -45,3 +52,9 @@ def test_steps_before_or_after_the_turn_are_odometry_and_a_skid_is_not(
 ) -> None:
     told = check_independence(make_samples(drift_s), find_preset("husky_a200"), PERIODS_S)
     assert [finding.id for finding in told] == (["pose_from_wheels"] if found else [])
+
+
+def test_uneven_steps_that_do_not_add_up_are_odometry_all_the_same() -> None:
+    vehicle = find_preset("husky_a200")
+    assert check_independence(make_samples(0.025, uneven_m=5e-5), vehicle, PERIODS_S)
+    assert not check_independence(make_samples(0.025, uneven_m=5e-4), vehicle, PERIODS_S)

@@ -1,0 +1,22 @@
+"""How large an effect must be to be seen: out of the noise, and worth a name."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipeline.diagnosis.excitation import _find_detectable
+from pipeline.diagnosis.verdict import LEAST_GAIN
+from pipeline.models import find_effect
+
+
+@pytest.mark.parametrize(
+    ("standard_errors", "share", "size"),
+    [(90.0, 1.0, 0.01), (18.0, 1.0, 0.05), (90.0, 4.0 * LEAST_GAIN, 0.05), (90.0, 0.25 * LEAST_GAIN, 0.2)],
+)
+def test_what_takes_less_of_the_loss_than_a_name_must_is_not_said_to_be_seen(
+    standard_errors: float, share: float, size: float
+) -> None:
+    usual = find_effect("lateral_skid")(c=0.1)
+    (found,) = _find_detectable(usual, standard_errors, share)
+    least = usual.parameters[0].least
+    assert found.size == pytest.approx(max(size, least.size if least else 0.0))
