@@ -90,7 +90,7 @@ def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
     frame = pl.DataFrame(rows, schema=kinds, orient="row")
     told = "; ".join(f"{one.dataset} {say_number(math.sqrt(one.total))} m/s" for one in budgets)
     note = "Cut by shares of the mean square. What makes held-out slip larger stands left of zero."
-    return Picture("causes", "Slip by cause", Drawing(chart, {"causes": frame}, note), f"Rms slip: {told}.")
+    return Picture("causes", "Slip by cause", Drawing(chart, {"causes": frame}, note, f"Rms slip: {told}."))
 
 
 def _tabulate_budgets(budgets: Sequence[Budget], names: Mapping[str, str]) -> Table:

@@ -18,15 +18,13 @@ class Picture:
     Attributes:
         id: stable name, also of its file.
         title: what it shows, in a few words.
-        drawing: chart and rows.
-        words: the same in a sentence or two, for people who cannot see it.
+        drawing: chart, rows and words.
         width: how much of a wide page it takes, `half` or `full`.
     """
 
     id: str
     title: str
     drawing: Drawing
-    words: str
     width: str = "full"
 
 

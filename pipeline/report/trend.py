@@ -1,7 +1,6 @@
 """The page of `slip trend`."""
 
 import itertools
-import re
 from collections.abc import Sequence
 
 import altair as alt
@@ -65,11 +64,11 @@ def _draw_vehicle(parameters: Sequence[ParameterTrend], vehicle: str, number: in
         words = (
             f"{one.points.height} runs, last {one.latest:.3g}. {begin_large(told)}; {say_power(one)}{odd}."
         )
-        pictures.append(Picture(name, f"{one.label}{unit}", _draw_parameter(one, name), words))
+        pictures.append(Picture(name, f"{one.label}{unit}", _draw_parameter(one, name, words)))
     return pictures
 
 
-def _draw_parameter(trend: ParameterTrend, name: str) -> Drawing:
+def _draw_parameter(trend: ParameterTrend, name: str, words: str) -> Drawing:
     """Runs with the intervals of their estimates, on the limits that all lie within, by ground."""
     rows = trend.points.drop("order").with_row_index("order").with_columns(pl.col("order").cast(pl.Float64))
     base = alt.Chart(alt.NamedData(f"{name}_points")).encode(x=_along(rows))
@@ -97,7 +96,7 @@ def _draw_parameter(trend: ParameterTrend, name: str) -> Drawing:
     note = (
         f"{begin_large(say_power(trend))}. Bars: where all runs lie at 95 %; strokes: level on that ground."
     )
-    return Drawing(chart, {f"{name}_points": rows}, note)
+    return Drawing(chart, {f"{name}_points": rows}, note, words)
 
 
 def _along(points: pl.DataFrame) -> alt.X:
@@ -119,11 +118,10 @@ def _picture(series: Series, name: str) -> Picture:
     steps = "; ".join(describe_step(series, step) for step in series.steps)
     unit = f" [{series.unit}]" if series.unit not in ("", "1") else ""
     words = f"{series.points.height} runs, last {series.latest:.3g}. {begin_large(steps) or 'No step'}."
-    drawing = _draw_series(series, re.sub(r"\W", "_", name))
-    return Picture(name, f"{series.quantity}{unit}", drawing, words, "half")
+    return Picture(name, f"{series.quantity}{unit}", _draw_series(series, name, words), "half")
 
 
-def _draw_series(series: Series, name: str) -> Drawing:
+def _draw_series(series: Series, name: str, words: str) -> Drawing:
     points = (
         series.points.drop("order").with_row_index("order").with_columns(pl.col("order").cast(pl.Float64))
     )
@@ -145,7 +143,8 @@ def _draw_series(series: Series, name: str) -> Drawing:
     )
     chart = alt.layer(lines, dots).properties(width=640, height=120, usermeta={"gutter": 60})
     rows = {f"{name}_points": points, f"{name}_levels": levels}
-    return Drawing(chart, rows, "; ".join(begin_large(describe_step(series, step)) for step in series.steps))
+    note = "; ".join(begin_large(describe_step(series, step)) for step in series.steps)
+    return Drawing(chart, rows, note, words)
 
 
 def _tabulate_levels(series: Series) -> pl.DataFrame:

@@ -7,6 +7,7 @@ import polars as pl
 
 from pipeline.fleet.place import ZONES
 from pipeline.report import theme
+from pipeline.report.axes import make_axis
 from pipeline.report.deployments.labels import Box, place_labels
 from pipeline.report.figures import Drawing
 
@@ -29,13 +30,14 @@ _SHAPES = {
 _ZONE_OPACITY = {"low": 0.0, "medium": 0.45, "high": 0.85}
 
 
-def draw_map(points: pl.DataFrame, own: pl.DataFrame, about: str) -> Drawing:
+def draw_map(points: pl.DataFrame, own: pl.DataFrame, about: str, words: str) -> Drawing:
     """Deployments at kinetic energy [J, log] against terrain complexity, with the user's datasets on top.
 
     Args:
         points: as of `place_deployments`.
         own: as of `place_datasets`; may be empty.
         about: what colours them, with its unit.
+        words: what it shows, for people who cannot see it.
     """
     own = number_datasets(own)
     arrows = points.filter(pl.col("bound").is_in(["upper", "lower"])).with_columns(
@@ -62,7 +64,8 @@ def draw_map(points: pl.DataFrame, own: pl.DataFrame, about: str) -> Drawing:
         "complexity / 10 is 3.5 and 4.8. Names without room are told on touching the mark; "
         "on a narrow screen own datasets have the numbers of the table."
     )
-    return Drawing(chart.properties(width=_WIDTH, height=_HEIGHT, usermeta={"gutter": 70}), rows, note)
+    chart = chart.properties(width=_WIDTH, height=_HEIGHT, usermeta={"gutter": 70})
+    return Drawing(chart, rows, note, words)
 
 
 def number_datasets(own: pl.DataFrame) -> pl.DataFrame:
@@ -91,10 +94,8 @@ def _tabulate_zones() -> pl.DataFrame:
 
 
 def _energy(field: str) -> alt.Y:
-    scale = alt.Scale(type="log", domain=[_LOWEST, _HIGHEST])
-    return alt.Y(
-        f"{field}:Q", scale=scale, axis=alt.Axis(title="maximum kinetic energy [J]", format="~s", tickCount=6)
-    )
+    scale = {"type": "log", "domain": [_LOWEST, _HIGHEST]}
+    return make_axis(alt.Y, field, "maximum kinetic energy [J]", scale=scale, format="~s", tickCount=6)
 
 
 def _complexity(field: str = "complexity") -> alt.X:

@@ -32,7 +32,7 @@ def picture_map(drawn: DeploymentMap) -> Picture:
         f"terrain complexity. At high risk: {', '.join(high) or 'none'}."
     )
     about = f"{measure.name} {INPUT_WORDS[drawn.input]} [{measure.unit}]"
-    return Picture("deployment_map", "The map", draw_map(points, own, about), words)
+    return Picture("deployment_map", "The map", draw_map(points, own, about, words))
 
 
 def render_map(drawn: DeploymentMap) -> str:

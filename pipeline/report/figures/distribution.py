@@ -17,13 +17,8 @@ def draw(scene: Scene) -> Drawing | None:
         return None
     curves, medians = tabulate_shares({name: frame["modulus"] for name, frame in scene.sound_slip.items()})
     chart = draw_shares("modulus_shares", medians, title="slip modulus of a time step [m/s]")
-    return Drawing(chart, {"modulus_shares": curves, "modulus_shares_medians": medians})
+    rows = {"modulus_shares": curves, "modulus_shares_medians": medians}
+    return Drawing(chart, rows, words=describe_medians(medians, "slip modulus"))
 
 
-def describe(scene: Scene) -> str:
-    """The medians."""
-    _, medians = tabulate_shares({name: frame["modulus"] for name, frame in scene.sound_slip.items()})
-    return describe_medians(medians, "slip modulus")
-
-
-FIGURE = Figure("Distribution over time steps", Section.HOW_BAD, draw, describe, order=20)
+FIGURE = Figure("Distribution over time steps", Section.HOW_BAD, draw, order=20)

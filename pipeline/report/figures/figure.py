@@ -38,20 +38,13 @@ class Drawing:
         chart: an Altair chart whose rows are named.
         rows: rows by the name that the chart uses; equal names mean equal rows in every figure.
         note: what the reader must know to trust it, for example that points were left out; may be empty.
+        words: the same in a sentence or two, for people who cannot see it.
     """
 
     chart: Picture
     rows: Mapping[str, pl.DataFrame]
     note: str = ""
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One part of a figure: what it shows in a few words, how, and in a sentence."""
-
-    title: str
-    drawing: Drawing
-    words: str
+    words: str = ""
 
 
 @dataclass(frozen=True)
@@ -62,20 +55,18 @@ class Figure:
         title: what it shows, in a few words.
         section: the question it answers.
         draw: the function from tables to a drawing; None when there is nothing to draw.
-        describe: the same in a sentence or two, for people who cannot see it.
         order: place within the section, small first.
         width: how much of a wide page it takes.
-        panels: of a figure that a page sets part by part: the parts by name, empty where there is nothing.
+        panels: of a figure that a page sets part by part: the parts by title, empty where there is nothing.
         id: stable name, that of its file.
     """
 
     title: str
     section: Section
     draw: Callable[[Scene], Drawing | None]
-    describe: Callable[[Scene], str]
     order: int
     width: Literal["half", "full"] = "half"
-    panels: Callable[[Scene], Mapping[str, Panel]] | None = None
+    panels: Callable[[Scene], Mapping[str, Drawing]] | None = None
     id: str = ""
 
 

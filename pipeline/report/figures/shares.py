@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.report import theme
+from pipeline.report.axes import make_axis
 from pipeline.report.figures import parts
 from pipeline.report.run import INPUT_WORDS
 
@@ -44,17 +45,13 @@ def draw_shares(name: str, medians: pl.DataFrame, *, title: str) -> Picture:
         row["series"]: f"{INPUT_WORDS[row['series']]}, median {row['value']:.2f} m/s"
         for row in medians.iter_rows(named=True)
     }
-    colour = parts.series_colour(list(words), words)
+    colour, whole = parts.series_colour(list(words), words), {"domain": [0, 1]}
     curve = (
         alt.Chart(alt.NamedData(name))
         .mark_line(strokeWidth=2)
         .encode(
-            x=alt.X("value:Q", axis=alt.Axis(title=title, format=",~r", tickCount=6, grid=False)),
-            y=alt.Y(
-                "share:Q",
-                axis=alt.Axis(title="share below", format="%", tickCount=4, minExtent=30),
-                scale=alt.Scale(domain=[0, 1]),
-            ),
+            x=make_axis(alt.X, "value", title, tickCount=6, grid=False),
+            y=make_axis(alt.Y, "share", "share below", scale=whole, format="%", tickCount=4, minExtent=30),
             color=colour,
             order="share:Q",
         )

@@ -37,6 +37,7 @@ def draw(scene: Scene) -> Drawing | None:
         chart.properties(usermeta=parts.brush_over_time() | parts.show_worst(scene)),
         rows | parts.span_rows(scene),
         f"{parts.tell_bands(scene)} {note}".strip(),
+        _describe(scene),
     )
 
 
@@ -64,7 +65,7 @@ def model_rows(scene: Scene) -> dict[str, pl.DataFrame]:
     return rows
 
 
-def describe(scene: Scene) -> str:
+def _describe(scene: Scene) -> str:
     """Names the lines and their root mean square distance."""
     words = [parts.SERIES_WORDS[name] for name in scene.slip]
     return (
@@ -75,4 +76,4 @@ def describe(scene: Scene) -> str:
     )
 
 
-FIGURE = Figure("Velocities: measured against ideal", Section.WHERE, draw, describe, order=30, width="full")
+FIGURE = Figure("Velocities: measured against ideal", Section.WHERE, draw, order=30, width="full")

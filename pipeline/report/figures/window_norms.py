@@ -21,7 +21,8 @@ def draw(scene: Scene) -> Drawing | None:
     curves, medians = tabulate_shares(norms)
     chart = draw_shares("norm_shares", medians, title="2 s window norm [m/s]")
     note = "The norm of the published figure: \u221a40 \u00d7 root mean square modulus of 2 s."
-    return Drawing(chart, {"norm_shares": curves, "norm_shares_medians": medians}, note)
+    rows = {"norm_shares": curves, "norm_shares_medians": medians}
+    return Drawing(chart, rows, note, describe_medians(medians, "2 s window norm"))
 
 
 def _list_norms(scene: Scene) -> dict[str, pl.Series]:
@@ -37,10 +38,4 @@ def _list_norms(scene: Scene) -> dict[str, pl.Series]:
     return {name: norms for name, norms in by_input.items() if not norms.is_empty()}
 
 
-def describe(scene: Scene) -> str:
-    """The medians."""
-    _, medians = tabulate_shares(_list_norms(scene))
-    return describe_medians(medians, "2 s window norm")
-
-
-FIGURE = Figure("Distribution over 2 s windows", Section.HOW_BAD, draw, describe, order=30)
+FIGURE = Figure("Distribution over 2 s windows", Section.HOW_BAD, draw, order=30)
