@@ -8,12 +8,12 @@ import contextlib
 import hashlib
 import os
 import subprocess
-import tempfile
 import threading
 from importlib.metadata import version
 from pathlib import Path
 
 from pipeline.core.interpreter import python_command
+from pipeline.store.files import replace_file
 
 _DIGEST_LENGTH = 64
 _EXPOSE = "window.vegaEmbed = vegaEmbed;"
@@ -80,9 +80,7 @@ def _write_checked(path: Path, script: str) -> None:
     body = script.encode()
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            file.write(hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
-        Path(file.name).replace(path)
+        replace_file(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body, durable=False)
 
 
 def _can_write(folder: Path) -> bool:

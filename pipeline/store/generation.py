@@ -154,11 +154,7 @@ class Generation:
         self.write_bytes(name, text.encode())
 
     def write_bytes(self, name: str, data: bytes) -> None:
-        """Write a file.
-
-        Raises:
-            StoreError: ``bad_file_name``, ``written_twice``, or the disk refuses.
-        """
+        """Write a file; errors as of `write_text`."""
         check_file_name(name)
         self._files[name] = self._write(name, data)
 

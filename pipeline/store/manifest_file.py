@@ -20,18 +20,8 @@ def encode_manifest(manifest: Manifest) -> bytes:
     Raises:
         StoreError: ``bad_details``, the details hold something JSON has no word for.
     """
-    content = {
-        "format": FORMAT,
-        "run": manifest.run,
-        "key": manifest.key,
-        "folder": manifest.folder.name,
-        "tables": {name: asdict(entry) for name, entry in manifest.tables.items()},
-        "files": {name: asdict(entry) for name, entry in manifest.files.items()},
-        "details": manifest.details,
-        "earlier": manifest.earlier,
-    }
     try:
-        return seal(content, indent=1)
+        return seal({"format": FORMAT, **asdict(manifest), "folder": manifest.folder.name}, indent=1)
     except (TypeError, ValueError) as error:
         raise StoreError(
             "bad_details",
@@ -96,15 +86,8 @@ def parse_manifest(data: bytes, home: Path) -> Manifest:
             where=str(path),
             hint="Use the newer version, or another folder with --out",
         )
-    return Manifest(
-        run=stored.run,
-        key=stored.key,
-        folder=folder,
-        tables=stored.tables,
-        files=stored.files,
-        details=stored.details,
-        earlier=stored.earlier,
-    )
+    told = {key: value for key, value in vars(stored).items() if key != "format"}
+    return Manifest(**told | {"folder": folder})
 
 
 def encode_marker(manifest: Manifest) -> bytes:

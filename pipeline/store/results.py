@@ -31,10 +31,6 @@ RUNS = "runs"
 CLAIMS = "batch/claims"
 
 
-def _ignore_step(step: str) -> None:
-    del step
-
-
 @dataclass(frozen=True, kw_only=True)
 class Survey:
     """The current generations that can be read, sorted by run, and why the others cannot."""
@@ -53,7 +49,7 @@ class Store:
     """
 
     def __init__(
-        self, root: Path, *, patience_s: float = 60.0, watch: Callable[[str], None] = _ignore_step
+        self, root: Path, *, patience_s: float = 60.0, watch: Callable[[str], None] = files.do_nothing
     ) -> None:
         self.root = Path(root)
         self._patience_s = patience_s
@@ -205,10 +201,7 @@ class Store:
         return answer_query(sql, root=self.root, manifests=manifests, allow_files=allow_files)
 
     def _select(self, partition: Partition | None) -> tuple[Manifest, ...]:
-        manifests = self.manifests()
-        if partition is None:
-            return manifests
-        return tuple(manifest for manifest in manifests if partition.holds(manifest))
+        return tuple(one for one in self.manifests() if partition is None or partition.holds(one))
 
     def verify(self) -> tuple[Problem, ...]:
         """Read everything again; what is not what was written."""

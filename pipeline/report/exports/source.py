@@ -1,18 +1,27 @@
 """The stored run that an export is made of."""
 
+from __future__ import annotations
+
 import itertools
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
-from pipeline.models import Model
 from pipeline.report.exports.feed import Feed
 from pipeline.report.run import INPUTS
-from pipeline.store import Manifest
 from pipeline.store.manifest import name_damage
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from pipeline.core.arrays import Ints
+    from pipeline.logs import LogWriter
+    from pipeline.logs.normalize import Given
+    from pipeline.models import Model
+    from pipeline.store import Manifest
 
 BATCH_ROWS = 16_384
 STRETCH_ROWS = 18_000
@@ -124,6 +133,21 @@ class ExportSource:
     def log_times(self, stamps: np.ndarray) -> np.ndarray:
         """Stamps [ns] on the recorder's clock."""
         return np.asarray(stamps, dtype=np.int64) + self.shift_ns
+
+    def write_stamped(
+        self, writer: LogWriter, topic: str, kind: str, stamps: Ints, fields: Mapping[str, Given]
+    ) -> None:
+        """Write messages with a header.
+
+        Args:
+            writer: of the derived log.
+            topic: of the messages.
+            kind: their type.
+            stamps: of their headers [ns]; they are logged at the same times on the recorder's clock.
+            fields: their columns; they are in the fixed frame where these name no other.
+        """
+        whole = {"header.frame_id": self.frame_id, **fields}
+        writer.write_columns(topic, kind, self.log_times(stamps), whole, header_time=stamps)
 
     @cached_property
     def stretches(self) -> list[tuple[int, int]]:
