@@ -17,7 +17,6 @@ from pipeline.logs.schema import Structure, leaf_paths, parse_msg
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from types import TracebackType
 
     from numpy.typing import NDArray
 
@@ -44,13 +43,7 @@ class _Rows(NamedTuple):
     payloads: NDArray[np.uint8]
 
     def select(self, chosen: Flags) -> _Rows:
-        return _Rows(
-            self.channel,
-            self.log_time[chosen],
-            self.publish_time[chosen],
-            self.sequence[chosen],
-            self.payloads[chosen],
-        )
+        return _Rows(self.channel, *(getattr(self, name)[chosen] for name in self._fields[1:]))
 
 
 class LogWriter:
@@ -191,9 +184,7 @@ class LogWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None:
             self.discard()
             return

@@ -25,7 +25,7 @@ from pipeline.store.names import encode_run, is_file_name, place_inside
 from pipeline.store.notes import LOG_NOTES
 from pipeline.store.results import RUNS, Store
 from pipeline.store.seals import seal, unseal
-from pipeline.store.verification import Examination, Problem, examine_files
+from pipeline.store.verification import Examination, examine_files
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -160,16 +160,12 @@ class Mirror:
             removed |= {name.rpartition("/")[0] for name in doomed}
         return len(removed)
 
-    def verify(self) -> tuple[Problem, ...]:
-        """Fetch and hash everything; what is not what was written.
+    def examine(self) -> Examination:
+        """Fetch and hash everything; what is not what was written, and what cannot be judged.
 
         Raises:
             StoreError: as `pull_index`.
         """
-        return self.examine().problems
-
-    def examine(self) -> Examination:
-        """As `verify`, with what cannot be judged."""
         return examine_files(self)
 
     def put_on_list(self, name: str) -> None:

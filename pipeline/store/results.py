@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.store.partitions import Partition
-    from pipeline.store.verification import Examination, Problem
+    from pipeline.store.verification import Examination
 
 LOCK = ".lock"
 RUNS = "runs"
@@ -203,12 +203,8 @@ class Store:
     def _select(self, partition: Partition | None) -> tuple[Manifest, ...]:
         return tuple(one for one in self.manifests() if partition is None or partition.holds(one))
 
-    def verify(self) -> tuple[Problem, ...]:
-        """Read everything again; what is not what was written."""
-        return self.examine().problems
-
     def examine(self) -> Examination:
-        """As `verify`, with what cannot be judged."""
+        """Read everything again; what is not what was written, and what cannot be judged."""
         from pipeline.store.verification import DiskFiles, examine_files  # noqa: PLC0415 - rarely needed
 
         return examine_files(DiskFiles(self.root))
@@ -357,7 +353,7 @@ class Store:
                 return []
             doomed = [home / name for name in manifest.earlier[keep:]]
             # First the manifest forgets them: killed in between, they are orphans for the next writer.
-            shorter = manifest.with_earlier(manifest.earlier[:keep])
+            shorter = replace(manifest, earlier=manifest.earlier[:keep])
             replace_listed(self.root, home / MANIFEST, encode_manifest(shorter), shorter)
             for folder in doomed:
                 if folder.exists():

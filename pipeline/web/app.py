@@ -45,17 +45,9 @@ if TYPE_CHECKING:
 _LONGEST_LENGTH = 18
 """Digits of the size of a log, before it is taken for a number."""
 
-_PAGES = {
-    "/": ("pipeline.web", "page.html", "text/html"),
-    "/page.css": ("pipeline.web", "page.css", "text/css"),
-    "/page.js": ("pipeline.web", "page.js", "text/javascript"),
-    "/pane.js": ("pipeline.web", "pane.js", "text/javascript"),
-    "/model.js": ("pipeline.web", "model.js", "text/javascript"),
-    "/parts.js": ("pipeline.web", "parts.js", "text/javascript"),
-    "/plan.js": ("pipeline.web", "plan.js", "text/javascript"),
-    "/difference.js": ("pipeline.web", "difference.js", "text/javascript"),
-    "/marks.js": ("pipeline.report", "marks.js", "text/javascript"),
-    "/plots.js": ("pipeline.report", "plots.js", "text/javascript"),
+_SCRIPTS = {
+    "pipeline.web": ("enter", "page", "pane", "model", "parts", "plan", "difference"),
+    "pipeline.report": ("marks", "plots"),
 }
 # The report's own policy stands inside it: it may run what it brought, and reach nothing.
 _SHUT_OFF = {
@@ -86,7 +78,13 @@ class Web:
             "plan": sessions.plan,
         }
         return [
-            *(Route(path, _serve_own(*where)) for path, where in _PAGES.items()),
+            Route("/", _serve_own("pipeline.web", "page.html", "text/html")),
+            Route("/page.css", _serve_own("pipeline.web", "page.css", "text/css")),
+            *(
+                Route(f"/{name}.js", _serve_own(package, f"{name}.js", "text/javascript"))
+                for package, names in _SCRIPTS.items()
+                for name in names
+            ),
             Route("/vega.js", self.bundle),
             Route("/model.toml", self.download),
             Route("/report", self.report),

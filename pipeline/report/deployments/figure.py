@@ -1,6 +1,7 @@
 """The map itself."""
 
 import math
+from typing import Any
 
 import altair as alt
 import polars as pl
@@ -80,17 +81,9 @@ def _tabulate_zones() -> pl.DataFrame:
     for name, end in ZONES:
         for place in (0.0, 10.0):
             low, high = (10.0 ** min(max(edge - place / 10.0, 0.0), 6.0) for edge in (start, end))
-            rows.append(
-                {
-                    "zone": f"{name} risk",
-                    "place": place,
-                    "low": low,
-                    "high": high,
-                    "opacity": _ZONE_OPACITY[name],
-                }
-            )
+            rows.append((f"{name} risk", place, low, high, _ZONE_OPACITY[name]))
         start = end
-    return pl.DataFrame(rows)
+    return pl.DataFrame(rows, schema=["zone", "place", "low", "high", "opacity"], orient="row")
 
 
 def _energy(field: str) -> alt.Y:
@@ -215,23 +208,18 @@ def _draw_names() -> list[alt.Chart]:
         .encode(x=_complexity("place"), y=_energy("height"), text="name:N")
         .transform_filter(f"datum.wide == (width >= {_NARROW})")
     )
-    right, left = (base.transform_filter(f"datum.side == '{side}'") for side in ("right", "left"))
-    # Four kinds of text: quiet or strong, right or left of the mark.
-    texts = (
-        right.mark_text(align="left", dx=_BESIDE, baseline="middle", fontSize=10, color=theme.QUIET),
-        left.mark_text(align="right", dx=-_BESIDE, baseline="middle", fontSize=10, color=theme.QUIET),
-    )
-    strong = (
-        right.mark_text(
-            align="left", dx=_BESIDE, baseline="middle", fontSize=10.5, fontWeight=600, color=theme.INK
-        ),
-        left.mark_text(
-            align="right", dx=-_BESIDE, baseline="middle", fontSize=10.5, fontWeight=600, color=theme.INK
-        ),
-    )
+    quiet: dict[str, Any] = {"fontSize": 10, "color": theme.QUIET}
+    strong: dict[str, Any] = {"fontSize": 10.5, "fontWeight": 600, "color": theme.INK}
+    sides: dict[str, dict[str, Any]] = {
+        "right": {"align": "left", "dx": _BESIDE},
+        "left": {"align": "right", "dx": -_BESIDE},
+    }
     return [
-        *(text.transform_filter("!datum.own") for text in texts),
-        *(text.transform_filter("datum.own") for text in strong),
+        base.transform_filter(f"datum.side == '{side}'")
+        .mark_text(baseline="middle", **look, **place)
+        .transform_filter(whose)
+        for whose, look in (("!datum.own", quiet), ("datum.own", strong))
+        for side, place in sides.items()
     ]
 
 

@@ -119,4 +119,4 @@ def _describe(rows: dict[str, pl.DataFrame]) -> str:
     return f"Autocorrelation of residuals one second apart: {'; '.join(told)}; noise stays below {bound:.2f}."
 
 
-FIGURE = Figure("Does what is left repeat itself?", Section.WHY, draw, order=4)
+FIGURE = Figure("Does what is left repeat itself?", Section.WHY, draw, order=4, live=list_autocorrelations)

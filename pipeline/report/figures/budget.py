@@ -19,15 +19,8 @@ if TYPE_CHECKING:
 
     from pipeline.report.scene import Scene
 
-_SCHEMA = {
-    "cause": pl.String,
-    "from": pl.Float64,
-    "to": pl.Float64,
-    "low": pl.Float64,
-    "high": pl.Float64,
-    "kind": pl.String,
-    "told": pl.String,
-}
+_NUMBERS = dict.fromkeys(("from", "to", "low", "high"), pl.Float64)
+_SCHEMA = {"cause": pl.String, **_NUMBERS, "kind": pl.String, "told": pl.String}
 _LEFT = {"disturbance": "disturbance", "localization_noise": "localization noise"}
 _COLOURS = {"effect": theme.MODEL, "disturbance": theme.GROUND, "localization_noise": theme.CROSS}
 

@@ -98,4 +98,4 @@ def describe(scene: Scene) -> str:
     )
 
 
-FIGURE = Figure("Over the commands", Section.WHERE, draw, order=20)
+FIGURE = Figure("Over the commands", Section.WHERE, draw, order=20, live=list_cells)

@@ -58,6 +58,7 @@ class Figure:
         order: place within the section, small first.
         width: how much of a wide page it takes.
         panels: of a figure that a page sets part by part: the parts by title, empty where there is nothing.
+        live: its rows that another model of the run changes.
         id: stable name, that of its file.
     """
 
@@ -67,6 +68,7 @@ class Figure:
     order: int
     width: Literal["half", "full"] = "half"
     panels: Callable[[Scene], Mapping[str, Drawing]] | None = None
+    live: Callable[[Scene], Mapping[str, pl.DataFrame]] | None = None
     id: str = ""
 
 

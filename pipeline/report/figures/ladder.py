@@ -14,13 +14,8 @@ from pipeline.report.run import INPUT_WORDS, mapping_in, number_in, objects_in
 from pipeline.report.scene import Scene
 from pipeline.report.words import say_number
 
-_SCHEMA = {
-    "rung": pl.Int64,
-    "step": pl.String,
-    "t": pl.Float64,
-    "told": pl.String,
-    "series": pl.String,
-}
+_SCHEMA = {"rung": pl.Int64, "step": pl.String, "t": pl.Float64, "told": pl.String, "series": pl.String}
+_BOUND = {"t": pl.Float64, "told": pl.String, "label": pl.String, "right": pl.Boolean, "raised": pl.Boolean}
 _BOUNDS = ("ceiling", "floor")
 _ROOM = 1.04
 _FAR = 0.6
@@ -113,21 +108,8 @@ def _list_bound(word: str, size: float | None, most: float) -> pl.DataFrame:
     A floor so high that its name would meet the ceiling's is named one row higher.
     """
     told, far = f"{say_number(size)} m", size is not None and size > _FAR * most
-    found = {
-        "t": size,
-        "told": told,
-        "label": f"{word} {told}",
-        "right": far,
-        "raised": far and word == "floor",
-    }
-    schema = {
-        "t": pl.Float64,
-        "told": pl.String,
-        "label": pl.String,
-        "right": pl.Boolean,
-        "raised": pl.Boolean,
-    }
-    return pl.DataFrame([] if size is None else [found], schema=schema)
+    row = (size, told, f"{word} {told}", far, far and word == "floor")
+    return pl.DataFrame([] if size is None else [row], schema=_BOUND, orient="row")
 
 
 def name_input(scene: Scene) -> str:
@@ -158,4 +140,4 @@ def _describe(scene: Scene, rows: Mapping[str, pl.DataFrame]) -> str:
     return f"Error of two-second predictions {words} on data not seen. {told}.{bounds}"
 
 
-FIGURE = Figure("The ladder: error after each effect", Section.WHY, draw, order=0)
+FIGURE = Figure("The ladder: error after each effect", Section.WHY, draw, order=0, live=list_rungs)

@@ -176,11 +176,6 @@ def brush_over_time() -> dict[str, object]:
     return {"brush": "time", "gutter": GUTTER - 11}
 
 
-def show_worst(scene: Scene) -> dict[str, object]:
-    """Tells the page to show the worst stretch alone at first; nothing where that is the whole run."""
-    return {} if scene.worst_span is None else {"window": list(scene.worst_span)}
-
-
 def brush_over_plane(x: str, y: str) -> dict[str, object]:
     """Tells the page that dragging a box marks the points with ``x`` and ``y`` inside."""
     return {"brush": "plane", "x": x, "y": y, "gutter": GUTTER + 4}

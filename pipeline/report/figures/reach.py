@@ -45,4 +45,4 @@ def list_reach(scene: Scene) -> dict[str, pl.DataFrame]:
     return {"reach": pl.concat(lines)}
 
 
-FIGURE = Figure("Predictions over two seconds", Section.WHY, draw, order=6, width="full")
+FIGURE = Figure("Predictions over two seconds", Section.WHY, draw, order=6, width="full", live=list_reach)

@@ -145,4 +145,6 @@ def _describe(motion: MotionView) -> str:
     return "Residuals against the signal that explains most of them: " + "; ".join(told) + "."
 
 
-FIGURE = Figure("What is left, against the signal that explains it", Section.WHY, draw, order=2)
+FIGURE = Figure(
+    "What is left, against the signal that explains it", Section.WHY, draw, order=2, live=list_residuals
+)

@@ -125,4 +125,4 @@ def _describe(signature: Signature) -> str:
 
 
 _TITLE = "What each effect does, and what was measured of it"
-FIGURE = Figure(_TITLE, Section.EFFECT, draw, order=0, panels=list_panels)
+FIGURE = Figure(_TITLE, Section.EFFECT, draw, order=0, panels=list_panels, live=list_signatures)

@@ -114,4 +114,4 @@ def _describe(responses: dict[str, pl.DataFrame]) -> str:
     return "Median response to a step of the command. " + "; ".join(told) + "."
 
 
-FIGURE = Figure("After a step of the command", Section.WHY, draw, order=3)
+FIGURE = Figure("After a step of the command", Section.WHY, draw, order=3, live=list_responses)

@@ -135,4 +135,4 @@ def describe(scene: Scene) -> str:
     return f"{told} Slip was highest, {row['modulus']:.2f} m/s, at x {row['x']:.1f} m, y {row['y']:.1f} m."
 
 
-FIGURE = Figure("On the map", Section.GLANCE, draw, order=10)
+FIGURE = Figure("On the map", Section.GLANCE, draw, order=10, live=list_arcs)

@@ -33,8 +33,10 @@ def draw(scene: Scene) -> Drawing | None:
     chart = alt.vconcat(*(_draw_panel(scene, component, line) for component, line in there.items()))
     rows = {f"velocity_{component}": line.frame for component, line in there.items()} | model_rows(scene)
     note = parts.tell_thinning(*there.values(), kept="first, last, lowest and highest of every bin")
+    # The page shows the worst stretch alone at first.
+    window = {} if scene.worst_span is None else {"window": list(scene.worst_span)}
     return Drawing(
-        chart.properties(usermeta=parts.brush_over_time() | parts.show_worst(scene)),
+        chart.properties(usermeta=parts.brush_over_time() | window),
         rows | parts.span_rows(scene),
         f"{parts.tell_bands(scene)} {note}".strip(),
         _describe(scene),
@@ -76,4 +78,6 @@ def _describe(scene: Scene) -> str:
     )
 
 
-FIGURE = Figure("Velocities: measured against ideal", Section.WHERE, draw, order=30, width="full")
+FIGURE = Figure(
+    "Velocities: measured against ideal", Section.WHERE, draw, order=30, width="full", live=model_rows
+)
