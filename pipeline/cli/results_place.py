@@ -38,11 +38,9 @@ class ResultsPlace:
 
         if self.mirror is None:
             if not self.root.is_dir():
+                hint = "Say where they are, or make them with `slip analyze` or `slip batch`"
                 raise StoreError(
-                    "no_results",
-                    "there are no results: it is no folder",
-                    where=str(self.root),
-                    hint="Say where they are, or make them with `slip analyze` or `slip batch`",
+                    "no_results", "there are no results: it is no folder", where=str(self.root), hint=hint
                 )
             return Store(self.root)
         self.mirror.pull_index()

@@ -200,11 +200,9 @@ class LogWriter:
             return known
         text = definition_text(name) if definition is None else definition
         if text is None:
+            hint = "Give `definition`, or use one of the standard types"
             raise LogError(
-                "unknown_type",
-                f"no definition of {name} is bundled",
-                where=str(self._path),
-                hint="Give `definition`, or use one of the standard types",
+                "unknown_type", f"no definition of {name} is bundled", where=str(self._path), hint=hint
             )
         number = self._mcap.register_schema(name, "ros2msg", text.encode())
         self._types[name] = _Type(number, parse_msg(name, text))
@@ -223,9 +221,7 @@ def _stamp_fields(structure: Structure, stamp: Ints, where: str) -> dict[str, Gi
     for prefix in ("header.stamp.", "transforms[].header.stamp."):
         if f"{prefix}sec" in leaves:
             return {f"{prefix}sec": stamp // _SECOND, f"{prefix}nanosec": stamp % _SECOND}
+    hint = "Leave header_time out"
     raise LogError(
-        "field_not_found",
-        f"{structure.name} has no header for the stamps",
-        where=where,
-        hint="Leave header_time out",
+        "field_not_found", f"{structure.name} has no header for the stamps", where=where, hint=hint
     )

@@ -63,11 +63,8 @@ def write_pictures(
         ReportError: the format is none of these, or the folder cannot be written.
     """
     if format not in FORMATS:
-        raise ReportError(
-            "figure_format_unknown",
-            f"no figure can be written as {format!r}",
-            hint=f"Use one of {', '.join(FORMATS)}",
-        )
+        hint = f"Use one of {', '.join(FORMATS)}"
+        raise ReportError("figure_format_unknown", f"no figure can be written as {format!r}", hint=hint)
     import vl_convert  # noqa: PLC0415 - starts a JavaScript engine
 
     written = []

@@ -23,11 +23,9 @@ def encode_manifest(manifest: Manifest) -> bytes:
     try:
         return seal({"format": FORMAT, **asdict(manifest), "folder": manifest.folder.name}, indent=1)
     except (TypeError, ValueError) as error:
+        hint = "Give texts, finite numbers, lists and mappings with text keys only"
         raise StoreError(
-            "bad_details",
-            f"the details of a generation must be JSON: {error}",
-            where=manifest.run,
-            hint="Give texts, finite numbers, lists and mappings with text keys only",
+            "bad_details", f"the details of a generation must be JSON: {error}", where=manifest.run, hint=hint
         ) from error
 
 
@@ -73,11 +71,9 @@ def parse_manifest(data: bytes, home: Path) -> Manifest:
             folder = resolve_inside(home, stored.folder)
     except (msgspec.DecodeError, ValueError, RecursionError, PathError) as error:
         said = error.what if isinstance(error, PathError) else " ".join(str(error).split())
+        hint = "Delete this one file and analyze its log again"
         raise StoreError(
-            "manifest_damaged",
-            f"the manifest is damaged ({said})",
-            where=str(path),
-            hint="Delete this one file and analyze its log again",
+            "manifest_damaged", f"the manifest is damaged ({said})", where=str(path), hint=hint
         ) from error
     if written_in > FORMAT:
         raise StoreError(

@@ -271,11 +271,8 @@ class Mirror:
 
     def _forget_gone(self, found: Mapping[str, object]) -> None:
         """Runs and notes that are not on the store any more, or not yet, are not in the mirror either."""
-        for path in self.store.homes():
-            name = (path / MANIFEST).relative_to(self.store.root).as_posix()
-            if name not in found:
-                self._hold(name).unlink(missing_ok=True)
-        for path in (self.store.root / LOG_NOTES).glob("*/*.json"):
+        notes = (self.store.root / LOG_NOTES).glob("*/*.json")
+        for path in (*(home / MANIFEST for home in self.store.homes()), *notes):
             name = path.relative_to(self.store.root).as_posix()
             if name not in found:
                 self._hold(name).unlink(missing_ok=True)

@@ -150,11 +150,9 @@ class Store:
         manifest = self.manifest(run)
         while True:
             if manifest is None:
+                hint = "Analyze its log first, or look with `slip status` for the runs there are"
                 raise StoreError(
-                    "no_such_run",
-                    f"there are no results of {run!r}",
-                    where=str(self.root),
-                    hint="Analyze its log first, or look with `slip status` for the runs there are",
+                    "no_such_run", f"there are no results of {run!r}", where=str(self.root), hint=hint
                 )
             try:
                 return manifest.read(table)

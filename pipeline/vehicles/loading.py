@@ -161,12 +161,8 @@ def read_toml(path: Path) -> dict[str, object]:
             "config_not_toml", f"not a valid TOML file: {error}", where=str(path), hint="Mend that line."
         ) from None
     except OSError as error:
-        raise ConfigurationError(
-            "config_unreadable",
-            f"cannot be read: {error.strerror}",
-            where=str(path),
-            hint="Check its permissions.",
-        ) from None
+        what, hint = f"cannot be read: {error.strerror}", "Check its permissions."
+        raise ConfigurationError("config_unreadable", what, where=str(path), hint=hint) from None
     return tree
 
 
@@ -204,9 +200,7 @@ def _names_under(folder: Path, log: Path) -> list[str]:
 
 
 def _bad_match(path: Path, number: int) -> ConfigurationError:
+    hint = 'Write: [[match]] glob = "2026/*/warthog*" and the keys it sets.'
     return ConfigurationError(
-        "config_invalid",
-        f"[[match]] number {number} has no `glob`",
-        where=str(path),
-        hint='Write: [[match]] glob = "2026/*/warthog*" and the keys it sets.',
+        "config_invalid", f"[[match]] number {number} has no `glob`", where=str(path), hint=hint
     )

@@ -209,11 +209,9 @@ def _effects_of(rung: Mapping[str, object]) -> list[str]:
 
 def _require_numbers(errors: Errors, run: str) -> None:
     if not (math.isfinite(errors.t_mrmse_m) and math.isfinite(errors.r_mrmse_rad)):
+        hint = "The model is as it was; take other values or another formula."
         raise WorkbenchError(
-            "not_finite",
-            "with that the model predicts no finite motion on this run",
-            where=run,
-            hint="The model is as it was; take other values or another formula.",
+            "not_finite", "with that the model predicts no finite motion on this run", where=run, hint=hint
         )
 
 

@@ -105,11 +105,9 @@ class Uploads:
             if upload is not None:
                 self.remove(upload)
             if isinstance(error, OSError):
+                hint = "Free some space."
                 raise WorkbenchError(
-                    "upload_not_written",
-                    f"the log cannot be kept: {error.strerror}",
-                    where=name,
-                    hint="Free some space.",
+                    "upload_not_written", f"the log cannot be kept: {error.strerror}", where=name, hint=hint
                 ) from error
             raise
 
@@ -175,11 +173,9 @@ class Uploads:
             except TimeoutError:
                 pass
         if received != upload.total:
+            hint = "Drop it again."
             raise WorkbenchError(
-                "upload_broken",
-                f"{received} of {upload.total} bytes came",
-                where=upload.name,
-                hint="Drop it again.",
+                "upload_broken", f"{received} of {upload.total} bytes came", where=upload.name, hint=hint
             )
         return digest.hexdigest()
 
