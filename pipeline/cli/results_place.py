@@ -23,11 +23,6 @@ class ResultsPlace:
     root: Path
     mirror: Mirror | None = None
 
-    @property
-    def address(self) -> str | None:
-        """Address on an object store; None for a folder."""
-        return None if self.mirror is None else self.mirror.address
-
     def open_store(self) -> Store:
         """The results, with the newest index where they are on an object store.
 

@@ -90,7 +90,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
     request = Request(
         targets=tuple(logs or ()),
         options=replace(options, out=place.root, config=None, fleet=options.config),
-        address=place.address,
+        address=None if place.mirror is None else place.mirror.address,
         executor=executor,
         jobs=workers,
         shard=None if shard is None else parse_shard(shard),

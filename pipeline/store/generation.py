@@ -113,12 +113,9 @@ class Generation:
             self._files[broken] = self._write(broken, rest)
         self._tables[name] = TableEntry(
             file=f"{name}.parquet",
-            rows=checked.report.rows,
-            quarantined=checked.report.quarantined,
-            sha256=entry.sha256,
-            bytes=entry.bytes,
             contract_version=checked.contract.version,
-            rules=checked.report.rules,
+            **vars(entry),
+            **vars(checked.report),
         )
         return checked.report
 

@@ -12,7 +12,7 @@ from pipeline.fleet.statistics.ranks import kendall_tau, list_swaps
 from pipeline.report.comparison.figures import draw_boxes, draw_runs
 from pipeline.report.elements import Cell, Column, Picture, Table
 from pipeline.report.page import render_figures
-from pipeline.report.run import INPUT_WORDS
+from pipeline.report.run import INPUT_WORDS, say_ends
 from pipeline.report.words import MISSING, say_distance, say_number
 
 if TYPE_CHECKING:
@@ -173,10 +173,7 @@ def _say_p(p: float) -> str:
 
 
 def _say_ends(row: Mapping[str, object]) -> str:
-    low, high = row["low"], row["high"]
-    if not isinstance(low, float) or not isinstance(high, float):
-        return MISSING
-    return f"{say_number(low)}\u00a0to\u00a0{say_number(high)}"
+    return say_ends(row).replace(" ", "\u00a0") or MISSING
 
 
 def tabulate_difficulty(shown: pl.DataFrame) -> Table:

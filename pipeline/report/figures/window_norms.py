@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from pipeline.report.figures.figure import Drawing, Figure, Section
-from pipeline.report.figures.shares import describe_medians, draw_shares, tabulate_shares
+from pipeline.report.figures.shares import draw_shares
 
 if TYPE_CHECKING:
     from pipeline.report.scene import Scene
@@ -18,11 +18,8 @@ def draw(scene: Scene) -> Drawing | None:
     norms = _list_norms(scene)
     if not norms:
         return None
-    curves, medians = tabulate_shares(norms)
-    chart = draw_shares("norm_shares", medians, title="2 s window norm [m/s]")
     note = "The norm of the published figure: \u221a40 \u00d7 root mean square modulus of 2 s."
-    rows = {"norm_shares": curves, "norm_shares_medians": medians}
-    return Drawing(chart, rows, note, describe_medians(medians, "2 s window norm"))
+    return draw_shares("norm_shares", norms, "2 s window norm", note=note)
 
 
 def _list_norms(scene: Scene) -> dict[str, pl.Series]:
