@@ -11,7 +11,7 @@ Source: Muir and Neuman, ICRA 1987; Taheri, Qiao and Ghaeminezhad, IJCA 113(3), 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -33,7 +33,7 @@ class Mecanum(Differential):
             "sideways", "rad/s", "a quarter of front right and rear left less front left and rear right"
         ),
     )
-    geometry = (
+    geometry: ClassVar[tuple[Quantity, ...]] = (
         Quantity("wheel_radius_m", "m", "r"),
         Quantity("track_width_m", "m", "b, between the middles of the left and right wheels"),
         Quantity("wheelbase_m", "m", "l, between the axles"),
