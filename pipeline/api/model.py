@@ -34,7 +34,7 @@ from pipeline.vehicles.configuration import VehicleSection
 if TYPE_CHECKING:
     from pipeline.analysis.geometry import Owner
     from pipeline.api.run import Run
-    from pipeline.report.figures.figure import Picture as Chart
+    from pipeline.report.axes import Picture as Chart
 
     Source = Literal["command", "measured"]
 

@@ -1,17 +1,14 @@
 """From the stored bytes of a chunk to its records, never asking for more memory than is plausible."""
 
-from __future__ import annotations
-
 import threading
 import zlib
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
-from typing import IO, TYPE_CHECKING, Final
+from typing import IO, Final
 
 import zstandard
 
-if TYPE_CHECKING:
-    from pipeline.logs.records import Buffer
+from pipeline.logs.records import Buffer
 
 MAX_CHUNK: Final = 1 << 30
 """Largest chunk that is inflated [bytes]; recorders write 1 to 100 MB."""

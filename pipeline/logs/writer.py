@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple, Self
+from typing import BinaryIO, Final, NamedTuple, Self
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
 
 from pipeline.core.arrays import Flags, Ints
 from pipeline.logs.definitions import definition_text
 from pipeline.logs.encode import encode_rows
 from pipeline.logs.errors import LogError, unsupported
+from pipeline.logs.normalize import Given
 from pipeline.logs.schema import Structure, leaf_paths, parse_msg
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-
-    from pipeline.logs.normalize import Given
-
 
 LIBRARY: Final = "slip-pipeline"
 COMPRESSIONS: Final = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}

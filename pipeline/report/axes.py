@@ -1,10 +1,11 @@
 """Axes of figures."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import altair as alt
 
+Picture: TypeAlias = alt.Chart | alt.LayerChart | alt.FacetChart | alt.VConcatChart
 Channel = TypeVar("Channel", alt.X, alt.Y)
 
 

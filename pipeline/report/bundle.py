@@ -13,7 +13,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 from pipeline.core.interpreter import python_command
-from pipeline.store.files import replace_file
 
 _DIGEST_LENGTH = 64
 _EXPOSE = "window.vegaEmbed = vegaEmbed;"
@@ -77,6 +76,8 @@ def _read_checked(path: Path) -> str | None:
 
 
 def _write_checked(path: Path, script: str) -> None:
+    from pipeline.store.files import replace_file  # noqa: PLC0415 - only where it is not cached yet
+
     body = script.encode()
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,24 +1,18 @@
 """The page of `slip compare --causes`."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
 
 import altair as alt
 import polars as pl
 
+from pipeline.fleet.causes import Budget, Causes, Difference
 from pipeline.report import theme
 from pipeline.report.elements import Column, Picture, Table
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.words import MISSING, say_number, say_share
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.fleet.causes import Budget, Causes, Difference
 
 _COLOURS = (
     theme.MODEL, theme.ON_COMMAND, theme.ON_MEASURED, theme.SLIP, theme.DRIVETRAIN, theme.MARK,

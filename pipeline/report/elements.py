@@ -1,14 +1,10 @@
 """What a page shows, as plain values: pictures and tables. `templates/elements.html` makes the HTML."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.report.figures import Drawing
+from pipeline.report.figures import Drawing
 
 
 @dataclass(frozen=True)

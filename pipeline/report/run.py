@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from pipeline.diagnosis.recording import FATAL
 from pipeline.report.words import say_number
 
 if TYPE_CHECKING:
@@ -72,6 +71,8 @@ class RunReport:
     @property
     def is_refused(self) -> bool:
         """Whether a finding makes every fit to the run meaningless, so that the diagnosis names nothing."""
+        from pipeline.diagnosis.recording import FATAL  # noqa: PLC0415 - heavy
+
         return any(finding.get("id") in FATAL for finding in self.items("findings"))
 
     @property

@@ -1,24 +1,18 @@
 """The page of `slip compare`."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import polars as pl
 
 from pipeline.core.durations import say_duration
 from pipeline.fleet.measures import MEASURES, compare_orders
 from pipeline.fleet.statistics.ranks import kendall_tau, list_swaps
+from pipeline.fleet.tables import Answer
 from pipeline.report.comparison.figures import draw_boxes, draw_runs
 from pipeline.report.elements import Cell, Column, Picture, Table
 from pipeline.report.page import render_figures
 from pipeline.report.run import INPUT_WORDS, say_ends
 from pipeline.report.words import MISSING, say_distance, say_number
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.fleet.tables import Answer
 
 _LEVEL = 0.05
 _MOST_SWAPS = 4

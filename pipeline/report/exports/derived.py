@@ -4,26 +4,20 @@ Message types are standard ROS 2 ones, which Foxglove, Lichtblick, PlotJuggler a
 of the original.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats, Ints
+from pipeline.identification import Prediction
 from pipeline.logs import LogWriter
+from pipeline.logs.normalize import Given
 from pipeline.report.exports import topics
 from pipeline.report.exports.markers import join_track, write_findings, write_trail
+from pipeline.report.exports.source import ExportSource
 from pipeline.report.exports.stretches import ModelFeed
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from pipeline.identification import Prediction
-    from pipeline.logs.normalize import Given
-    from pipeline.report.exports.source import ExportSource
 
 _BODY = "base_link"
 _TWIST = "geometry_msgs/msg/TwistStamped"

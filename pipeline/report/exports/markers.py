@@ -1,21 +1,14 @@
 """Markers in the derived log: the way driven coloured by slip, and findings where they happened."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats, Ints
+from pipeline.logs import LogWriter
+from pipeline.logs.normalize import Given
 from pipeline.report import theme
 from pipeline.report.exports import topics
-
-if TYPE_CHECKING:
-    from pipeline.logs import LogWriter
-    from pipeline.logs.normalize import Given
-    from pipeline.report.exports.source import ExportSource
-
+from pipeline.report.exports.source import ExportSource
 
 _MARKER = "visualization_msgs/msg/Marker"
 _LINE_STRIP, _TEXT = 4, 9

@@ -1,27 +1,21 @@
 """The stored run that an export is made of."""
 
-from __future__ import annotations
-
 import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
+from pipeline.core.arrays import Ints
+from pipeline.logs import LogWriter
+from pipeline.logs.normalize import Given
+from pipeline.models import Model
 from pipeline.report.exports.feed import Feed
 from pipeline.report.run import INPUTS
+from pipeline.store import Manifest
 from pipeline.store.manifest import name_damage
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from pipeline.core.arrays import Ints
-    from pipeline.logs import LogWriter
-    from pipeline.logs.normalize import Given
-    from pipeline.models import Model
-    from pipeline.store import Manifest
 
 BATCH_ROWS = 16_384
 STRETCH_ROWS = 18_000

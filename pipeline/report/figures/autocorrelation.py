@@ -1,8 +1,6 @@
 """Autocorrelation of residuals: structure that a model has left over lives for seconds, noise does not."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import altair as alt
 import polars as pl
@@ -15,13 +13,9 @@ from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.residuals import QUANTITIES
 from pipeline.report.motion_view import COMPONENTS, MotionView
+from pipeline.report.scene import Scene
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pipeline.report.scene import Scene
-
-    Correlation = tuple[Floats, Floats, float]
+Correlation = tuple[Floats, Floats, float]
 
 
 def draw(scene: Scene) -> Drawing | None:

@@ -1,8 +1,6 @@
 """Who carries the slip: one bar from the ideal model's slip down to the floor, effect by effect."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import altair as alt
 import polars as pl
@@ -12,12 +10,8 @@ from pipeline.report.axes import make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS, mapping_in, number_in, objects_in
+from pipeline.report.scene import Scene
 from pipeline.report.words import say_number, say_share
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.report.scene import Scene
 
 _NUMBERS = dict.fromkeys(("from", "to", "low", "high"), pl.Float64)
 _SCHEMA = {"cause": pl.String, **_NUMBERS, "kind": pl.String, "told": pl.String}

@@ -1,19 +1,13 @@
 """Correlation of residuals with the input: what the model does with its input is right where none is left."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import polars as pl
 
 from pipeline.identification.correlation import LONGEST_S, cross_correlate
 from pipeline.report.figures.autocorrelation import draw_correlations, list_correlations
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.residuals import QUANTITIES
-
-if TYPE_CHECKING:
-    from pipeline.report.motion_view import MotionView
-    from pipeline.report.scene import Scene
+from pipeline.report.motion_view import MotionView
+from pipeline.report.scene import Scene
 
 _WORDS = {"f_x": "speed", "f_y": "sideways speed", "f_w": "yaw rate", "f_x_f_w": "speed \u00d7 yaw rate"}
 

@@ -1,14 +1,8 @@
 """How the slip modulus is distributed over the time steps."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.shares import draw_shares
-
-if TYPE_CHECKING:
-    from pipeline.report.scene import Scene
+from pipeline.report.scene import Scene
 
 
 def draw(scene: Scene) -> Drawing | None:

@@ -1,8 +1,6 @@
 """Is the log long enough: how narrow the intervals are, and how sure the names, by seconds of driving."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
 
 import altair as alt
 import polars as pl
@@ -14,12 +12,8 @@ from pipeline.report.axes import make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import mapping_in, number_in, numbers_in, objects_in
+from pipeline.report.scene import Scene
 from pipeline.report.words import begin_large
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from pipeline.report.scene import Scene
 
 _SCHEMA = {"effect": pl.String, "number": pl.String, "seconds": pl.Float64, "value": pl.Float64}
 _COLOURS = (

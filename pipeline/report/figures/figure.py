@@ -7,17 +7,15 @@ import importlib
 import pkgutil
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    import altair as alt
     import polars as pl
 
+    from pipeline.report.axes import Picture
     from pipeline.report.scene import Scene
-
-    Picture: TypeAlias = alt.Chart | alt.LayerChart | alt.FacetChart | alt.VConcatChart
 
 
 class Section(Enum):

@@ -1,17 +1,11 @@
 """Slip modulus over time, on the command and on the measured wheels."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.scales import find_range
+from pipeline.report.scene import Scene
 from pipeline.report.words import say_number
-
-if TYPE_CHECKING:
-    from pipeline.report.scene import Scene
 
 
 def draw(scene: Scene) -> Drawing | None:

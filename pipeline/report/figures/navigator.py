@@ -1,9 +1,5 @@
 """The whole run in a strip, over which the stretch is dragged that other figures draw large."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import altair as alt
 import polars as pl
 
@@ -11,10 +7,8 @@ from pipeline.report import theme
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS
+from pipeline.report.scene import Scene
 from pipeline.report.thinning import break_lines, thin_to_peaks
-
-if TYPE_CHECKING:
-    from pipeline.report.scene import Scene
 
 _BINS = 600
 

@@ -1,25 +1,16 @@
 """Residuals against the signal that explains them, before and after the model's effects."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import altair as alt
 import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
 from pipeline.report import theme
-from pipeline.report.axes import make_axis
+from pipeline.report.axes import Picture, make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
-from pipeline.report.motion_view import COMPONENTS, SIGNALS
-
-if TYPE_CHECKING:
-    from pipeline.report.figures.figure import Picture
-    from pipeline.report.motion_view import MotionView
-    from pipeline.report.scene import Scene
-
+from pipeline.report.motion_view import COMPONENTS, SIGNALS, MotionView
+from pipeline.report.scene import Scene
 
 QUANTITIES = {"x": ("forward", "m/s"), "y": ("sideways", "m/s"), "w": ("yaw rate", "rad/s")}
 

@@ -1,25 +1,17 @@
 """The signature of each effect: the residual without and with it, against the variable that it acts on."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import altair as alt
 import numpy as np
 import polars as pl
 
-from pipeline.identification.signature import SINCE_STEP, VARIABLES
+from pipeline.identification.signature import SINCE_STEP, VARIABLES, Signature
 from pipeline.report import theme
-from pipeline.report.axes import make_axis
+from pipeline.report.axes import Picture, make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.residuals import QUANTITIES
+from pipeline.report.scene import Scene
 from pipeline.report.words import say_number, say_share
-
-if TYPE_CHECKING:
-    from pipeline.identification.signature import Signature
-    from pipeline.report.figures.figure import Picture
-    from pipeline.report.scene import Scene
 
 _SERIES = {"before": "error without it", "after": "with it", "curve": "what it does"}
 

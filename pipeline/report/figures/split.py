@@ -1,19 +1,13 @@
 """What the drivetrain does to the command, and what the ground does to the wheels' motion."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import altair as alt
 import polars as pl
 
 from pipeline.report import theme
 from pipeline.report.axes import make_axis
 from pipeline.report.figures.figure import Drawing, Figure, Section
+from pipeline.report.scene import Scene
 from pipeline.report.words import say_split
-
-if TYPE_CHECKING:
-    from pipeline.report.scene import Scene
 
 _PARTS = {
     "drivetrain": "drivetrain (command to wheels)",

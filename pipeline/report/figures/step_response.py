@@ -1,22 +1,14 @@
 """What the body does after a step of the command: the median over all steps, scaled to the step's height."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import altair as alt
 import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.report.axes import make_axis
+from pipeline.report.axes import Picture, make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
-
-if TYPE_CHECKING:
-    from pipeline.report.figures.figure import Picture
-    from pipeline.report.scene import Scene
-
+from pipeline.report.scene import Scene
 
 _CHANNELS = {"x": ("forward velocity", 0.15), "w": ("yaw rate", 0.15)}
 _BEFORE_S, _AFTER_S, _RATE_HZ = 0.5, 3.0, 20.0

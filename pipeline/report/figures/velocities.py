@@ -1,21 +1,14 @@
 """Velocities over time: what was measured against what the ideal model says, gaps left open."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import altair as alt
 import polars as pl
 
+from pipeline.report.axes import Picture
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scales import find_range
-from pipeline.report.scene import COMPONENTS, LINE_BINS
+from pipeline.report.scene import COMPONENTS, LINE_BINS, Scene, Thinned
 from pipeline.report.thinning import break_lines, drop_flat_rows, thin_series
-
-if TYPE_CHECKING:
-    from pipeline.report.figures.figure import Picture
-    from pipeline.report.scene import Scene, Thinned
 
 _QUANTITIES = {
     "x": ("forward velocity v_x", "m/s"),

@@ -1,16 +1,10 @@
 """How the published quantity, the 2 s window norm, is distributed."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import polars as pl
 
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.shares import draw_shares
-
-if TYPE_CHECKING:
-    from pipeline.report.scene import Scene
+from pipeline.report.scene import Scene
 
 
 def draw(scene: Scene) -> Drawing | None:
