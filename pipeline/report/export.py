@@ -1,18 +1,23 @@
 """Figures as files, for papers, and as charts, for notebooks."""
 
+from __future__ import annotations
+
 import re
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 from pipeline.core.errors import naming_os_errors
-from pipeline.report.axes import Picture as Chart
-from pipeline.report.elements import Picture
 from pipeline.report.errors import ReportError
 from pipeline.report.page import draw_pictures
-from pipeline.report.run import RunReport
 from pipeline.report.scene import Scene
 from pipeline.report.specs import fill_chart, fill_spec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from pipeline.report.axes import Picture as Chart
+    from pipeline.report.elements import Picture
+    from pipeline.report.run import RunReport
 
 Format = Literal["svg", "pdf", "png"]
 FORMATS: tuple[Format, ...] = get_args(Format)
