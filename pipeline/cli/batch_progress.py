@@ -49,17 +49,17 @@ class LineWatch(SilentWatch):
         self._done += 1
         self._read += size
         what = f"{line.state}: {line.reason}" if line.reason else line.state
-        left = f", {self._say_left()}" if self._done < self._todo else ""
+        left = f", about {say_duration(self.estimate_rest())} left" if self._done < self._todo else ""
         say(f"[{self._done}/{self._todo}] {line.run or line.path} {what} ({line.seconds:.1f} s){left}")
 
     def _begin(self, todo: int, size: int) -> None:
         self._todo, self._size = todo, size
         self._started = time.monotonic()
 
-    def _say_left(self) -> str:
-        """How long the rest takes if a byte of it, or else a log, takes as long as those before."""
+    def estimate_rest(self) -> float:
+        """Seconds that the rest takes if a byte of it, or else a log, takes as long as those before."""
         share = self._read / self._size if self._read else self._done / self._todo
-        return f"about {say_duration((time.monotonic() - self._started) * (1.0 - share) / share)} left"
+        return (time.monotonic() - self._started) * (1.0 - share) / share
 
 
 class BarWatch(LineWatch):
@@ -90,7 +90,7 @@ class BarWatch(LineWatch):
             text = tidy_line(f"{line.run or line.path} {line.state}: {line.reason}")
             self._bar.console.print(text, markup=False, highlight=False)
         if self._task is not None:
-            left = self._say_left() if self._done < self._todo else ""
+            left = f"about {say_duration(self.estimate_rest())} left" if self._done < self._todo else ""
             self._bar.update(self._task, advance=1, left=left)
 
     def __exit__(self, *_: object) -> None:
